@@ -37,7 +37,7 @@ def drive_from_phases(phases: ArrayLike, amplitudes: ArrayLike | None = None) ->
         ValueError: not finite real numbers, an amplitude outside [0, 1], or shapes that do not broadcast.
 
     Warns:
-        ScaleWarning: the phases seem to be in degrees.
+        ScaleWarning: the phases seem to be in degrees, or levels of a device.
     """
     phi = real_tensor("phases", phases, "rad")
     _warn_of_degrees(phi.detach())
@@ -57,10 +57,12 @@ def drive_from_phases(phases: ArrayLike, amplitudes: ArrayLike | None = None) ->
 
 
 def _warn_of_degrees(phases: torch.Tensor) -> None:
-    """Warn of whole numbers up to 90 or more; phases that are not wrapped are seldom whole."""
+    """Warn of whole numbers up to 90 or more, degrees or levels; phases in rad are seldom whole."""
     if phases.numel() > 1 and phases.abs().max() >= 90 and torch.equal(phases, phases.round()):
         shown = f"phases: whole numbers from {phases.min():g} to {phases.max():g} rad"
-        warn_user(f"{shown}; are these degrees? Then take numpy.radians(phases)")
+        warn_user(
+            f"{shown}; are these degrees, or levels of a device? Of degrees, take numpy.radians(phases)"
+        )
 
 
 def phases_of(drive: ArrayLike) -> torch.Tensor:

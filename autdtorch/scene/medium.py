@@ -58,7 +58,8 @@ class Medium:
         object.__setattr__(self, "density", density)
         object.__setattr__(self, "sound_speed", sound_speed)
         object.__setattr__(self, "absorption", not_negative("Medium.absorption", self.absorption, "dB/m"))
-        if not _USUAL_SPEEDS[0] <= sound_speed <= _USUAL_SPEEDS[1]:
+        least, most = _USUAL_SPEEDS
+        if sound_speed > most or sound_speed < least <= density:  # 1 and 1 are of a problem without units
             odd = f"Medium.sound_speed: {sound_speed:g} m/s, as of no fluid; it comes after the density"
             warn_user(f"{odd}, which is {density:g} kg/m^3: are they swapped, or in other units?")
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.obstacles import Mesh, Obstacle, VoxelMask
 from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import LENGTH_TOLERANCE
@@ -14,21 +15,23 @@ from autdtorch.utils.validation import LENGTH_TOLERANCE
 if TYPE_CHECKING:
     from autdtorch.scene.scene import Scene
 
-_USUAL_EXTENT = 0.1, 2000.0  # [wavelengths] across array and control points
-_USUAL_SIZE = 20.0  # [extents of array and control points] across everything, unless lengths are in mm
+_SHORTEST = 0.1  # [wavelengths per m of wavelength] across array and control points: 1 m at 100 Hz in air
+_LONGEST = 5e3  # [wavelengths] across array and control points
+_USUAL_RATIO = 50.0  # of everything to array and control points, unless lengths are in mm
 _LEAST_EXTENT = 15.0  # [wavelengths], for arrays and control points that are closer
+_FAR = 10.0  # [m]; nearer walls and wider domains may be meant
 _SAME_FREQUENCY = 0.01  # relative difference, for which the absorption changes by 2 %
+_PAIRS = 2**20  # of points and normals that are held at once
 
 
-def warn_of_implausible(scene: Scene, domain_is_given: bool) -> None:
+def warn_of_implausible(scene: Scene) -> None:
     """Warn of units, foci behind the array and the air of another frequency."""
-    extent = _observed_extent(scene)
-    least, most = (bound * scene.wavelength for bound in _USUAL_EXTENT)
-    if not least <= extent <= most:
+    extent, wavelength = _diagonal(_observed(scene)), scene.wavelength
+    if not _SHORTEST * wavelength**2 <= extent <= max(_LONGEST * wavelength, _FAR):
         found = f"{extent:.4g} m from end to end of array and control points, but a wavelength of"
         ask = "are lengths in m and the frequency in Hz, 40 kHz as 40e3?"
-        warn_user(f"Scene: {found} {scene.wavelength:.4g} m; {ask}")
-    for name, hint in _too_large(scene, domain_is_given):
+        warn_user(f"Scene: {found} {wavelength:.4g} m; {ask}")
+    for name, hint in _too_large(scene):
         warn_user(f"Scene.{name}{hint}")
     _warn_of_foci_behind(scene)
     known = scene.medium.absorption_frequency
@@ -40,14 +43,10 @@ def warn_of_implausible(scene: Scene, domain_is_given: bool) -> None:
 
 
 def unit_hint(scene: Scene, obstacle: Obstacle) -> str:
-    """Return what to do about an obstacle far larger or farther than the array and the foci; else nothing."""
-    if not _is_far_larger(scene, obstacle.lower, obstacle.upper):
-        return ""
-    if isinstance(obstacle, Mesh):
-        return "; take scale=1e-3 for a file in millimetres"
-    if isinstance(obstacle, VoxelMask):
-        return "; is its spacing in m, 1 mm as 1e-3?"
-    return "; are its lengths in m, 16 mm as 16e-3?"
+    """Return what to do about a refused obstacle far larger or farther than array and foci; else nothing."""
+    points = _observed(scene)
+    both = torch.cat([points, points.new_tensor([obstacle.lower, obstacle.upper])])
+    return _unit_question(obstacle) if _diagonal(both) > _usual_reach(scene, points) else ""
 
 
 def extent_of(obstacle: Obstacle) -> str:
@@ -57,45 +56,82 @@ def extent_of(obstacle: Obstacle) -> str:
     return f"{low} to {high} m"
 
 
-def _too_large(scene: Scene, domain_is_given: bool) -> Iterator[tuple[str, str]]:
-    """Yield names and descriptions of the parts that are far larger than array and control points."""
+def _unit_question(obstacle: Obstacle) -> str:
+    if isinstance(obstacle, Mesh):
+        return "; take scale=1e-3 for a file in millimetres"
+    if isinstance(obstacle, VoxelMask):
+        return "; is its spacing in m, 1 mm as 1e-3?"
+    return "; are its lengths in m, 16 mm as 16e-3?"
+
+
+def _too_large(scene: Scene) -> Iterator[tuple[str, str]]:
+    """Yield names and descriptions of the parts that are far larger than what they should fit.
+
+    These are array and control points; for the domain, all that is in it.
+    """
+    points = _observed(scene)
+    everything = [points]
     for index, obstacle in enumerate(scene.obstacles):
-        if hint := unit_hint(scene, obstacle):
-            yield f"obstacles[{index}]", f": {type(obstacle).__name__} of {extent_of(obstacle)}{hint}"
+        corners = points.new_tensor([obstacle.lower, obstacle.upper])
+        everything.append(corners)
+        if _is_too_large(scene, points, _without_slabs(corners, points)):
+            told = f"{type(obstacle).__name__} of {extent_of(obstacle)}{_unit_question(obstacle)}"
+            yield f"obstacles[{index}]", f": {told}"
     ask = "is it in m, 100 mm as 100e-3?"
     if (plane := scene.observation_plane) is not None:
-        lower, upper = plane.corners.amin(dim=0), plane.corners.amax(dim=0)
-        if _is_far_larger(scene, lower.tolist(), upper.tolist()):
+        everything.append(plane.corners)
+        if _is_too_large(scene, points, plane.corners):
             yield "observation_plane", f": of {plane.size} m around {plane.center} m; {ask}"
-    if domain_is_given and _is_far_larger(scene, *scene.domain):
+    if _is_too_large(scene, torch.cat(everything), points.new_tensor(scene.domain)):
         yield "domain", f": {scene.domain[0]} to {scene.domain[1]} m; {ask}"
 
 
-def _is_far_larger(
-    scene: Scene, lower: list[float] | tuple[float, ...], upper: list[float] | tuple[float, ...]
-) -> bool:
-    """Return whether a box with these corners makes the scene far larger than array and control points."""
-    points = _observed(scene)
-    corners = torch.cat([points, points.new_tensor([lower, upper])])
-    usual = max(_observed_extent(scene), _LEAST_EXTENT * scene.wavelength)
-    return float((corners.amax(dim=0) - corners.amin(dim=0)).norm()) > _USUAL_SIZE * usual
+def _is_too_large(scene: Scene, points: torch.Tensor, part: torch.Tensor) -> bool:
+    """Return whether a part (N, 3) reaches so far beyond points (N, 3) [m] that it can hardly be meant."""
+    return _diagonal(torch.cat([points, part])) > max(_usual_reach(scene, points), _FAR)
+
+
+def _usual_reach(scene: Scene, points: torch.Tensor) -> float:
+    return _USUAL_RATIO * max(_diagonal(points), _LEAST_EXTENT * scene.wavelength)
+
+
+def _without_slabs(corners: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    """Return corners (2, 3) cut to the points (N, 3) on each axis where they pass these at both ends.
+
+    So a wall across the scene may be as wide as one likes, since it is meant to have no end.
+    """
+    lower, upper = points.amin(dim=0), points.amax(dim=0)
+    passes = (corners[0] < lower) & (corners[1] > upper)
+    return torch.where(passes, torch.stack([lower, upper]), corners)
 
 
 def _observed(scene: Scene) -> torch.Tensor:
     return torch.cat([scene.array.positions, scene.control_points])
 
 
-def _observed_extent(scene: Scene) -> float:
-    """Return the diagonal [m] of the bounding box of array and control points."""
-    points = _observed(scene)
+def _diagonal(points: torch.Tensor) -> float:
+    """Return the diagonal [m] of the bounding box of points (N, 3)."""
     return float((points.amax(dim=0) - points.amin(dim=0)).norm())
 
 
 def _warn_of_foci_behind(scene: Scene) -> None:
-    """Warn where every control point lies behind every transducer; some may, as on a sphere around all."""
-    array = scene.array
-    ahead = scene.control_points @ array.normals.T - (array.normals * array.positions).sum(dim=1)
-    if (ahead < -LENGTH_TOLERANCE).all():
-        x, y, z = (f"{entry:.3g}" for entry in array.normals[0].tolist())
-        lie = "all lie behind the array" if len(ahead) > 1 else "lies behind the array"
-        warn_user(f"Scene.control_points: {lie}, whose normal is ({x}, {y}, {z}); turn it, or move the array")
+    """Warn where all lies behind every disc; some points may, and an obstacle ahead may reflect.
+
+    Point sources have no direction.
+    """
+    array, points = scene.array, scene.control_points
+    discs = radii_of(array) > 0
+    if not discs.any():
+        return
+    normals, facing = torch.unique(array.normals[discs], dim=0, return_inverse=True)  # most arrays have one
+    heights = (normals[facing] * array.positions[discs]).sum(dim=1)
+    start = heights.new_zeros(len(normals)).scatter_reduce(0, facing, heights, "amin", include_self=False)
+    corners = [
+        torch.cartesian_prod(*points.new_tensor([body.lower, body.upper]).T) for body in scene.obstacles
+    ]
+    for some in torch.split(torch.cat([points, *corners]), max(1, _PAIRS // len(normals))):
+        if (some @ normals.T >= start - LENGTH_TOLERANCE).any():
+            return
+    x, y, z = (f"{entry:.3g}" for entry in normals[0].tolist())
+    lie = "all lie behind the array" if len(points) > 1 else "lies behind the array"
+    warn_user(f"Scene.control_points: {lie}, whose normal is ({x}, {y}, {z}); turn it, or move the array")

@@ -101,7 +101,8 @@ class Scene:
         Warns:
             OverlapWarning: two obstacles of different materials overlap.
             ScaleWarning: lengths, or the file of a mesh, seem to be in mm, or the frequency in kHz; all
-                control points lie behind the array; or `Medium.air` was made for another frequency.
+                control points and obstacles lie behind an array of discs; or `Medium.air` was made for
+                another frequency.
         """
         require_kind("Scene.array", array, TransducerArray)
         require_kind("Scene.medium", medium, Medium)
@@ -129,7 +130,7 @@ class Scene:
         _require_separate_points(self)
         _require_in_domain(self)
         _warn_of_overlaps(self.obstacles)
-        warn_of_implausible(self, domain is not None)
+        warn_of_implausible(self)
 
     @suggesting
     def moved(

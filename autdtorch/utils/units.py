@@ -22,7 +22,8 @@ from autdtorch.utils.validation import (
 )
 
 _place: ContextVar[str] = ContextVar("place of what is warned of", default="")
-_TURN = 2 * math.pi * (1 + 1e-9)  # [rad], with room for rounding
+_LEAST_DEGREES = 10.0  # beyond a turn in rad, so that whole numbers of rad, as a loop over turns has, are few
+_BETWEEN = {"autdtorch", "contextlib", "dataclasses", "functools"}  # call for the user, as `replace` does
 
 
 class ScaleWarning(UserWarning):
@@ -30,24 +31,24 @@ class ScaleWarning(UserWarning):
 
 
 def warn_user(text: str, category: type[Warning] = ScaleWarning) -> None:
-    """Warn at the line outside this package that called it, however deep the call is."""
+    """Warn at the line of the user that led here, however deep the call is."""
     depth, frame = 2, sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "autdtorch":
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _BETWEEN:
         depth, frame = depth + 1, frame.f_back
     warnings.warn(_place.get() + text, category, stacklevel=depth)
 
 
 def angle(name: str, value: object) -> float:
-    """Return `value` as an angle [rad]; warn of more than a turn, which is rather in degrees."""
+    """Return `value` as an angle [rad]; warn of one that seems to be in degrees."""
     number = finite_number(name, value, "rad")
     _warn_of_degrees(name, (number,), f"math.radians({number:g})")
     return number
 
 
 def angles(name: str, value: object, degrees: object = None) -> Vector:
-    """Return `value`, three angles [rad], or `degrees`, the three in degrees, as radians.
+    """Return `value`, three angles [rad], or `degrees`, the three in degrees, as radians within half a turn.
 
-    More than a turn in `value` brings a warning; both at once are refused.
+    A `value` that seems to be in degrees brings a warning; both at once are refused.
     """
     turn = finite_vector(name, value, "rad")
     if degrees is None:
@@ -56,7 +57,8 @@ def angles(name: str, value: object, degrees: object = None) -> Vector:
         return turn
     if any(turn):
         raise invalid(f"{name}_degrees", degrees, f"must not be given beside {name}, {turn} rad", "degrees")
-    x, y, z = map(math.radians, finite_vector(f"{name}_degrees", degrees, "degrees"))
+    given = finite_vector(f"{name}_degrees", degrees, "degrees")
+    x, y, z = (math.radians(math.remainder(one, 360)) for one in given)
     return x, y, z
 
 
@@ -89,6 +91,7 @@ def warned_within(place: str) -> Iterator[None]:
 
 
 def _warn_of_degrees(name: str, turn: Sequence[float], fix: str) -> None:
-    if max(map(abs, turn)) > _TURN:
+    """Warn of an angle beyond a turn in whole or half numbers; one that is counted on in rad is seldom so."""
+    if any(abs(one) >= _LEAST_DEGREES and (2 * one).is_integer() for one in turn):
         shown = turn[0] if len(turn) == 1 else turn
         warn_user(f"{name}: {shown} rad is more than a turn; are these degrees? Then take {fix}")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import math
+import pickle
 import warnings
 from dataclasses import replace
 
@@ -34,8 +36,16 @@ def scene(*obstacles, **changes):
     return at.Scene(**parts | changes)
 
 
-def facing(x, normal, **other):
-    return scene(array=at.TransducerArray.grid((4, 4), 10e-3, (x, 50e-3, 50e-3), normal), **other)
+def grid(x=1e-3, normal=(1, 0, 0), pitch=10e-3, **other):
+    return at.TransducerArray.grid((4, 4), pitch, (x, 50e-3, 50e-3), normal, **other)
+
+
+def facing(x, normal, *obstacles, **other):
+    return scene(*obstacles, array=grid(x, normal, radius=4e-3), **other)
+
+
+def wall(x=0.2, size=(0.05, 10.0, 10.0), **changes):
+    return box(center=(x, 50e-3, 50e-3), size=size, **changes)
 
 
 @pytest.fixture(scope="module")
@@ -44,9 +54,18 @@ def objective():
     return at.SimulatedObjective(free, at.make_propagator(free))
 
 
+SECTION = {
+    "medium": {"density": 1.293, "sound_speed": 340.0},
+    "array": {"type": "grid", "shape": [4, 4], "pitch": 10e-3, "center": [1e-3, 50e-3, 50e-3]},
+    "control_points": {"type": "points", "positions": FOCI.tolist()},
+}
 WARNED = {
     "rotation=45": (lambda: box(rotation=(0, 0, 45)), r"Box\.rotation.*degrees.*rotation_degrees=\(0, 0, 45"),
     "rotation=-180": (lambda: box(rotation=(-180, 0, 0)), r"Box\.rotation.*degrees"),
+    "moved scene": (lambda: facing(0.2, (1, 0, 0)).moved((0, 0, 1e-3)), "control_points.*behind"),
+    "replaced": (lambda: replace(scene(), frequency=40.0), "frequency in Hz"),
+    "replaced box": (lambda: replace(box(), rotation=(0, 0, 45)), "rotation_degrees"),
+    "file": (lambda: at.load_scene(SECTION | {"frequency": 40.0}), "frequency in Hz"),
     "moved": (lambda: scene(box()).moved(rotation=(0, 0, 20)), r"rotation.*rotation_degrees"),
     "angle=90": (lambda: at.TransducerArray.autd3((0, 0, 0), angle=90), r"angle.*math\.radians\(90\)"),
     "circle": (lambda: at.circle_points(MIDDLE, 0.03, 4, (1, 0, 0), 45), "angle.*degrees"),
@@ -56,9 +75,13 @@ WARNED = {
     "mm of center": (lambda: scene(at.Sphere((41, 50, 50), 8e-3, rigid=True)), r"obstacles\[0\].*in m"),
     "mm of domain": (lambda: scene(domain=((0, 0, 0), (100, 100, 100))), r"Scene\.domain.*in m"),
     "mm of plane": (lambda: scene(observation_plane=replace(PLANE, size=(9, 9))), "observation_plane.*in m"),
+    "phase levels": (lambda: at.drive_from_phases(np.arange(0, 256, 16)), "phases.*levels of a device"),
+    "kHz of 1 m": (lambda: scene(frequency=40.0, control_points=[(1, 0.05, 0.05)]), "frequency in Hz"),
     "kHz": (lambda: scene(frequency=40.0), "frequency in Hz, 40 kHz as 40e3"),
     "humidity": (lambda: at.Medium.air(20, 0.5), "relative_humidity.*50"),
     "other air": (lambda: scene(medium=at.Medium.air(frequency=25e3)), "Scene.medium.*frequency=40000"),
+    "mm of wall": (lambda: scene(wall(200.0, (50.0, 600.0, 400.0))), r"obstacles\[0\].*in m"),
+    "mm/s": (lambda: at.Medium(1.2, 340e3), "sound_speed.*other units"),
     "swapped": (lambda: at.Medium(340.0, 1.2), "sound_speed.*swapped"),
     "behind": (lambda: facing(0.2, (1, 0, 0)), "control_points.*behind.*normal"),
     "turned away": (lambda: facing(1e-3, (-1, 0, 0)), "control_points.*behind.*normal"),
@@ -73,26 +96,91 @@ def test_what_is_possible_but_seldom_meant_is_told_at_the_line_of_the_caller(nam
     assert {one.filename for one in caught} == {__file__}
 
 
-def test_what_is_meant_is_not_told():
+def lone(focus, **changes):
+    """Return a scene of one point source and a focus that far [m]."""
+    array = at.TransducerArray([(0, 0, 0)], (1, 0, 0))
+    return at.Scene(
+        **{"array": array, "medium": AIR, "frequency": 40e3, "control_points": [(focus, 0, 0)]} | changes
+    )
+
+
+def in_water(frequency):
+    tank = wall(0.02, (0.01, 0.6, 0.4))
+    points = [(0.01, 0.05, 0.05)]
+    array, water = grid(0, pitch=1e-3), at.Medium(998.0, 1482.0)
+    return at.Scene(array, water, frequency, points, [tank])
+
+
+def moved_and_read():
+    tall = scene(wall())
+    tall.moved((0, 0, 20e-3))
+    replace(tall, frequency=41e3)
+    domain = dict(zip(("lower", "upper"), tall.domain, strict=True))
+    same = {"type": "box", "center": [0.2, 0.05, 0.05], "size": [0.05, 10.0, 10.0], "rigid": True}
+    at.load_scene(SECTION | {"frequency": 40e3, "domain": domain, "obstacles": [same]})
+
+
+NEAR = {"control_points": [(0.1, 0.05, 0.05)]}
+MEANT = {
+    "turns": lambda: box(rotation=(math.pi, -math.pi, 2 * math.pi)),
+    "two turns in degrees": lambda: replace(box(rotation_degrees=(0, 0, 720)), rigid=True),
+    "a loop over turns": lambda: [
+        scene(box()).moved(rotation=(0, 0, turn)) for turn in (7, 2.2 * math.pi, 12.1)
+    ],
+    "a wall of 1 m": lambda: scene(wall(0.65, (1.0,) * 3), medium=at.Medium.air(), **NEAR),
+    "a wall of 5 m": lambda: scene(wall(size=(0.05, 5.0, 3.0)), **NEAR),
+    "a table": lambda: scene(wall(size=(0.02, 2.0, 1.0)), frequency=60e3, **NEAR),
+    "a wall without end": lambda: [scene(wall(size=(0.05, wide, wide)), **NEAR) for wide in (10, 100, 1e4)],
+    "a hall": lambda: scene(wall(6.0, (0.1, 12.0, 8.0)), wall(-6.0, (0.1, 12.0, 8.0)), **NEAR),
+    "a tank at 1 MHz": lambda: in_water(1e6),
+    "a tank at 2 MHz": lambda: in_water(2e6),
+    "a plane of 3 m": lambda: scene(observation_plane=replace(PLANE, size=(3, 3))),
+    "a domain of 3 m": lambda: scene(domain=((-1.5,) * 3, (1.5,) * 3)),
+    "a scene that is moved, replaced, read": moved_and_read,
+    "some foci behind": lambda: facing(1e-3, (1, 0, 0), control_points=at.sphere_points(MIDDLE, 0.1, 9)),
+    "sources without direction": lambda: scene(array=grid(0.2)),
+    "foci that a wall reflects": lambda: facing(0.2, (1, 0, 0), wall(0.4)),
+    "a loudspeaker in a hall": lambda: lone(20.0),
+    "a focus at 1 cm of 3 kHz": lambda: lone(0.01, frequency=3e3),
+    "a loudspeaker of 500 Hz": lambda: lone(0.3, frequency=500.0),
+    "no units": lambda: lone(2.0, medium=at.Medium(1, 1), frequency=1.0),
+    "air of nearly this frequency": lambda: scene(medium=at.Medium.air(frequency=40.1e3)),
+    "an absorption": lambda: scene(frequency=25e3, medium=replace(at.Medium.air(), absorption=0.5)),
+    "phases": lambda: at.drive_from_phases(at.focus_phases(ARRAY.positions, FOCI[0], 739.2)),
+    "whole phases": lambda: at.drive_from_phases(torch.arange(16)),
+}
+
+
+@pytest.mark.parametrize("name", MEANT)
+def test_what_is_meant_is_not_told(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        scene(box(rotation=(math.pi, -math.pi, 2 * math.pi)))
-        wall = box(center=(0.6, 0.05, 0.05), size=(1.0, 1.0, 1.0))
-        scene(wall, medium=at.Medium.air(), control_points=[(0.05, 0.05, 0.05)])
-        around = at.sphere_points((1e-3, 50e-3, 50e-3), 0.1, 9)  # some behind
-        scene(control_points=around, medium=at.Medium.air(20, 50, frequency=40.1e3))
-        scene(frequency=25e3, medium=replace(at.Medium.air(), absorption=0.5))
-        at.drive_from_phases(at.focus_phases(ARRAY.positions, FOCI[0], 739.2))
-        at.drive_from_phases(torch.arange(16))
+        MEANT[name]()
 
 
-@given(degrees=st.tuples(*[st.floats(-360, 360)] * 3))
+@pytest.mark.parametrize("part", ["obstacle", "plane", "domain"])
+def test_each_cause_is_told_once(part):
+    sphere, plane = at.Sphere((41, 50, 50), 8e-3, rigid=True), replace(PLANE, size=(100, 100))
+    more = {
+        "obstacle": {"obstacles": [sphere], "domain": ((-1,) * 3, (100,) * 3)},
+        "plane": {"observation_plane": plane, "domain": ((-100,) * 3, (100,) * 3)},
+        "domain": {"domain": ((-100,) * 3, (100,) * 3)},
+    }
+    with pytest.warns(at.ScaleWarning, match=part) as caught:
+        scene(**more[part])
+    assert len(caught) == 1
+
+
+@given(degrees=st.tuples(*[st.floats(-1080, 1080)] * 3))
 def test_degrees_are_radians_in_the_end(degrees):
     turned = box(rotation_degrees=degrees)
-    assert turned.rotation == tuple(map(math.radians, degrees))
+    for radians, meant in zip(turned.rotation, degrees, strict=True):
+        assert abs(radians) <= math.pi
+        assert math.remainder(math.degrees(radians) - meant, 360) == pytest.approx(0, abs=1e-9)
     assert replace(turned, center=(0, 0, 0)).rotation == turned.rotation
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a turn of 360 degrees may round to more
+        warnings.simplefilter("error")
+        assert replace(turned, rigid=True).rotation == turned.rotation
         assert (
             scene(box()).moved(rotation_degrees=degrees).obstacles
             == scene(box()).moved(rotation=turned.rotation).obstacles
@@ -181,22 +269,38 @@ KEYWORDS = {
     "spcing": (lambda seen: at.make_propagator(seen.scene, spcing=1e-3), "spacing"),
     "centre": (lambda _: box(centre=MIDDLE), "center"),
     "rotation_deg": (lambda _: box(rotation_deg=(0, 0, 45)), "rotation_degrees"),
-    "diameter": (lambda _: at.Sphere(MIDDLE, diameter=1.0, rigid=True), "radius"),
     "control_point": (lambda _: at.Scene(ARRAY, AIR, 40e3, control_point=FOCI), "control_points"),
     "level": (lambda seen: at.gabs(seen, level=8), "levels"),
     "trails": (lambda seen: at.run(at.LSS(), seen, trails=3), "trials"),
     "decibel": (lambda _: at.plot_plane(MAP, PLANE, decibel=True), "decibels"),
     "humidity": (lambda _: at.Medium.air(20, humidity=50), "relative_humidity"),
-    "units": (lambda _: at.TransducerArray.autd3((0, 0, 0), unit=(2, 1)), "units"),
+    "unit": (lambda _: at.TransducerArray.autd3((0, 0, 0), unit=(2, 1)), "units"),
+    "fields": (lambda _: at.view3d(scene(), fields={}), "field"),
+    "quantity": (lambda _: at.plot_trials(quantity={}), "quantities"),
+    "file_path": (lambda _: at.save_scene(scene(), file_path="a.yaml"), "path"),
 }
 
 
 @pytest.mark.parametrize("name", KEYWORDS)
 def test_a_wrong_keyword_brings_the_right_one(name, objective):
     call, right = KEYWORDS[name]
-    with pytest.raises(TypeError, match=rf"'{name}|\b{right}\b") as caught:
+    with pytest.raises(TypeError, match=rf"keyword argument '.*\(did you mean '{right}'\?\)$"):
         call(objective)
-    assert right in str(caught.value).partition("keyword argument")[2]
+
+
+def test_a_keyword_like_no_other_brings_all():
+    with pytest.raises(TypeError, match=r"'diameter'; keywords: center, radius, .*\brigid\b"):
+        at.Sphere(MIDDLE, diameter=1.0, rigid=True)
+
+
+@pytest.mark.parametrize("package", [at, hardware])
+def test_every_public_function_answers_a_wrong_keyword(package):
+    functions = [one for one in map(package.__getattr__, package.__all__) if inspect.isfunction(one)]
+    assert functions
+    for function in functions:
+        assert pickle.loads(pickle.dumps(function)) is function
+        with pytest.raises(TypeError, match=r"keyword argument 'zzqy'(; keywords: | \(did you mean)"):
+            function(zzqy=1)
 
 
 def test_errors_within_a_function_stay_what_they_are():
@@ -222,7 +326,7 @@ def test_a_wrong_name_brings_the_right_one(package, name, right):
 def test_one_wrong_letter_finds_the_name(name, place, letter):
     wrong = f"{name[: place % len(name)]}{letter}{name[place % len(name) :]}"
     if len(name) > 4 and wrong not in at.__all__:
-        assert did_you_mean(wrong, at.__all__)
+        assert repr(name) in did_you_mean(wrong, at.__all__)
 
 
 def test_one_is_singular():
