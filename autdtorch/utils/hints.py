@@ -19,13 +19,19 @@ _UNEXPECTED = re.compile(r"got an unexpected keyword argument '(\w+)'")
 _SUGGESTS = "_suggests"  # attribute of functions that are decorated by `suggesting`
 
 
-def did_you_mean(given: object, accepted: Collection[str]) -> str:
-    """Return a question for messages with the accepted name most like `given`; empty if none is alike."""
+def nearest_name(given: object, accepted: Collection[str]) -> str | None:
+    """Return the accepted name most like `given`; None if none is alike."""
     if not isinstance(given, str):
-        return ""
+        return None
     nearest = difflib.get_close_matches(given.casefold(), {name.casefold() for name in accepted})
     alike = [name for name in accepted if name.casefold() in nearest]  # some differ in capitals alone
-    return f" (did you mean {max(alike, key=partial(_likeness, given))!r}?)" if alike else ""
+    return max(alike, key=partial(_likeness, given), default=None)
+
+
+def did_you_mean(given: object, accepted: Collection[str]) -> str:
+    """Return a question for messages with the accepted name most like `given`; empty if none is alike."""
+    name = nearest_name(given, accepted)
+    return f" (did you mean {name!r}?)" if name else ""
 
 
 def _likeness(given: str, name: str) -> float:

@@ -192,3 +192,15 @@ def test_levels_out_of_range_are_refused(device: hw.Device, levels, message: str
 def test_a_number_of_boards_that_a_device_cannot_have_is_refused(device: hw.Device, boards: int) -> None:
     with pytest.raises(ValueError, match=rf"boards: {boards}; must be"):
         device.with_boards(boards)
+
+
+@pytest.mark.parametrize(
+    ("name", "suggested"),
+    [("autd3", "AUTD3"), ("autd33", "AUTD3"), ("OpenMDP", "OPENMPD"), ("x", "SONICSURFACE")],
+)
+def test_a_name_given_as_a_device_is_answered_with_the_nearest_device_once(name: str, suggested: str) -> None:
+    with pytest.raises(
+        ValueError, match=rf"'{name}'; must be a Device, such as hardware\.{suggested}"
+    ) as caught:
+        hw.open_link(name)  # type: ignore[arg-type]
+    assert "did you mean" not in str(caught.value)

@@ -200,7 +200,7 @@ REFUSED = {
     "class": (lambda seen: at.run(at.BayesOpt, seen), r"method.*BayesOpt\(\)"),
     "scene": (lambda seen: at.run(at.GABS(), seen.scene), r"objective.*SimulatedObjective\(scene"),
     "device": (lambda _: hardware.open_link("autd3"), r"device.*hardware\.AUTD3.*open_autd3\(\)"),
-    "near device": (lambda _: hardware.open_link("ultrano"), "device.*did you mean 'ultraino'"),
+    "near device": (lambda _: hardware.open_link("ultrano"), r"such as hardware\.ULTRAINO$"),
     "capitals": (lambda _: at.Holography("GS"), "algorithm.*did you mean 'gs'"),
     "sphere": (
         lambda _: at.analytic.rigid_sphere(FOCI, ARRAY.positions, 739 + 1j, MIDDLE, 0.01),

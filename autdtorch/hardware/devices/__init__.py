@@ -11,7 +11,7 @@ from autdtorch.hardware.devices.device import Device
 from autdtorch.hardware.devices.openmpd import OPENMPD
 from autdtorch.hardware.devices.sonicsurface import SONICSURFACE
 from autdtorch.hardware.devices.ultraino import ULTRAINO
-from autdtorch.utils.hints import did_you_mean
+from autdtorch.utils.hints import nearest_name
 from autdtorch.utils.validation import invalid
 
 __all__ = ["AUTD3", "DEVICES", "OPENMPD", "SONICSURFACE", "ULTRAINO"]
@@ -29,7 +29,6 @@ def require_device(device: object) -> None:
     """Refuse what is no device, such as the name of one."""
     if isinstance(device, Device):
         return
-    name = device.lower() if isinstance(device, str) and device.lower() in DEVICES else "sonicsurface"
+    name = nearest_name(device, DEVICES) or "sonicsurface"
     network = " on USB; open_autd3() opens AUTD3 on the network" if name == "autd3" else ""
-    hint = did_you_mean(device, DEVICES)
-    raise invalid("device", device, f"must be a Device, such as hardware.{name.upper()}{network}{hint}")
+    raise invalid("device", device, f"must be a Device, such as hardware.{name.upper()}{network}")
