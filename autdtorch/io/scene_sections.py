@@ -34,7 +34,8 @@ def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
 
     Numbers keep their full precision. An array that was made by a method such as `TransducerArray.autd3`, or
     joined of such arrays, keeps that form. A mesh becomes an .obj file in its own coordinates, a voxel mask
-    an .npz file, beside the YAML file and with its name. Files that are there are replaced.
+    an .npz file, beside the YAML file and with its name. Files that are there are replaced. A medium becomes
+    its numbers, without `Medium.absorption_frequency`.
 
     Args:
         path: of the file, ``.yaml`` or ``.yml``.
@@ -63,7 +64,7 @@ def scene_sections(scene: Scene, name: str) -> dict[str, Any]:
     sections: dict[str, Any] = {
         "name": scene.name,
         "frequency": scene.frequency,
-        "medium": {field.name: getattr(medium, field.name) for field in fields(medium)},
+        "medium": {field.name: getattr(medium, field.name) for field in fields(medium) if field.init},
         "array": boards[0] if len(boards) == 1 else boards,
         "obstacles": [
             _obstacle(one, f"{name}_{number}", f"Scene.obstacles[{number}]")
@@ -132,24 +133,22 @@ def scene_lines(scene: Scene, drive: torch.Tensor, name: str, beside: bool = Fal
     beside = beside and any("path" in section for section in sections["obstacles"])
     lines = ["from pathlib import Path", ""] if beside else []
     lines += ["import autdtorch as at", ""]
-    names = ["array"] if len(boards) == 1 else [f"array_{number}" for number in range(len(boards))]
-    for board_name, board in zip(names, boards, strict=True):
+    arrays = ["array"] if len(boards) == 1 else [f"array_{number}" for number in range(len(boards))]
+    for array, board in zip(arrays, boards, strict=True):
         kind = board["type"]
         function = "TransducerArray" if kind == "positions" else f"TransducerArray.{kind}"
-        lines.append(
-            _call(board_name, function, {key: value for key, value in board.items() if key != "type"})
-        )
+        lines.append(_call(array, function, {key: value for key, value in board.items() if key != "type"}))
     if len(boards) > 1:
-        lines.append(f"array = {' + '.join(names)}")
-    names = []
+        lines.append(f"array = {' + '.join(arrays)}")
+    obstacles = []
     for number, section in enumerate(sections["obstacles"]):
-        names.append(f"obstacle_{number}")
+        obstacles.append(f"obstacle_{number}")
         kind = next(known.__name__ for known, name in _KINDS.items() if name == section["type"])
         function = f"{kind}.load" if kind == "VoxelMask" else kind
         own = {key: value for key, value in section.items() if key != "type"}
         if beside and "path" in own:
             own["path"] = _Code(f"Path(__file__).with_name({own['path']!r})")
-        lines.append(_call(names[-1], function, own))
+        lines.append(_call(obstacles[-1], function, own))
     plane = "None"
     if scene.observation_plane is not None:
         plane = "plane"
@@ -158,8 +157,8 @@ def scene_lines(scene: Scene, drive: torch.Tensor, name: str, beside: bool = Fal
     lines.append(f"points = {_value(sections['control_points']['positions'], 9)}")
     domain = [sections["domain"]["lower"], sections["domain"]["upper"]]
     lines.append(
-        f"scene = at.Scene(\n    array, medium, {scene.frequency!r}, points, [{', '.join(names)}], {plane}, "
-        f"{domain!r}, name={scene.name!r}\n)"
+        f"scene = at.Scene(\n    array, medium, {scene.frequency!r}, points, [{', '.join(obstacles)}], "
+        f"{plane}, {domain!r}, name={scene.name!r}\n)"
     )
     values = {"phases": phases_of(drive).tolist()}
     amplitudes = amplitudes_of(drive).clamp(max=1.0)  # rounding may exceed 1

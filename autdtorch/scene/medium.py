@@ -7,8 +7,7 @@ equations are also those of ANSI S1.26 and of Bass et al., J. Acoust. Soc. Am. 9
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, field
 
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.units import warn_user
@@ -37,6 +36,9 @@ class Medium:
         density: [kg/m^3], 1e-9 to 1e9.
         sound_speed: [m/s], 1e-3 to 1e6.
         absorption: of a plane wave at the drive frequency [dB/m], >= 0.
+        absorption_frequency: [Hz] for which `air` computed the absorption, None where a number was given. A
+            scene of another frequency warns; results do not depend on it. It does not count in comparisons,
+            and neither `dataclasses.replace` nor `save_scene` keeps it.
 
     Raises:
         ValueError: an attribute is not finite or out of range.
@@ -48,9 +50,7 @@ class Medium:
     density: float
     sound_speed: float
     absorption: float = 0.0
-
-    #: Frequency [Hz] for which `air` computed the absorption; None where it was given.
-    absorption_frequency: ClassVar[float | None] = None
+    absorption_frequency: float | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Check the attributes."""
@@ -94,7 +94,7 @@ class Medium:
                 f"{dry}; a share of {relative_humidity:g} is relative_humidity={100 * relative_humidity:g}"
             )
         medium = cls(density, sound_speed, absorption)
-        # No field: an absorption that is given, or replaced, is of no known frequency.
+        # No argument of Medium: an absorption that is given, or replaced, is of no known frequency.
         object.__setattr__(medium, "absorption_frequency", float(frequency))
         return medium
 

@@ -1,5 +1,6 @@
 """A scene that is saved is the scene that is loaded, and so are the lines of Python that make it."""
 
+import dataclasses
 import functools
 import math
 import operator
@@ -211,3 +212,16 @@ def test_an_obstacle_of_ones_own_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"obstacles\[0\].*Own"):
         at.save_scene(tmp_path / "scene.yaml", scene)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_frequency_of_air_is_no_part_of_a_saved_or_replaced_medium(tmp_path):
+    """It only brings a warning: media that differ in it are equal, and files have the numbers alone."""
+    air = at.Medium.air()
+    scene = dataclasses.replace(
+        scene_with(at.Sphere((0.04, 0.04, 0.04), 3e-3, rigid=True), plane=False), medium=air
+    )
+    at.save_scene(tmp_path / "scene.yaml", scene)
+    loaded = at.load_scene(tmp_path / "scene.yaml").medium
+    assert (air.absorption_frequency, loaded.absorption_frequency) == (40e3, None)
+    assert (loaded, hash(loaded)) == (air, hash(air))
+    assert dataclasses.replace(air, absorption=1.0).absorption_frequency is None
