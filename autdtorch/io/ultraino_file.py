@@ -19,7 +19,7 @@ from xml.parsers import expat
 import numpy as np
 
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.validation import within
+from autdtorch.utils.validation import invalid, within
 
 SUFFIX = ".xml.gz"
 
@@ -117,8 +117,8 @@ def _values(what: str, records: list[Any], defaults: Mapping[str, float]) -> dic
         ]
         for number, value in enumerate(column):
             if not isinstance(value, float) or not math.isfinite(value):
-                shown = "another object" if isinstance(value, _Record) else repr(value)
-                raise ValueError(f"{what} {number}, {name}: {shown}; must be a finite number")
+                shown = "another object" if isinstance(value, _Record) else value
+                raise invalid(f"{what} {number}, {name}", shown, "must be a finite number")
         columns[name] = np.array(column)
     return columns
 
