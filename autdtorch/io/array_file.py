@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,11 +14,11 @@ from autdtorch.io.csv_table import read_rows, table_of
 from autdtorch.io.ultraino_file import SUFFIX, read_ultraino
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import device_axes, in_plane
-from autdtorch.scene.scene import ScaleWarning
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.neighbours import closest_pair
 from autdtorch.utils.numpy_file import read_arrays
+from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import ArrayLike, path_of, within
 
 # Columns of a CSV file with the positions of transducers and the directions of emission, and their units.
@@ -28,7 +26,8 @@ PLACE_COLUMNS = {"x": "m", "y": "m", "z": "m"}
 NORMAL_COLUMNS = {"nx": "", "ny": "", "nz": ""}
 SIZE_COLUMNS = {"source_strength": "Pa m", "radius": "m"}
 _IGNORED = {"frame": "", "transducer": "", "phase": "rad", "amplitude": ""}
-_PITCHES = {"m": (1e-3, 0.1), "mm": (1.0, 100.0)}  # of arrays for airborne ultrasound, in each unit
+_PITCHES = {"m": (3e-3, 0.1), "mm": (3.0, 100.0)}  # of arrays for airborne ultrasound, in each unit
+_UNIT_ROUNDING = 1e-3  # by which the length of a normal may differ from 1, in a file of few digits
 
 
 @suggesting
@@ -44,8 +43,8 @@ def load_array(
 
     - `.csv`: columns `x [m]`, `y [m]`, `z [m]` (or `[mm]`, `[cm]`), and `nx`, `ny`, `nz` for the directions
       of emission, by default +z; optionally `source_strength [Pa m]` and `radius [m]`. Names and units may be
-      in a comment. Without names, the columns are x, y, z or x, y, z, nx, ny, nz. A unit that is not stated
-      is inferred from the distance of neighbours, with a `ScaleWarning`.
+      in a comment. Without names, the columns are x, y, z or x, y, z, nx, ny, nz, of length 1. A unit that
+      is not stated is inferred from the distance of neighbours, with a `ScaleWarning`.
     - `.npz`: arrays `positions` (M, 3) [m] and `normals` (M, 3) or (3,), optionally `source_strength` [Pa m]
       and `radius` [m], numbers or (M,).
     - `.pat`: a board of OpenMPD, emitting along +z; `OpenMPDBoard.load` also reads its calibration.
@@ -88,7 +87,7 @@ def _from_ultraino(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def _from_csv(path: str | os.PathLike[str]) -> dict[str, Any]:
     known = PLACE_COLUMNS | NORMAL_COLUMNS | SIZE_COLUMNS | _IGNORED
-    table = table_of(read_rows(path), known, partial(_names, path), partial(_unit, path))
+    table = table_of(read_rows(path), known, _names, _unit)
     wanted = PLACE_COLUMNS | (NORMAL_COLUMNS if NORMAL_COLUMNS.keys() & table.keys() else {})
     if missing := [name for name in wanted if name not in table]:
         raise ValueError(f"{path}: no column {', '.join(missing)}; must have {', '.join(wanted)}")
@@ -102,34 +101,39 @@ def _from_csv(path: str | os.PathLike[str]) -> dict[str, Any]:
     }
 
 
-def _names(path: str | os.PathLike[str], values: Array) -> list[str]:
+def _names(values: Array) -> list[str]:
     """Return the names of columns without header."""
     names = [*PLACE_COLUMNS, *NORMAL_COLUMNS]
     if values.shape[1] not in (3, 6):
         accepted = (
             f"must be 3 or 6 ({', '.join(names)}), or begin with a line of names such as x [mm],y [mm],z [mm]"
         )
-        raise ValueError(f"{path}: {values.shape[1]} columns without names; {accepted}")
+        raise ValueError(f"{values.shape[1]} columns without names; {accepted}")
+    lengths = np.linalg.norm(values[:, 3:], axis=1)
+    if values.shape[1] == 6 and (wrong := np.abs(lengths - 1) > _UNIT_ROUNDING).any():
+        found = f"columns 4 to 6 without names, of length {lengths[wrong][0]:.4g} in row {wrong.argmax() + 1}"
+        fix = "write decimals with a point, or separate cells by semicolons, or name the columns"
+        raise ValueError(f"{found}; must be normals of length 1: {fix}")
     return names[: values.shape[1]]
 
 
-def _unit(path: str | os.PathLike[str], kind: str, table: Mapping[str, Array]) -> str:
+def _unit(kind: str, table: Mapping[str, Array]) -> str | None:
     """Return the unit of lengths or strengths that state none: that in which the pitch is a usual one."""
     if kind != "m":
-        return kind
-    if table.keys() >= PLACE_COLUMNS.keys():
+        return kind if kind == "Pa m" else None
+    why = ""
+    if table.keys() >= PLACE_COLUMNS.keys() and len(table["x"]) > 1:
         places = torch.from_numpy(np.stack([table[name] for name in PLACE_COLUMNS], axis=1))
         pitch = closest_pair(places)[0]
         for unit, (least, most) in _PITCHES.items():
             if least <= pitch < most:
-                why = f"since neighbours are {pitch:.4g} {unit} apart"
-                warnings.warn(
-                    f"{path}: no unit of length; taken as {unit}, {why}", ScaleWarning, stacklevel=2
+                warn_user(
+                    f"no unit of length; taken as {unit}, since neighbours are {pitch:.4g} {unit} apart"
                 )
                 return unit
-    raise ValueError(
-        f"{path}: columns {', '.join(table)} have no unit; the header must be as x [m] or x [mm]"
-    )
+        why = f", and neighbours {pitch:.4g} apart are no array of 3 to 100 mm in m or mm"
+    columns = ", ".join(table)
+    raise ValueError(f"columns {columns} have no unit{why}; the header must be as x [m] or x [mm] or x [cm]")
 
 
 def _from_npz(path: str | os.PathLike[str]) -> dict[str, Any]:

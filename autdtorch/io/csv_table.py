@@ -8,21 +8,20 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from autdtorch.io.stated_units import FACTORS, mentioned_units, stated_unit, unit_called
 from autdtorch.utils.array_types import AnyArray, Array
 from autdtorch.utils.files import replacing
-from autdtorch.utils.validation import require_known
+from autdtorch.utils.units import warned_within
+from autdtorch.utils.validation import invalid, require_known, within
 
-_UNITS: dict[str, dict[str, float]] = {  # factors to SI of the accepted units, by SI unit
-    "": {"": 1.0},
-    "m": {"m": 1.0, "mm": 1e-3, "cm": 1e-2},
-    "rad": {"rad": 1.0, "deg": math.pi / 180, "°": math.pi / 180},
-    "Pa m": {"Pa m": 1.0},
-}
-_LONGEST = 1000  # characters of a name or a comment that are read; the search for units takes their square
+_LONGEST = 1000  # characters of a name or a comment that are read
+
+
+Guess: TypeAlias = Callable[[str, Mapping[str, Array]], str | None]
 
 
 class Column(NamedTuple):
@@ -83,8 +82,7 @@ class Rows(NamedTuple):
         for place, number in enumerate(row):
             if number is None or not math.isfinite(number):
                 name = names[place] if names else f"column {place + 1}"
-                accepted = f"{cells[place]!r}; must be a finite number"
-                raise ValueError(f"{self.path}, line {line}, {name}: {accepted}")
+                raise invalid(f"{self.path}, line {line}, {name}", cells[place], "must be a finite number")
         return [number for number in row if number is not None]
 
 
@@ -110,7 +108,7 @@ def table_of(
     rows: Rows,
     columns: Mapping[str, str],
     named: Callable[[Array], list[str]],
-    unit_of: Callable[[str, Mapping[str, Array]], str],
+    guess: Guess,
 ) -> dict[str, Array]:
     """Return the columns (R,) of a table in SI units, by name.
 
@@ -118,25 +116,42 @@ def table_of(
         rows: of the file.
         columns: SI unit of each name that may occur: "m" (or mm, cm in the file), "rad" (or deg), "Pa m", "".
         named: returns the names of the columns of numbers (R, C) that have neither header nor comment.
-        unit_of: returns the unit of columns that state none, from their SI unit and their numbers by name.
+        guess: returns the unit of columns that state none, from their SI unit and their numbers by name, and
+            warns; None where the columns are not used.
+
+    Errors and warnings of both functions get the path in front.
     """
+    rows = _without_index(rows)
     first, header = (1, _header(rows, columns)) if rows.has_header else (0, _from_comments(rows, columns))
     if first == len(rows.lines):
         raise ValueError(f"{rows.path}: no row under the header; must have at least one")
     if header is None:
         values = rows.numbers(first)
-        header = [Column(name, None) for name in named(values)]
+        with within(rows.path), warned_within(rows.path):
+            header = [Column(name, None) for name in named(values)]
     else:
         values = rows.numbers(first, [column.name for column in header])
     table = dict(zip((column.name for column in header), values.T, strict=True))
-    for kind in {columns[name]: None for name, unit in header if unit is None}:
-        without = [name for name, unit in header if unit is None and columns[name] == kind]
-        unit = _unit_in(rows.comments, kind) or unit_of(kind, {name: table[name] for name in without})
-        for name in without:
-            table[name] = table[name] * _UNITS[kind][unit]
-    return table | {
-        name: table[name] * _UNITS[columns[name]][unit] for name, unit in header if unit is not None
-    }
+    for kind in {columns[name]: None for name, unit in header if unit is None and columns[name]}:
+        without = {name: table[name] for name, unit in header if unit is None and columns[name] == kind}
+        if (unit := _unit(rows, kind, without, guess)) is not None:
+            table |= {name: values * FACTORS[kind][unit] for name, values in without.items()}
+    return table | {name: table[name] * FACTORS[columns[name]][unit] for name, unit in header if unit}
+
+
+def _unit(rows: Rows, kind: str, table: Mapping[str, Array], guess: Guess) -> str | None:
+    """Return the unit of columns whose names have none: that of the comments, or a guess that fits them."""
+    with within(rows.path), warned_within(rows.path):
+        if (stated := stated_unit(rows.comments, kind)) is not None:
+            return stated
+        unit = guess(kind, table)
+        others = mentioned_units(rows.comments, kind) - {unit}
+        if unit is None or not others:
+            return unit
+        found = (
+            f"columns {', '.join(table)} seem to be in {unit}, but a comment has {', '.join(sorted(others))}"
+        )
+        raise ValueError(f"{found}; the header must be as {next(iter(table))} [{unit}]")
 
 
 def write_table(path: str | os.PathLike[str], columns: Mapping[str, AnyArray]) -> None:
@@ -162,12 +177,20 @@ def _separator(line: str) -> str:
 def _cells(where: str, line: str, separator: str) -> list[str]:
     """Return the cells of a line without blanks around them; an empty one at the end is left out."""
     if not separator:
-        return re.sub(r"(?<!\s)\s+(?=[\[(])", "", line).split()  # a unit belongs to its name
+        return re.split(r"(?<!\s)\s+(?![\[(\s])", line.strip())  # a unit belongs to its name
     try:
         cells = [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
     except csv.Error as error:
         raise ValueError(f"{where}: {error}; must be CSV in UTF-8") from error
     return cells[:-1] if len(cells) > 1 and not cells[-1] else cells
+
+
+def _without_index(rows: Rows) -> Rows:
+    """Return rows without a first column that has no name and counts from 0, as pandas writes it."""
+    (line, header), *others = rows.lines
+    if header[0] or [cells[0] for _, cells in others] != [str(number) for number in range(len(others))]:
+        return rows
+    return rows._replace(lines=[(line, header[1:]), *((number, cells[1:]) for number, cells in others)])
 
 
 def _header(rows: Rows, columns: Mapping[str, str]) -> list[Column]:
@@ -181,7 +204,7 @@ def _header(rows: Rows, columns: Mapping[str, str]) -> list[Column]:
     for name, unit in header:
         kind = columns[name]
         if unit is None and any(columns[other] == kind and stated for other, stated in header):
-            accepted = " or ".join(f"{name} [{unit}]" for unit in _UNITS[kind])
+            accepted = " or ".join(f"{name} [{unit}]" for unit in FACTORS[kind])
             raise ValueError(f"{where}: column {name!r}; must be {accepted}")
     return header
 
@@ -205,31 +228,18 @@ def _column(where: str, cell: str, columns: Mapping[str, str]) -> Column:
     """Return the column of a header such as `x [mm]`, `x (mm)`, `x_mm` or `X`."""
     by_name = {name.casefold(): name for name in columns}
     cell = cell[:_LONGEST]
-    text = cell.casefold()
-    match = re.fullmatch(r"([^\[\]()]*?)\s*[\[(](.*)[\])]", text)
-    if match is None and text not in by_name:
-        match = re.fullmatch(r"(.+)[_/](\w+)", text)
-        if match and match[1].strip() not in by_name:
+    match = re.fullmatch(r"([^\[\]()]*?)\s*[\[(](.*)[\])]", cell)
+    if match is None and cell.casefold() not in by_name:
+        match = re.fullmatch(r"(.+)[_/](\w+)", cell)
+        if match and match[1].strip().casefold() not in by_name:
             match = None
-    name, unit = (match[1].strip(), match[2].strip()) if match else (text, None)
-    require_known(where, [by_name.get(name, cell if match is None else name)], columns, "column")
-    name = by_name[name]
-    units = _UNITS[columns[name]]
-    if unit is None:
-        return Column(name, None if columns[name] else "")
-    for known in units:
-        if known.casefold() == unit:
-            return Column(name, known)
-    accepted = " or ".join(f"{name} [{known}]" if known else name for known in units)
+    written, text = (match[1].strip(), match[2].strip()) if match else (cell, None)
+    name = by_name.get(written.casefold(), written)
+    require_known(where, [name], columns, "column")
+    kind = columns[name]
+    if text is None:
+        return Column(name, None if kind else "")
+    if (unit := unit_called(text, kind)) is not None:
+        return Column(name, unit)
+    accepted = " or ".join(f"{name} [{known}]" if known else name for known in FACTORS[kind])
     raise ValueError(f"{where}: column {cell!r}; must be {accepted}")
-
-
-def _unit_in(comments: list[str], kind: str) -> str | None:
-    """Return the one unit that the comments state, as in "units: mm", "in mm", "[mm]" or "mm" alone."""
-    found = set()
-    for unit in _UNITS[kind]:
-        word = re.escape(unit)
-        pattern = rf"{word}|.*(?:\bin|\bunits?\s*[:=]?)\s*{word}(?!\w).*|.*[\[(]{word}[\])].*"
-        if any(re.fullmatch(pattern, comment, re.IGNORECASE | re.DOTALL) for comment in comments):
-            found.add(unit)
-    return found.pop() if len(found) == 1 else None

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +22,10 @@ from autdtorch.scene.drive import (
     phases_of,
     validate_drive,
 )
-from autdtorch.scene.scene import ScaleWarning
 from autdtorch.utils.array_types import AnyArray, Array
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.numpy_file import read_arrays, write_arrays
+from autdtorch.utils.units import warn_user, warned_within
 from autdtorch.utils.validation import ArrayLike, path_of, real_tensor, require_kind, require_one_of, within
 
 _FORMATS = (".csv", ".npz")
@@ -89,8 +87,8 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
     - `.csv` and `.npz` of `save_drive`.
     - `.csv` with the columns `phase [rad]` (or `[deg]`) and `amplitude`, by default 1; phases are phi. Names
       and units may be in a comment. Without names, one column is phases, and two are phases and amplitudes if
-      only one of them can be amplitudes. A unit that is not stated is taken as rad if the phases are within a
-      turn and not all whole numbers. A `ScaleWarning` says what was inferred.
+      only one of them can be amplitudes and not all numbers are whole. A unit that is not stated is taken as
+      rad if the phases are within a turn and not all whole numbers. A `ScaleWarning` says what was inferred.
     - `.csv` of OpenMPD and AcousTools: numbers of frames and transducers, then a row of phases [rad] for each
       frame. These are arg q, at full amplitude, in the order of the file.
     - `.xml.gz` or `.xml`: a simulation of Ultraino, as it is shown, without its animations; its phases are
@@ -133,14 +131,14 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
 def _from_csv(path: Path) -> torch.Tensor:
     rows = read_rows(path)
     if (frames := _openmpd_frames(rows)) is not None:
-        return drive_from_phases(-frames)
-    table = table_of(rows, _COLUMNS, partial(_names, path), partial(_unit, path))
+        return _of_arguments(path, frames, 1.0)
+    table = table_of(rows, _COLUMNS, _names, _unit)
     for name, device in DEVICES.items():
         if any(f"{name} {column}" in table for column in device.columns):
             return _in_frames(path, _played(path, name, table), table)
     if "phase" not in table:
         raise ValueError(f"{path}: no column phase; must have phase, or a device's such as autd3 phase")
-    with within(path):
+    with within(path), warned_within(str(path)):
         drive = drive_from_phases(table["phase"], table.get("amplitude", 1.0))
     return _in_frames(path, drive, table)
 
@@ -158,35 +156,33 @@ def _openmpd_frames(rows: Rows) -> Array | None:
     return frames
 
 
-def _names(path: Path, values: Array) -> list[str]:
+def _names(values: Array) -> list[str]:
     """Return the names of columns (R, C) without header: phase, or phase and amplitude in their order."""
     if values.shape[1] == 1:
         return ["phase"]
     amplitudes = [bool(((column >= 0) & (column <= 1)).all()) for column in values.T]
-    if len(amplitudes) != 2 or sum(amplitudes) != 1:
+    whole = (values == values.round()).all()  # perhaps decimals that begin with a comma
+    if len(amplitudes) != 2 or sum(amplitudes) != 1 or whole:
         accepted = (
-            "the first line must name them, as in phase [rad],amplitude; "
+            "the first line must name them, as in phase [rad],amplitude, and decimals begin with a point; "
             "frames of phases follow a line with their number and that of transducers"
         )
-        raise ValueError(f"{path}: {values.shape[1]} columns without names; {accepted}")
+        raise ValueError(f"{values.shape[1]} columns without names; {accepted}")
     names = ["amplitude", "phase"] if amplitudes[0] else ["phase", "amplitude"]
-    text = f"{path}: columns without names; taken as {' and '.join(names)}, since only one is within 0 to 1"
-    warnings.warn(text, ScaleWarning, stacklevel=2)
+    warn_user(f"columns without names; taken as {' and '.join(names)}, since only one is within 0 to 1")
     return names
 
 
-def _unit(path: Path, kind: str, table: Mapping[str, Array]) -> str:
+def _unit(kind: str, table: Mapping[str, Array]) -> str | None:
     """Return the unit of columns that state none: rad, if the phases can hardly be levels or degrees."""
     if kind != "rad":
-        return kind  # of positions, which are not used
+        return None  # of positions, which are not used
     phases = table["phase"]
     if (np.abs(phases) <= _TURN).all() and not (phases == phases.round()).all():
-        warnings.warn(
-            f"{path}: no unit of phases; taken as rad, since all are within a turn", ScaleWarning, 2
-        )
+        warn_user("no unit of phases; taken as rad, since all are within a turn")
         return "rad"
     span = f"phases from {phases.min():g} to {phases.max():g} without a unit"
-    raise ValueError(f"{path}: {span}; the first line must name it, as in phase [rad] or phase [deg]")
+    raise ValueError(f"{span}; the first line must name it, as in phase [rad] or phase [deg]")
 
 
 def _from_ultraino(path: Path) -> torch.Tensor:
@@ -195,10 +191,15 @@ def _from_ultraino(path: Path) -> torch.Tensor:
     if not amplitudes.any():
         if not file.phases.any():
             raise ValueError(f"{path}: all phases and amplitudes are 0; must be saved with a drive")
-        warnings.warn(f"{path}: all amplitudes are 0, but not the phases; taken as 1", ScaleWarning, 2)
+        warn_user(f"{path}: all amplitudes are 0, but not the phases; taken as 1")
         amplitudes = np.ones_like(amplitudes)
-    with within(path):
-        return drive_from_phases(-file.phases, amplitudes)
+    return _of_arguments(path, file.phases, amplitudes)
+
+
+def _of_arguments(path: Path, phases: Array, amplitudes: Array | float) -> torch.Tensor:
+    """Return the drive of phases that are arg q; messages have them as the file does."""
+    with within(path), warned_within(str(path)):
+        return drive_from_phases(phases, amplitudes).conj().resolve_conj()
 
 
 def _in_frames(path: Path, drive: torch.Tensor, table: Mapping[str, AnyArray]) -> torch.Tensor:

@@ -18,6 +18,7 @@ from autdtorch.scene.drive import drive_from_phases
 from autdtorch.scene.scene import ScaleWarning
 
 TRIANGLE = [[0.0, 0.0, 0.0], [10.5e-3, 0.0, 2e-3], [0.0, 12e-3, 0.0]]
+IN_METRES = "0,0,0\n0.0105,0,0.002\n0,0.012,0\n"
 IN_MM = "0,0,0\n10.5,0,2\n0,12,0\n"
 
 
@@ -40,6 +41,12 @@ def written(tmp_path, text, name="a.csv"):
         "x [mm] y [mm] z [mm]\n" + IN_MM.replace(",", "  "),
         "# mm\n0,0 0,0 0,0\n10,5 0,0 2,0\n0,0 12,0 0,0\n",
         "x [mm],y [mm],z [mm],\n" + IN_MM.replace("\n", ",\n"),
+        "# units: millimetres\n" + IN_MM,
+        "# positions in Millimeters, made by M. in m/s\n" + IN_MM,
+        "# units: length mm, angle rad, strength Pa m\n" + IN_MM,
+        "# units: meters, made in cm steps\n" + IN_METRES,
+        "x [millimeters],y [millimetre],z [mm]\n" + IN_MM,
+        ",x [mm],y [mm],z [mm]\n0,0,0,0\n1,10.5,0,2\n2,0,12,0\n",  # as pandas writes its index
     ],
 )
 def test_units_and_names_are_found_where_they_are(tmp_path, text):
@@ -67,8 +74,18 @@ def test_a_unit_that_is_not_stated_is_inferred_and_told(tmp_path, names, unit, f
     ("text", "message"),
     [
         ("0,0,0\n", r"a.csv: columns x, y, z have no unit; .* x \[m\] or x \[mm\]"),
+        ("0,0,0\n1,0,0\n2,0,0\n", r"neighbours 1 apart are no array.* or x \[cm\]"),
+        ("# units: furlongs\n" + IN_MM, r"state the unit 'furlongs'; must be one of m, mm, cm"),
+        ("# x y z in inches\n" + IN_MM, r"state the unit 'inches'"),
+        ("# all mm\n" + IN_METRES, r"seem to be in m, but a comment has mm; .*x \[m\]"),
+        # Decimals with commas, whose cells are separated by commas, too
+        ("0,010,0,020,0,000\n0,020,0,020,0,000\n", r"columns 4 to 6 .* of length 20 .*semicolons"),
+        ("0,1, 0,2, 0,3\n", r"normals of length 1"),
+        (",x [mm],y [mm],z [mm]\n7,0,0,0\n9,10.5,0,2\n", r"line 1: unknown column ''"),
+        ("x [mm] why [mm]\n0 0\n", r"unknown column 'why'"),
+        ("x [mm] y [foot]\n0 0\n", r"column 'y \[foot\]'"),
         ("0,0,0\n0.3,0,0\n", r"have no unit"),  # a pitch of 300 or 0.3 mm
-        ("# in mm\n# x [m] to the right\nx,y,z\n0,0,0\n0.3,0,0\n", r"have no unit"),
+        ("# in mm\n# x [m] to the right\nx,y,z\n0,0,0\n0.3,0,0\n", r"the unit 'mm' and 'm'; must be one of"),
         ("0,0\n1,0\n", r"2 columns without names; must be 3 or 6"),
         ("0,0,0,1\n1,0,0,1\n", r"4 columns without names; must be 3 or 6"),
         ("x [mm];y [mm];z [mm]\n0;0.5;0\n1,5;0;0\n", r"decimals begin with \. and with a comma"),
@@ -114,6 +131,11 @@ def test_an_array_comes_back_from_every_format(tmp_path_factory, rows, suffix, n
         ("phase [deg];amplitude\n0;1\n90;1\n180;1\n", None),
         ("# phase [deg]\n0\n90\n180\n", None),
         ("# in degrees or so\n# phase_deg\n0\n90\n180\n", None),
+        ("# phases in degrees\n0\n90\n180\n", None),
+        ("phase [degrees]\n0\n90\n180\n", None),
+        ("phase_degree\n0\n90\n180\n", None),
+        ("# units: radians\n0\n1.5707963267948966\n3.141592653589793\n", None),
+        (",phase [deg]\n0,0\n1,90\n2,180\n", None),
         ("phase\n0\n1.5707963267948966\n3.141592653589793\n", "taken as rad"),
         ("0\n1,5707963267948966\n3,141592653589793\n", "taken as rad"),
         ("1\t0\n1\t1.5707963267948966\n1\t3.141592653589793\n", "taken as amplitude and phase"),
@@ -133,6 +155,10 @@ def test_phases_are_read_as_they_come(tmp_path, text, told):
         ("0\n64\n127\n", r"phases from 0 to 127 without a unit; .*phase \[rad\] or phase \[deg\]"),
         ("0\n1\n2\n", r"phases from 0 to 2 without a unit"),
         ("0.5,0.2\n0.1,0.9\n", r"2 columns without names; the first line must name them"),
+        ("0,5\n1,5\n", r"2 columns without names; .*decimals begin with a point"),
+        ("# in rad\n0,5\n1,5\n", r"2 columns without names; .*decimals begin with a point"),
+        ("# in units of pi\n0.5\n1.5\n", r"state the unit 'pi'; must be one of rad, deg"),
+        ("# degrees of freedom\n0.5\n1.5\n", r"seem to be in rad, but a comment has deg"),
         ("1,2,3\n3,4,5\n", r"3 columns without names"),
         ("2,4\n0,1,2,3\n", r"1 rows of 4 phases; must be 2 of 4, as in the first line"),
         ("2,4\n0,1,2,3\n0,1,2\n", r"line 3: 3 cells; must be 4"),
@@ -150,6 +176,34 @@ def test_rows_of_openmpd_are_frames_of_arg_q(tmp_path_factory, frames):
     path = written(tmp_path_factory.mktemp("rows"), "\n".join(lines))
     expected = torch.polar(torch.ones(len(frames), 3).double(), torch.tensor(frames, dtype=torch.float64))
     torch.testing.assert_close(load_drive(path), expected, rtol=0, atol=1e-12)
+
+
+def test_rows_of_openmpd_in_degrees_are_told_as_the_file_has_them(tmp_path):
+    with pytest.warns(ScaleWarning, match=r"a.csv: phases: whole numbers from -90 to 180 rad") as caught:
+        load_drive(written(tmp_path, "1,3\n0,-90,180\n"))
+    assert {one.filename for one in caught} == {__file__}
+
+
+@pytest.mark.parametrize(
+    ("load", "text"),
+    [(load_array, IN_MM), (load_drive, "0.5\n1.5\n"), (load_drive, "0.5,1\n1.5,1\n")],
+)
+def test_a_guess_is_told_once_with_the_file_at_the_line_that_reads_it(tmp_path, load, text):
+    with pytest.warns(ScaleWarning, match=r"a.csv: ") as caught:
+        load(written(tmp_path, text))
+    assert {one.filename for one in caught} == {__file__}
+    assert all(str(one.message).count("a.csv") == 1 for one in caught)
+
+
+@given(st.text(" \tinuts:=[](),.m°/Pad", max_size=60))
+@settings(max_examples=100)
+def test_any_comment_is_read_or_refused(tmp_path_factory, comment):
+    path = written(tmp_path_factory.mktemp("comment"), f"# {comment}\n{IN_MM}")
+    with contextlib.suppress(ValueError), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        unit = 1e-3 if "m" not in comment.replace("mm", "") else None
+        pitch = load_array(path).positions[1, 0].item()
+        assert unit is None or pitch == pytest.approx(10.5 * unit)
 
 
 def test_two_boards_of_openmpd_have_the_order_of_its_rows():
@@ -259,6 +313,15 @@ def test_what_ultraino_leaves_out_has_its_default(tmp_path):
     assert (array.source_strength, array.radius, array.normals.tolist()) == (2.53, 4.5e-3, [[0, 0, 1]])
     with pytest.warns(ScaleWarning, match="all amplitudes are 0"):
         assert load_drive(path)[0] == pytest.approx(1j)
+
+
+def test_a_huge_value_of_ultraino_is_not_repeated(tmp_path):
+    huge = transducer(0, (0, 0, 0), (1, 0, 0, 0), {"phase": 0.5}).replace(
+        "<float>0.5</float>", f"<string>{'x' * 100_000}</string>"
+    )
+    with pytest.raises(ValueError, match=r"board.xml.gz: transducer 0, phase: 'xx") as caught:
+        load_drive(packed(tmp_path, simulation([huge], [0])))
+    assert len(str(caught.value)) < 500 + len(str(tmp_path))
 
 
 BOMB = (
