@@ -27,7 +27,7 @@ _BETWEEN = {"autdtorch", "contextlib", "dataclasses", "functools"}  # call for t
 
 
 class ScaleWarning(UserWarning):
-    """A quantity seems to be in another unit or of another frequency than the scene, or one was guessed."""
+    """A quantity seems to be in another unit or of another frequency, or its unit was guessed."""
 
 
 def warn_user(text: str, category: type[Warning] = ScaleWarning) -> None:
