@@ -16,8 +16,7 @@ from autdtorch.utils.hints import did_you_mean, with_extra
 COMMANDS = ("explore", "collect")
 """Words that stand for another command than a study, anywhere among the arguments."""
 
-MULTIRUN = {"-m", "--multirun"}
-
+_SWEEP = re.compile(r"\+*hydra\.mode=(RunMode\.)?MULTIRUN")  # as -m
 _LAUNCHER = re.compile(r"\+*hydra/launcher=(slurm|submitit_\w+|joblib)")
 _OPTIONS = {
     option: action.nargs is None  # whether a word follows
@@ -49,8 +48,11 @@ def command_of(arguments: list[str]) -> str | None:
     return None
 
 
-def require_options(arguments: Sequence[str]) -> None:
-    """Refuse, in one line, options that Hydra does not have and settings that a sweep does not take."""
+def is_sweep(arguments: Sequence[str]) -> bool:
+    """Return whether the arguments ask for a sweep.
+
+    Refuse, in one line, options that Hydra does not have and settings that a sweep does not take.
+    """
     parser = get_args_parser()
 
     def refuse(message: str) -> NoReturn:
@@ -63,17 +65,19 @@ def require_options(arguments: Sequence[str]) -> None:
         raise ValueError(f"{wrong}: unknown option{hint}; {accepted}")
 
     parser.error = refuse  # type: ignore[method-assign]
-    if "--version" not in arguments:  # which prints and ends
-        parser.parse_args(arguments)
+    if "--version" in arguments:  # which prints and ends
+        return False
+    sweep = bool(parser.parse_args(arguments).multirun) or any(map(_SWEEP.fullmatch, arguments))
     for word in arguments:
         if found := _LAUNCHER.fullmatch(word):
             plugin = "joblib" if found[1] == "joblib" else "submitit"
             if not _has_plugin(f"hydra_{plugin}_launcher"):
                 needs = f"needs the extra cluster: {with_extra('cluster')}"
                 raise ValueError(f"hydra/launcher: {found[1]!r}; {needs}")
-        if re.match(r"\+*output=", word) and MULTIRUN & set(arguments):
+        if sweep and re.match(r"\+*output=", word):
             accepted = "a sweep has a folder for each job in hydra.sweep.dir"
             raise ValueError(f"{word}: {accepted}, as hydra.sweep.dir={word.partition('=')[2]}")
+    return sweep
 
 
 def _has_plugin(name: str) -> bool:

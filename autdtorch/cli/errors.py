@@ -18,6 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from autdtorch import hardware
 from autdtorch.cli.arguments import COMMANDS
 from autdtorch.utils.hints import did_you_mean, with_extra
+from autdtorch.utils.trusted import TARGET
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 """Environment variable that asks for tracebacks."""
@@ -76,18 +77,19 @@ def _message(error: BaseException) -> str:
     return _of_hydra(error, text)
 
 
-def _of_missing(file: str, options: Sequence[str]) -> str:
-    """Return the message of a config that is not there, such as "scene/two_cube"."""
-    groups = ("hydra/launcher", "hardware/sensor", file.partition("/")[0])
-    group = next(group for group in groups if file.startswith(f"{group}/"))
-    name = file.removeprefix(f"{group}/")
+def _of_missing(group: str, name: str, options: Sequence[str]) -> str:
+    """Return the message of a config that is not there, such as "two_cube" of the group "scene"."""
     path = Path(name)
     if path.suffix in (".yaml", ".yml") or len(path.parts) > 1:
         stem, folder = path.stem, path.parent.parent if path.parent.name == group else Path("FOLDER")
         ours = f"{group}={stem}"
-        mine = f"a file of your own is FOLDER/{group}/NAME.yaml, given as --config-dir FOLDER {group}=NAME"
+        # Hydra's own groups may hold shell commands and are not read from --config-dir.
+        given = "hydra.searchpath=[{}]" if group.startswith("hydra/") else "--config-dir {}"
+        mine = (
+            f"a file of your own is FOLDER/{group}/NAME.yaml, given as {given.format('FOLDER')} {group}=NAME"
+        )
         if stem not in options:
-            ours = f"--config-dir {folder} {group}={stem}"
+            ours = f"{given.format(folder)} {group}={stem}"
         return f"{group}: {name!r}; must be a name, not a path: {ours}; {mine}"
     more = f"; the extra cluster brings more ({with_extra('cluster')}), hydra.searchpath=[FOLDER] your own"
     more = more if group == "hydra/launcher" else ""
@@ -95,21 +97,26 @@ def _of_missing(file: str, options: Sequence[str]) -> str:
 
 
 def _siblings(error: BaseException | None) -> list[str]:
-    """Return the keys that are there, where an error of OmegaConf is about one that is not."""
+    """Return the settings that are there, where an error of OmegaConf is about one that is not."""
     parent = getattr(error, "parent_node", None)
-    return [str(key) for key in parent] if isinstance(parent, DictConfig) else []
+    return [str(key) for key in parent if key != TARGET] if isinstance(parent, DictConfig) else []
 
 
 def _of_hydra(error: BaseException, text: str) -> str:
     """Return a message of Hydra in our words; others as they are, in one line."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
-        return _of_missing(error.missing_cfg_file, error.options)
-    # Hydra would advise to add the key, which we would then refuse.
+        found = re.search(r"Available options in '(.+)'", text)
+        group = found[1] if found else error.missing_cfg_file.rpartition("/")[0]
+        return _of_missing(group, error.missing_cfg_file.removeprefix(f"{group}/"), error.options)
     if unknown := re.match(r"Could not override '(.+)'", text):
         key = str(getattr(error.__cause__, "full_key", None) or unknown[1])
         keys = _siblings(error.__cause__)
         hint = did_you_mean(key.rpartition(".")[2], keys)
-        listed = f"; allowed keys: {', '.join(keys)}" if keys and "." in key else ""
+        listed = ""
+        if "." in key:  # others are all set, and Hydra's advice to add one would then be refused
+            added = re.search(r"To append to your config use (\+.+)", text)
+            listed += f"; keys that are set: {', '.join(keys)}" if keys else ""
+            listed += f"; a key that the file leaves out is added as {added[1]}" if added else ""
         return f"{key}: unknown key{hint}{listed}; autdtorch --cfg job lists the settings"
     if found := re.match(r"(Error merging override [^,\n]+)", text):
         text = f"{found[1]}: {error.__cause__}"

@@ -25,7 +25,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 import autdtorch
-from autdtorch.cli.arguments import MULTIRUN, command_of, prepare_streams, quoted, require_options
+from autdtorch.cli.arguments import command_of, is_sweep, prepare_streams, quoted
 from autdtorch.cli.config_files import CONFIGS, register
 from autdtorch.cli.errors import AGAIN, FULL_ERROR, FailedJob, in_one_line, stop
 from autdtorch.cli.workers import end_workers_with_us, leave_workers_alone
@@ -74,11 +74,11 @@ def main() -> None:
         elif arguments == ["--version"]:
             print(f"autdtorch {autdtorch.__version__}")
         else:
-            require_options(arguments)
+            sweep = is_sweep(arguments)
             sys.argv[1:] = arguments
             register()
             _explore() if command == "explore" else _run()
-            if MULTIRUN & set(arguments):
+            if sweep:
                 print("autdtorch collect merges the results of a sweep into one table and one report")
     except _Carrier as carrier:
         error = carrier.__cause__ or carrier
@@ -102,7 +102,7 @@ def _run(config: DictConfig) -> None:
     swept = job.mode == RunMode.MULTIRUN
     try:
         with warnings.catch_warnings(), _named(f"job {job.job.num}: " if swept else ""):
-            warnings.showwarning = lambda message, *_: logger.warning("%s", message)  # without our source
+            warnings.showwarning = _log_warning
             _job(config, Path(job.sweep.dir) if swept else None)
     except Exception as error:
         if not swept:
@@ -125,6 +125,11 @@ def _explore(config: DictConfig) -> None:
         explore_scene(settings, modules)
     except Exception as error:
         raise _Carrier from error
+
+
+def _log_warning(message: Warning | str, *_: object) -> None:
+    """Log a warning without the line of our source, and without what the scene of a config is a part of."""
+    logger.warning("%s", str(message).removeprefix("scene mapping: "))
 
 
 @contextlib.contextmanager

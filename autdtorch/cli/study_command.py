@@ -26,6 +26,7 @@ from autdtorch.scene.scene import Scene
 from autdtorch.study.results import StudyResult, summary_rows
 from autdtorch.study.run import StudyMethod, name_of, run_study
 from autdtorch.utils.validation import require_one_of
+from autdtorch.utils.wording import counted
 
 _HELP = """autdtorch collect FOLDER [modules=NAME]
 
@@ -103,7 +104,7 @@ def collect(arguments: list[str]) -> None:
     save_summary(sweep, folder / SUMMARY_FILE)
     command = shlex.join(["autdtorch", "collect", *arguments])
     report = write_report(sweep.results, sweep.scenes, folder, command, sweep.seeds, sweep.unfinished)
-    count = "1 study" if sweep.studies == 1 else f"{sweep.studies} studies"
+    count = counted(sweep.studies, "study", "studies")
     files = f"the table is {_quoted(folder / SUMMARY_FILE)}, the report {_quoted(report)}"
     _print_table(sweep.results, f"{count}: {files}")
 

@@ -17,6 +17,6 @@ def in_digits(number: float, digits: int) -> str:
     return f"{number:.{decimals_of([number], digits)}f}"
 
 
-def counted(count: int, noun: str) -> str:
-    """Return a count with its noun, such as "1 run" or "3 runs"."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+def counted(count: int, noun: str, plural: str | None = None) -> str:
+    """Return a count with its noun, such as "1 run" or "3 runs"; `plural` is that of an irregular noun."""
+    return f"{count} {noun if count == 1 else plural or f'{noun}s'}"

@@ -180,20 +180,35 @@ WRONG = [
     (["collect"], "collect: ''; must be one folder"),
     (["collect", "."], r"\.: no finished study \(results\.h5\) there or below"),
     (["experiment=paper", "scenes=3"], "scenes: 3; must be a mapping"),
-    (["method.level=8"], r"method\.level: unknown key \(did you mean 'levels'\?\); allowed keys: .*order"),
+    (
+        ["method.level=8"],
+        r"method\.level: unknown key \(did you mean 'levels'\?\); keys that are set: levels, ",
+    ),
+    (
+        ["scene.medium.absorption=1"],
+        r"scene\.medium\.absorption: .*set: density, sound_speed; .* as \+scene\.medium\.absorption=1;",
+    ),
     (["trails=3"], r"trails: unknown key \(did you mean 'trials'\?\)"),
     (["scene.freqency=4"], r"scene\.freqency: unknown key \(did you mean 'frequency'\?\)"),
     (["method=GABS"], r"method: 'GABS'; must be one of .* \(did you mean 'gabs'\?\)"),
     (["scene=two_cube"], r"scene: 'two_cube'; .* \(did you mean 'two_cubes'\?\)"),
     (["scene=configs/scene/two_cubes.yaml"], "scene: .* a name, not a path: scene=two_cubes; .*--config-dir"),
     (["scene=lab/scene/duct.yaml"], "scene: .* a name, not a path: --config-dir lab scene=duct"),
+    (["hydra/job_logging=stdou"], "hydra/job_logging: 'stdou'; .*did you mean 'stdout'"),
+    (
+        ["hydra/job_logging=lab/mine.yaml"],
+        r"hydra/job_logging: .*: hydra\.searchpath=\[FOLDER\] hydra/job_logging=mine",
+    ),
     (["hardware=emulated", "hardware/sensor=scpe"], r"hardware/sensor: 'scpe'; .*did you mean 'scope'"),
     (["explor"], "explor: must be key=value, .*did you mean 'explore'"),
     (["scene=homogeneous", "explore", "explore.port=-1"], "port: -1; must be an integer >= 0"),
     (["scene=homogeneous", "collect"], "collect: 'scene=homogeneous'; must be one folder"),
     (["--scene", "two_cubes"], "--scene: unknown option; settings have no dashes, as in scene=VALUE"),
     (["--multrun", "seed=1,2"], "--multrun: unknown option .*did you mean '--multirun'"),
-    (["-m", "output=x"], r"output=x: a sweep has a folder .* hydra\.sweep\.dir=x"),
+    *(
+        ([sweep, "output=x"], r"output=x: a sweep has a folder .* hydra\.sweep\.dir=x")
+        for sweep in ("-m", "--multirun", "--multi", "hydra.mode=MULTIRUN")
+    ),
     (["poses={rotaton: [0, 0, 1], count: 3}"], "poses: unknown key 'rotaton' .*'rotation'"),
 ]
 
@@ -248,7 +263,17 @@ def test_the_best_drive_is_written_as_the_levels_of_a_device(run, refused, tmp_p
 def test_degrees_on_the_command_line_are_told(run, capsys):
     words = ("scene=three_cubes", "solver.spacing=2e-3", "method=lss", "plane_spacing=0.02")
     assert run(*words, "+scene.obstacles.0.rotation=[0,0,45]") == 0
-    assert "obstacles[0]: Box.rotation: (0.0, 0.0, 45.0) rad is more than a turn" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert re.search(
+        r"^obstacles\[0\]: Box\.rotation: \(0\.0, 0\.0, 45\.0\) rad is more than a turn", told, re.MULTILINE
+    )
+
+
+@pytest.mark.filterwarnings("always")
+def test_a_scene_in_millimetres_is_told_under_one_name(run, capsys):
+    words = ("scene=homogeneous", "method=lss", "~scene.observation_plane", "~scene.domain")
+    assert run(*words, "scene.control_points.radius=20") == 0
+    assert re.search(r"^Scene: ", capsys.readouterr().err, re.MULTILINE)
 
 
 def test_the_traceback_comes_back_where_it_is_asked_for(run, refused, monkeypatch):
