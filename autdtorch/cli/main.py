@@ -127,7 +127,7 @@ def _explore(config: DictConfig) -> None:
         raise _Carrier from error
 
 
-def _log_warning(message: Warning | str, *_: object) -> None:
+def _log_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     """Log a warning without the line of our source, and without what the scene of a config is a part of."""
     logger.warning("%s", str(message).removeprefix("scene mapping: "))
 

@@ -159,7 +159,7 @@ def _simulated(body: StillBody, folder: Path | None) -> tuple[torch.Tensor, torc
     cache = None if folder is None else DiskCache(folder)
     digest = digest_of(source_digest(), package_versions(), _described(body))
     if cache is not None and (found := cache.load(digest, shape, 1)) is not None:
-        logger.debug("scattering operator loaded from %s", folder)
+        logger.info("scattering operator of an earlier run, kept in %s", folder)
         return torch.from_numpy(found[0]), waves.axes, found[1][0]
     spacing = 1e3 * body.solver.spacing
     logger.debug("simulating a scattering operator: %d waves, cells of %.3g mm", shape[0], spacing)

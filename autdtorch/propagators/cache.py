@@ -31,12 +31,14 @@ _NO_EFFECT = ("control_points", "observation_plane", "name")
 
 
 class DiskCache:
-    """A folder of complex matrices, each with a few numbers, under their digests."""
+    """A folder of complex matrices, each with a few numbers, under their digests.
+
+    The folder is made with the first matrix.
+    """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
-        """Make the folder if it is missing."""
+        """Nothing is read or made here."""
         self.folder = Path(folder)
-        self.folder.mkdir(parents=True, exist_ok=True)
 
     def load(
         self, digest: str, shape: tuple[int, ...], numbers: int
@@ -82,10 +84,12 @@ def disk_cache(folder: str | os.PathLike[str] | Literal[False] | None) -> DiskCa
     if folder is False:
         return None
     path = path_of(name, folder, "a folder, or False")
-    try:
-        return DiskCache(path)
-    except OSError as error:
-        raise invalid(name, str(path), f"must be a folder, or one that can be made ({error})") from error
+    there = next(one for one in (path, *path.absolute().parents) if os.path.lexists(one) or one.parent == one)
+    if not os.path.isdir(there) or (there != path and not os.access(there, os.W_OK | os.X_OK)):
+        raise invalid(
+            name, str(path), f"must be a folder, or one that can be made, but {there} is in the way"
+        )
+    return DiskCache(path)
 
 
 def _with_checksum(digest: str, shape: tuple[int, ...], body: bytes) -> bytes:

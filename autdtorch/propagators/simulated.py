@@ -7,6 +7,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Literal, Protocol, overload, runtime_checkable
 
 import torch
@@ -85,6 +86,7 @@ class SimulatedPropagator:
         max_periods: periods after which a run ends in any case, with a `SteadyStateWarning`.
         runs: all simulations in order. A run in several boxes counts as one; symmetry images and loaded
             matrices take none.
+        loaded_from: folder of the cache that a matrix came from, or None.
     """
 
     def __init__(
@@ -97,6 +99,7 @@ class SimulatedPropagator:
         self.scene, self.method, self.spacing = plan.scene, plan.method, plan.spacing
         self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
         self.runs: list[Run] = []
+        self.loaded_from: Path | None = None
         self._reported = 0
         self._plan, self._cache, self._given = plan, cache, tuple(others)
         # What a folder holds must not decide how later fields are computed: nothing is kept beside a cache.
@@ -298,7 +301,8 @@ class SimulatedPropagator:
         shape = len(points), len(self.scene.array)
         if (found := self._cache.load(cache_key(self._plan, points), shape, 2)) is None:
             return None
-        logger.debug("transfer matrix of %s loaded from %s", self.scene.name, self._cache.folder)
+        self.loaded_from = self._cache.folder
+        logger.debug("transfer matrix of %s loaded from %s", self.scene.name, self.loaded_from)
         matrix, (error, periods) = found
         return TransferMatrix(torch.from_numpy(matrix), error, int(periods), (), from_points=True)
 

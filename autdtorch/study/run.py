@@ -341,6 +341,8 @@ def _in_short(propagator: Propagator, result: SceneResult) -> str:
         work += _accuracy(propagator, simulation)
         if propagator.cells:
             work += f", {propagator.cells:,} cells of {1e3 * propagator.spacing:.3g} mm"
+    if isinstance(propagator, SimulatedPropagator) and propagator.loaded_from is not None:
+        work += f", the matrix of an earlier run, kept in {propagator.loaded_from}"
     parts = [f"{work}, {simulation.matrix_seconds + simulation.plane_seconds:.1f} s"]
     for name, method in result.methods.items():
         trials = counted(method.trials, "trial")

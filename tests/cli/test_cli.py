@@ -235,6 +235,7 @@ def test_runs_of_other_methods_in_a_scene_simulate_its_matrix_once(run, tmp_path
         assert run(*words, f"method={method}", "drive=full") == 0
         captured = capsys.readouterr()
         assert f"box, {runs} run" in captured.err
+        assert (f"kept in {Path('outputs', 'matrices')}" in captured.err) == (method == "gradient")
         shares.append(float(re.search(r"([\d.]+) % of [\d.]+ Pa", captured.out)[1]))
         folder = tmp_path / "outputs" / f"two_cubes_{method}"
         found = load_results(folder).scenes["two_cubes"]
@@ -340,6 +341,7 @@ def test_one_scene_and_one_method(run, tmp_path, capsys):
     assert run("scene=homogeneous", "method=gabs", "solver.method=free_space", "trials=2") == 0
     folder = tmp_path / "outputs" / "homogeneous_gabs"
     assert written(tmp_path) == {f"outputs/homogeneous_gabs/{name}" for name in SINGLE_FILES}
+    assert [path.name for path in (tmp_path / "outputs").iterdir()] == ["homogeneous_gabs"]
     assert Path.cwd() == tmp_path
     method = load_results(folder).scenes["homogeneous"].methods["gabs"]
     assert method.trials == 2
@@ -356,7 +358,7 @@ def test_one_scene_and_one_method(run, tmp_path, capsys):
 def test_what_is_finished_is_not_computed_again(run, tmp_path, capsys, monkeypatch):
     command = ("scene=homogeneous", "method=lssg", "solver.method=free_space", "plane_spacing=10e-3")
     assert run(*command, f"solver.cache={tmp_path / 'one'}", "output=here") == 0
-    assert (tmp_path / "one").is_dir()
+    assert not (tmp_path / "one").exists()  # free space has no matrix to keep
     table = capsys.readouterr().out
     monkeypatch.setattr(autdtorch.study.run, "_run_scene", lambda *_: pytest.fail("computed again"))
     assert run(*command, f"solver.cache={tmp_path / 'two'}", "output=here") == 0  # changes no result

@@ -61,6 +61,7 @@ def test_what_was_simulated_is_not_simulated_again(tmp_path):
     assert torch.equal(kept, matrix)
     assert kept_error == error
     assert not again.runs
+    assert (first.loaded_from, again.loaded_from) == (None, tmp_path)
     assert not again._others[0].runs
     drives = torch.ones((5, 4), dtype=torch.complex128)
     assert torch.allclose(again.field(drives, scene.control_points), matrix.sum(dim=1))
@@ -84,12 +85,17 @@ def test_a_folder_by_the_environment(tmp_path, monkeypatch):
     monkeypatch.setenv("AUTDTORCH_CACHE_DIR", str(tmp_path / "new" / "folder"))
     make_propagator(scene, "box", SPACING, cache=False).transfer_matrix()
     assert not (tmp_path / "new").exists()
-    make_propagator(scene, "box", SPACING).transfer_matrix()
+    propagator = make_propagator(scene, "box", SPACING)
+    make_propagator(scene, "free_space").transfer_matrix()
+    assert not (tmp_path / "new").exists()  # nothing to keep yet
+    propagator.transfer_matrix()
+    assert propagator.loaded_from is None
     assert len(files(tmp_path / "new" / "folder")) == 1
     (tmp_path / "file").touch()
-    monkeypatch.setenv("AUTDTORCH_CACHE_DIR", str(tmp_path / "file"))
-    with pytest.raises(ValueError, match=r"AUTDTORCH_CACHE_DIR: .* must be a folder"):
-        make_propagator(scene, "box", SPACING)
+    for below in ("", "below/it"):
+        monkeypatch.setenv("AUTDTORCH_CACHE_DIR", str(tmp_path / "file" / below))
+        with pytest.raises(ValueError, match=r"AUTDTORCH_CACHE_DIR: .* must be a folder"):
+            make_propagator(scene, "box", SPACING)
     for refused in (True, 3, ""):
         with pytest.raises(ValueError, match=r"cache: .* must be the path of a folder, or False"):
             make_propagator(scene, "box", SPACING, cache=refused)
@@ -194,7 +200,6 @@ def test_a_damaged_file_is_computed_again(tmp_path):
 
 def test_a_folder_that_cannot_be_used_costs_no_result(tmp_path):
     cache = DiskCache(tmp_path / "folder")
-    (tmp_path / "folder").rmdir()
     (tmp_path / "folder").write_text("a file now")
     cache.save("one", np.ones((2, 3)), 0.0)
     assert cache.load("one", (2, 3), 1) is None
