@@ -86,9 +86,8 @@ def disk_cache(folder: str | os.PathLike[str] | Literal[False] | None) -> DiskCa
     path = path_of(name, folder, "a folder, or False")
     there = next(one for one in (path, *path.absolute().parents) if os.path.lexists(one) or one.parent == one)
     if not os.path.isdir(there) or (there != path and not os.access(there, os.W_OK | os.X_OK)):
-        raise invalid(
-            name, str(path), f"must be a folder, or one that can be made, but {there} is in the way"
-        )
+        accepted = f"must be a folder, or one that can be made, but {there} is no folder to write in"
+        raise invalid(name, str(path), accepted)
     return DiskCache(path)
 
 
