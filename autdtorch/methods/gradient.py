@@ -8,13 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, cast
+from typing import ClassVar, TypeGuard, cast
 
 import numpy as np
 import torch
 
-from autdtorch.methods.base import Method, Problem, Step, Trials, generators_of, known_matrix, starts_of
+from autdtorch.methods.base import Method, Problem, Step, known_matrix, starts_of
 from autdtorch.methods.driver import run
+from autdtorch.methods.seeds import Trials, generators_of
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.bound import checked_matrix
 from autdtorch.objectives.goals import WEAKEST_FOCUS, scores_of, slope_of
@@ -95,13 +96,20 @@ def gradient_ascent(
         The drive that each trial chose.
     """
     method = GradientAscent(starts, steps)
-    if not isinstance(objective, torch.Tensor | np.ndarray | list | tuple):
+    if not _is_matrix(objective):
         return run(method, cast(Objective, objective), trials, seed, score=score)
     matrix = torch.from_numpy(checked_matrix(objective, "objective"))
     points, transducers = matrix.shape
     state = method.start(Problem(transducers, points, score, transfer_matrix=matrix), seed, trials)
     pressure = (method.ask(state) @ matrix.mT).abs()
     return method.best(method.tell(state, pressure))
+
+
+def _is_matrix(objective: object) -> TypeGuard[ArrayLike]:
+    """Return whether this is a transfer matrix: numbers, and neither an objective nor a list of them."""
+    if isinstance(objective, list | tuple):
+        return not any(isinstance(entry, Objective) for entry in objective)
+    return isinstance(objective, torch.Tensor | np.ndarray)
 
 
 def random_drives(count: int, transducers: int, generator: torch.Generator) -> torch.Tensor:

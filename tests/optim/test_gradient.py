@@ -50,3 +50,15 @@ def test_every_trial_ends_at_the_best_of_the_paper_scene(paper_objective):
 def test_what_nothing_reaches_is_no_reason_to_fail(make_objective):
     solution = gradient_ascent(make_objective(torch.zeros(2, 3, dtype=torch.complex128)))
     assert solution.score.tolist() == [0.0]
+
+
+def test_objectives_in_a_list_are_run_one_after_the_other_and_rows_are_a_matrix(
+    make_objective, random_matrix
+):
+    matrices = [random_matrix(2, 4, seed) for seed in range(2)]
+    found = gradient_ascent([make_objective(matrix) for matrix in matrices])
+    for solution, matrix in zip(found, matrices, strict=True):
+        best = gradient_ascent(matrix.tolist()).score.item()
+        assert solution.score.item() == pytest.approx(best, rel=1e-3)  # what smoothing leaves
+    with pytest.raises(ValueError, match=r"objective\[1\]"):
+        gradient_ascent([make_objective(matrices[0]), matrices[1]])
