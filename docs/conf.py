@@ -41,7 +41,7 @@ autodoc_preserve_defaults = True
 autodoc_type_aliases = {
     "ArrayLike": "autdtorch.utils.validation.ArrayLike",
     "Score": "autdtorch.objectives.objective.Score",
-    "Trials": "autdtorch.methods.base.Trials",
+    "Trials": "autdtorch.methods.seeds.Trials",
     "Vector": "autdtorch.utils.validation.Vector",
 }
 add_module_names = False

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import logging
-import numbers
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, NamedTuple, TypeAlias
+from typing import ClassVar, NamedTuple
 
-import numpy as np
 import torch
 
+from autdtorch.methods.doubts import log_doubts, lone_score
+from autdtorch.methods.seeds import Trials, trial_seeds
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal, goal_of, scores_of
 from autdtorch.objectives.objective import (
@@ -27,7 +26,6 @@ from autdtorch.utils.memory import require_memory
 from autdtorch.utils.validation import (
     complex_tensor,
     integer_at_least,
-    integers,
     invalid,
     real_tensor,
     require_callable,
@@ -35,18 +33,7 @@ from autdtorch.utils.validation import (
     within,
 )
 
-logger = logging.getLogger(__name__)
-
-Trials: TypeAlias = int | Sequence[int]
-"""A number of trials T, or the numbers of the T trials to run, so that a study can run them in blocks."""
-
-TRIAL_BYTES = 6_000.0
-"""Memory of a trial [bytes]; most of it is the state of its random generator."""
-
 _LOUDEST = 1e9  # Largest pressure [Pa] that is no error of a program; air has 1e5 Pa
-
-_LONE = 3.0  # ratio of the highest score to the next one above which it may be an outlier
-_COMPARED = 8  # scores from which on this is looked at
 
 NEAR_TIE = 1e-5
 """Relative difference below which scores count as equal. Symmetric scenes have many equal scores, and the
@@ -300,12 +287,12 @@ class Method(ABC):
             accepted = f"must be a magnitude from 0 to {_LOUDEST:g}, not a level in dB or a signed sample"
             raise invalid(f"{name}{place}", value, accepted, "Pa")
         pressure = pressure.reshape(*batch, -1)
-        score = scores_of(state.problem.goal, pressure).detach().cpu()
+        score = scores_of(state.problem.goal, pressure)
         state = replace(state, best=_improved(state, pressure, score))
         step = self.advance(state, pressure, score)
         trials = state.trials if step.goes_on is None else state.trials[step.goes_on]
         state = replace(state, trials=trials, drives=step.drives, search=step.search)
-        self._log_doubts(state)
+        log_doubts(self.label, self._doubts(state))
         return state
 
     def best(self, state: State) -> Solution:
@@ -318,24 +305,9 @@ class Method(ABC):
         history = torch.cat([history, history[:, -1:].expand(-1, missing)], dim=1)
         return replace(state.best, drive=state.problem.quantise(state.best.drive), history=history)
 
-    def _doubts(self, state: State, trial: int) -> Iterator[str]:
-        """Describe what is doubtful about the readings of a trial after `tell`: a lone highest score."""
-        score = state.best.history[trial]
-        score = score[score.isfinite()]
-        if state.done and len(score) >= _COMPARED:
-            second, first = score.topk(2).values.flip(0).tolist()
-            if 0 < _LONE * second < first:
-                which = f"the score {first:.3g} of evaluation {int(score.argmax())}, counted from 0,"
-                yield f"{which} is {first / second:.3g} times the next highest: observe its drive again"
-
-    def _log_doubts(self, state: State) -> None:
-        """Log in one line what is doubtful about the first of the trials that have doubtful readings."""
-        doubts = [(trial, "; ".join(self._doubts(state, trial))) for trial in range(len(state.seeds))]
-        doubtful = [(trial, doubt) for trial, doubt in doubts if doubt]
-        if doubtful:
-            trial, doubt = doubtful[0]
-            more = f" ({len(doubtful) - 1} more trials have doubtful readings)" if len(doubtful) > 1 else ""
-            logger.warning("%s, trial %d: %s%s", self.label, trial, doubt, more)
+    def _doubts(self, state: State) -> Sequence[Iterable[str]]:
+        """Describe what is doubtful about the readings of each trial after `tell`: a lone highest score."""
+        return [lone_score(score) for score in state.best.history] if state.done else []
 
     def _require_own(self, state: State) -> None:
         require_kind("state", state, State)
@@ -364,46 +336,6 @@ def first_of_best(score: torch.Tensor) -> torch.Tensor:
     """Return the index (T,) of the first of scores (T, B) within `NEAR_TIE` of the best."""
     best = score.amax(dim=1, keepdim=True)
     return (score >= best - NEAR_TIE * best.abs()).byte().argmax(dim=1)
-
-
-def generators_of(seeds: Sequence[int]) -> list[torch.Generator]:
-    """Return a random generator for each seed."""
-    return [torch.Generator("cpu").manual_seed(seed) for seed in seeds]
-
-
-def states_of(generators: Sequence[torch.Generator]) -> torch.Tensor:
-    """Return the states (T, N), uint8, of generators, as a `State` keeps them."""
-    return torch.stack([generator.get_state() for generator in generators])
-
-
-def restored(states: torch.Tensor) -> list[torch.Generator]:
-    """Return generators in the states (T, N), uint8."""
-    generators = [torch.Generator("cpu") for _ in states]
-    for generator, state in zip(generators, states, strict=True):
-        generator.set_state(state.clone())  # it would read a row from the beginning of the whole tensor
-    return generators
-
-
-def trial_seeds(seed: int, trials: Trials) -> list[int]:
-    """Return the seed of each trial, which does not depend on the other trials."""
-    seed = integer_at_least("seed", seed, 0)
-    if isinstance(trials, numbers.Integral):
-        count = integer_at_least("trials", trials, 1)
-        require_memory("trials", count, TRIAL_BYTES * count)
-        return [trial_seed(seed, trial) for trial in range(count)]
-    accepted = "must be an integer >= 1, or trial numbers, each once"
-    if isinstance(trials, Sequence):
-        require_memory("trials", f"{len(trials)} numbers", TRIAL_BYTES * len(trials))
-    chosen = integers("trials", trials, 0, accepted)
-    if not chosen or len(set(chosen)) < len(chosen):
-        raise invalid("trials", chosen, accepted)
-    return [trial_seed(seed, trial) for trial in chosen]
-
-
-def trial_seed(seed: int, trial: int) -> int:
-    """Return the seed of one trial."""
-    # Half the range of uint64: torch takes seeds as signed.
-    return int(np.random.SeedSequence((seed, trial)).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
 def _real(name: str, value: object, shape: Sequence[int], unit: str = "") -> torch.Tensor:

@@ -1,19 +1,43 @@
-"""Doubtful readings: those that a fitted matrix contradicts, and those of dead or saturated sensors."""
+"""Doubtful readings: lone scores, those that a fitted matrix contradicts, and dead or saturated sensors."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import logging
+from collections.abc import Iterable, Iterator, Sequence
 
 import torch
 
 from autdtorch.methods.magnitudes import Magnitudes
 
+logger = logging.getLogger(__name__)
+
+_LONE = 3.0  # ratio of the highest score to the next one above which it may be an outlier
+_COMPARED = 8  # scores from which on this is looked at
 _RESPONSE = 2.0  # variance that a row explains, each unknown, over that of the rest; 1 for noise alone
 _CONSTANT = 1e-6  # relative deviation of readings that are all the same
 _UNEXPLAINED = 0.3  # rms of what the fit leaves, in rms readings; noise 10 dB below them leaves 0.22
 _SURPRISE = 6.0  # standard deviations of the noise, and
 _LEAST_SURPRISE = 0.3  # of the fitted pressure, by which the last reading must be off to be an outlier
 _SHOWN = 3  # outliers that are listed
+
+
+def log_doubts(label: str, doubts: Sequence[Iterable[str]]) -> None:
+    """Log in one line what is doubtful about the first of the trials that have doubtful readings."""
+    doubtful = [(trial, text) for trial, own in enumerate(doubts) if (text := "; ".join(own))]
+    if doubtful:
+        trial, text = doubtful[0]
+        more = f" ({len(doubtful) - 1} more trials have doubtful readings)" if len(doubtful) > 1 else ""
+        logger.warning("%s, trial %d: %s%s", label, trial, text, more)
+
+
+def lone_score(history: torch.Tensor) -> Iterator[str]:
+    """Describe a highest score far above all others of a trial (E,), which are -inf after its end."""
+    score = history[history.isfinite()]
+    if len(score) >= _COMPARED:
+        second, first = score.topk(2).values.flip(0).tolist()
+        if 0 < _LONE * second < first:
+            which = f"the score {first:.3g} of evaluation {int(score.argmax())}, counted from 0,"
+            yield f"{which} is {first / second:.3g} times the next highest: observe its drive again"
 
 
 def sensor_doubts(drives: torch.Tensor, read: Magnitudes, fitted: torch.Tensor) -> Iterator[str]:

@@ -8,7 +8,8 @@ from typing import cast, overload
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, State, Trials, trial_seeds
+from autdtorch.methods.base import Method, Problem, State
+from autdtorch.methods.seeds import Trials, trial_seeds
 from autdtorch.methods.solution import Solution
 from autdtorch.methods.state_file import load_state, save_state
 from autdtorch.objectives.goals import WEAKEST_FOCUS

@@ -9,8 +9,9 @@ from typing import ClassVar, Literal
 import torch
 
 from autdtorch.methods import coordinates
-from autdtorch.methods.base import NEAR_TIE, Method, Problem, State, Step, Trials, generators_of, starts_of
+from autdtorch.methods.base import NEAR_TIE, Method, Problem, State, Step, starts_of
 from autdtorch.methods.driver import run
+from autdtorch.methods.seeds import Trials, generators_of
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import Objective, Score

@@ -6,19 +6,20 @@ Enough magnitudes determine each row of the matrix up to a phase (docs/decisions
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, State, Step, Trials, generators_of, restored, states_of
+from autdtorch.methods.base import Method, Problem, State, Step
 from autdtorch.methods.doubts import reading_doubts, sensor_doubts
 from autdtorch.methods.driver import run
 from autdtorch.methods.gradient import climb, climbed, random_drives
 from autdtorch.methods.magnitudes import Magnitudes, range_ends
 from autdtorch.methods.matrix_fits import Fit, kept, posteriors
 from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, prior_mean, prior_of
+from autdtorch.methods.seeds import Trials, generators_of, restored, states_of
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, scores_of
 from autdtorch.objectives.objective import Objective, Score
@@ -143,11 +144,14 @@ class Identify(Method):
         score = scores_of(state.problem.goal, pressure)
         return replace(found, drive=search["drives"][chosen], pressure=pressure, score=score)
 
-    def _doubts(self, state: State, trial: int) -> Iterator[str]:
+    def _doubts(self, state: State) -> Sequence[Iterable[str]]:
         """Describe doubtful sensors after the random drives, in time to mend them, and all at the end."""
         random = self.prior is None and state.best.history.shape[1] == self._random_drives(state.problem)
-        if not (random or state.done):
-            return
+        looked = random or state.done
+        return [self._doubts_of(state, trial) for trial in range(len(state.seeds))] if looked else []
+
+    def _doubts_of(self, state: State, trial: int) -> Iterator[str]:
+        """Describe the doubtful sensors of a trial, and at the end its doubtful readings."""
         search = {name: tensor[trial] for name, tensor in state.search.items()}
         drives, observed, fitted = search["drives"], search["observed"], search["fitted"]
         count = len(search["outliers"])  # of readings that were fitted

@@ -205,10 +205,14 @@ def goal_of(score: Score) -> Score:
 
 
 def scores_of(goal: Score, pressure: torch.Tensor) -> torch.Tensor:
-    """Return the scores (...) that a goal or any function gives for magnitudes (..., P), after checking them.
+    """Return the scores (...) of a goal or any function for magnitudes (..., P), after checking them.
 
-    The function gets a copy, which it may change.
+    They are on the CPU, without a gradient. The function gets a copy, which it may change.
     """
+    return _checked_scores(goal, pressure).detach().cpu()
+
+
+def _checked_scores(goal: Score, pressure: torch.Tensor) -> torch.Tensor:
     found = real_tensor("score", goal(pressure.clone()))
     if found.shape != pressure.shape[:-1]:
         accepted = f"must be {tuple(pressure.shape[:-1])}, one number for each drive"
@@ -217,10 +221,10 @@ def scores_of(goal: Score, pressure: torch.Tensor) -> torch.Tensor:
 
 
 def differentiable_scores(goal: Score, pressure: torch.Tensor) -> torch.Tensor:
-    """Return `scores_of` magnitudes that require a gradient; `ValueError` for scores that have none."""
+    """Return the scores of magnitudes that require a gradient, with it; `ValueError` where they have none."""
     accepted = "must be differentiable by PyTorch, for a method that climbs it"
     try:
-        score = scores_of(goal, pressure)
+        score = _checked_scores(goal, pressure)
     except RuntimeError as error:  # of PyTorch, such as for a conversion to NumPy
         raise invalid("score", goal, f"{accepted} ({error})") from error
     if pressure.requires_grad and not score.requires_grad:

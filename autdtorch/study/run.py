@@ -15,8 +15,9 @@ from typing import Any, TypeAlias
 import torch
 
 from autdtorch.io.goal_section import goal_section, require_score
-from autdtorch.methods.base import TRIAL_BYTES, Method, Problem, Trials
+from autdtorch.methods.base import Method, Problem
 from autdtorch.methods.driver import run
+from autdtorch.methods.seeds import TRIAL_BYTES, Trials
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.objectives.metrics import focus_metrics

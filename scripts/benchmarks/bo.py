@@ -22,8 +22,8 @@ from shared.document import table
 from shared.scenes import PAPER, paper_scene
 
 import autdtorch as at
-from autdtorch.methods.base import trial_seeds
 from autdtorch.methods.bayes.bayes import NOISE, drives_at
+from autdtorch.methods.seeds import trial_seeds
 from autdtorch.objectives.objective import weakest_focus
 
 EVALUATIONS, INITIAL, FIXED = 256, 16, 6

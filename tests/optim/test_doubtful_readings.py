@@ -128,6 +128,13 @@ def test_a_lone_highest_score_is_told(make_objective, random_matrix, method, cap
     assert "of evaluation 15, counted from 0, is" in caplog.text
 
 
+def test_scores_are_compared_once_at_the_end(make_objective, random_matrix, monkeypatch):
+    compared = []
+    monkeypatch.setattr("autdtorch.methods.base.lone_score", lambda score: compared.append(score) or [])
+    at.gabs(make_objective(random_matrix(3, 8, 0)), levels=4, trials=3)
+    assert len(compared) == 3  # one for each trial, not for each step, which would take half of the time
+
+
 def test_the_end_of_a_range_needs_different_drives():
     generator = torch.Generator().manual_seed(0)
     drives = random_drives(20, 6, generator)

@@ -4,9 +4,9 @@ import math
 import pytest
 import torch
 
-from autdtorch.methods.base import trial_seed
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.lssg import lssg
+from autdtorch.methods.seeds import trial_seed
 
 
 def weakest(matrix, drive):

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import autdtorch as at
-from autdtorch.methods.base import NEAR_TIE, Step, trial_seed
+from autdtorch.methods.base import NEAR_TIE, Step
+from autdtorch.methods.seeds import trial_seed
 from autdtorch.objectives.perturbations import Quantised
 
 GUESS = torch.randn(3, 5, dtype=torch.complex128, generator=torch.Generator().manual_seed(1))
@@ -376,3 +377,11 @@ def test_drives_that_a_caller_scales_in_place_leave_the_state_alone(random_matri
 def test_bayes_opt_needs_two_transducers(make_objective, random_matrix):
     with pytest.raises(ValueError, match="transducers of the objective's array: 1; must be an integer >= 2"):
         at.bayes_opt(make_objective(random_matrix(2, 1, 0)), fixed_transducer=0)
+
+
+@each(METHODS)
+def test_scores_of_a_goal_with_parameters_carry_no_gradient(objective, method):
+    weight = torch.ones((), dtype=torch.float64, requires_grad=True)
+    found = at.run(method, objective, score=lambda pressure: weight * pressure.amin(dim=-1))
+    assert not found.score.requires_grad
+    assert not found.history.requires_grad

@@ -10,21 +10,12 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
 
-from autdtorch.methods.base import (
-    Method,
-    Problem,
-    State,
-    Step,
-    Trials,
-    generators_of,
-    restored,
-    starts_of,
-    states_of,
-)
+from autdtorch.methods.base import Method, Problem, State, Step, starts_of
 from autdtorch.methods.driver import run
 from autdtorch.methods.gradient import climbed
 from autdtorch.methods.matrix_fits import kept, posteriors
 from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, prior_mean, prior_of
+from autdtorch.methods.seeds import Trials, generators_of, restored, states_of
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, scores_of
 from autdtorch.objectives.objective import Objective, Score
