@@ -18,7 +18,7 @@ import torch
 
 from autdtorch.methods.base import Method, Problem, State
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.goals import Goal
+from autdtorch.methods.state_origin import differences, origin_of
 from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import replace_file
@@ -26,7 +26,7 @@ from autdtorch.utils.numpy_file import read_arrays
 from autdtorch.utils.validation import invalid, path_of, require_kind, within
 
 _BEST, _SEARCH, _HEADER = "best.", "search.", "header"
-_VERSION = 2  # of the format; a new one where `State`, or what a method keeps in `search`, changes
+_VERSION = 3  # of the format; a new one where `State`, or what a method keeps in `search`, changes
 _COLUMNS = tuple(field.name for field in dataclasses.fields(Solution))
 
 
@@ -49,7 +49,7 @@ def save_state(path: str | os.PathLike[str], method: Method, state: State) -> No
     tensors |= {f"{_SEARCH}{name}": tensor for name, tensor in state.search.items()}
     arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in tensors.items()}
     digests = {name: digest_of(array.shape, array) for name, array in arrays.items()}
-    header = [_VERSION, _origin(method, state.problem), digests]
+    header = [_VERSION, origin_of(method, state.problem), digests]
     arrays[_HEADER] = np.array(json.dumps([*header, digest_of(*header)]))
     content = io.BytesIO()
     np.savez(content, **arrays)
@@ -62,7 +62,9 @@ def load_state(path: str | os.PathLike[str], method: Method, problem: Problem) -
     Args:
         path: of the file.
         method: of the same settings as when the state was saved.
-        problem: with the same numbers of transducers and foci, and the same goal.
+        problem: the same as when the state was saved: numbers of transducers and foci, goal, start, scene and
+            transfer matrix. Of a goal that is a function, code and values are compared, but not what it finds
+            by global names; of an object of a class of one's own, unless it is a dataclass, the name alone.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -73,7 +75,7 @@ def load_state(path: str | os.PathLike[str], method: Method, problem: Problem) -
     require_kind("problem", problem, Problem)
     arrays = read_arrays(path_of("path", path))
     with within(os.fspath(path)):
-        _require_as_saved(arrays, arrays.pop(_HEADER, None), _origin(method, problem))
+        _require_as_saved(arrays, arrays.pop(_HEADER, None), origin_of(method, problem))
     tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
     best = Solution(**{name: tensors[f"{_BEST}{name}"] for name in _COLUMNS})
     search = {
@@ -83,7 +85,9 @@ def load_state(path: str | os.PathLike[str], method: Method, problem: Problem) -
     return State(method, problem, seeds, tensors["trials"], tensors["drives"], search, best)
 
 
-def _require_as_saved(arrays: Mapping[str, AnyArray], header: AnyArray | None, origin: str) -> None:
+def _require_as_saved(
+    arrays: Mapping[str, AnyArray], header: AnyArray | None, origin: dict[str, Any]
+) -> None:
     """Check the header of a file: its version, what it is the state of, and the digest of each array."""
     if header is None:
         raise ValueError("header: missing; must be a file of save_state, of this version of autdtorch")
@@ -97,21 +101,10 @@ def _require_as_saved(arrays: Mapping[str, AnyArray], header: AnyArray | None, o
     if not whole:
         raise ValueError("header: changed; must be as save_state wrote it")
     if written != origin:
-        raise ValueError(f"state of {written}; must be of {origin}")
+        found, wanted = differences(written, origin)
+        raise ValueError(f"state of {found}; must be of {wanted}")
     missing = [f"{name}: missing" for name in digests if name not in arrays]
-    found = {name: digest_of(array.shape, array) for name, array in arrays.items()}
-    changed = [f"{name}: changed" for name, digest in found.items() if digest != digests.get(name)]
+    there = {name: digest_of(array.shape, array) for name, array in arrays.items()}
+    changed = [f"{name}: changed" for name, digest in there.items() if digest != digests.get(name)]
     if missing or changed:
         raise ValueError(f"{', '.join(missing + changed)}; must be as save_state wrote it")
-
-
-def _origin(method: Method, problem: Problem) -> str:
-    """Return method, settings, size, goal and start of a problem as JSON; of a tensor, its digest."""
-    settings = dataclasses.asdict(method)
-    prior = settings.get("prior")
-    if prior is not None and prior["transfer_matrix"] is None:  # then it is that of the problem
-        prior["transfer_matrix"] = problem.transfer_matrix
-    goal = problem.goal
-    named = repr(goal) if isinstance(goal, Goal) else getattr(goal, "__qualname__", type(goal).__name__)
-    parts = [method.name, settings, problem.transducers, problem.foci, named, problem.start]
-    return json.dumps(parts, default=digest_of)

@@ -1,5 +1,7 @@
 """Files of states: what was changed in them is refused, and named."""
 
+import dataclasses
+import functools
 import json
 
 import numpy as np
@@ -9,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import autdtorch as at
+from autdtorch.methods import state_file
 from autdtorch.methods.catalogue import METHODS
 
 GUESS = torch.randn(2, 4, dtype=torch.complex128, generator=torch.Generator().manual_seed(1))
@@ -119,3 +122,79 @@ def test_fields_that_nobody_saved_are_refused(states, tmp_path):
     np.savez(tmp_path / "state.npz", **{**arrays, "search.more": np.zeros(2)})
     with pytest.raises(ValueError, match=r"search\.more: changed"):
         at.load_state(tmp_path / "state.npz", method, problem)
+
+
+def test_a_state_goes_on_in_its_own_scene_and_matrix_alone(make_objective, random_matrix, tmp_path):
+    method, path = at.GABS(levels=3), tmp_path / "state.npz"
+    own = at.Problem.of(make_objective(random_matrix(2, 4, 0)))
+    points = own.scene.control_points + 1e-3
+    others = {
+        "scene": dataclasses.replace(own, scene=dataclasses.replace(own.scene, control_points=points)),
+        "transfer_matrix": dataclasses.replace(own, transfer_matrix=random_matrix(2, 4, 1)),
+        "start": dataclasses.replace(own, start=torch.ones(4, dtype=torch.complex128)),
+    }
+    at.save_state(path, method, method.start(own))
+    at.load_state(path, method, at.Problem.of(make_objective(random_matrix(2, 4, 0))))
+    for name, other in others.items():
+        with pytest.raises(ValueError, match=rf"state of .*gabs.*{name}.*; must be of .*{name}"):
+            at.load_state(path, method, other)
+
+
+def scaled(pressure, factor):
+    return factor * pressure.amin(dim=-1)
+
+
+def around(weight):
+    return lambda pressure: (weight * pressure).amin(dim=-1)
+
+
+GOALS = {
+    "lowest": lambda: lambda pressure: pressure.amin(dim=-1),
+    "lowest of all but one": lambda: lambda pressure: pressure[..., 1:].amin(dim=-1),
+    "highest": lambda: lambda pressure: -pressure.amax(dim=-1),
+    "twice": lambda: lambda pressure: 2 * pressure.amin(dim=-1),
+    "default": lambda: lambda pressure, weight=2.5: weight * pressure.amin(dim=-1),
+    "other default": lambda: lambda pressure, weight=3.5: weight * pressure.amin(dim=-1),
+    "partial": lambda: functools.partial(scaled, factor=2.0),
+    "other partial": lambda: functools.partial(scaled, factor=3.0),
+    "closure": lambda: around(torch.tensor([1.0, 2.0], requires_grad=True)),
+    "other closure": lambda: around(torch.tensor([1.0, 3.0])),
+}
+
+
+def test_a_state_goes_on_under_a_function_of_the_same_code_and_values_alone(tmp_path):
+    method, path = at.GABS(levels=3), tmp_path / "state.npz"
+    for name, made in GOALS.items():
+        at.save_state(path, method, method.start(at.Problem(4, 2, made())))
+        at.load_state(path, method, at.Problem(4, 2, made()))
+        for other in GOALS.keys() - {name}:
+            with pytest.raises(ValueError, match=r"state of .*goal.*; must be of"):
+                at.load_state(path, method, at.Problem(4, 2, GOALS[other]()))
+
+
+# What each method keeps in files of this version. Where it changes, `_VERSION` must, too.
+KEPT_VERSION = 3
+KEPT = {
+    "lss": "",
+    "lssg": "before foci order weights",
+    "gabs": "before order weights",
+    "bayes_opt": "answer ends entries factors fitted generators length_scale noise outliers points spread "
+    "values variance",
+    "identify": "answer drives ends entries factors fitted generators observed outliers spread variance",
+    "random_search": "generators",
+    "gradient_ascent": "",
+    "holography": "",
+}
+
+
+def test_what_methods_keep_belongs_to_the_version_of_the_format(make_objective, random_matrix):
+    objective = make_objective(random_matrix(2, 4, 0))
+    kept = {name: set() for name in METHODS}
+    for method in SMALL:
+        state = method.start(at.Problem.of(objective))
+        kept[method.name] |= set(state.search)
+        while not state.done:
+            state = method.tell(state, objective(method.ask(state)))
+            kept[method.name] |= set(state.search)
+    found = {name: " ".join(sorted(names)) for name, names in kept.items()}
+    assert (state_file._VERSION, found) == (KEPT_VERSION, KEPT)
