@@ -71,7 +71,11 @@ def _silent(observed: torch.Tensor, fitted: torch.Tensor, unknowns: int) -> torc
 
 
 def reading_doubts(
-    observed: torch.Tensor, read: Magnitudes, fitted: torch.Tensor, deviation: torch.Tensor
+    observed: torch.Tensor,
+    read: Magnitudes,
+    fitted: torch.Tensor,
+    deviation: torch.Tensor,
+    prior: bool,
 ) -> Iterator[str]:
     """Describe readings that the fit left out, a fit that leaves much, and a last reading far from it.
 
@@ -80,6 +84,7 @@ def reading_doubts(
         read: as they were used.
         fitted: magnitudes (N, P) [Pa] that the fitted matrix gives; it does not know the last readings.
         deviation: of the noise that was fitted (P,) [Pa].
+        prior: whether a prior is behind the fit, which may be wrong instead.
     """
     away = (read.nearest(fitted) - fitted)[-1].abs()
     surprise = (away > _SURPRISE * deviation) & (away > _LEAST_SURPRISE * fitted[-1])
@@ -94,7 +99,8 @@ def reading_doubts(
     if len(places) > _SHOWN:
         shown.append(f"{len(places) - _SHOWN} more")
     if shown:
-        yield f"outliers, counted from 0: {', '.join(shown)}"
+        cause = "; the readings or the prior are wrong" if prior else ""
+        yield f"outliers, counted from 0: {', '.join(shown)}{cause}"
     level, rest = float(read.power.mean().sqrt()), float(deviation.max())
     if rest > _UNEXPLAINED * level:
         yield f"the fit leaves {rest:.3g} of {level:.3g} Pa rms: the drive may be far from the best"

@@ -16,7 +16,7 @@ from autdtorch.methods.base import Method, Problem, State, Step
 from autdtorch.methods.doubts import reading_doubts, sensor_doubts
 from autdtorch.methods.driver import run
 from autdtorch.methods.gradient import climb, climbed, random_drives
-from autdtorch.methods.magnitudes import Magnitudes, range_ends
+from autdtorch.methods.magnitudes import Magnitudes
 from autdtorch.methods.matrix_fits import Fit, kept, posteriors
 from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, prior_mean, prior_of
 from autdtorch.methods.seeds import Trials, generators_of, restored, states_of
@@ -156,10 +156,12 @@ class Identify(Method):
         drives, observed, fitted = search["drives"], search["observed"], search["fitted"]
         count = len(search["outliers"])  # of readings that were fitted
         outliers = torch.nn.functional.pad(search["outliers"], (0, 0, 0, len(drives) - count))
-        read = Magnitudes.of(observed, outliers, range_ends(drives, observed))
+        read = Magnitudes.of(observed, outliers, search["ends"])
         yield from sensor_doubts(drives[:count], read.first(count), fitted[:count])
         if state.done:
-            yield from reading_doubts(observed, read, fitted, search["variance"].sqrt())
+            yield from reading_doubts(
+                observed, read, fitted, search["variance"].sqrt(), prior=self.prior is not None
+            )
             if int(search["answer"]) < count:
                 yield f"the last drive is far worse than the solution, evaluation {int(search['answer'])}"
 

@@ -10,6 +10,10 @@ _GROSS = 4.5  # times the median; of random phases, one magnitude in a million e
 _NOTHING = 1e-3  # times the median; one in a million is below it
 _EQUAL = 1e-6  # relative difference of readings at the end of a sensor's range
 _SATURATED = 4  # different drives that have this reading
+_ENOUGH, _DISTINCT = (
+    8,
+    0.9,
+)  # lower readings, and the share of them that differ, of a sensor that reads finely
 _ALIKE = 0.999  # overlap of drives above which they count as one
 
 
@@ -69,9 +73,10 @@ def gross_outliers(observed: torch.Tensor) -> torch.Tensor:
 
 
 def range_ends(drives: torch.Tensor, observed: torch.Tensor) -> torch.Tensor:
-    """Return where the range of each sensor ends (P,) [Pa], infinite where no reading (N, P) shows it.
+    """Return where the range of each sensor may end (P,) [Pa], infinite where no reading (N, P) shows it.
 
-    There, several different drives (N, M) have the same highest reading, but not all of them.
+    There, several different drives (N, M) have the same highest reading, but not all of them. It is the end
+    of the range if the sensor `reads_finely`; coarse steps make equal readings, too.
     """
     unit = drives / drives.norm(dim=1, keepdim=True).clamp_min(1e-300)
     ends = torch.full_like(observed[0], torch.inf)
@@ -83,3 +88,13 @@ def range_ends(drives: torch.Tensor, observed: torch.Tensor) -> torch.Tensor:
             if (1 / alike).sum() >= _SATURATED:
                 ends[point] = highest
     return ends
+
+
+def reads_finely(observed: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
+    """Return for which sensors (P,) the readings (N, P) below the `ends` differ, and are enough to say so."""
+    fine = torch.zeros_like(ends, dtype=torch.bool)
+    for point, column in enumerate(observed.T):
+        lower = column[(column > 0) & (column < (1 - _EQUAL) * ends[point])].sort().values
+        distinct = int((lower.diff() > _EQUAL * lower[1:]).sum()) + 1
+        fine[point] = len(lower) >= _ENOUGH and distinct >= _DISTINCT * len(lower)
+    return fine

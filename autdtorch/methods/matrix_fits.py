@@ -3,24 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 
-from autdtorch.methods.magnitudes import Magnitudes, gross_outliers, range_ends
+from autdtorch.methods.magnitudes import Magnitudes, gross_outliers, range_ends, reads_finely
 from autdtorch.methods.matrix_posterior import MatrixPosterior, MatrixPrior
 from autdtorch.methods.phase_retrieval import retrieve
 
 _KEPT = ("factors", "entries", "variance")  # of the posterior, from which the next fit goes on
 _SCREENINGS = 8  # fits, each without what the one before shows to be outliers
+_BETTER = (
+    0.5  # deviation of readings from the fit that takes the highest as limits, in those of one that does not
+)
 
 
 class Fit(NamedTuple):
-    """The posterior of a trial, and the readings as they were taken."""
+    """The posterior of a trial, and the readings as they were taken.
+
+    Attributes:
+        posterior: of the matrix.
+        read: magnitudes (N, P), of which some are outliers or limits.
+        ends: where the range of each sensor ends (P,) [Pa]; infinite where it was not reached.
+    """
 
     posterior: MatrixPosterior
     read: Magnitudes
+    ends: torch.Tensor
 
 
 def posteriors(
@@ -48,55 +58,75 @@ def posteriors(
         before = {
             name: search[name][trial].clone() for name in (*_KEPT, "spread", "outliers") if name in search
         }
+        given = None if prior is None else prior.in_units_of(own, seen)
         noise = None if variance is None else variance[trial]
-        found.append(_screened(prior, before, own, seen, generator, noise))
+        found.append(_Trial(given, before, own, seen, generator, noise).fit())
     return found
 
 
-def _screened(
-    prior: MatrixPrior | None,
-    before: Mapping[str, torch.Tensor],
-    drives: torch.Tensor,
-    observed: torch.Tensor,
-    generator: torch.Generator,
-    variance: torch.Tensor | None,
-) -> Fit:
-    """Return the posterior of a trial, fitted until the fit shows no further outlier."""
-    ends = range_ends(drives, observed)
-    outliers = torch.zeros_like(observed, dtype=torch.bool)
-    if before:
-        outliers[: len(before["outliers"])] = before["outliers"]
-    elif prior is None:
-        outliers = gross_outliers(observed)
-    given = None if prior is None else prior.in_units_of(drives, observed)
-    for _ in range(_SCREENINGS):
-        read = Magnitudes.of(observed, outliers, ends)
-        start = _start(given, before, drives, read, generator)
-        if variance is not None:
-            start = replace(start, variance=variance)
-        fit = start.fitted(drives, read, infer_noise=variance is None)
-        shown = fit.outliers(drives, read, observed)
-        if torch.equal(shown, outliers):
-            break
-        outliers = shown
-    return Fit(fit, read)
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """All that the fit of a trial begins with; see `posteriors`."""
 
+    prior: MatrixPrior | None
+    before: Mapping[str, torch.Tensor]
+    drives: torch.Tensor
+    observed: torch.Tensor
+    generator: torch.Generator
+    variance: torch.Tensor | None
 
-def _start(
-    prior: MatrixPrior | None,
-    before: Mapping[str, torch.Tensor],
-    drives: torch.Tensor,
-    read: Magnitudes,
-    generator: torch.Generator,
-) -> MatrixPosterior:
-    """Return the posterior that a fit begins at: the one before, or where phase retrieval ends."""
-    given = MatrixPrior.unknown(read, drives.shape[1]) if prior is None else prior
-    if before:
-        return MatrixPosterior(replace(given, spread=before["spread"]), *(before[name] for name in _KEPT))
-    start = MatrixPosterior.start(given)
-    if prior is not None:
-        return start
-    return replace(start, entries=retrieve(drives, read, generator).T / given.spread[:, None])
+    def fit(self) -> Fit:
+        """Return the fit without outliers, where readings at the end of a sensor's range are limits.
+
+        A sensor that reads in coarse steps has equal highest readings near the best drive, too. These fit like
+        all others; readings at the end of a range spoil a fit that does not take them as limits.
+        """
+        ends = range_ends(self.drives, self.observed)
+        found = self._screened(ends, None)
+        unsure = ends.isfinite() & ~reads_finely(self.observed, ends)
+        if not unsure.any():
+            return found
+        plain = self._screened(ends.masked_fill(unsure, torch.inf), found.posterior.matrix)
+        rest, plain_rest = (own.posterior.deviations(self.drives, own.read) for own in (found, plain))
+        ends = ends.masked_fill(unsure & (rest > _BETTER * plain_rest), torch.inf)
+        for fit in (found, plain):
+            if torch.equal(ends, fit.ends):
+                return fit
+        return self._screened(ends, plain.posterior.matrix)
+
+    def _screened(self, ends: torch.Tensor, matrix: torch.Tensor | None) -> Fit:
+        """Return the fit that shows no further outlier; the first begins at a matrix (P, M), if any."""
+        outliers = torch.zeros_like(self.observed, dtype=torch.bool)
+        if self.before:
+            outliers[: len(self.before["outliers"])] = self.before["outliers"]
+        elif self.prior is None:
+            outliers = gross_outliers(self.observed)
+        for _ in range(_SCREENINGS):
+            read = Magnitudes.of(self.observed, outliers, ends)
+            start = self._start(read, matrix)
+            if self.variance is not None:
+                start = replace(start, variance=self.variance)
+            fit = start.fitted(self.drives, read, infer_noise=self.variance is None)
+            shown, matrix = fit.outliers(self.drives, read, self.observed), fit.matrix
+            if torch.equal(shown, outliers):
+                break
+            outliers = shown
+        return Fit(fit, read, ends)
+
+    def _start(self, read: Magnitudes, matrix: torch.Tensor | None) -> MatrixPosterior:
+        """Return the posterior that a fit begins at: with neither one before nor a prior, that of a matrix.
+
+        Without a matrix, it is that of phase retrieval, which takes longer than all the rest.
+        """
+        prior = self.prior or MatrixPrior.unknown(read, self.drives.shape[1])
+        if before := self.before:
+            known = replace(prior, spread=before["spread"])
+            return MatrixPosterior(known, *(before[name] for name in _KEPT))
+        start = MatrixPosterior.start(prior)
+        if self.prior is not None:
+            return start
+        rows = retrieve(self.drives, read, self.generator).T if matrix is None else matrix
+        return replace(start, entries=rows / prior.spread[:, None])
 
 
 def kept(found: Sequence[Fit]) -> dict[str, torch.Tensor]:
@@ -106,4 +136,5 @@ def kept(found: Sequence[Fit]) -> dict[str, torch.Tensor]:
         **tensors,
         "spread": torch.stack([fit.posterior.prior.spread for fit in found]),
         "outliers": torch.stack([fit.read.outliers for fit in found]),
+        "ends": torch.stack([fit.ends for fit in found]),
     }

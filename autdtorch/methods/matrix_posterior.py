@@ -179,6 +179,15 @@ class MatrixPosterior:
         deviation = torch.maximum(usual.nanmedian(), usual.nanmedian(dim=0).values.nan_to_num()) / _MEDIAN
         return doubtful.logical_and(ratio > _OUTLIER * deviation)
 
+    def deviations(self, drives: torch.Tensor, read: Magnitudes) -> torch.Tensor:
+        """Return how far the readings of each control point (P,) are from this fit, rms [Pa].
+
+        Over the readings that no unknown explains; without any, one more would be needed to say.
+        """
+        line = _Linearised.at(self, drives, read)
+        shares = (line.unexplained_shares(self) * line.decided).sum(dim=0)
+        return (line.left.square().sum(dim=0) / shares.clamp_min(1)).sqrt()
+
     def _scaled(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return rows (P, M) and changes (K, P, M) of the prior, by the factors."""
         rows, changes = self.prior.rows, self.prior.changes
