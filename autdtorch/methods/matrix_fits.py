@@ -78,8 +78,8 @@ class _Trial:
     def fit(self) -> Fit:
         """Return the fit without outliers, where readings at the end of a sensor's range are limits.
 
-        A sensor that reads in coarse steps has equal highest readings near the best drive, too. These fit like
-        all others; readings at the end of a range spoil a fit that does not take them as limits.
+        A sensor that reads in coarse steps has equal highest readings near the best drive, too. These fit
+        like all others; readings at the end of a range spoil a fit that does not take them as limits.
         """
         ends = range_ends(self.drives, self.observed)
         found = self._screened(ends, None)
