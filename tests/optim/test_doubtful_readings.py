@@ -2,13 +2,15 @@
 
 import logging
 import math
+import re
 
 import pytest
 import torch
 
 import autdtorch as at
 from autdtorch.methods.gradient import random_drives
-from autdtorch.methods.magnitudes import gross_outliers, range_ends
+from autdtorch.methods.magnitudes import gross_outliers, range_ends, reads_finely
+from autdtorch.methods.phase_retrieval import retrieve
 
 
 class Faulty:
@@ -40,6 +42,23 @@ def replaced(point, reading):
     def change(number, pressure):
         pressure[point] = reading(number)
         return pressure
+
+    return change
+
+
+def in_steps(step, most=math.inf):
+    """Read in steps, up to the end of the range."""
+    return lambda number, pressure: (pressure.clamp(max=most) / step).round() * step
+
+
+def noisy(level, seed=0):
+    """Add noise to pressures, of this rms."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def change(number, pressure):
+        return (
+            pressure + level * torch.randn(pressure.shape, dtype=torch.complex128, generator=generator)
+        ).abs()
 
     return change
 
@@ -81,6 +100,66 @@ def test_outliers_change_nothing_and_are_told(share, change):
 def test_good_readings_are_not_doubted(share):
     assert share(times(1, []), evaluations=64)[1] == ""
     assert share(times(1, []), evaluations=47)[1] == ""
+
+
+@pytest.mark.parametrize("level", [0.1, 0.316], ids=["20 dB", "10 dB"])
+@pytest.mark.parametrize("seed", range(3))
+def test_noisy_readings_are_not_doubted(make_objective, random_matrix, caplog, level, seed):
+    matrix = random_matrix(3, 12, seed)
+    rms = float(matrix.norm(dim=1).mean())  # of readings at random phases
+    at.identify(Faulty(make_objective(matrix), noisy(level * rms, seed)))
+    assert not re.search("outliers|sensor|leaves", caplog.text)
+
+
+COARSE = [
+    (1, 16, 0.5, None),
+    (2, 6, 0.5, None),
+    (2, 6, 1.0, None),
+    (4, 16, 0.5, None),
+    (3, 8, 0.5, 16),
+    (1, 16, 0.5, 24),
+]
+
+
+@pytest.mark.parametrize(("points", "transducers", "step", "evaluations"), COARSE)
+def test_a_coarse_sensor_is_not_taken_for_saturated(
+    make_objective, random_matrix, caplog, points, transducers, step, evaluations
+):
+    matrix = random_matrix(points, transducers, 0)
+    objective = make_objective(matrix)
+    prior = None if evaluations is None else at.Prior(matrix + 0.1 * random_matrix(points, transducers, 50))
+    found = at.identify(Faulty(objective, in_steps(step)), evaluations, prior=prior)
+    assert caplog.text == ""  # before, "saturates" in all six
+    # Steps of a quarter of the pressures: 0.95 to 1 were measured.
+    assert objective(found.drive).amin() > 0.9 * at.gradient_ascent(objective).score
+
+
+def test_a_coarse_sensor_that_saturates_gives_lower_limits(make_objective, random_matrix, caplog):
+    objective = make_objective(random_matrix(4, 16, 0))
+    found = at.identify(Faulty(objective, in_steps(0.1, most=6.0)))
+    assert "control point 1 reads 6 Pa" in caplog.text
+    assert "saturates" in caplog.text
+    assert objective(found.drive).amin() > 0.9 * at.gradient_ascent(objective).score  # 0.996 was measured
+
+
+def test_with_a_poor_prior_the_doubt_is_of_the_prior_too(make_objective, random_matrix, caplog):
+    matrix, off = random_matrix(3, 8, 1), random_matrix(3, 8, 51)
+    at.identify(make_objective(matrix), 16, prior=at.Prior(matrix + 0.5 * off), seed=1)
+    assert "outliers" in caplog.text  # though the readings are exact
+    assert "the readings or the prior are wrong" in caplog.text
+
+
+def test_phases_are_retrieved_once_for_all_screenings(paper_objective, monkeypatch, caplog):
+    calls = []
+
+    def counted(*arguments):
+        calls.append(arguments)
+        return retrieve(*arguments)
+
+    monkeypatch.setattr("autdtorch.methods.matrix_fits.retrieve", counted)
+    at.identify(Faulty(paper_objective, times(2, [11], 1)), 64)
+    assert "evaluation 11 at control point 1" in caplog.text  # no gross outlier: a second screening shows it
+    assert len(calls) == 1
 
 
 @pytest.mark.parametrize("factor", [0, 100])
@@ -144,6 +223,14 @@ def test_the_end_of_a_range_needs_different_drives():
     assert range_ends(drives, 0 * magnitudes).isinf().all()
     again = drives[:1] * torch.polar(torch.ones(20).double(), torch.linspace(0, 6, 20).double())[:, None]
     assert range_ends(again, torch.ones(20, 1).double()).isinf().all()  # one drive, at 20 common phases
+
+
+def test_a_sensor_reads_finely_where_enough_lower_readings_differ():
+    readings = 5 * torch.rand(20, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    end = torch.tensor([4.0], dtype=torch.float64)
+    assert reads_finely(readings, end).all()
+    assert not reads_finely(readings[:6], end).any()
+    assert not reads_finely(readings.round(decimals=0), end).any()
 
 
 def test_gross_outliers_are_far_from_the_median():
