@@ -13,7 +13,17 @@ from matplotlib.ticker import FixedLocator, NullLocator
 
 from autdtorch.plot import style
 from autdtorch.plot.data import ByMethod, by_scene, labelled, methods_of, require_each
-from autdtorch.plot.style import TICK_SIZE, Look, add_legend, label_of, log_axes, looks_of, styled, text_width
+from autdtorch.plot.style import (
+    TICK_SIZE,
+    Look,
+    add_legend,
+    label_of,
+    log_axes,
+    looks_of,
+    styled,
+    text_width,
+    wrapped,
+)
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import boolean, invalid, members, require_kind
 
@@ -21,6 +31,8 @@ _FRONT: dict[str, Any] = {"color": "0.8", "linewidth": 4.0, "solid_joinstyle": "
 _PANEL, _HEIGHT = 2.6, 2.5  # inch
 _INSIDE = 2.0  # inch, of a panel, without labels
 _BESIDE = 0.08  # inch, between a point and its name
+_MARGIN = 0.15  # between points and the ends of an axis, as a share of what the points span
+_NAME_WIDTH, _NAME_LINES = 0.8, 3  # inch, and lines; of longer names the rest is left out
 
 OVERHEAD = 2.0  # fitted costs are at least this many times the smallest: overhead is at most half of each
 FEWEST = 3  # points for a fit
@@ -45,7 +57,8 @@ def plot_pareto(
         xlabel: label of the cost, with its unit.
         ylabel: label of the result, with its unit.
         higher_is_better: True if the result is a score, not an error.
-        names: by scene and method, N names of the points; shown along the front of all methods.
+        names: by scene and method, N names of the points; shown along the front of all methods, long ones
+            in up to three lines.
 
     Raises:
         ValueError: no scene, points that are not (N, 2) finite numbers, or a cost or error <= 0.
@@ -64,9 +77,8 @@ def plot_pareto(
         everything = np.concatenate(list(drawn.values()))
         best = _pareto_front(everything, higher_is_better)
         texts = [] if names is None else _texts(f"names[{scene!r}]", names[scene], drawn)
-        shown = {index: texts[index] for index in best if texts}
-        left = max((text_width(text, TICK_SIZE) for text in shown.values()), default=0.0) + _BESIDE
-        ax.margins(max(0.15, left / (_INSIDE - 2 * left)), 0.15)
+        shown = {index: wrapped(texts[index], _NAME_WIDTH, _NAME_LINES) for index in best if texts}
+        _make_room(ax, [_size(text) for text in shown.values()])
         log_axes(ax, "x" if higher_is_better else "xy")
         _name_front(ax, everything, shown, higher_is_better)
         # The best result within each cost: steps up to the edge of the panel.
@@ -93,17 +105,36 @@ def _pareto_front(points: Array, higher_is_better: bool) -> list[int]:
     return kept
 
 
+def _size(name: str) -> Array:
+    """Return width and height [inch] of a name with its distance from a point."""
+    lines = name.split("\n")
+    width = max(text_width(line, TICK_SIZE) for line in lines)
+    return np.array([width, 1.2 * TICK_SIZE / 72 * len(lines)]) + _BESIDE
+
+
+def _make_room(ax: Axes, sizes: Sequence[Array]) -> None:
+    """Leave room for names of sizes [inch] left of all points, and above and below them."""
+    width, height = np.max([*sizes, np.zeros(2)], axis=0)
+    ax.margins(_MARGIN, max(_MARGIN, height / (_INSIDE - 2 * height)))
+    ax.set_xscale("log")
+    low, high = np.log10(ax.get_xlim())
+    first, share = low + _MARGIN / (1 + 2 * _MARGIN) * (high - low), width / _INSIDE
+    ax.set_xlim(10 ** min(low, (first - share * high) / (1 - share)), 10**high)
+
+
 def _name_front(ax: Axes, points: Array, names: Mapping[int, str], higher_is_better: bool) -> None:
     """Write names on the side of the front that has no points, without those that would cover another."""
     up, side = (3, "bottom") if higher_is_better else (-3, "top")
     where: Any = {"xytext": (-4, up), "textcoords": "offset points", "ha": "right", "va": side}
     place = (ax.transData + ax.transAxes.inverted()).transform(points) * _INSIDE
-    written: list[Array] = []
+    written: list[tuple[Array, float]] = []  # places and heights
     for index, name in names.items():
-        room = (text_width(name, TICK_SIZE) + _BESIDE, TICK_SIZE / 72 + _BESIDE)
-        if all((abs(place[index] - other) > room).any() for other in written):
+        width, height = _size(name)
+        # Costs rise along the front: a name covers one before it if it is too wide, and that is too high.
+        apart = [abs(place[index] - other) > (width, room) for other, room in written]
+        if all(one.any() for one in apart):
             ax.annotate(name, tuple(points[index]), fontsize=TICK_SIZE, **where)
-            written.append(place[index])
+            written.append((place[index], height))
 
 
 def _texts(name: str, given: Mapping[str, Sequence[str]], drawn: Mapping[str, Array]) -> list[str]:

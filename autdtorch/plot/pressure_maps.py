@@ -43,6 +43,8 @@ _WIDTH = 7.0  # of the maps in a figure of several, unless they are more than th
 _LEAST_COLUMN, _LEAST_ROW = 1.4, 0.8  # for the numbers of a colour bar, and the name of a method
 _BAR = 0.11  # thickness of a colour bar
 _LABELS = 0.62  # for tick labels and the name of an axis
+_NAME_LINE = 0.16  # for each line of the name of a row
+_END = 0.25  # for the half of the last tick label that is beyond its axis, and a margin
 
 
 @styled
@@ -173,9 +175,14 @@ def _rows_of_maps(
     widths = [max(_LEAST_COLUMN, width) for width, _ in sizes]
     row = max(_LEAST_ROW, *(height for _, height in sizes))
     between = (0.25, 0.15) if alike else (_LABELS, 0.5)  # columns and rows [inch]
+    names = [wrapped(label_of(method), row) for method in methods]
+    beside = _NAME_LINE * max(len(name.splitlines()) for name in names) + _LABELS + _END
+    below = 1.4 if any(pressure) else 1.1  # or above: titles, the axis and the colour bar
     figure = new_figure(
-        1.0 + sum(widths) + between[0] * (len(widths) - 1), 1.4 + (row + between[1]) * len(methods)
+        beside + sum(widths) + between[0] * (len(widths) - 1), below + (row + between[1]) * len(methods)
     )
+    if [(widths[0], row)] == sizes:  # one column, that its maps fill
+        figure.set_layout_engine("compressed")  # "constrained" cuts off labels beside them
     heights = [*(row for _ in methods), _BAR]
     axes = figure.subplots(
         len(heights), len(widths), squeeze=False, height_ratios=heights, width_ratios=widths
@@ -206,8 +213,8 @@ def _rows_of_maps(
         beyond = _beyond(magnitudes.values(), limits)
         bar = figure.colorbar(mesh, cax=column[-1], orientation="horizontal", extend=beyond)
         _label_bar(bar, limits, "|p|", "Pa", width)
-    for ax, method in zip(axes[:-1, 0], methods, strict=True):
-        _name_row(ax, wrapped(label_of(method), row))
+    for ax, name in zip(axes[:-1, 0], names, strict=True):
+        _name_row(ax, name)
     return figure
 
 

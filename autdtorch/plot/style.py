@@ -210,6 +210,7 @@ def readable(name: str) -> str:
     return name.replace("_", " ")
 
 
-def wrapped(text: str, width: float) -> str:
-    """Return the text in lines of at most a width [inch]."""
-    return textwrap.fill(text.replace(",", ", ").replace(",  ", ", "), max(8, int(width / _LETTER)))
+def wrapped(text: str, width: float, most: int | None = None) -> str:
+    """Return the text in lines of at most a width [inch]; beyond `most` lines an ellipsis ends it."""
+    spaced, letters = text.replace(",", ", ").replace(",  ", ", "), max(8, int(width / _LETTER))
+    return textwrap.fill(spaced, letters, max_lines=most, placeholder="\N{HORIZONTAL ELLIPSIS}")

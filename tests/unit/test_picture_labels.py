@@ -4,6 +4,7 @@ import itertools
 import re
 
 import numpy as np
+import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
@@ -109,6 +110,45 @@ def test_labels_over_trials_are_clear(data: st.DataObject) -> None:
     require_clear(
         at.plot_poses(path, np.arange(7.0), "shift along the path [mm]", "weakest of eight foci [Pa]")
     )
+
+
+POINT_NAMES = ("", "0.5 mm", "gabs,levels=8,passes=3", "W" * 22, "x" * 60, "a name of sixty letters " * 3)
+
+
+@pytest.mark.parametrize("name", POINT_NAMES)
+@pytest.mark.parametrize("higher_is_better", [False, True])
+@pytest.mark.parametrize("count", [1, 4])
+def test_names_of_points_on_a_front_are_clear(name: str, higher_is_better: bool, count: int) -> None:
+    random = np.random.default_rng(3)
+    points = {scene: {"gabs": random.lognormal(0, 1, (count, 2))} for scene in ("lab", "two_cubes")}
+    names = {scene: {"gabs": [name] * count} for scene in points}
+    figure = at.plot_pareto(points, "time [s]", "result [%]", higher_is_better, names)
+    require_clear(figure)
+    for ax in figure.axes:
+        texts = [text for text in ax.texts if text.get_text()]
+        assert bool(texts) == bool(name)
+        for box in (text.get_window_extent() for text in texts):  # does not lie on the axis and its numbers
+            assert ax.bbox.x0 <= box.x0 <= box.x1 <= ax.bbox.x1
+            assert ax.bbox.y0 <= box.y0 <= box.y1 <= ax.bbox.y1
+
+
+ROWS = (["a"], ["a", "b", "a very long method name indeed"], ["gabs,levels=8,passes=3", "lss"], ["x" * 60])
+SIDES = [(0.1, 0.1), (0.012, 0.2), (0.2, 0.012)]
+
+
+@pytest.mark.parametrize("rows", ROWS)
+@pytest.mark.parametrize("size", SIDES)
+def test_names_of_rows_are_clear(rows: list[str], size: tuple[float, float]) -> None:
+    plane = at.Plane((0.08, 0.05, 0.05), (1, 0, 0), size)
+    maps = {"two_cubes": {row: np.full((20, 20), 120.0) for row in rows}}
+    require_clear(at.plot_planes(maps, {"two_cubes": plane}))
+
+
+def test_names_of_rows_of_one_scene_are_clear() -> None:
+    plane, pressure = at.Plane((0.08, 0.05, 0.05), (1, 0, 0), (0.1, 0.1)), np.full((20, 20), 50.0)
+    maps = {"a": pressure, "b": 2 * pressure, "a very long method name indeed": pressure}
+    box = at.Box((0.08, 0.05, 0.05), (0.01,) * 3, rigid=True)
+    require_clear(at.plot_planes(maps, plane, [(0.08, 0.03, 0.045)], [box]))
 
 
 SIDE = st.floats(1.0, 3e3)  # mm
