@@ -1,5 +1,6 @@
 """The live view as a program uses it: scene and drive are read and set, and results waited for."""
 
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from live_view import SPACING, opened, pressures, settled, share_of_bound, simul
 
 import autdtorch as at
 from autdtorch.plot.explore import calculation
+from autdtorch.plot.explore.picture import Grip
 from autdtorch.plot.view3d import rendering_problem
 
 pytest.importorskip("trame_rca", reason="trame: install autdtorch[explore]")
@@ -69,7 +71,8 @@ def test_what_cannot_be_set_changes_nothing(view, scene):
     with pytest.raises(ValueError, match="scene"):
         view.scene = "two_cubes"
     with pytest.raises(ValueError, match="spacing"):
-        view.scene = replace(scene, frequency=90e3, medium=at.Medium(1.2, 343.0))  # too coarse cells
+        medium = at.Medium.air(frequency=90e3)
+        view.scene = replace(scene, medium=medium, frequency=90e3)  # too coarse cells
     for wrong in (drive[:3], 2 * drive, float("nan") * drive):
         with pytest.raises(ValueError, match="drive"):
             view.drive = wrong
@@ -78,6 +81,78 @@ def test_what_cannot_be_set_changes_nothing(view, scene):
     view.close()
     with pytest.raises(RuntimeError, match="closed"):
         view.drive = drive
+    with pytest.raises(RuntimeError, match="closed"):
+        view.ready()
+
+
+def test_a_view_that_closes_before_it_comes_to_a_call_says_so(view, scene, monkeypatch):
+    view.ready()
+    server = view._server
+    monkeypatch.setattr(server, "_call", lambda *_: view.close())  # after the check that it runs
+    with pytest.raises(RuntimeError, match="closed"):
+        view.scene = scene
+
+
+def in_session(view, act):
+    """Call a function of the session in its thread."""
+    view._server.call(lambda: act(view._shown.session))
+
+
+def test_the_view_follows_though_the_search_before_failed(view, monkeypatch):
+    view.ready()
+    begun, may_fail = threading.Event(), threading.Event()
+
+    def fail(*_):
+        begun.set()
+        may_fail.wait()
+        raise RuntimeError("no drive today")
+
+    monkeypatch.setattr(calculation.Calculator, "_steps", fail)
+    in_session(view, lambda session: session.find())
+    assert begun.wait(10)
+
+    def look_elsewhere(session):
+        session.attempt(lambda: session.now.with_plane("z"), moving=False)
+        session.settle()
+
+    in_session(view, look_elsewhere)
+    may_fail.set()
+    with pytest.raises(RuntimeError, match="no drive today"):
+        view.ready()
+    session = view._shown.session
+    assert session.display.result.request.situation.plane == "z"
+
+
+def test_the_mouse_lets_go_of_what_another_scene_has_no_more(view, scene):
+    def hold_the_last_body(session):
+        x, y, z = session.now.bodies[-1].center
+        session._mouse._grip = Grip("body", 1, np.array([x, y, z]), np.array([x, y, z]))
+
+    for change in (
+        lambda: setattr(view, "scene", replace(scene, obstacles=scene.obstacles[:1])),
+        lambda: in_session(view, lambda session: session.undo()),
+        lambda: in_session(view, lambda session: session.redo()),
+    ):
+        in_session(view, hold_the_last_body)
+        change()
+        in_session(view, lambda session: session._mouse._move())  # the body would move, or be none
+        count = len(view.scene.obstacles)
+        assert view.scene.obstacles == scene.obstacles[:count]
+
+
+def test_the_camera_stays_where_the_domain_does(view, scene):
+    def camera():
+        picture = view._shown.session.display.picture
+        return np.array([*picture.plotter.camera_position[0], picture.plotter.camera.parallel_scale])
+
+    first = camera()
+    in_session(view, lambda session: session.display.picture.move_camera(30.0, 10.0, 1.5))
+    turned = camera()
+    assert np.abs(turned - first).max() > 1
+    view.scene = replace(scene, obstacles=scene.obstacles[:1])
+    np.testing.assert_allclose(camera(), turned, rtol=1e-9)
+    view.scene = replace(scene, domain=[[0, 0, 0], [0.1, 0.1, 0.11]])
+    assert np.abs(camera() - turned).max() > 1
 
 
 def test_who_waits_is_told_why_there_is_no_result(view, monkeypatch):

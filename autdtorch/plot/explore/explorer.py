@@ -84,6 +84,7 @@ class Explorer:
             RuntimeError: the view is closed.
             Exception: what ended the calculation, which the page shows, too.
         """
+        self._server.require_running()
         session = self._shown.session
         while not session.ready.wait(0.2):  # in steps that let Ctrl+C through
             self._server.require_running()

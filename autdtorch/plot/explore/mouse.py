@@ -51,6 +51,10 @@ class Mouse:
             tag = self._interactor.AddObserver(event, listener, _FIRST)
             setattr(self, f"_{event}", self._interactor.GetCommand(tag))
 
+    def let_go(self) -> None:
+        """Hold nothing any more: what was gripped may have gone."""
+        self._grip = None
+
     def _press(self, *_: object) -> None:
         x, y = self._interactor.GetEventPosition()
         found = self._picture.grip(x, y)

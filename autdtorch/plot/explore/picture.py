@@ -23,10 +23,7 @@ _SAMPLES = 600  # along a ray through the scene, to find the body under the mous
 _AROUND = 1.05  # height of the window, relative to the domain's sphere; leaves room for letters
 _LETTERS = 9.0  # size of tick labels and titles
 _SAMPLES_A_PIXEL = 4
-_MARK, _WIRE = (
-    0.33,
-    0.04,
-)  # wavelengths: radii of the ring around a focus, so that it is seen, and of its wire
+_MARK, _WIRE = 0.33, 0.04  # wavelengths: radii of the ring around a focus, so that it is seen, and its wire
 _CHOSEN = 1.6  # size of the ring around the chosen focus
 _SLANTING = 0.2  # sine of the least angle of a line of sight to a plane in which something is dragged
 _RING = 1.1, 1.4  # radii of the ring around the chosen transducer, relative to its disc
@@ -76,6 +73,7 @@ class Picture:
         """Draw a situation, as yet without a field."""
         self.plotter = meshes.empty_plotter(situation.scene.domain, off_screen=True)
         self._dark = False
+        self._domain: Any = None  # that the camera looks at
         self.draw(situation)
         self.plotter.render_window.AddObserver("WindowResizeEvent", lambda *_: self._fit())
 
@@ -87,10 +85,9 @@ class Picture:
         return same_bodies and one.scene.array is other.scene.array and one.scene.domain == other.scene.domain
 
     def draw(self, situation: Situation) -> None:
-        """Draw a situation in place of another, as yet without a field."""
+        """Draw a situation in place of another, as yet without a field; in one domain the camera stays."""
         scene, self._situation = situation.scene, situation
         self.plotter.clear_actors()
-        meshes.look_at(self.plotter, scene.domain)
         self._bodies = [meshes.add_obstacle(self.plotter, body.first) for body in situation.bodies]
         self._foci: list[Any] = []
         self._faces = meshes.add_transducers(
@@ -102,9 +99,12 @@ class Picture:
         self._actor = meshes.add_sheet(self.plotter, self._sheet, colours.PRESSURE_MAP, (0.0, 1.0))
         self.set_dark(self._dark)
         self.place(situation, 0, 0)
-        self._fitted = self.plotter.camera.parallel_scale
-        self._first = self.plotter.camera_position
-        self._fit()
+        if scene.domain != self._domain:
+            self._domain = scene.domain
+            meshes.look_at(self.plotter, scene.domain)
+            self._fitted = self.plotter.camera.parallel_scale
+            self._first = self.plotter.camera_position
+            self._fit()
 
     def _fit(self) -> None:
         """Show the whole domain in a window of another size, unless the user has zoomed."""

@@ -9,6 +9,7 @@ import secrets
 import threading
 import weakref
 from collections.abc import Awaitable, Callable
+from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ HOST = "127.0.0.1"
 _NAMES = HOST, "localhost"  # by which a browser may call this machine; others are those of an attack
 _ASSETS = Path(__file__).with_name("assets")
 _PATIENCE = 60.0  # s until the server must have started
+_STEP = 0.2  # s between looks whether it still runs, while something is waited for
 
 Defer = Callable[..., None]
 End = Callable[[], Awaitable[None]]
@@ -77,7 +79,7 @@ class Server:
     def wait(self) -> None:
         """Wait until it is closed, in steps that let Ctrl+C through."""
         while self.running:
-            self._thread.join(0.5)
+            self._thread.join(_STEP)
 
     def call(self, function: Callable[[], object]) -> None:
         """Call a function in the thread, and wait for its end.
@@ -85,12 +87,21 @@ class Server:
         Raises:
             RuntimeError: it is closed.
         """
+        done: Future[None] = Future()
 
-        async def called() -> None:
-            function()
+        def called() -> None:
+            try:
+                function()
+            except Exception as error:
+                done.set_exception(error)
+            else:
+                done.set_result(None)
 
         self.require_running()
-        asyncio.run_coroutine_threadsafe(called(), self._loop).result(_PATIENCE)
+        self._call(called)
+        while not wait([done], _STEP).done:  # it may be closed before it comes to the call
+            self.require_running()
+        done.result()
 
     def close(self) -> None:
         """Stop the server and end the thread."""

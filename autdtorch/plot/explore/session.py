@@ -165,6 +165,7 @@ class Session:
 
     def show(self, scene: Scene) -> None:
         """Show another scene, as a step; a search that runs goes on there, and another array begins one."""
+        self._mouse.let_go()
         before = self.now
         self._history.step(before.with_scene(scene))
         if not same_array(scene.array, before.scene.array):
@@ -184,12 +185,14 @@ class Session:
 
     def undo(self) -> None:
         """Go a step back."""
+        self._mouse.let_go()
         self._end_search()
         self._history.undo()
         self._show()
 
     def redo(self) -> None:
         """Take a step again."""
+        self._mouse.let_go()
         self._end_search()
         self._history.redo()
         self._show()
@@ -213,6 +216,7 @@ class Session:
 
     def remove_focus(self) -> None:
         """Remove the chosen focus."""
+        self._mouse.let_go()
         points = self.now.scene.control_points
         if len(points) > 1:
             kept = torch.arange(len(points), device="cpu") != self.display.chosen("focus", len(points))
@@ -336,7 +340,7 @@ class Session:
             elif isinstance(found, Finished):
                 self.ready.set()
             elif isinstance(found, Failure):
-                self._search, self._running, self.failure = None, False, found.error
+                self._search, self._running = None, False
                 self._state.update(
                     {
                         "message": refusal(found.error),
@@ -345,6 +349,8 @@ class Session:
                         "shown": found.request.number,
                     }
                 )
+                self._ask_waiting()
+                self.failure = found.error
             elif self._running:
                 text = f"{found.label}: {found.evaluations} of at most {found.most} evaluations"
                 self._state.progress = 100 * found.evaluations / max(found.most, 1)
@@ -366,7 +372,12 @@ class Session:
         what = "calculated" if request.fine else "coarse, calculated"
         self._state.status = f"{self._ended}{what} in {result.seconds:.2g} s"
         self._ended = "" if request.fine else self._ended
-        if is_newest and self._waits:
+        if is_newest:
+            self._ask_waiting()
+
+    def _ask_waiting(self) -> None:
+        """Ask for what waited for the end of a method, if anything did."""
+        if self._waits:
             self._waits = False
             self._ask()
 
