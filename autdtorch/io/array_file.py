@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
-from autdtorch.io.csv_table import read_rows, table_of
+from autdtorch.io.csv_table import Guessed, read_rows, table_of
 from autdtorch.io.ultraino_file import SUFFIX, read_ultraino
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import device_axes, in_plane
@@ -18,7 +18,6 @@ from autdtorch.utils.array_types import Array
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.neighbours import closest_pair
 from autdtorch.utils.numpy_file import read_arrays
-from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import ArrayLike, path_of, within
 
 # Columns of a CSV file with the positions of transducers and the directions of emission, and their units.
@@ -117,20 +116,19 @@ def _names(values: Array) -> list[str]:
     return names[: values.shape[1]]
 
 
-def _unit(kind: str, table: Mapping[str, Array]) -> str | None:
+def _unit(kind: str, table: Mapping[str, Array]) -> Guessed | None:
     """Return the unit of lengths or strengths that state none: that in which the pitch is a usual one."""
     if kind != "m":
-        return kind if kind == "Pa m" else None
+        return Guessed(kind, "") if kind == "Pa m" else None
     why = ""
     if table.keys() >= PLACE_COLUMNS.keys() and len(table["x"]) > 1:
         places = torch.from_numpy(np.stack([table[name] for name in PLACE_COLUMNS], axis=1))
         pitch = closest_pair(places)[0]
         for unit, (least, most) in _PITCHES.items():
             if least <= pitch < most:
-                warn_user(
-                    f"no unit of length; taken as {unit}, since neighbours are {pitch:.4g} {unit} apart"
+                return Guessed(
+                    unit, f"length; taken as {unit}, since neighbours are {pitch:.4g} {unit} apart"
                 )
-                return unit
         why = f", and neighbours {pitch:.4g} apart are no array of 3 to 100 mm in m or mm"
     columns = ", ".join(table)
     raise ValueError(f"columns {columns} have no unit{why}; the header must be as x [m] or x [mm] or x [cm]")

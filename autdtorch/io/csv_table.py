@@ -15,13 +15,20 @@ import numpy as np
 from autdtorch.io.stated_units import FACTORS, mentioned_units, stated_unit, unit_called
 from autdtorch.utils.array_types import AnyArray, Array
 from autdtorch.utils.files import replacing
-from autdtorch.utils.units import warned_within
+from autdtorch.utils.units import warn_user, warned_within
 from autdtorch.utils.validation import invalid, require_known, within
 
 _LONGEST = 1000  # characters of a name or a comment that are read
 
 
-Guess: TypeAlias = Callable[[str, Mapping[str, Array]], str | None]
+class Guessed(NamedTuple):
+    """A unit that a file does not state."""
+
+    unit: str
+    why: str  # of what, and why, for a warning; empty where no other is in use
+
+
+Guess: TypeAlias = Callable[[str, Mapping[str, Array]], Guessed | None]
 
 
 class Column(NamedTuple):
@@ -117,9 +124,9 @@ def table_of(
         columns: SI unit of each name that may occur: "m" (or mm, cm in the file), "rad" (or deg), "Pa m", "".
         named: returns the names of the columns of numbers (R, C) that have neither header nor comment.
         guess: returns the unit of columns that state none, from their SI unit and their numbers by name, and
-            warns; None where the columns are not used.
+            why; None where the columns are not used.
 
-    Errors and warnings of both functions get the path in front.
+    The errors of both functions, and the warnings of the first, get the path in front.
     """
     rows = _without_index(rows)
     first, header = (1, _header(rows, columns)) if rows.has_header else (0, _from_comments(rows, columns))
@@ -144,14 +151,16 @@ def _unit(rows: Rows, kind: str, table: Mapping[str, Array], guess: Guess) -> st
     with within(rows.path), warned_within(rows.path):
         if (stated := stated_unit(rows.comments, kind)) is not None:
             return stated
-        unit = guess(kind, table)
-        others = mentioned_units(rows.comments, kind) - {unit}
-        if unit is None or not others:
-            return unit
-        found = (
-            f"columns {', '.join(table)} seem to be in {unit}, but a comment has {', '.join(sorted(others))}"
-        )
-        raise ValueError(f"{found}; the header must be as {next(iter(table))} [{unit}]")
+        if (guessed := guess(kind, table)) is None:
+            return None
+        unit, why = guessed
+        if others := mentioned_units(rows.comments, kind) - {unit}:
+            found = f"columns {', '.join(table)} seem to be in {unit}"
+            accepted = f"the header must be as {next(iter(table))} [{unit}]"
+            raise ValueError(f"{found}, but a comment has {', '.join(sorted(others))}; {accepted}")
+        if why:
+            warn_user(f"no unit of {why}")
+        return unit
 
 
 def write_table(path: str | os.PathLike[str], columns: Mapping[str, AnyArray]) -> None:

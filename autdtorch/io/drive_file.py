@@ -13,7 +13,7 @@ import torch
 
 from autdtorch.hardware.devices import DEVICES
 from autdtorch.io.array_file import NORMAL_COLUMNS, PLACE_COLUMNS, SIZE_COLUMNS
-from autdtorch.io.csv_table import Rows, read_rows, table_of, write_table
+from autdtorch.io.csv_table import Guessed, Rows, read_rows, table_of, write_table
 from autdtorch.io.ultraino_file import SUFFIX, read_ultraino
 from autdtorch.scene.arrays import TransducerArray, radii_of, strengths_of
 from autdtorch.scene.drive import (
@@ -173,14 +173,13 @@ def _names(values: Array) -> list[str]:
     return names
 
 
-def _unit(kind: str, table: Mapping[str, Array]) -> str | None:
+def _unit(kind: str, table: Mapping[str, Array]) -> Guessed | None:
     """Return the unit of columns that state none: rad, if the phases can hardly be levels or degrees."""
     if kind != "rad":
         return None  # of positions, which are not used
     phases = table["phase"]
     if (np.abs(phases) <= _TURN).all() and not (phases == phases.round()).all():
-        warn_user("no unit of phases; taken as rad, since all are within a turn")
-        return "rad"
+        return Guessed("rad", "phases; taken as rad, since all are within a turn")
     span = f"phases from {phases.min():g} to {phases.max():g} without a unit"
     raise ValueError(f"{span}; the first line must name it, as in phase [rad] or phase [deg]")
 

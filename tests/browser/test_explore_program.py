@@ -70,9 +70,9 @@ def test_what_cannot_be_set_changes_nothing(view, scene):
     drive = view.drive
     with pytest.raises(ValueError, match="scene"):
         view.scene = "two_cubes"
+    too_coarse = replace(scene, medium=at.Medium.air(frequency=90e3), frequency=90e3)
     with pytest.raises(ValueError, match="spacing"):
-        medium = at.Medium.air(frequency=90e3)
-        view.scene = replace(scene, medium=medium, frequency=90e3)  # too coarse cells
+        view.scene = too_coarse
     for wrong in (drive[:3], 2 * drive, float("nan") * drive):
         with pytest.raises(ValueError, match="drive"):
             view.drive = wrong
