@@ -21,6 +21,8 @@ from autdtorch.utils.validation import (
 AMPLITUDE_TOLERANCE = 1e-6
 """Excess of |q| over 1 that is accepted: the rounding error of a drive computed in float32."""
 
+_LEAST_WAVENUMBER = 1.0  # [rad/m], at 55 Hz in air; wavelengths in m are below
+
 
 @suggesting
 def drive_from_phases(phases: ArrayLike, amplitudes: ArrayLike | None = None) -> torch.Tensor:
@@ -99,6 +101,10 @@ def focus_phases(positions: ArrayLike, focus: ArrayLike, wavenumber: float) -> t
     """
     sources = points_tensor("positions", positions)
     wavenumber = real_wavenumber(wavenumber)
+    if wavenumber < _LEAST_WAVENUMBER:
+        warn_user(
+            f"wavenumber: {wavenumber:g} rad/m; is it the wavelength? Then take 2 * pi / {wavenumber:g}"
+        )
     foci = real_tensor("focus", focus, "m")
     if foci.ndim == 1:
         single = torch.tensor([finite_vector("focus", focus)], dtype=torch.float64, device=sources.device)

@@ -9,6 +9,7 @@ import torch
 
 from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.obstacles import Mesh, Obstacle, VoxelMask
+from autdtorch.utils.neighbours import closest_pair
 from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
@@ -20,17 +21,23 @@ _LONGEST = 5e3  # [wavelengths] across array and control points
 _USUAL_RATIO = 50.0  # of everything to array and control points, unless lengths are in mm
 _LEAST_EXTENT = 15.0  # [wavelengths], for arrays and control points that are closer
 _FAR = 10.0  # [m]; nearer walls and wider domains may be meant
+_HIGHEST, _DENSEST_GAS = 1e6, 20.0  # [Hz, kg/m^3]; a gas absorbs what is higher within millimetres
+_WIDEST, _WIDEST_WAVES = 1.0, 30.0  # [m, wavelengths] between neighbours of an array
+_FEWEST = 4  # transducers that make an array, whose normal counts
 _SAME_FREQUENCY = 0.01  # relative difference, for which the absorption changes by 2 %
 _PAIRS = 2**20  # of points and normals that are held at once
 
 
 def warn_of_implausible(scene: Scene) -> None:
     """Warn of units, foci behind the array and the air of another frequency."""
-    extent, wavelength = _diagonal(_observed(scene)), scene.wavelength
-    if not _SHORTEST * wavelength**2 <= extent <= max(_LONGEST * wavelength, _FAR):
+    extent, wavelength, places = _diagonal(_observed(scene)), scene.wavelength, scene.array.positions
+    is_absorbed = scene.medium.density < _DENSEST_GAS and scene.frequency > _HIGHEST
+    if is_absorbed or not _SHORTEST * wavelength**2 <= extent <= max(_LONGEST * wavelength, _FAR):
         found = f"{extent:.4g} m from end to end of array and control points, but a wavelength of"
         ask = "are lengths in m and the frequency in Hz, 40 kHz as 40e3?"
         warn_user(f"Scene: {found} {wavelength:.4g} m; {ask}")
+    elif len(places) > 1 and (pitch := closest_pair(places)[0]) > max(_WIDEST, _WIDEST_WAVES * wavelength):
+        warn_user(f"Scene.array: neighbours are {pitch:.4g} m apart; are positions in m, 10 mm as 10e-3?")
     for name, hint in _too_large(scene):
         warn_user(f"Scene.{name}{hint}")
     _warn_of_foci_behind(scene)
@@ -115,16 +122,15 @@ def _diagonal(points: torch.Tensor) -> float:
 
 
 def _warn_of_foci_behind(scene: Scene) -> None:
-    """Warn where all lies behind every disc; some points may, and an obstacle ahead may reflect.
+    """Warn where all lies behind every transducer; some points may, and an obstacle ahead may reflect.
 
-    Point sources have no direction.
+    A few point sources are no array that faces somewhere.
     """
     array, points = scene.array, scene.control_points
-    discs = radii_of(array) > 0
-    if not discs.any():
+    if len(array) < _FEWEST and not radii_of(array).any():
         return
-    normals, facing = torch.unique(array.normals[discs], dim=0, return_inverse=True)  # most arrays have one
-    heights = (normals[facing] * array.positions[discs]).sum(dim=1)
+    normals, facing = torch.unique(array.normals, dim=0, return_inverse=True)  # most arrays have one
+    heights = (normals[facing] * array.positions).sum(dim=1)
     start = heights.new_zeros(len(normals)).scatter_reduce(0, facing, heights, "amin", include_self=False)
     corners = [
         torch.cartesian_prod(*points.new_tensor([body.lower, body.upper]).T) for body in scene.obstacles

@@ -41,6 +41,7 @@ _DEFAULT_MARGIN = 2.0  # [wavelengths] of air on each side, where no domain is g
 _FARTHEST = 1e6  # [m] along an axis; far beyond any simulation, and volumes do not overflow
 _FREQUENCIES = 1e-3, 1e12  # [Hz]
 _DECIBELS = 20 / math.log(10)  # in a neper
+_LOWEST = 1000.0  # [Hz], below which a frequency may be in kHz
 _MOST_ABSORPTION = 3.0  # [dB per wavelength]: the model assumes a small imaginary part of the wavenumber
 
 
@@ -126,6 +127,8 @@ class Scene:
         most = _MOST_ABSORPTION / self.wavelength
         if medium.absorption > most:
             accepted = f"must be at most {most:.4g} dB/m, {_MOST_ABSORPTION:g} dB per wavelength"
+            if self.frequency < _LOWEST:
+                accepted += f"; is the frequency, {self.frequency:g}, in Hz, 40 kHz as 40e3?"
             raise invalid("Scene.medium.absorption", medium.absorption, accepted, "dB/m")
         _require_separate_points(self)
         _require_in_domain(self)
@@ -366,19 +369,19 @@ def require_clear(array: TransducerArray, name: str, points: torch.Tensor) -> No
         raise invalid(f"{name}[{point}]", points[point], accepted, "m")
 
 
-def require_inside(domain: tuple[Vector, Vector], name: str, points: torch.Tensor) -> None:
-    """Refuse points (N, 3) [m] outside the corners (lower, upper) of a domain."""
+def require_inside(domain: tuple[Vector, Vector], name: str, points: torch.Tensor, fix: str = "") -> None:
+    """Refuse points (N, 3) [m] outside the corners (lower, upper) of a domain; `fix` says what would help."""
     lower, upper = (torch.tensor(corner, dtype=torch.float64, device="cpu") for corner in domain)
     outside = ((points < lower - LENGTH_TOLERANCE) | (points > upper + LENGTH_TOLERANCE)).any(dim=-1)
     if outside.any():
         first = int(outside.nonzero()[0, 0])
-        accepted = f"must be inside the domain, {domain[0]} to {domain[1]} m"
+        accepted = f"must be inside the domain, {domain[0]} to {domain[1]} m{fix}"
         raise invalid(f"{name}[{first}]", points[first], accepted, "m")
 
 
 def _require_in_domain(scene: Scene) -> None:
     for name, points in _contents(scene):
-        require_inside(scene.domain, name, points)
+        require_inside(scene.domain, name, points, "; domain=None fits it to the scene")
     for index, obstacle in enumerate(scene.obstacles):
         if _shared((obstacle.lower, obstacle.upper), scene.domain) is None:
             accepted = f"must be at least partly inside the domain, {scene.domain[0]} to {scene.domain[1]} m"

@@ -20,7 +20,7 @@ from autdtorch.fdtd.grid import MIN_CELLS_PER_WAVELENGTH, make_grid
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
-from autdtorch.scene.scene import Medium, OverlapWarning, Scene
+from autdtorch.scene.scene import Medium, OverlapWarning, ScaleWarning, Scene
 from autdtorch.utils.array_types import Array
 
 AIR = Medium(density=1.2, sound_speed=340.0)
@@ -168,6 +168,7 @@ class _Draft:
         corners = np.array((np.zeros(3), self.spacing * self.domain))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", OverlapWarning)
+            warnings.simplefilter("ignore", ScaleWarning)  # points behind sources that face anywhere
             return Scene(array, AIR, FREQUENCY, candidates[chosen[2:]], self.obstacles, domain=corners)
 
     def add_obstacle(self, inside: bool) -> None:

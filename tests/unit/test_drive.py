@@ -15,6 +15,9 @@ from autdtorch.scene.drive import (
     validate_drive,
 )
 
+# phases may be whole numbers
+pytestmark = pytest.mark.filterwarnings("ignore::autdtorch.utils.units.ScaleWarning")
+
 phases_arrays = hnp.arrays(
     float, hnp.array_shapes(min_dims=1, max_dims=3, max_side=5), elements=st.floats(-1e3, 1e3)
 )
@@ -38,7 +41,6 @@ def test_drive_and_phases_round_trip(phases):
     torch.testing.assert_close(drive_from_phases(found), drive, rtol=0, atol=1e-12)
 
 
-@pytest.mark.filterwarnings("ignore::autdtorch.utils.units.ScaleWarning")  # equal whole numbers
 @given(phases=phases_arrays, data=st.data())
 def test_amplitudes_round_trip(phases, data):
     amplitudes = data.draw(hnp.arrays(float, phases.shape, elements=st.floats(0, 1)))

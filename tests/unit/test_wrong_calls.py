@@ -83,6 +83,9 @@ WARNED = {
     "mm of wall": (lambda: scene(wall(200.0, (50.0, 600.0, 400.0))), r"obstacles\[0\].*in m"),
     "mm/s": (lambda: at.Medium(1.2, 340e3), "sound_speed.*other units"),
     "swapped": (lambda: at.Medium(340.0, 1.2), "sound_speed.*swapped"),
+    "points that face away": (lambda: scene(array=grid(0.2)), "control_points.*behind.*normal"),
+    "MHz": (lambda: scene(frequency=40e6), "frequency in Hz"),
+    "mm of pitch": (lambda: scene(array=grid(1e-3, pitch=10)), "array.*10 m apart.*in m"),
     "behind": (lambda: facing(0.2, (1, 0, 0)), "control_points.*behind.*normal"),
     "turned away": (lambda: facing(1e-3, (-1, 0, 0)), "control_points.*behind.*normal"),
 }
@@ -138,7 +141,7 @@ MEANT = {
     "a domain of 3 m": lambda: scene(domain=((-1.5,) * 3, (1.5,) * 3)),
     "a scene that is moved, replaced, read": moved_and_read,
     "some foci behind": lambda: facing(1e-3, (1, 0, 0), control_points=at.sphere_points(MIDDLE, 0.1, 9)),
-    "sources without direction": lambda: scene(array=grid(0.2)),
+    "sources without direction": lambda: lone(-0.05),
     "foci that a wall reflects": lambda: facing(0.2, (1, 0, 0), wall(0.4)),
     "a loudspeaker in a hall": lambda: lone(20.0),
     "a focus at 1 cm of 3 kHz": lambda: lone(0.01, frequency=3e3),

@@ -59,7 +59,7 @@ class Mesh(Obstacle):
         rotation_degrees: these angles (3,) in degrees, in place of `rotation`; it is no attribute afterwards.
         repair: whether to mend what is not watertight: join vertices up to 1e-3 of the extent apart, turn
             triangles over, leave out doubled ones and stray pieces, close holes up to 30 % of the area, and
-            make the surface anew from winding numbers where it crosses itself. A warning says what was done.
+            make the surface anew where it crosses itself. The log says what was done, as a warning.
         vertices: (V, 3) [m], float64, in the scene.
         faces: vertices of each triangle (F, 3), int64, counter-clockwise as seen from outside.
         digest: of vertices and faces. Meshes of equal digest and material are equal, whatever their files.

@@ -7,9 +7,11 @@ doi:10.1145/2461912.2461916), which tell inside from outside of any soup of tria
 
 from __future__ import annotations
 
+import contextlib
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
@@ -45,10 +47,8 @@ def repaired(corners: Array, triangles: Index) -> Repaired:
     Raises:
         ValueError: a sheet without an inside, or a hole too large to guess; the message names it.
     """
-    try:
+    with contextlib.suppress(ValueError):
         return Repaired(*solid_of(corners, triangles), [])
-    except ValueError as error:
-        reason = str(error)
     done: list[str] = []
     vertices, faces = joined(corners, triangles, _FARTHEST)
     faces = _without_doubles(faces, done)
@@ -59,8 +59,8 @@ def repaired(corners: Array, triangles: Index) -> Repaired:
         return Repaired(
             *solid_of(vertices, faces), done or [f"joined vertices up to {_FARTHEST:.0e} of its extent apart"]
         )
-    except ValueError:
-        return Repaired(*_anew(vertices, faces, done, reason), done)
+    except ValueError as error:
+        return Repaired(*_anew(vertices, faces, done, str(error)), done)
 
 
 def _without_doubles(faces: Index, done: list[str]) -> Index:
@@ -111,7 +111,7 @@ def _oriented(vertices: Array, faces: Index, done: list[str]) -> Index:
 
 def _closed(vertices: Array, faces: Index, done: list[str]) -> Triangles:
     """Close holes by their flat outlines, or by a fan around their middle."""
-    area = areas_of(vertices[faces]).sum()
+    area, closed = areas_of(vertices[faces]).sum(), []
     for loop in _outlines(faces):
         rim = vertices[loop]
         try:
@@ -126,7 +126,11 @@ def _closed(vertices: Array, faces: Index, done: list[str]) -> Triangles:
             most = f"must be at most {_LARGEST_HOLE:.0%} of that of a body"
             raise ValueError(f"{found}, {share:.0%} of all area; {most}")
         faces = np.concatenate([faces, own])
-        done.append(f"closed {found}")
+        closed.append((share, found))
+    if closed:
+        largest = max(closed)[1]
+        many = f"{len(closed)} holes, the largest {largest.removeprefix('a hole ')}"
+        done.append(f"closed {largest if len(closed) == 1 else many}")
     return vertices, faces
 
 
@@ -155,7 +159,7 @@ def _outlines(faces: Index) -> list[Index]:
 
 
 def _anew(vertices: Array, faces: Index, done: list[str], reason: str) -> Triangles:
-    """Make the surface anew where a soup of triangles winds around half."""
+    """Make the surface anew: at distance 0 from a soup of triangles, inside where it winds around half."""
     import igl
 
     lower, upper = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
@@ -163,8 +167,15 @@ def _anew(vertices: Array, faces: Index, done: list[str], reason: str) -> Triang
     counts = np.ceil((upper - lower) / cell).astype(int) + 5
     axes = [low + cell * (np.arange(count) - 2) for low, count in zip(lower, counts, strict=True)]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).transpose(2, 1, 0, 3).reshape(-1, 3)
-    turns = winding_number(vertices, faces, places)
-    found, triangles, _ = igl.marching_cubes(0.5 - np.abs(turns), places, *counts, 0.0)
+    inside = np.abs(winding_number(vertices, faces, places)) > 0.5
+    # Winding numbers jump at the surface: their level set would have steps. Distances do not.
+    grown, shrunk = (
+        each(inside.reshape(counts[::-1]), iterations=2).ravel() for each in (binary_dilation, binary_erosion)
+    )
+    near = grown & ~shrunk
+    distance = np.full(len(places), 4 * cell)
+    distance[near] = np.sqrt(igl.point_mesh_squared_distance(places[near], vertices, faces)[0])
+    found, triangles, _ = igl.marching_cubes(np.where(inside, -distance, distance), places, *counts, 0.0)
     if not len(triangles):
         raise ValueError(
             f"{reason}; it has no inside that winding numbers would tell; must be a body, not a sheet"
