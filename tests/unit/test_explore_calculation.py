@@ -53,10 +53,10 @@ def test_a_plane_that_takes_long_is_shown_coarse_before_the_error_and_sharp_afte
 
 def test_a_newer_request_and_the_end_stop_what_is_calculated():
     reports = queue.SimpleQueue()
-    made = Calculator(0.7e-3, reports.put)  # takes many seconds
+    made = Calculator(0.35e-3, reports.put)  # takes ten times as long as what is waited for
     scene = at.load_scene("configs/scene/two_cubes.yaml")
     made.ask(Request(1, Situation.of(scene, in_phase(scene))))
-    time.sleep(0.5)
+    time.sleep(0.1)
     made.ask(Request(2, Situation.of(scene, in_phase(scene)), fine=False))
     assert [one.request.number for one in until_finished(reports, 2)] == [2]
     made.ask(Request(3, Situation.of(scene, in_phase(scene))))

@@ -2,6 +2,7 @@
 
 import json
 import math
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -248,7 +249,10 @@ def test_exports_are_self_contained(scene: at.Scene, tmp_path: Path) -> None:
     assert any(np.allclose(corner[:3], (40e-3, 30e-3, 80e-3)) for corner in corners)
     assert "cameras" not in content
     pytest.importorskip("trame_pyvista", reason="in the extra notebook")
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     view3d(scene, field=field, reference=1.5, save=tmp_path / "scene.html").close()
+    assert handlers == [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    assert signal.set_wakeup_fd(-1) == -1
     page = (tmp_path / "scene.html").read_text(encoding="utf-8")
     assert all(text in page for text in ("pressure [dB]<div", "0 dB = 1.5 Pa"))
     assert 'src="http' not in page

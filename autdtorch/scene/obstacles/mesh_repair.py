@@ -1,8 +1,8 @@
 """Repair of surfaces that enclose nothing as they are: scans with holes, turned triangles, crossing parts.
 
 What is mended in its place comes first: vertices that nearly agree, doubled triangles, orientation, stray
-pieces, holes. What crosses itself after that is made anew from winding numbers (Jacobson et al. 2013,
-doi:10.1145/2461912.2461916), which tell inside from outside of any soup of triangles.
+pieces, holes. A new surface replaces what crosses itself after that, by winding numbers (Jacobson et al.
+2013, doi:10.1145/2461912.2461916), which tell inside from outside of any soup of triangles.
 """
 
 from __future__ import annotations
