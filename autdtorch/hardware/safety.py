@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import contextlib
 import functools
 import logging
@@ -20,6 +19,7 @@ import torch
 from autdtorch.hardware.link import Link
 from autdtorch.hardware.played import AmplitudeScale
 from autdtorch.hardware.sensors.sensor import Sensor, SensorError, checked_reading
+from autdtorch.utils.signals import send_again
 from autdtorch.utils.validation import (
     integer_at_least,
     invalid,
@@ -77,8 +77,8 @@ def ended_by_signals() -> Iterator[None]:
             if isinstance(error, Signalled):  # it is on its way out
                 return
             error = error.__context__
-        if _finalises(frame):  # a thread without the locks of `threading`, which the main thread may hold
-            _thread.start_new_thread(_signal_again, (signal.Signals(number),))
+        if _finalises(frame):
+            send_again(number)
             return
         raise Signalled(number)
 
@@ -107,11 +107,6 @@ def _finalises(frame: FrameType | None) -> bool:
             return True
         frame = frame.f_back
     return False
-
-
-def _signal_again(number: signal.Signals) -> None:
-    time.sleep(0.001)
-    _thread.interrupt_main(number)
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,14 @@ stays held in it, and whoever acquires it waits forever.
 
 from __future__ import annotations
 
-import _thread
 import os
 import signal
 import threading
-import time
 from collections.abc import Callable
 from types import FrameType
 from typing import Any, Protocol
+
+from autdtorch.utils.signals import send_again
 
 
 class _Lock(Protocol):
@@ -75,17 +75,12 @@ def _let_go() -> None:
 def _let_go_in_parent() -> None:
     _let_go()
     while _fork.signals:
-        _thread.start_new_thread(_signal_again, (_fork.signals.pop(),))
+        send_again(_fork.signals.pop())
 
 
 def _let_go_in_child() -> None:
     _fork.signals.clear()  # sent to the parent
     _let_go()
-
-
-def _signal_again(number: int) -> None:
-    time.sleep(1e-3)  # until the functions called at forks have ended
-    _thread.interrupt_main(signal.Signals(number))
 
 
 if hasattr(os, "register_at_fork"):

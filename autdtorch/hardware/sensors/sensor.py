@@ -10,6 +10,7 @@ from typing import Protocol, runtime_checkable
 import torch
 
 from autdtorch.objectives.objective import validate_magnitudes
+from autdtorch.utils.signals import send
 
 #: Time limit of a reading while the outputs are off [s]: a person may take minutes, a hung sensor forever.
 LONGEST = 600.0
@@ -82,8 +83,5 @@ def _wake(seconds: float, done: threading.Event, is_late: threading.Event) -> No
         return
     is_late.set()
     while not done.is_set():
-        if hasattr(signal, "pthread_kill"):
-            signal.pthread_kill(threading.main_thread().ident or 0, _WAKE)
-        else:
-            signal.raise_signal(_WAKE)
+        send(_WAKE)
         done.wait(_AGAIN)
