@@ -11,7 +11,7 @@ _LATER = 1e-3  # [s]
 
 
 def send_again(number: int) -> None:
-    """Send a signal to the main thread a little later: one that came where Python drops what handlers raise."""
+    """Send a signal to the main thread a little later, if Python drops what its handler raises now."""
     # a thread without the locks of `threading`, which the main thread may hold
     _thread.start_new_thread(_send_later, (signal.Signals(number),))
 
