@@ -102,8 +102,8 @@ class Scene:
         Warns:
             OverlapWarning: two obstacles of different materials overlap.
             ScaleWarning: lengths, or the file of a mesh, seem to be in mm, or the frequency in kHz; all
-                control points and obstacles lie behind an array of discs; or `Medium.air` was made for
-                another frequency.
+                control points and obstacles lie behind the array; or `Medium.air` was made for another
+                frequency.
         """
         require_kind("Scene.array", array, TransducerArray)
         require_kind("Scene.medium", medium, Medium)
