@@ -3,9 +3,11 @@
 import asyncio
 import gc
 import re
+import signal
 import socket
 import subprocess
 import sys
+import threading
 import urllib.error
 import urllib.request
 import weakref
@@ -201,6 +203,24 @@ def test_a_live_view_that_nobody_has_any_more_ends():
     assert gone() is None
     with pytest.raises(OSError, match="refused"):
         socket.create_connection(("127.0.0.1", port), timeout=5)
+
+
+def test_ctrl_c_in_a_wait_leaves_a_view_to_be_closed():
+    """A calculation that runs on while Python ends aborts the program."""
+    live = at.explore(at.load_scene("configs/scene/sphere.yaml"), spacing=2e-3)
+    before = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # ignored, if a script started the tests
+    threading.Timer(0.5, signal.raise_signal, [signal.SIGINT]).start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            live.wait()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    live.scene = live.scene  # the server answers
+    live.close()
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", urlsplit(live.address).port), timeout=5)
 
 
 def test_views_may_be_opened_by_several_threads_at_once():

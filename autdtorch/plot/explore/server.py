@@ -54,6 +54,8 @@ class Server:
         self._failure: BaseException | None = None
         self._connections: weakref.WeakSet[asyncio.BaseTransport] = weakref.WeakSet()
         self._started = threading.Event()
+        # not the thread's `join`: in Python 3.11, Ctrl-C in it marks the thread as ended while it runs
+        self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="autdtorch explore page", daemon=True)
         self._thread.start()
         if not self._started.wait(_PATIENCE):
@@ -69,7 +71,7 @@ class Server:
     @property
     def running(self) -> bool:
         """True until it is closed."""
-        return self._thread.is_alive()
+        return not self._ended.is_set()
 
     def require_running(self) -> None:
         """Raise a `RuntimeError` if it is closed."""
@@ -78,8 +80,8 @@ class Server:
 
     def wait(self) -> None:
         """Wait until it is closed, in steps that let Ctrl+C through."""
-        while self.running:
-            self._thread.join(_STEP)
+        while not self._ended.wait(_STEP):
+            pass
 
     def call(self, function: Callable[[], object]) -> None:
         """Call a function in the thread, and wait for its end.
@@ -107,7 +109,8 @@ class Server:
         """Stop the server and end the thread."""
         if self.running:
             asyncio.run_coroutine_threadsafe(self._stop(), self._loop)
-            self._thread.join(_PATIENCE)
+            if threading.current_thread() is not self._thread:  # in which garbage may be collected
+                self._ended.wait(_PATIENCE)
 
     async def _stop(self) -> None:
         for connection in self._connections:
@@ -127,6 +130,7 @@ class Server:
             self._started.set()
             _end_tasks(self._loop)
             self._loop.close()
+            self._ended.set()
 
     async def _serve(self) -> None:
         self._trame = trame = get_server(f"explore-{self.token}", client_type="vue3")
