@@ -7,6 +7,7 @@ import math
 import torch
 
 from autdtorch.scene.arrays import TransducerArray, strengths_of
+from autdtorch.utils.cpu_tensors import COMPLEX
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.neighbours import distances
 from autdtorch.utils.validation import (
@@ -58,7 +59,7 @@ def free_space_matrix(points: ArrayLike, array: TransducerArray, wavenumber: com
     require_memory("points", tuple(points.shape), PAIR_BYTES * len(points) * len(array))
     # node by node, with memory for one matrix only
     terms = (w * green(points, at, wavenumber) for at, w in zip(positions.unbind(1), weights, strict=True))
-    none = torch.zeros((), dtype=torch.complex128, device="cpu")
+    none = torch.zeros((), **COMPLEX)
     return 4 * math.pi * strengths_of(array).to(points.device) * sum(terms, start=none)
 
 

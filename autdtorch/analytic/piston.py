@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from scipy.special import j1
 
+from autdtorch.utils.cpu_tensors import COMPLEX
 from autdtorch.utils.units import real_wavenumber
 from autdtorch.utils.validation import ArrayLike, Vector, points_tensor, positive, real_tensor, unit_vector
 
@@ -37,7 +38,7 @@ def piston_directivity(angle: ArrayLike, wavenumber: float, radius: float) -> to
     argument = reach * np.sin(angles.cpu().numpy())
     safe = np.where(argument == 0, 1, argument)
     ratio = np.where(argument == 0, 1, 2 * j1(safe) / safe)
-    return torch.as_tensor(ratio, dtype=torch.complex128, device="cpu").to(angles.device)
+    return torch.as_tensor(ratio, **COMPLEX).to(angles.device)
 
 
 def piston_on_axis(distance: ArrayLike, wavenumber: float, radius: float) -> torch.Tensor:

@@ -18,6 +18,7 @@ import torch
 from scipy.special import spherical_jn, spherical_yn
 
 from autdtorch.utils.array_types import ComplexArray
+from autdtorch.utils.cpu_tensors import COMPLEX, REAL
 
 _LOST = 1e-280  # Magnitude below which j_l loses digits to underflow
 _TINY = 1e-12  # distance from the centre [m] below which a point has the direction z
@@ -47,7 +48,7 @@ def real_waves(degree: int) -> torch.Tensor:
     Of (l, m) and (l, -m), column (l, m), m > 0, has cos(m phi), and column (l, -m) has sin(m phi).
     """
     order, (place, sign) = orders(degree), mirrored(degree)
-    mixing = torch.zeros(len(order), len(order), dtype=torch.complex128, device="cpu")
+    mixing = torch.zeros(len(order), len(order), **COMPLEX)
     for own, m in enumerate(order.tolist()):
         half = torch.tensor(math.sqrt(0.5) * (1 if m > 0 else 1j), dtype=mixing.dtype, device="cpu")
         mixing[own, own] = half if m else 1.0
@@ -97,10 +98,10 @@ class _Recurrence(NamedTuple):
 
 @functools.lru_cache(8)
 def _recurrence(degree: int) -> _Recurrence:
-    none = torch.zeros(0, dtype=torch.float64, device="cpu")
+    none = torch.zeros(0, **REAL)
     factor, back, tops = [none], [none], [math.sqrt(1 / (4 * math.pi))]
     for n in range(1, degree + 1):
-        m = torch.arange(n, dtype=torch.float64, device="cpu")
+        m = torch.arange(n, **REAL)
         factor.append(((4 * n * n - 1) / (n * n - m * m)).sqrt())
         m = m[:-1]
         back.append((((n - 1) ** 2 - m * m) / (4 * (n - 1) ** 2 - 1)).sqrt())

@@ -18,6 +18,7 @@ from autdtorch.hardware.sensors.by_hand import typed
 from autdtorch.objectives.perturbations import random_rms
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.cpu_tensors import COMPLEX
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.validation import (
     boolean,
@@ -247,7 +248,7 @@ def _deviating(
     if not boards:
         return matrix, wired
     each = len(boards[0].pins)
-    asked = torch.ones(each, dtype=torch.complex128, device="cpu")
+    asked = torch.ones(each, **COMPLEX)
     corrections = torch.cat([board.calibrated(asked) for board in boards])[wired]
     pins = [each * number + pin for number, board in enumerate(boards) for pin in board.pins]
     places = torch.tensor(pins, dtype=torch.int64, device="cpu")[wired]

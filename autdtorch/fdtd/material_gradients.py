@@ -25,6 +25,7 @@ from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stencil import OFFSETS, Stencil
 from autdtorch.fdtd.stepping import Assembly, air_stencil, assembly_of
 from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.validation import fluid
 
 _STEP = 1e-4  # Relative step of the central differences: truncation and rounding are about 1e-8
@@ -135,7 +136,7 @@ def cells_of_maps(
         if given is not None and given.shape != shape:
             raise ValueError(f"{name}: shape {tuple(given.shape)}; must be {shape}, the cells of the domain")
     stencil = air_stencil(grid, region)
-    air = torch.ones(shape, dtype=torch.float64, device="cpu")
+    air = torch.ones(shape, **REAL)
     relative = air if density is None else density / region.fluid.density
     speed = air if sound_speed is None else sound_speed / region.fluid.sound_speed
     # the impedance of a face half-way between two cells is off by tan(k / 2) / (k / 2)

@@ -25,6 +25,7 @@ from autdtorch.fdtd.turning import turned_shape
 from autdtorch.utils.apertures import Apertures, Discs
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.cached import cached_property
+from autdtorch.utils.cpu_tensors import COMPLEX
 
 # Distance [cells] from the rim of the interior within which points are not read from the grid. Interpolation
 # is poor there, and the Huygens surface, two cells from the rim, is farther than half a cell from such a
@@ -180,10 +181,10 @@ class NearToFar:
     def _mean(self, amplitude: Tensor, inner: Tensor) -> Tensor:
         """Return the means (P, R) over the targets' nodes, given the field `inner` at those in the box."""
         near, runs = self.targets.chosen(~self.far), amplitude.shape[1]
-        field = torch.zeros((*self.within.shape, runs), dtype=torch.complex128, device="cpu")
+        field = torch.zeros((*self.within.shape, runs), **COMPLEX)
         field[self.within] = inner
         field[~self.within] = self.box.radiated(amplitude, near.positions[~self.within])
-        mean = torch.zeros((len(self.far), runs), dtype=torch.complex128, device="cpu")
+        mean = torch.zeros((len(self.far), runs), **COMPLEX)
         mean[~self.far] = torch.einsum("pnr,n->pr", field, near.weights.to(field.dtype))
         if self.far.any():
             mean[self.far] = self.box.radiated(amplitude, self.targets.chosen(self.far).discs)
@@ -199,7 +200,7 @@ class NearToFar:
         far = self.far[chosen]
         near = (torch.cumsum(~self.far, 0) - 1)[chosen[~far]]  # their numbers among all that are not far
         within, some = self.within[near], self.targets.chosen(chosen[~far])
-        received = torch.zeros((len(self.box.surface[0]), len(far)), dtype=torch.complex128, device="cpu")
+        received = torch.zeros((len(self.box.surface[0]), len(far)), **COMPLEX)
         # reciprocity of Green's function
         received[:, ~far] = self._received(some, weights * ~within, far=False)
         received[:, far] = self._received(
@@ -217,11 +218,11 @@ class NearToFar:
 
         Targets that are `far` discs have one weight each.
         """
-        found = [torch.zeros((len(self.box.surface[0]), 0), dtype=torch.complex128, device="cpu")]
+        found = [torch.zeros((len(self.box.surface[0]), 0), **COMPLEX)]
         for first in range(0, len(weights), _TOGETHER):
             some, own = targets.chosen(slice(first, first + _TOGETHER)), weights[first : first + _TOGETHER]
             columns = torch.arange(len(own), device="cpu").repeat_interleave(own.shape[1])
-            amplitude = torch.zeros((own.numel(), len(own)), dtype=torch.complex128, device="cpu")
+            amplitude = torch.zeros((own.numel(), len(own)), **COMPLEX)
             amplitude[torch.arange(own.numel(), device="cpu"), columns] = own.flatten().to(amplitude)
             sources = some.discs if far else some.positions.flatten(0, 1)
             found.append(self.box.waves(self.box.surface[0], sources, amplitude))

@@ -23,6 +23,7 @@ from torch import Tensor
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
 from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_basis, drive_signal, fourier_sum
 from autdtorch.utils.array_types import Index
+from autdtorch.utils.cpu_tensors import COMPLEX
 
 Phasors = NDArray[np.complex128]
 # Fewest periods of a block. Shorter blocks cost more overhead, and the phasors kept cover less time.
@@ -157,7 +158,7 @@ def windows_of_run(
     ones = torch.ones((len(cells), 1), dtype=assembly.dtype, device="cpu")
     receivers = Receivers(torch.from_numpy(cells[:, None]), ones)
     state, basis = assembly.silence(sources), drive_basis(steps, periods)
-    total = silence = torch.zeros(len(cells), dtype=torch.complex128, device="cpu")
+    total = silence = torch.zeros(len(cells), **COMPLEX)
     sums: dict[int, Tensor] = {}  # Fourier sums from the beginning to where windows begin and end
     for block in itertools.count():
         first = block * steps

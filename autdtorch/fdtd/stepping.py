@@ -23,6 +23,7 @@ from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, St
 from autdtorch.fdtd.region import Region, Shape
 from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.validation import invalid
 
 logger = logging.getLogger(__name__)
@@ -34,7 +35,7 @@ RAMP_PERIODS = 8
 # Initial uniform pressure, relative to the largest force. From exact zeros the wave's precursors would decay
 # into subnormal numbers, on which processors are slow (2.4 times, measured at 120^3 in float32).
 _BACKGROUND = 1e-20
-_ONE_NODE = torch.ones(1, dtype=torch.float64, device="cpu")  # Weight of a point with a single node
+_ONE_NODE = torch.ones(1, **REAL)  # Weight of a point with a single node
 
 
 @dataclass(frozen=True)
@@ -201,7 +202,7 @@ def drive_signal(steps_per_period: Fraction, first: int, count: int) -> Tensor:
 
 def drive_basis(steps: int, periods: int) -> Tensor:
     """Return the weights (2, steps) of the real and imaginary part of a phasor, for records of `periods`."""
-    turn = 2 * math.pi * periods / steps * torch.arange(1, steps + 1, dtype=torch.float64, device="cpu")
+    turn = 2 * math.pi * periods / steps * torch.arange(1, steps + 1, **REAL)
     return 2 / steps * torch.stack((torch.cos(turn), torch.sin(turn)))
 
 

@@ -18,6 +18,7 @@ from autdtorch.hardware.played import Wiring
 from autdtorch.hardware.transport.autd3_network import Autd3Port
 from autdtorch.hardware.transport.port import LinkError, Port, SerialPort, SharedPort, closed_on_error
 from autdtorch.hardware.transport.usb import find_device
+from autdtorch.utils.cpu_tensors import COMPLEX
 from autdtorch.utils.validation import invalid, number_between, require_callable, require_kind
 
 #: Default settle time [s]. Sound goes 1.7 m in it; a T4010A1 rings up in some 30 periods, 0.75 ms, as the
@@ -134,7 +135,7 @@ class Link(contextlib.AbstractContextManager["Link"]):
             raise OffError(f"{error}; the outputs may still be on: switch the device's power off") from error
 
     def _send_silence(self) -> None:
-        off = torch.zeros(self.device.transducers, dtype=torch.complex128, device="cpu")
+        off = torch.zeros(self.device.transducers, **COMPLEX)
         silence = self.device.frame(off)
         # Twice: a device that was left in mid-frame takes the first for the rest of that frame, and one with
         # two buffers may keep the last drive in the other.

@@ -11,6 +11,7 @@ from autdtorch.hardware.devices.device import Device
 from autdtorch.objectives.objective import Objective
 from autdtorch.objectives.perturbations import Perturbation
 from autdtorch.scene.drive import AMPLITUDE_TOLERANCE, validate_drive, validate_single_drive
+from autdtorch.utils.cpu_tensors import COMPLEX, REAL
 from autdtorch.utils.validation import indices, invalid, number_between, positive
 
 _FINEST = 2.0**-14  # resolution of the search; two levels of a device here are further apart
@@ -36,7 +37,7 @@ class Wiring:
         return self.device.quantised(self._of_device(drive))[self.transducers]
 
     def _of_device(self, drive: torch.Tensor) -> torch.Tensor:
-        everyone = torch.zeros(self.device.transducers, dtype=torch.complex128, device="cpu")
+        everyone = torch.zeros(self.device.transducers, **COMPLEX)
         everyone[self.transducers] = validate_single_drive(drive, len(self.transducers))
         return everyone
 
@@ -74,7 +75,7 @@ class AmplitudeScale:
 
     def _highest(self, limit: float) -> torch.Tensor:
         """Return the amplitude to ask of each transducer (M,) for the highest of its levels up to `limit`."""
-        asked = torch.zeros(len(self._wiring.transducers), dtype=torch.float64, device="cpu")
+        asked = torch.zeros(len(self._wiring.transducers), **REAL)
         step = 1.0
         while step >= _FINEST:
             more = (asked + step).clamp(max=1)

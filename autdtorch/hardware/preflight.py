@@ -11,6 +11,7 @@ import torch
 
 from autdtorch.hardware.safety import LimitedLink
 from autdtorch.hardware.sensors.sensor import Sensor, checked_reading
+from autdtorch.utils.cpu_tensors import COMPLEX, REAL
 from autdtorch.utils.validation import integer_at_least, number_between, require_callable, require_kind
 
 _DEVIATIONS = 6.0  # threshold above the noise, in standard deviations of its mean power
@@ -78,13 +79,13 @@ def check_transducers(
     count = len(link.link.transducers)
     powers = []
     try:
-        for number, alone in enumerate(torch.eye(count, dtype=torch.complex128, device="cpu"), start=1):
+        for number, alone in enumerate(torch.eye(count, **COMPLEX), start=1):
             watch(f"transducer {number} of {count}")
             link.play(alone)
             powers.append(_power(partial(link.reading, sensor, points), readings))
     finally:
         link.off()
-    pressure = torch.tensor(powers, dtype=torch.float64, device="cpu").sqrt()
+    pressure = torch.tensor(powers, **REAL).sqrt()
     above_noise = math.sqrt(silence * (1 + _DEVIATIONS / math.sqrt(readings * points)))
     return Preflight(pressure, math.sqrt(silence), max(above_noise, _WEAK * float(pressure.median())))
 

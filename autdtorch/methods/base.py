@@ -22,6 +22,7 @@ from autdtorch.objectives.objective import (
 )
 from autdtorch.objectives.perturbations import quantised, simulated_matrix
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.cpu_tensors import COMPLEX, REAL
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.validation import (
     complex_tensor,
@@ -251,11 +252,11 @@ class Method(ABC):
         starts_of(problem, count)
         step = self.begin(problem, seeds)
         empty = Solution(
-            torch.zeros(count, problem.transducers, dtype=torch.complex128, device="cpu"),
-            torch.zeros(count, problem.foci, dtype=torch.float64, device="cpu"),
-            torch.full((count,), -torch.inf, dtype=torch.float64, device="cpu"),
+            torch.zeros(count, problem.transducers, **COMPLEX),
+            torch.zeros(count, problem.foci, **REAL),
+            torch.full((count,), -torch.inf, **REAL),
             torch.zeros(count, dtype=torch.int64, device="cpu"),
-            torch.empty(count, 0, dtype=torch.float64, device="cpu"),
+            torch.empty(count, 0, **REAL),
         )
         places = torch.arange(count, device="cpu")
         return State(self, problem, tuple(seeds), places, step.drives, step.search, empty)

@@ -10,6 +10,7 @@ import torch
 
 from autdtorch.methods.base import first_of_best
 from autdtorch.scene.drive import drive_from_phases, phases_of
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.validation import integers, invalid
 
 Search = Mapping[str, torch.Tensor]
@@ -86,5 +87,5 @@ def ascend(search: Search, step: int, score: torch.Tensor) -> tuple[Search, torc
 @functools.lru_cache(maxsize=8)
 def _phases(levels: int) -> torch.Tensor:
     """Return e^{-i phi} (levels,) of the phases to compare."""
-    turns = torch.arange(levels, dtype=torch.float64, device="cpu")
+    turns = torch.arange(levels, **REAL)
     return drive_from_phases(2 * math.pi * turns / levels)

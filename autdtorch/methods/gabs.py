@@ -15,6 +15,7 @@ from autdtorch.methods.seeds import Trials, generators_of
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import Objective, Score
+from autdtorch.utils.cpu_tensors import COMPLEX
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.validation import integer_at_least, invalid
 
@@ -80,7 +81,7 @@ class GABS(Method):
         """Observe the first transducer alone, or each alone where their strengths decide the order."""
         count = problem.transducers
         if self.order == "strength":
-            alone = torch.eye(count, dtype=torch.complex128, device="cpu")
+            alone = torch.eye(count, **COMPLEX)
             return Step(alone.expand(len(seeds), -1, -1), {})
         orders = coordinates.indices_of(self.order, count).expand(len(seeds), -1)
         if self.order == "random":
@@ -119,7 +120,7 @@ class GABS(Method):
             orders = torch.cat([orders.new_full((len(orders), 1), self.first), others], dim=1)
         if (given := starts_of(problem, len(orders))) is not None:
             return coordinates.begin_ascent(coordinates.at_levels(given, self.levels), orders)
-        alone = torch.eye(orders.shape[1], dtype=torch.complex128, device="cpu")
+        alone = torch.eye(orders.shape[1], **COMPLEX)
         return coordinates.begin_ascent(alone[orders[:, 0]], orders)
 
 

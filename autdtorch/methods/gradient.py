@@ -20,6 +20,7 @@ from autdtorch.methods.solution import Solution
 from autdtorch.objectives.bound import checked_matrix
 from autdtorch.objectives.goals import WEAKEST_FOCUS, scores_of, slope_of
 from autdtorch.objectives.objective import Objective, Score
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import ArrayLike, integer_at_least
@@ -132,7 +133,7 @@ def climbed(goal: Score, matrix: torch.Tensor, drive: torch.Tensor, steps: int) 
     Each ascent is on one matrix (P, M) or on its own (S, P, M). The goal is smoothed less and less.
     """
     velocity = torch.zeros_like(drive)
-    for progress in torch.linspace(0, 1, steps, dtype=torch.float64, device="cpu").tolist():
+    for progress in torch.linspace(0, 1, steps, **REAL).tolist():
         smoothing, step = (first * (last / first) ** progress for first, last in (_SMOOTHING, _STEP))
         pressure = _pressure(matrix, drive)
         weights = slope_of(goal, pressure.abs(), smoothing)

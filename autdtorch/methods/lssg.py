@@ -15,6 +15,7 @@ from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import Objective, Score
 from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise
+from autdtorch.utils.cpu_tensors import COMPLEX
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.validation import integer_at_least, invalid
 
@@ -81,7 +82,7 @@ class LSSG(Method):
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Compare the offsets of the first focus."""
         foci = _focus_drives(problem)
-        start = torch.ones(1, problem.foci, dtype=torch.complex128, device="cpu")
+        start = torch.ones(1, problem.foci, **COMPLEX)
         order = coordinates.indices_of(self.order, problem.foci)[None]
         search = {**coordinates.begin_ascent(start, order), "foci": foci}
         return Step(normalise(coordinates.candidates(search, self.levels, 0) @ foci), search)

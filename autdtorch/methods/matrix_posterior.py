@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from autdtorch.methods.magnitudes import Magnitudes
+from autdtorch.utils.cpu_tensors import COMPLEX
 from autdtorch.utils.threads import one_library_thread
 
 _STEPS = 10  # of Gauss and Newton
@@ -69,7 +70,7 @@ class MatrixPrior:
     @classmethod
     def unknown(cls, read: Magnitudes, transducers: int) -> MatrixPrior:
         """Return the prior of a matrix of which only magnitudes (N, P) of full drives are known."""
-        rows = torch.zeros(read.value.shape[1], transducers, dtype=torch.complex128, device="cpu")
+        rows = torch.zeros(read.value.shape[1], transducers, **COMPLEX)
         spread = read.power.div(transducers).sqrt()
         # A focus that nothing reaches has an unknown row, too.
         spread = spread.clamp_min(_DARK * float(spread.max())).clamp_min(_TINY)

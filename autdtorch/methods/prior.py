@@ -12,6 +12,7 @@ from autdtorch.methods.base import Problem
 from autdtorch.methods.gradient import climb, random_drives
 from autdtorch.methods.matrix_posterior import MatrixPrior
 from autdtorch.objectives.objective import validate_matrix
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.validation import complex_tensor, invalid, number_between, require_known, within
 
 _STARTS, _CLIMB_STEPS = 16, 300  # of the climbs to the best drive of a simulation
@@ -94,7 +95,7 @@ def prior_mean(prior: Prior, problem: Problem) -> torch.Tensor:
 def matrix_prior(prior: Prior, problem: Problem) -> MatrixPrior:
     """Return the Gaussian prior of the transfer matrix of a problem."""
     matrix = prior_mean(prior, problem)
-    each = torch.ones(problem.transducers, dtype=torch.float64, device="cpu")
+    each = torch.ones(problem.transducers, **REAL)
     changes = matrix.new_empty(0, *matrix.shape) if prior.variants is None else prior.variants - matrix
     widths = [prior.gain * each, prior.phase * each, _SCALE * each[:1], each.new_ones(len(changes))]
     entries = matrix.abs().square().mean(dim=1).sqrt()

@@ -17,6 +17,7 @@ import torch
 from autdtorch.objectives.objective import Objective, observe_drives, require_objective, validate_drives
 from autdtorch.scene.drive import drive_from_phases, validate_drive
 from autdtorch.scene.phase_levels import PhaseLevels
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.validation import (
     boolean,
     indices,
@@ -109,7 +110,7 @@ class FailedTransducers(Perturbation):
         """
         super().__init__(objective)
         count = len(self.scene.array)
-        self._alive = torch.ones(count, dtype=torch.float64, device="cpu")
+        self._alive = torch.ones(count, **REAL)
         self._alive[indices("transducers", transducers, count)] = 0
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:

@@ -18,6 +18,7 @@ from autdtorch.analytic.green import free_space_matrix
 from autdtorch.analytic.spherical_waves import degrees, harmonics, regular_radial
 from autdtorch.propagators.operator import ScatteringOperator, incoming_waves, parts_of, waves_at
 from autdtorch.scene.arrays import TransducerArray
+from autdtorch.utils.cpu_tensors import COMPLEX, REAL
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import (
@@ -112,7 +113,7 @@ def scattered_waves(
         matrices = [_without(body, fewer) for body in operators]
         alone = torch.cat([own @ waves for own, waves in zip(matrices, incoming, strict=True)])
         coupled = torch.cat([own @ torch.cat(row, dim=1) for own, row in zip(matrices, rows, strict=True)])
-        identity = torch.eye(count, dtype=torch.complex128, device="cpu")
+        identity = torch.eye(count, **COMPLEX)
         found.append(torch.linalg.solve(identity - coupled, alone))
     return found
 
@@ -132,7 +133,7 @@ def _regular_waves(body: ScatteringOperator, other: ScatteringOperator) -> torch
     degree = body.degree
     nodes, weights = np.polynomial.legendre.leggauss(degree + other.degree + 1)
     count = 2 * (degree + other.degree + 1)
-    turns = 2 * math.pi * torch.arange(count, dtype=torch.float64, device="cpu") / count
+    turns = 2 * math.pi * torch.arange(count, **REAL) / count
     height = torch.from_numpy(nodes)
     across = (1 - height.square()).sqrt()
     directions = torch.stack(
@@ -141,9 +142,9 @@ def _regular_waves(body: ScatteringOperator, other: ScatteringOperator) -> torch
     ).reshape(-1, 3)
     area = torch.from_numpy(np.repeat(weights * 2 * math.pi / count, count))
     back = (harmonics(degree, directions).conj() * area[:, None]).mT
-    radii = torch.tensor(_SHELLS, dtype=torch.float64, device="cpu") * body.radius
+    radii = torch.tensor(_SHELLS, **REAL) * body.radius
     sizes = regular_radial(degree, body.wavenumber * radii[:, None])
-    found: torch.Tensor = torch.zeros((), dtype=torch.complex128, device="cpu")
+    found: torch.Tensor = torch.zeros((), **COMPLEX)
     for radius, size in zip(radii, sizes, strict=True):
         places = body.center + radius * directions @ body.axes.mT
         found = found + size.conj()[:, None] * (back @ waves_at(other, places))

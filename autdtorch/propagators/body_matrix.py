@@ -25,6 +25,7 @@ from autdtorch.scene.obstacles import Obstacle, Sphere
 from autdtorch.scene.obstacles.moving import at_rest, circumscribed, is_movable, shifted
 from autdtorch.scene.scene import OverlapWarning, ScaleWarning, Scene
 from autdtorch.utils.cached import cached_property
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.digest import digest_of, package_versions, source_digest
 from autdtorch.utils.memory import require_memory
 
@@ -115,7 +116,7 @@ class Placed(NamedTuple):
         if has_closed_form(body.obstacles, body.medium):
             matrix, axes = (
                 _of_sphere(body.obstacles[0], scene, body.degree),
-                torch.eye(3, dtype=torch.float64, device="cpu"),
+                torch.eye(3, **REAL),
             )
         else:
             comparable = all(map(is_movable, body.obstacles))  # others may have no hash
@@ -131,7 +132,7 @@ class Placed(NamedTuple):
 def placed(obstacles: Sequence[Obstacle], medium: Medium, frequency: float, solver: Solver) -> Placed:
     """Return the body that obstacles make, around the origin where they can be moved."""
     still, turn = at_rest(obstacles)
-    shift = torch.zeros(3, dtype=torch.float64, device="cpu")
+    shift = torch.zeros(3, **REAL)
     if all(map(is_movable, still)):
         shift, _ = circumscribed(still)
         still = tuple(shifted(one, -shift, _DIGITS) for one in still)

@@ -24,6 +24,7 @@ from autdtorch.propagators.symmetry import symmetries
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.cached import cached_property
+from autdtorch.utils.cpu_tensors import COMPLEX
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.threads import one_library_thread, spread
 
@@ -57,7 +58,7 @@ class BodyWaves:
         """Simulate T (N, N); return also the largest residual of the runs, relative."""
         if not len(self._box.assembly.heterogeneous.index):  # obstacles of the medium's own material
             count = (self.degree + 1) ** 2
-            return torch.zeros((count, count), dtype=torch.complex128, device="cpu"), 0.0
+            return torch.zeros((count, count), **COMPLEX), 0.0
         box, plan, kernel = self._box, self.plan, make_kernel(self.plan.kernel)
         mixing = real_waves(self.degree)
         incoming = self._regular(box.driven) @ mixing

@@ -29,6 +29,7 @@ from autdtorch.propagators.simulation import Run, Simulation, Stepped
 from autdtorch.scene.scene import require_clear
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.cached import cached_property
+from autdtorch.utils.cpu_tensors import COMPLEX, REAL
 from autdtorch.utils.threads import one_library_thread, spread
 
 logger = logging.getLogger(__name__)
@@ -154,7 +155,7 @@ class BoxSimulation(Simulation):
             box, cells = boxes[index], transforms[index].cells
             forces = box.sources(field)
             if not forces.force.any():  # obstacles of air, or drives that cancel
-                nothing = torch.zeros(len(cells), dtype=torch.complex128, device="cpu")
+                nothing = torch.zeros(len(cells), **COMPLEX)
                 return SteadyState(nothing, 0, 0.0, True)
             settings = tolerance, plan.max_periods, observe, stepped, floor
             return run_to_steady_state(box.assembly, self._kernel, forces, cells, *settings)
@@ -210,17 +211,17 @@ def _coupled(
     begin = time.perf_counter()
     runs = driving[0].shape[1]
     largest = torch.stack([field.norm(dim=0) for field in driving]).amax(dim=0)
-    sums = torch.zeros((), dtype=torch.complex128, device="cpu")
+    sums = torch.zeros((), **COMPLEX)
     sequences = [Extrapolation(MOST_PASSES) for _ in range(runs)]
     periods, reached = np.zeros(runs, np.int64), np.ones(runs, bool)
     cells = sum(len(transform.cells) for transform in transforms)
     value, size = pressure(driving[0].new_zeros((cells, runs))), None
-    left = torch.zeros(runs, dtype=torch.float64, device="cpu")
-    least = torch.tensor(floors, dtype=torch.float64, device="cpu").clamp(min=torch.finfo(torch.float64).tiny)
+    left = torch.zeros(runs, **REAL)
+    least = torch.tensor(floors, **REAL).clamp(min=torch.finfo(torch.float64).tiny)
     for number in range(1, MOST_PASSES + 1):
         parts = []
         own = tolerance / 2 ** (number + 1)  # half the tolerance in all passes
-        unsettled = torch.zeros((len(boxes), runs), dtype=torch.float64, device="cpu")
+        unsettled = torch.zeros((len(boxes), runs), **REAL)
         for index, field in enumerate(driving):
             share = field.norm(dim=0) / largest
             loose = (own / share).clamp(max=_LOOSEST).tolist()
@@ -229,7 +230,7 @@ def _coupled(
             parts.append(torch.stack([each.pressure for each in steady], dim=1))
             periods += [each.periods for each in steady]
             reached &= [each.converged for each in steady]
-            residuals = torch.tensor([each.residual for each in steady], dtype=torch.float64, device="cpu")
+            residuals = torch.tensor([each.residual for each in steady], **REAL)
             unsettled[index] = share * residuals
         left += unsettled.amax(dim=0)
         sums = sums + torch.cat(parts)

@@ -16,6 +16,7 @@ from autdtorch.propagators.scene_region import region_of, warn_of_ending_walls, 
 from autdtorch.scene.arrays import strengths_of
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene, require_inside
+from autdtorch.utils.cpu_tensors import COMPLEX
 from autdtorch.utils.validation import (
     ArrayLike,
     integer_at_least,
@@ -99,7 +100,7 @@ def differentiable_field(
     receivers, nodes, stepper = assembly.receivers(targets), scene.array.nodes, make_kernel(kernel)
     steps, block = block_of(assembly.steps_per_period)
     signal = drive_signal(assembly.steps_per_period, 0, steps * math.ceil(periods / block)).to(precision)
-    fields = [torch.zeros((0, len(targets)), dtype=torch.complex128, device="cpu")]
+    fields = [torch.zeros((0, len(targets)), **COMPLEX)]
     for row in drive.reshape(-1, drive.shape[-1]):
         strength = strengths_of(scene.array) * row.cpu()
         sources = cells.driven(assembly.sources(nodes.positions, strength, nodes.weights))

@@ -17,6 +17,7 @@ from autdtorch.propagators.operator_propagator import OperatorPropagator
 from autdtorch.propagators.plan import make_kernel, plan
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.cpu_tensors import COMPLEX, REAL
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.memory import available_memory
 from autdtorch.utils.validation import positive
@@ -110,10 +111,10 @@ def estimate(
 def _rate(kernel: str, dtype: torch.dtype, cells: int) -> float:
     """Return the steps of a cell in a second, timed on a box of air with about this many cells."""
     half = _AIR_SPACING * max(1, round(cells ** (1 / 3)) - 2 * _AIR_RIM) / 2
-    place = torch.zeros((1, 3), dtype=torch.float64, device="cpu")
+    place = torch.zeros((1, 3), **REAL)
     region = Region(Fluid(1.2, 340.0), 0.0, 40e3, (), ((-half,) * 3, (half,) * 3), place.numpy())
     assembly, stepper = assemble(region, _AIR_SPACING, dtype), make_kernel(kernel)
-    sources = assembly.sources(place, torch.ones(1, dtype=torch.complex128, device="cpu"))
+    sources = assembly.sources(place, torch.ones(1, **COMPLEX))
     receivers, state = assembly.receivers(place + half / 2), assembly.silence(sources)
     signal = drive_signal(assembly.steps_per_period, 0, _MEASURED_STEPS).to(dtype)
     spent = math.inf

@@ -24,6 +24,7 @@ from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import Index
 from autdtorch.utils.cached import cached_property
+from autdtorch.utils.cpu_tensors import COMPLEX
 
 _MOST_BYTES = 1e9  # of the amplitudes of all transducers
 _DRIVES = 16  # Drives whose fields are kept
@@ -81,7 +82,7 @@ class KeepingSimulation(BoxSimulation):
         new = self._keep_transducers(points)
         if self._transducers is None:  # the boxes are simulated as one
             return super().transfer_matrix(points)
-        unit = torch.eye(len(self.plan.scene.array), dtype=torch.complex128, device="cpu")
+        unit = torch.eye(len(self.plan.scene.array), **COMPLEX)
         field = self._sum(self._transducers, None, unit, points)
         kept = self._transducers.runs
         remaining, periods = max(run.remaining for run in kept), max(run.periods for run in kept)
@@ -96,7 +97,7 @@ class KeepingSimulation(BoxSimulation):
         keys, kept = [row.numpy().tobytes() for row in drive], self._drives
         known = [row for row, key in enumerate(keys) if key in kept]
         new = [row for row, key in enumerate(keys) if key not in kept]
-        field = torch.zeros((len(drive), len(points)), dtype=torch.complex128, device="cpu")
+        field = torch.zeros((len(drive), len(points)), **COMPLEX)
         for row in known:
             field[row] = self._sum(kept[keys[row]], None, drive[row, None], points)[0]
         if not new:
@@ -151,7 +152,7 @@ class KeepingSimulation(BoxSimulation):
         first, place = np.unique(representative, return_inverse=True)
         array = self.plan.scene.array
         alone = [apertures_of(array).chosen(slice(own, own + 1)) for own in first]
-        strength = torch.ones((len(alone), 1), dtype=torch.complex128, device="cpu")
+        strength = torch.ones((len(alone), 1), **COMPLEX)
         solved = self._stepped(alone, strength, Apertures.of_points(points))
         if self._apart:
             amplitudes = []

@@ -25,6 +25,7 @@ from autdtorch.scene.arrays import TransducerArray, strengths_of
 from autdtorch.scene.geometry import composed_rotation
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle
+from autdtorch.utils.cpu_tensors import COMPLEX, REAL
 from autdtorch.utils.numpy_file import read_arrays, write_arrays
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.units import turn_tensor
@@ -124,8 +125,8 @@ class ScatteringOperator:
     @property
     def energy(self) -> float:
         """The rms of |S^H S - 1| over waves, S = 1 + 2 T: 0 for an exact T without losses."""
-        scattering = torch.eye(len(self.matrix), dtype=torch.complex128, device="cpu") + 2 * self.matrix
-        left = scattering.mH @ scattering - torch.eye(len(self.matrix), dtype=torch.complex128, device="cpu")
+        scattering = torch.eye(len(self.matrix), **COMPLEX) + 2 * self.matrix
+        left = scattering.mH @ scattering - torch.eye(len(self.matrix), **COMPLEX)
         return float(left.norm() / math.sqrt(len(left)))
 
     def moved(
@@ -194,9 +195,7 @@ class ScatteringOperator:
                 or math.isqrt(len(matrix)) ** 2 != len(matrix)
             ):
                 raise ValueError(f"matrix: shape {tuple(matrix.shape)}; must be (N, N), N a square")
-            center = torch.tensor(
-                finite_vector("center", arrays["center"]), dtype=torch.float64, device="cpu"
-            )
+            center = torch.tensor(finite_vector("center", arrays["center"]), **REAL)
             axes = real_tensor("axes", arrays["axes"])
             if axes.shape != (3, 3):
                 raise ValueError(f"axes: shape {tuple(axes.shape)}; must be (3, 3)")

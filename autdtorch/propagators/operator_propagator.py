@@ -26,6 +26,7 @@ from autdtorch.propagators.thin_walls import warn_of_thin_walls
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import require_clear
 from autdtorch.utils.cached import cached_property
+from autdtorch.utils.cpu_tensors import COMPLEX, REAL
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import ArrayLike, boolean, differentiable_points, points_grid, points_tensor
 
@@ -157,7 +158,7 @@ class OperatorPropagator:
         """Return the estimated relative error of each point's row of the transfer matrix, float64 (P,)."""
         places = self._checked(points).detach()
         matrix, served = self._by_waves(places)
-        errors = torch.zeros(len(places), dtype=torch.float64, device="cpu")
+        errors = torch.zeros(len(places), **REAL)
         errors[served] = self._wave_errors(places[served], matrix[served])
         if not served.all():
             errors[~served] = self._box.point_errors(places[~served])
@@ -171,7 +172,7 @@ class OperatorPropagator:
             more = self._plan.at(self.spacing, _MORE_WAVES * self.tolerance)
             other, served = OperatorPropagator(more, self._cache)._by_waves(points)
             left_out = (matrix - other).norm(dim=1) / sizes(matrix, free)
-            errors = torch.full((len(points),), self.tolerance, dtype=torch.float64, device="cpu")
+            errors = torch.full((len(points),), self.tolerance, **REAL)
             return torch.where(served, left_out + _ROUNDING, errors)
         second = OperatorPropagator(self._plan.second, self._cache)
         other = second.transfer_matrix(points)
@@ -213,7 +214,7 @@ class OperatorPropagator:
     def _by_waves(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return G (P, M) at points (P, 3), and which rows (P,) the waves serve; others are 0."""
         served = self.serves(points)
-        matrix = torch.zeros((len(points), len(self.scene.array)), dtype=torch.complex128, device="cpu")
+        matrix = torch.zeros((len(points), len(self.scene.array)), **COMPLEX)
         if served.any():
             outside = points[served]
             parts = [self._converged(part) for part in torch.split(outside, _AT_ONCE)]

@@ -26,6 +26,7 @@ from autdtorch.propagators.thin_walls import warn_of_thin_walls
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.cached import cached_property
+from autdtorch.utils.cpu_tensors import COMPLEX
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import ArrayLike, boolean, points_grid
@@ -258,7 +259,7 @@ class SimulatedPropagator:
             if len(grid) == 1:
                 self._report_enclosed(points, result.matrix.mT)
             return (drive @ result.matrix.mT).reshape(*drive.shape[:-1], *grid)
-        field = torch.zeros((len(flat), len(points)), dtype=torch.complex128, device="cpu")
+        field = torch.zeros((len(flat), len(points)), **COMPLEX)
         if (loud := flat.any(dim=1)).any():
             field[loud], runs = self._simulation.fields(flat[loud], points)
             self.runs += runs

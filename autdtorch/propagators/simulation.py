@@ -27,6 +27,7 @@ from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.cached import cached_property
+from autdtorch.utils.cpu_tensors import COMPLEX
 from autdtorch.utils.progress import Progress, show_progress
 from autdtorch.utils.validation import ArrayLike, invalid, points_tensor
 from autdtorch.utils.wording import counted
@@ -170,7 +171,7 @@ class Simulation(ABC):
     def transfer_matrix(self, points: torch.Tensor) -> TransferMatrix:
         """Simulate the transfer matrix of points (P, 3); no run begins at one that no sound reaches."""
         heard = ~self.silent(points[:, None])
-        matrix = torch.zeros((len(points), len(self.plan.scene.array)), dtype=torch.complex128, device="cpu")
+        matrix = torch.zeros((len(points), len(self.plan.scene.array)), **COMPLEX)
         if not heard.any():
             return TransferMatrix(matrix, 0.0, 0, (), from_points=True)
         found = self._matrix_of(points[heard])
@@ -184,7 +185,7 @@ class Simulation(ABC):
         sources, receivers = (targets, transducers) if orbits.from_points else (transducers, targets)
         begins = "points" if orbits.from_points else "transducers"
         logger.debug("transfer matrix: %d runs serve %d %s", orbits.runs, len(orbits.representative), begins)
-        strength = torch.ones((orbits.runs, 1), dtype=torch.complex128, device="cpu")
+        strength = torch.ones((orbits.runs, 1), **COMPLEX)
         alone = [sources.chosen(slice(own, own + 1)) for own in orbits.representatives]
         found, runs = self.run(alone, strength, receivers)
         rows, remaining = orbits.expand(found), max(run.remaining for run in runs)

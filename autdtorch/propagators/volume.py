@@ -9,6 +9,7 @@ import torch
 from autdtorch.propagators.simulated import Propagator
 from autdtorch.scene.drive import validate_single_drive
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.cpu_tensors import COMPLEX, REAL
 from autdtorch.utils.neighbours import nearest
 from autdtorch.utils.validation import ArrayLike, invalid, positive, require_kind
 
@@ -35,15 +36,15 @@ def volume_field(propagator: Propagator, drive: ArrayLike, spacing: float | None
     scene = propagator.scene
     drive = validate_single_drive(drive, len(scene.array))
     spacing = scene.wavelength / 4 if spacing is None else positive("spacing", spacing, "m")
-    lower, upper = torch.tensor(scene.domain, dtype=torch.float64, device="cpu")
+    lower, upper = torch.tensor(scene.domain, **REAL)
     counts = [max(2, round(float(length) / spacing)) for length in upper - lower]
     if math.prod(counts) > _MOST_CELLS:
         raise invalid("spacing", spacing, f"gives {counts} cells, must give at most {_MOST_CELLS}", "m")
-    steps = [torch.arange(count, dtype=torch.float64, device="cpu") + 0.5 for count in counts]
+    steps = [torch.arange(count, **REAL) + 0.5 for count in counts]
     axes = zip(lower, upper, steps, counts, strict=True)
     points = torch.cartesian_prod(*(low + (high - low) * step / count for low, high, step, count in axes))
     valid = are_shown(scene, points)
-    field = torch.full((len(points),), complex(math.nan, math.nan), dtype=torch.complex128, device="cpu")
+    field = torch.full((len(points),), complex(math.nan, math.nan), **COMPLEX)
     field[valid] = propagator.field(drive, points[None, valid])[0]  # a grid, which may touch obstacles
     return field.reshape(counts)
 

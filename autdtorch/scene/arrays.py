@@ -12,6 +12,7 @@ import torch
 from autdtorch.scene.geometry import Coordinates, in_plane, plane_basis
 from autdtorch.scene.transducer_values import disc_radius, for_each, unit_normals
 from autdtorch.utils.apertures import Apertures
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.neighbours import require_distinct
@@ -311,7 +312,7 @@ def radii_of(array: TransducerArray) -> torch.Tensor:
 
 
 def _expanded(values: float | torch.Tensor, count: int) -> torch.Tensor:
-    each = torch.as_tensor(values, dtype=torch.float64, device="cpu")
+    each = torch.as_tensor(values, **REAL)
     return each.as_subclass(torch.Tensor).expand(count)
 
 
@@ -347,12 +348,12 @@ def _autd3_places(count_x: int, count_y: int) -> torch.Tensor:
     ]
     width, height = AUTD3_UNIT
     shifts = torch.cartesian_prod(width * _centred(count_x), height * _centred(count_y))
-    return (shifts[:, None] + torch.tensor(unit, dtype=torch.float64, device="cpu")).reshape(-1, 2)
+    return (shifts[:, None] + torch.tensor(unit, **REAL)).reshape(-1, 2)
 
 
 def _centred(count: int) -> torch.Tensor:
     """Return `count` positions one apart, around 0."""
-    return torch.arange(count, dtype=torch.float64, device="cpu") - (count - 1) / 2
+    return torch.arange(count, **REAL) - (count - 1) / 2
 
 
 def _disc_rule() -> tuple[torch.Tensor, torch.Tensor]:

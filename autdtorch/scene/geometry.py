@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.units import angle as checked_angle
@@ -56,7 +57,7 @@ def plane_basis(normal: ArrayLike) -> tuple[torch.Tensor, torch.Tensor]:
     u is the projection into the plane of the coordinate axis that cyclically follows the axis nearest to
     `normal`. So normal +x gives (y, z), +y (z, x), +z (x, y), and -x gives (y, -z).
     """
-    n = torch.tensor(unit_vector("normal", normal), dtype=torch.float64, device="cpu")
+    n = torch.tensor(unit_vector("normal", normal), **REAL)
     axis = (int(n.abs().argmax()) + 1) % 3
     u = -n[axis] * n
     u[axis] += 1.0
@@ -75,7 +76,7 @@ def in_plane(places: ArrayLike, center: ArrayLike, normal: ArrayLike, angle: flo
     local = real_tensor("places", places, "m").detach().cpu()
     if local.ndim != 2 or local.shape[1] not in (2, 3):
         raise ValueError(f"places: shape {tuple(local.shape)}; must be (M, 2) or (M, 3)")
-    origin = torch.tensor(finite_vector("center", center), dtype=torch.float64, device="cpu")
+    origin = torch.tensor(finite_vector("center", center), **REAL)
     return origin + local @ device_axes(normal, angle)[: local.shape[1]]
 
 
@@ -88,7 +89,7 @@ def device_axes(normal: ArrayLike, angle: float = 0.0) -> torch.Tensor:
     u, v = plane_basis(normal)
     x = math.cos(turn) * u + math.sin(turn) * v
     y = math.cos(turn) * v - math.sin(turn) * u
-    return torch.stack((x, y, torch.tensor(unit_vector("normal", normal), dtype=torch.float64, device="cpu")))
+    return torch.stack((x, y, torch.tensor(unit_vector("normal", normal), **REAL)))
 
 
 def rotation_matrix(rotation: Vector) -> torch.Tensor:
@@ -108,10 +109,10 @@ def composed_rotation(
     cosines: Sequence[float] | torch.Tensor, sines: Sequence[float] | torch.Tensor
 ) -> torch.Tensor:
     """Return the matrix of `rotation_matrix` from cosines and sines (3,), differentiable in tensors."""
-    matrix = torch.eye(3, dtype=torch.float64, device="cpu")
+    matrix = torch.eye(3, **REAL)
     for axis, (cosine, sine) in enumerate(zip(cosines, sines, strict=True)):
         first, second = (axis + 1) % 3, (axis + 2) % 3
-        turn = torch.eye(3, dtype=torch.float64, device="cpu")
+        turn = torch.eye(3, **REAL)
         turn[first, first] = turn[second, second] = cosine
         turn[second, first] = sine
         turn[first, second] = -sine
@@ -141,7 +142,7 @@ def circle_points(
     origin, radius, count = _round(center, radius, count)
     u, v = plane_basis(normal)
     start = checked_angle("angle", angle)
-    angles = start + 2 * math.pi * torch.arange(count, dtype=torch.float64, device="cpu") / count
+    angles = start + 2 * math.pi * torch.arange(count, **REAL) / count
     return origin + radius * (angles.cos()[:, None] * u + angles.sin()[:, None] * v)
 
 
@@ -163,7 +164,7 @@ def sphere_points(center: ArrayLike, radius: float, count: int) -> torch.Tensor:
         ValueError: an argument is not finite, has the wrong shape or is out of range.
     """
     origin, radius, count = _round(center, radius, count)
-    number = torch.arange(count, dtype=torch.float64, device="cpu")
+    number = torch.arange(count, **REAL)
     height = 1 - (2 * number + 1) / count
     angle, across = math.pi * (3 - math.sqrt(5)) * number, (1 - height.square()).sqrt()
     return origin + radius * torch.stack((across * angle.cos(), across * angle.sin(), height), dim=1)
@@ -171,7 +172,7 @@ def sphere_points(center: ArrayLike, radius: float, count: int) -> torch.Tensor:
 
 def _round(center: ArrayLike, radius: float, count: int) -> tuple[torch.Tensor, float, int]:
     """Return centre (3,) [m], radius [m] and number of points after checking them."""
-    origin = torch.tensor(finite_vector("center", center), dtype=torch.float64, device="cpu")
+    origin = torch.tensor(finite_vector("center", center), **REAL)
     radius = positive("radius", radius, "m")
     count = integer_at_least("count", count, 1)
     require_memory("count", count, _POINT_BYTES * count)
@@ -210,7 +211,7 @@ class Plane:
     @property
     def corners(self) -> torch.Tensor:
         """The four corners (4, 3) [m]."""
-        signs = torch.tensor([-1.0, 1.0], dtype=torch.float64, device="cpu")
+        signs = torch.tensor([-1.0, 1.0], **REAL)
         return self._at(signs * self.size[0] / 2, signs * self.size[1] / 2).reshape(4, 3)
 
     def points(self, spacing: float) -> torch.Tensor:
@@ -229,14 +230,14 @@ class Plane:
 
     def _at(self, along_u: torch.Tensor, along_v: torch.Tensor) -> torch.Tensor:
         u, v = self.basis
-        center = torch.tensor(self.center, dtype=torch.float64, device="cpu")
+        center = torch.tensor(self.center, **REAL)
         return center + along_u[:, None, None] * u + along_v[None, :, None] * v
 
 
 def cell_centers_of(plane: Plane, counts: tuple[int, int]) -> torch.Tensor:
     """Return the centres (Nu, Nv, 3) [m] of `counts` = (Nu, Nv) equal cells that fill a plane."""
     along = [
-        length * ((torch.arange(count, dtype=torch.float64, device="cpu") + 0.5) / count - 0.5)
+        length * ((torch.arange(count, **REAL) + 0.5) / count - 0.5)
         for length, count in zip(plane.size, counts, strict=True)
     ]
     return plane._at(along[0], along[1])

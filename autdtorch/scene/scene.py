@@ -16,6 +16,7 @@ from autdtorch.scene.medium import Medium as Medium
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.moving import moved
 from autdtorch.scene.plausibility import extent_of, unit_hint, warn_of_implausible
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.html import html_facts
 from autdtorch.utils.neighbours import nearest, require_distinct
@@ -156,7 +157,7 @@ class Scene:
             ValueError: an obstacle then holds a transducer or control point, or is of a kind that cannot be
                 moved; a `VoxelMask` cannot be turned.
         """
-        shift = torch.tensor(finite_vector("offset", offset), dtype=torch.float64, device="cpu")
+        shift = torch.tensor(finite_vector("offset", offset), **REAL)
         turn = angles("rotation", rotation, rotation_degrees)
         return replace(self, obstacles=moved(self.obstacles, shift, turn))
 
@@ -344,7 +345,7 @@ def _overlap(obstacle: Obstacle, other: Obstacle) -> bool:
     if shared is None:
         return False
     lower, upper = shared
-    share = (torch.arange(_OVERLAP_SAMPLES, dtype=torch.float64, device="cpu") + 0.5) / _OVERLAP_SAMPLES
+    share = (torch.arange(_OVERLAP_SAMPLES, **REAL) + 0.5) / _OVERLAP_SAMPLES
     points = lower + (upper - lower) * torch.cartesian_prod(share, share, share)
     return bool((obstacle.contains(points) & other.contains(points)).any())
 
@@ -353,7 +354,7 @@ def _shared(
     box: tuple[Vector, Vector], other: tuple[Vector, Vector]
 ) -> tuple[torch.Tensor, torch.Tensor] | None:
     """Return the corners of the intersection of two boxes (lower, upper); None if they at most touch."""
-    corners = torch.tensor([box, other], dtype=torch.float64, device="cpu")
+    corners = torch.tensor([box, other], **REAL)
     lower, upper = corners[:, 0].amax(dim=0), corners[:, 1].amin(dim=0)
     return (lower, upper) if (upper - lower).min() > LENGTH_TOLERANCE else None
 
@@ -371,7 +372,7 @@ def require_clear(array: TransducerArray, name: str, points: torch.Tensor) -> No
 
 def require_inside(domain: tuple[Vector, Vector], name: str, points: torch.Tensor, fix: str = "") -> None:
     """Refuse points (N, 3) [m] outside the corners (lower, upper) of a domain; `fix` says what would help."""
-    lower, upper = (torch.tensor(corner, dtype=torch.float64, device="cpu") for corner in domain)
+    lower, upper = (torch.tensor(corner, **REAL) for corner in domain)
     outside = ((points < lower - LENGTH_TOLERANCE) | (points > upper + LENGTH_TOLERANCE)).any(dim=-1)
     if outside.any():
         first = int(outside.nonzero()[0, 0])

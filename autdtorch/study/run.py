@@ -33,6 +33,7 @@ from autdtorch.study.folder import open_folder
 from autdtorch.study.provenance import provenance_now
 from autdtorch.study.results import MethodResult, SceneResult, Simulation, StudyResult, median_trial
 from autdtorch.study.trial_file import TrialFile
+from autdtorch.utils.cpu_tensors import COMPLEX
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.neighbours import nearest
 from autdtorch.utils.progress import Progress, show_progress
@@ -116,7 +117,7 @@ def run_study(
             if isinstance(method, Method):
                 points, transducers = len(scene.control_points), len(scene.array)
                 # In place of the matrix that the simulation will give: a prior needs one, of this shape.
-                blank = torch.zeros(points, transducers, dtype=torch.complex128, device="cpu")
+                blank = torch.zeros(points, transducers, **COMPLEX)
                 problem = Problem(transducers, points, goal, scene, blank)
                 with within(f"method {name}"):
                     method.require_fit(problem, min(counts[name], method.block))

@@ -14,6 +14,7 @@ import torch
 from autdtorch.methods.solution import Solution, joined
 from autdtorch.objectives.metrics import focus_metrics
 from autdtorch.study.results import stored_solution
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.json_lines import JsonLines
 from autdtorch.utils.validation import integer_at_least, invalid, not_negative, real_tensor, require_kind
 
@@ -60,7 +61,7 @@ class TrialFile:
     def found(self, scene: str, method: str, trials: int) -> tuple[Solution, torch.Tensor]:
         """Return the joined solution of the first `trials` trials, and seconds (T,) of each."""
         each = [self._trials[scene, method, trial] for trial in range(trials)]
-        seconds = torch.tensor([share for _, share in each], dtype=torch.float64, device="cpu")
+        seconds = torch.tensor([share for _, share in each], **REAL)
         return joined([solution for solution, _ in each]), seconds
 
     def _row(self, scene: str, method: str, trial: int) -> dict[str, Any]:

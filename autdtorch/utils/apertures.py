@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from autdtorch.utils.array_types import AnyArray, Array
+from autdtorch.utils.cpu_tensors import REAL
 
 PATTERN_TERMS = 13
 """Powers of the square of the sine of an angle in a far-field pattern."""
@@ -31,7 +32,7 @@ class Apertures(NamedTuple):
     @classmethod
     def of_points(cls, points: torch.Tensor) -> Self:
         """Return points (P, 3) as sources or receivers."""
-        return cls(points[:, None], torch.ones(1, dtype=torch.float64, device="cpu"))
+        return cls(points[:, None], torch.ones(1, **REAL))
 
     def chosen(self, index: slice | torch.Tensor) -> Self:
         """Return some of the sources or receivers."""

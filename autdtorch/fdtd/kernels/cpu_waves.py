@@ -19,6 +19,7 @@ from torch import Tensor
 from autdtorch.fdtd.kernels.compiled import INNER, entry
 from autdtorch.utils.apertures import PATTERN_TERMS, Discs
 from autdtorch.utils.array_types import AnyArray
+from autdtorch.utils.cpu_tensors import COMPLEX
 from autdtorch.utils.threads import even_parts, spread
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
@@ -187,7 +188,7 @@ def superposition(
     the result.
     """
     if isinstance(points, Discs):
-        fields = torch.zeros((len(points.radii), amplitude.shape[1]), dtype=torch.complex128, device="cpu")
+        fields = torch.zeros((len(points.radii), amplitude.shape[1]), **COMPLEX)
         for index, some in points.of_equal_radius():
             fields[index] = _superposed(some, sources, amplitude, wavenumber, nearest, dtype)
         return fields

@@ -12,6 +12,7 @@ import torch
 from autdtorch.hardware.devices.device import Device, Firmware
 from autdtorch.scene.arrays import AUTD3_TRANSDUCERS
 from autdtorch.scene.phase_levels import PhaseLevels
+from autdtorch.utils.cpu_tensors import COMPLEX
 
 
 class _Autd3(Device):
@@ -43,7 +44,7 @@ class _Autd3Firmware:
         """Return the drive (N,): phase n / 256 of a period, amplitude i / 255."""
         levels = np.frombuffer(self._playing, np.uint8).reshape(2, -1).T.tolist()
         played = [cmath.rect(i / 255, 2 * math.pi * n / 256) for n, i in levels]
-        return torch.tensor(played, dtype=torch.complex128, device="cpu")
+        return torch.tensor(played, **COMPLEX)
 
 
 #: One board. An intensity i is proportional to the amplitude, as the firmware gives it the pulse width

@@ -14,6 +14,7 @@ from autdtorch.hardware.devices.device import Device, Firmware
 from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
 from autdtorch.hardware.transport.serial_chips import FT232H
 from autdtorch.scene.phase_levels import PhaseLevels
+from autdtorch.utils.cpu_tensors import COMPLEX
 from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid, members
 
 _BOARD = 256
@@ -39,7 +40,7 @@ class _OpenMPD(Device):
         sent = super().drive(*levels)
         if not self.files:
             return sent
-        ones = torch.ones(_BOARD, dtype=torch.complex128, device="cpu")
+        ones = torch.ones(_BOARD, **COMPLEX)
         parts = zip(self.files, torch.split(sent, _BOARD, -1), strict=True)
         by_file = torch.cat([part[..., list(file.pins)] for file, part in parts], dim=-1)
         factors = torch.cat([file.calibrated(ones) for file in self.files])
@@ -83,7 +84,7 @@ class _OpenMPDFirmware:
             cmath.rect(math.sin(math.pi * duty / 128), 2 * math.pi * (phase + (duty - 64) / 2) / 128)
             for phase, duty in pulses
         ]
-        return torch.tensor(played, dtype=torch.complex128, device="cpu")
+        return torch.tensor(played, **COMPLEX)
 
 
 #: One board, by pin. OpenMPD's solver (`discretise`) has the same levels, but truncates where this rounds.

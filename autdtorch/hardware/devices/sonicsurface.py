@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from autdtorch.hardware.devices.device import Device, Firmware
 from autdtorch.hardware.transport.serial_chips import ft232r
 from autdtorch.scene.phase_levels import PhaseLevels
+from autdtorch.utils.cpu_tensors import COMPLEX
 from autdtorch.utils.validation import ArrayLike
 
 _BOARD, _BAUD = 256, 230_400
@@ -74,7 +75,7 @@ class _SonicSurfaceFirmware:
     def drive(self) -> torch.Tensor:
         """Return the drive (256,): the pulse of phase n begins n / 32 of a period late."""
         played = [0j if n == self._OFF else cmath.exp(2j * math.pi * n / 32) for n in self._playing]
-        by_channel = torch.tensor(played, dtype=torch.complex128, device="cpu")
+        by_channel = torch.tensor(played, **COMPLEX)
         return by_channel[torch.from_numpy(sonicsurface_channels())]
 
 

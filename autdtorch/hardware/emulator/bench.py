@@ -15,6 +15,7 @@ from autdtorch.hardware.transport.autd3_network import Autd3Port, autd3_kit
 from autdtorch.hardware.transport.port import Port
 from autdtorch.objectives.perturbations import SNRS, random_rms
 from autdtorch.scene.drive import amplitudes_of, phases_of
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.validation import (
     complex_tensor,
     indices,
@@ -57,7 +58,7 @@ class EmulatedBench:
         if self.transfer_matrix.ndim != 2 or self.transfer_matrix.shape[1] != len(self._transducers):
             shape = tuple(self.transfer_matrix.shape)
             raise ValueError(f"transfer_matrix: shape {shape}; must be (P, {len(self._transducers)})")
-        self._working = torch.ones(len(self._transducers), dtype=torch.float64, device="cpu")
+        self._working = torch.ones(len(self._transducers), **REAL)
         if failed := integers("dead", dead, 0, "must be indices of transducers"):
             self._working[indices("dead", failed, len(self._transducers))] = 0
         each = device.transducers // len(device.serials)

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import torch
 
 from autdtorch.hardware.sensors.sensor import Sensor, SensorError, checked_reading
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.progress import is_terminal
 from autdtorch.utils.validation import ArrayLike, not_negative, points_tensor, require_callable, require_kind
 
@@ -51,7 +52,7 @@ class ManualSensor:
         """
         places = (_place(number, self._points) for number in range(len(self._points)))
         readings = [self._answer(f"Pressure at {place} [Pa]: ") for place in places]
-        return torch.tensor(readings, dtype=torch.float64, device="cpu")
+        return torch.tensor(readings, **REAL)
 
     def _answer(self, question: str) -> float:
         hint = ""

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import torch
 
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.validation import invalid
 
 
@@ -38,7 +39,7 @@ class LockIn:
             raise invalid("step", step, f"must be < {0.5 / frequency:g}, half a period", "s")
         if cycles * samples < 2:
             raise invalid("samples", samples, f"must be >= {math.ceil(2 / cycles)}, two periods")
-        places = torch.arange(samples, dtype=torch.float64, device="cpu")
+        places = torch.arange(samples, **REAL)
         angle = 2 * math.pi * cycles * places
         window = (math.pi * (places + 0.5) / samples).sin().square()
         self._basis = torch.stack([torch.ones_like(angle), angle.cos(), angle.sin()])

@@ -18,6 +18,7 @@ from autdtorch.hardware.sensors.sensor import SensorError
 from autdtorch.hardware.transport.port import LinkError, closed_on_error
 from autdtorch.hardware.transport.usb import find_device
 from autdtorch.hardware.transport.usbtmc import UsbtmcPort
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.validation import (
     integer_at_least,
     invalid,
@@ -176,7 +177,7 @@ class ScopeSensor:
         self._microphones = members("microphones", microphones, Microphone)
         self._captures = integer_at_least("captures", captures, 1)
         volts = [one._volts for one in self._microphones]
-        self._volts_per_pascal = torch.tensor(volts, dtype=torch.float64, device="cpu")
+        self._volts_per_pascal = torch.tensor(volts, **REAL)
         self._coarsest = {
             one.input: max(one.loudest * one._volts / _DIVISIONS, scpi.FINEST) for one in self._microphones
         }
@@ -224,7 +225,7 @@ class ScopeSensor:
             self.recaptures += 1
         self._require_unclipped(waveforms)
         # Samples that all have the same code do not show the noise of their rounding.
-        steps = torch.tensor([one.resolution for one in waveforms], dtype=torch.float64, device="cpu")
+        steps = torch.tensor([one.resolution for one in waveforms], **REAL)
         variance = fit.residual.square().maximum(steps.square() / 12)
         powers = torch.stack([fit.phasor.abs().square(), lock_in.noise_gain * variance], dim=1)
         return powers / self._volts_per_pascal[:, None].square()

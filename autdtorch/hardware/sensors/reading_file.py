@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from autdtorch.hardware.sensors.sensor import SensorError
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.validation import (
     integer_at_least,
     invalid,
@@ -77,4 +78,4 @@ class FileSensor:
         numbers = [not_negative("pressure", float(word), "Pa") for word in text.replace(",", " ").split()]
         if len(numbers) != self._points:
             raise invalid("pressure", numbers, f"must be {self._points} numbers", "Pa")
-        return torch.tensor(numbers, dtype=torch.float64, device="cpu")
+        return torch.tensor(numbers, **REAL)

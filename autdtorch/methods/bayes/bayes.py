@@ -20,6 +20,7 @@ from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, scores_of
 from autdtorch.objectives.objective import Objective, Score
 from autdtorch.scene.drive import drive_from_phases, phases_of
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import integer_at_least, invalid, number_between, require_one_of
@@ -159,7 +160,7 @@ class BayesOpt(Method):
             points[:, 0] = self._points(given)
         search = {
             "points": points,
-            "values": torch.empty(len(seeds), 0, self._outputs(problem), dtype=torch.float64, device="cpu"),
+            "values": torch.empty(len(seeds), 0, self._outputs(problem), **REAL),
             "generators": states_of(generators),
         }
         return Step(self._drives(points), search)

@@ -15,6 +15,7 @@ from autdtorch.methods.bayes.packages import (
     ZeroMean,
     fit_gpytorch_mll,
 )
+from autdtorch.utils.cpu_tensors import REAL
 
 KernelName: TypeAlias = Literal["phases", "circle", "phasor"]
 """The space in which a process measures phases: as numbers, on the circle, or by the phasors they make."""
@@ -30,7 +31,7 @@ _DARK = 1e-12  # least mean intensity of a focus, in those of the strongest
 _TINY = 1e-30  # and where all are dark [Pa^2]
 _PHASOR_REACH = 0.2  # [turns]
 
-_NOISES = 10.0 ** torch.linspace(-6, 0, 25, dtype=torch.float64, device="cpu")
+_NOISES = 10.0 ** torch.linspace(-6, 0, 25, **REAL)
 """Candidates for the variance of a reading's noise, in mean intensities."""
 
 
@@ -175,7 +176,7 @@ def fitted(
         noise: as in `Fit`; "inferred" to fit it, too.
     """
     shape = values.shape[0], values.shape[2]
-    given = torch.full(shape, 0.0 if isinstance(noise, str) else noise, dtype=torch.float64, device="cpu")
+    given = torch.full(shape, 0.0 if isinstance(noise, str) else noise, **REAL)
     if kernel == "phasor":
         ones = torch.ones_like(given)
         return Fit(ones, _likeliest_noise(points, values) if isinstance(noise, str) else given)
@@ -184,7 +185,7 @@ def fitted(
         [_fit_alone(kernel, own, column[:, None], noise) for column in columns.T]
         for own, columns in zip(points, standard, strict=True)
     ]
-    length_scale, variance = torch.tensor(fits, dtype=torch.float64, device="cpu").unbind(dim=-1)
+    length_scale, variance = torch.tensor(fits, **REAL).unbind(dim=-1)
     return Fit(length_scale, variance)
 
 
@@ -242,6 +243,6 @@ def _kernel(kernel: KernelName, fit: Fit, rows: Rows | None, unit: torch.Tensor)
 
 def _reach(kernel: KernelName, fit: Fit) -> torch.Tensor:
     if kernel == "phasor":
-        return torch.full(fit.noise.shape[:1], _PHASOR_REACH, dtype=torch.float64, device="cpu")
+        return torch.full(fit.noise.shape[:1], _PHASOR_REACH, **REAL)
     shortest = fit.length_scale.amin(dim=-1)
     return shortest / (2 * math.pi) if kernel == "circle" else shortest

@@ -27,6 +27,7 @@ import torch
 from autdtorch.methods.base import Method, Problem, Step, known_matrix
 from autdtorch.objectives.goals import Goal
 from autdtorch.objectives.objective import Objective, Score
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.validation import (
     ArrayLike,
@@ -153,7 +154,7 @@ def holography(
 def wanted_pressures(goal: Score, points: int) -> tuple[torch.Tensor, bool]:
     """Return the pressures (P,) that a goal wants, and whether they are absolute [Pa], not relative."""
     if not isinstance(goal, Goal):
-        return torch.ones(points, dtype=torch.float64, device="cpu"), False
+        return torch.ones(points, **REAL), False
     return torch.from_numpy(goal.wanted(points)), goal.absolute
 
 

@@ -16,6 +16,7 @@ from autdtorch.plot.view3d import meshes
 from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.geometry import Plane
 from autdtorch.utils.array_types import Array
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.validation import Vector
 
 _INK = {False: ("black", "white"), True: ("#e6e6e6", "#14171c")}  # lines and background, by dark
@@ -204,7 +205,7 @@ class Picture:
         spots = {
             "focus": (
                 scene.control_points,
-                torch.tensor(scene.wavelength / 4, dtype=torch.float64, device="cpu"),
+                torch.tensor(scene.wavelength / 4, **REAL),
             )
         }
         radii = radii_of(scene.array)

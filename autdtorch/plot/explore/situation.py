@@ -13,6 +13,7 @@ from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.moving import is_movable, is_turnable, shifted, turned
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.cached import cached_property
+from autdtorch.utils.cpu_tensors import COMPLEX, REAL
 from autdtorch.utils.validation import ArrayLike, Vector, finite_vector, require_one_of
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -53,7 +54,7 @@ class Body:
     @cached_property
     def pose(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Turn (3, 3) about a pivot (3,) [m], and offset (3,) [m] after it, from where it was at first."""
-        pivot = torch.tensor(_middle(self.first), dtype=torch.float64, device="cpu")
+        pivot = torch.tensor(_middle(self.first), **REAL)
         turn = rotation_matrix(self.angles) @ rotation_matrix(Body.of(self.first).angles).mT
         return turn, pivot, pivot.new_tensor(self.center) - pivot
 
@@ -207,7 +208,7 @@ class Situation:
 
 def in_phase(scene: Scene) -> torch.Tensor:
     """Return the drive (M,) with phase 0 and amplitude 1."""
-    return torch.ones(len(scene.array), dtype=torch.complex128, device="cpu")
+    return torch.ones(len(scene.array), **COMPLEX)
 
 
 def checked_drive(drive: ArrayLike, scene: Scene) -> torch.Tensor:

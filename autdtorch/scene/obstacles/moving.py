@@ -15,6 +15,7 @@ from autdtorch.scene.obstacles.base import Obstacle
 from autdtorch.scene.obstacles.mesh import Mesh
 from autdtorch.scene.obstacles.primitives import Box, Cylinder, Sphere
 from autdtorch.scene.obstacles.voxel_mask import VoxelMask
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.validation import Vector, invalid
 
 # The fields that place and turn an obstacle. A class of the user's own may have others, and is not moved
@@ -48,8 +49,7 @@ def circumscribed(obstacles: Sequence[Obstacle]) -> tuple[torch.Tensor, float]:
     """
     still, turn = at_rest(obstacles)
     lower, upper = (
-        torch.tensor([getattr(one, side) for one in still], dtype=torch.float64, device="cpu")
-        for side in ("lower", "upper")
+        torch.tensor([getattr(one, side) for one in still], **REAL) for side in ("lower", "upper")
     )
     center = (lower.amin(dim=0) + upper.amax(dim=0)) / 2
     reach = [
@@ -111,10 +111,10 @@ def at_rest(obstacles: Sequence[Obstacle]) -> tuple[tuple[Obstacle, ...], torch.
     come to rest in one orientation.
     """
     turn = _first_turn(obstacles)
-    if torch.equal(turn, torch.eye(3, dtype=torch.float64, device="cpu")):
+    if torch.equal(turn, torch.eye(3, **REAL)):
         return tuple(obstacles), turn
     if any(type(one) not in _TURNS for one in obstacles):
-        return tuple(obstacles), torch.eye(3, dtype=torch.float64, device="cpu")
+        return tuple(obstacles), torch.eye(3, **REAL)
     digits = _DIGITS_AT_REST, _ANGLE_DIGITS_AT_REST
     return tuple(turned(one, turn.mT, torch.zeros_like(turn[0]), *digits) for one in obstacles), turn
 
@@ -128,7 +128,7 @@ def _first_turn(obstacles: Sequence[Obstacle]) -> torch.Tensor:
         if isinstance(one, Cylinder):
             x, y, z = one.axis
             return rotation_matrix((0.0, math.acos(max(-1.0, min(1.0, z))), math.atan2(y, x)))
-    return torch.eye(3, dtype=torch.float64, device="cpu")
+    return torch.eye(3, **REAL)
 
 
 def angles_of(turn: torch.Tensor) -> torch.Tensor:

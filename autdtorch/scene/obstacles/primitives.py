@@ -11,6 +11,7 @@ import torch
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.base import Obstacle
 from autdtorch.scene.obstacles.triangles import BOX_TRIANGLES, SEGMENTS, revolved
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.units import angles
 from autdtorch.utils.validation import Vector, finite_vector, positive, positive_entries, unit_vector
@@ -76,7 +77,7 @@ class Box(_Centred):
 
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return two triangles for each face; see `Obstacle.surface`."""
-        signs = torch.tensor([-0.5, 0.5], dtype=torch.float64, device="cpu")
+        signs = torch.tensor([-0.5, 0.5], **REAL)
         corners = torch.cartesian_prod(signs, signs, signs) * signs.new_tensor(self.size)
         vertices = signs.new_tensor(self.center) + corners @ rotation_matrix(self.rotation).T
         return vertices, BOX_TRIANGLES.clone()
@@ -122,7 +123,7 @@ class Sphere(_Centred):
 
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return a polyhedron with its vertices on the sphere; see `Obstacle.surface`."""
-        angles = torch.linspace(0, math.pi, SEGMENTS // 2 + 1, dtype=torch.float64, device="cpu")
+        angles = torch.linspace(0, math.pi, SEGMENTS // 2 + 1, **REAL)
         profile = self.radius * torch.stack([angles.sin(), -angles.cos()], dim=-1)
         return revolved(profile, self.center, (0.0, 0.0, 1.0))
 
@@ -165,7 +166,7 @@ class Cylinder(_Centred):
         """Return a prism with its edges on the cylinder; see `Obstacle.surface`."""
         radius, half = self.radius, self.height / 2
         profile = [(0, -half), (radius, -half), (radius, half), (0, half)]
-        return revolved(torch.tensor(profile, dtype=torch.float64, device="cpu"), self.center, self.axis)
+        return revolved(torch.tensor(profile, **REAL), self.center, self.axis)
 
     @property
     def _half_extents(self) -> Vector:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from autdtorch.scene.geometry import circle_points
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.validation import Vector
 
 SEGMENTS = 48
@@ -26,7 +27,7 @@ def revolved(profile: torch.Tensor, center: Vector, axis: Vector) -> tuple[torch
     """
     rings, count = len(profile) - 2, SEGMENTS
     circle = circle_points((0.0, 0.0, 0.0), 1.0, count, axis)
-    upwards = torch.tensor(axis, dtype=torch.float64, device="cpu")
+    upwards = torch.tensor(axis, **REAL)
     bottom, top = (profile[end, 1] * upwards for end in (0, -1))
     sides = profile[1:-1, :1, None] * circle + profile[1:-1, 1:, None] * upwards
     vertices = torch.cat([bottom[None], sides.reshape(-1, 3), top[None]])
@@ -38,4 +39,4 @@ def revolved(profile: torch.Tensor, center: Vector, axis: Vector) -> tuple[torch
         torch.stack([ring[:-1], turned[1:], ring[1:]], dim=-1).reshape(-1, 3),
         torch.stack([torch.full_like(ring[0], rings * count + 1), ring[-1], turned[-1]], dim=-1),
     ]
-    return torch.tensor(center, dtype=torch.float64, device="cpu") + vertices, torch.cat(triangles)
+    return torch.tensor(center, **REAL) + vertices, torch.cat(triangles)

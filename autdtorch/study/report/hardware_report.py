@@ -21,6 +21,7 @@ from autdtorch.objectives.objective import Objective
 from autdtorch.plot.trials import plot_convergence
 from autdtorch.study.report import alt_texts
 from autdtorch.study.report.document import code, picture, rendered
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.files import naming, replace_file
 from autdtorch.utils.wording import in_digits
 
@@ -60,7 +61,7 @@ def write_hardware_report(
     maximised the `goal`.
     """
     evaluations, scene = log.evaluations, simulated.scene
-    working = torch.ones(len(scene.array), dtype=torch.float64, device="cpu")
+    working = torch.ones(len(scene.array), **REAL)
     working[preflight.dead] = 0
     measured = torch.stack([one.pressure for one in evaluations])
     predicted = simulated(working * torch.stack([one.drive for one in evaluations]))
