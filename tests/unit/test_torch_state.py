@@ -114,6 +114,7 @@ def test_what_inference_mode_has_made_serves_gradients_later() -> None:
     assert drive.grad.abs().sum() > 0
 
 
+BOTH = {"REAL", "COMPLEX"}
 MAKERS = {"arange", "as_tensor", "empty", "eye", "full", "linspace"}
 MAKERS |= {"ones", "rand", "randn", "tensor", "zeros"}
 
