@@ -126,6 +126,8 @@ def test_every_tensor_is_made_with_its_dtype_and_device() -> None:
             match call:
                 case ast.Call(func=ast.Attribute(value=ast.Name("torch"), attr=name)) if name in MAKERS:
                     given = {keyword.arg for keyword in call.keywords}
+                    if {ast.unparse(each.value) for each in call.keywords if each.arg is None} & BOTH:
+                        given |= {"device", "dtype"}
                     # integers have one dtype, and what is there keeps its own
                     required = {"device"} if name in ("arange", "as_tensor") else {"device", "dtype"}
                     assert required <= given, f"{path}:{call.lineno}: {ast.unparse(call)}"
