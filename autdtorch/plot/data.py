@@ -6,11 +6,11 @@ from collections.abc import Collection, Iterable, Mapping
 from typing import TypeAlias
 
 import numpy as np
-import torch
 
 from autdtorch.scene.drive import phases_of, validate_single_drive
 from autdtorch.scene.geometry import Plane, cell_centers_of
 from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.obstacles.overlaps import inside_any
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import (
     ArrayLike,
@@ -101,16 +101,6 @@ def outside_on_plane(magnitude: Array, plane: Plane, obstacles: Iterable[Obstacl
     """
     points = cell_centers_of(plane, (magnitude.shape[0], magnitude.shape[1]))
     return np.where(inside_any(points, obstacles).numpy(), np.nan, magnitude)
-
-
-def inside_any(points: torch.Tensor, obstacles: Iterable[Obstacle]) -> torch.Tensor:
-    """Return whether each of the points (..., 3) [m] is inside an obstacle, bool (...)."""
-    inside = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu")
-    for obstacle in obstacles:
-        lower, upper = points.new_tensor(obstacle.lower), points.new_tensor(obstacle.upper)
-        near = ((points >= lower) & (points <= upper)).all(dim=-1) & ~inside  # distances to meshes are slow
-        inside[near] = obstacle.contains(points[near])
-    return inside
 
 
 def largest(magnitude: Array) -> float:

@@ -15,6 +15,7 @@ from autdtorch.scene.geometry import Coordinates, Plane
 from autdtorch.scene.medium import Medium as Medium
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.moving import moved
+from autdtorch.scene.obstacles.overlaps import overlap, shared_box
 from autdtorch.scene.plausibility import extent_of, unit_hint, warn_of_implausible
 from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.hints import suggesting
@@ -37,7 +38,6 @@ from autdtorch.utils.validation import (
 )
 from autdtorch.utils.wording import counted
 
-_OVERLAP_SAMPLES = 16  # along each axis of the intersection of two bounding boxes
 _DEFAULT_MARGIN = 2.0  # [wavelengths] of air on each side, where no domain is given
 _FARTHEST = 1e6  # [m] along an axis; far beyond any simulation, and volumes do not overflow
 _FREQUENCIES = 1e-3, 1e12  # [Hz]
@@ -324,39 +324,17 @@ def _in_later_medium(scene: Scene, index: int, points: torch.Tensor) -> torch.Te
 
 
 def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
-    """Warn of overlapping pairs of different material, where the order of the list matters.
-
-    The intersection of two bounding boxes is sampled at the centres of `_OVERLAP_SAMPLES`^3 cells.
-    """
+    """Warn of overlapping pairs of different material, where the order of the list matters."""
     material = attrgetter("density", "sound_speed", "rigid")
     pairs = [
         f"{index} overlaps {earlier}"
         for index, obstacle in enumerate(obstacles)
         for earlier, other in enumerate(obstacles[:index])
-        if material(obstacle) != material(other) and _overlap(obstacle, other)
+        if material(obstacle) != material(other) and overlap(obstacle, other)
     ]
     if pairs:
         text = f"{', '.join(pairs)}, of another material; where both are, the later counts"
         warn_user(f"Scene.obstacles: {text}", OverlapWarning)
-
-
-def _overlap(obstacle: Obstacle, other: Obstacle) -> bool:
-    shared = _shared((obstacle.lower, obstacle.upper), (other.lower, other.upper))
-    if shared is None:
-        return False
-    lower, upper = shared
-    share = (torch.arange(_OVERLAP_SAMPLES, **REAL) + 0.5) / _OVERLAP_SAMPLES
-    points = lower + (upper - lower) * torch.cartesian_prod(share, share, share)
-    return bool((obstacle.contains(points) & other.contains(points)).any())
-
-
-def _shared(
-    box: tuple[Vector, Vector], other: tuple[Vector, Vector]
-) -> tuple[torch.Tensor, torch.Tensor] | None:
-    """Return the corners of the intersection of two boxes (lower, upper); None if they at most touch."""
-    corners = torch.tensor([box, other], **REAL)
-    lower, upper = corners[:, 0].amax(dim=0), corners[:, 1].amin(dim=0)
-    return (lower, upper) if (upper - lower).min() > LENGTH_TOLERANCE else None
 
 
 def require_clear(array: TransducerArray, name: str, points: torch.Tensor) -> None:
@@ -384,7 +362,7 @@ def _require_in_domain(scene: Scene) -> None:
     for name, points in _contents(scene):
         require_inside(scene.domain, name, points, "; domain=None fits it to the scene")
     for index, obstacle in enumerate(scene.obstacles):
-        if _shared((obstacle.lower, obstacle.upper), scene.domain) is None:
+        if shared_box((obstacle.lower, obstacle.upper), scene.domain) is None:
             accepted = f"must be at least partly inside the domain, {scene.domain[0]} to {scene.domain[1]} m"
             accepted += unit_hint(scene, obstacle)
             raise ValueError(f"Scene.obstacles[{index}]: {extent_of(obstacle)}; {accepted}")

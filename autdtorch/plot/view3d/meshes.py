@@ -10,13 +10,14 @@ import numpy as np
 import torch
 
 from autdtorch.plot import colours
-from autdtorch.plot.data import MM, inside_any, outside_on_plane, plane_magnitude, single_drive_phases
+from autdtorch.plot.data import MM, outside_on_plane, plane_magnitude, single_drive_phases
 from autdtorch.plot.view3d.font import use_font
 from autdtorch.plot.view3d.still_axes import add_still_axes
 from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.drive import amplitudes_of
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.obstacles.overlaps import inside_any
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.neighbours import closest_pair, distances

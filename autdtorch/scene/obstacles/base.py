@@ -8,7 +8,16 @@ from typing import Self
 
 import torch
 
-from autdtorch.utils.validation import ArrayLike, Vector, boolean, fluid, invalid, not_negative, real_tensor
+from autdtorch.utils.validation import (
+    LENGTH_TOLERANCE,
+    ArrayLike,
+    Vector,
+    boolean,
+    fluid,
+    invalid,
+    not_negative,
+    real_tensor,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +86,18 @@ class Obstacle(ABC):
         """
         points = _points(points)
         margin = not_negative("margin", margin, "m")
-        return self._inside(points.reshape(-1, 3), margin).reshape(points.shape[:-1])
+        flat = points.reshape(-1, 3)
+        near = self.near(flat, margin)  # distances to meshes are slow
+        inside = torch.zeros(len(flat), dtype=torch.bool, device=flat.device)
+        inside[near] = self._inside(flat[near], margin)
+        return inside.reshape(points.shape[:-1])
+
+    def near(self, points: torch.Tensor, margin: float = 0.0) -> torch.Tensor:
+        """Return whether each of the points (..., 3) [m] is at most `margin` [m] from the bounding box."""
+        lower, upper = points.new_tensor([self.lower, self.upper])
+        beside = margin + LENGTH_TOLERANCE
+        near: torch.Tensor = ((points >= lower - beside) & (points <= upper + beside)).all(dim=-1)
+        return near
 
     def signed_distance(self, points: ArrayLike) -> torch.Tensor:
         """Return the distance of each point to the surface, float64 (...) [m], negative inside.
