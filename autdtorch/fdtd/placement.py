@@ -4,7 +4,7 @@ Elements at faces and edges are accurate to second order wherever these fall (`a
 left is least for a face 0.45 cells behind the last centre: 0.1 % of the field for a rigid cube at 1 mm, 0.5 %
 at 0.1 cells and 1 % at 0.9. A slit narrower than a cell needs a layer of centres in it: without a pressure of
 its own it is closed. Among similar placements the grid takes a symmetric one: a symmetric scene needs fewer
-runs (`propagators/symmetry.py`).
+runs (`fdtd/symmetry.py`).
 """
 
 from __future__ import annotations

@@ -15,12 +15,13 @@ import numpy as np
 import torch
 
 from autdtorch.analytic.spherical_waves import mirrored, outgoing_waves, parities, real_waves, regular_waves
+from autdtorch.fdtd.grids import Grouping, one_box
+from autdtorch.fdtd.kernels.choice import make_kernel
 from autdtorch.fdtd.scattered_field import ScatteredField
 from autdtorch.fdtd.steady_state import SteadyState, run_to_steady_state
+from autdtorch.fdtd.symmetry import symmetries
 from autdtorch.propagators.box import BoxSimulation
-from autdtorch.propagators.grids import Grouping, one_box
-from autdtorch.propagators.plan import MOST_JUDGED, Plan, make_kernel
-from autdtorch.propagators.symmetry import symmetries
+from autdtorch.propagators.plan import MOST_JUDGED, Plan
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.cached import cached_property

@@ -18,11 +18,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from autdtorch.fdtd.grids import MOST_PASSES, one_box
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
 from autdtorch.fdtd.steady_state import Extrapolation, SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.turning import is_turned
-from autdtorch.propagators.grids import MOST_PASSES, one_box
 from autdtorch.propagators.moved_boxes import assembled_box
 from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import Run, Simulation, Stepped

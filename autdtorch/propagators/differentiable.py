@@ -8,10 +8,10 @@ import torch
 
 from autdtorch.fdtd.adjoint import recorded
 from autdtorch.fdtd.grid import make_grid, require_fine, warn_if_coarse
+from autdtorch.fdtd.kernels.choice import available_kernel, make_kernel, precision_of
 from autdtorch.fdtd.material_gradients import cells_of_maps, cells_of_obstacles, domain_cells
 from autdtorch.fdtd.steady_state import block_of, fewest_periods
 from autdtorch.fdtd.stepping import drive_dft, drive_signal
-from autdtorch.propagators.plan import available_kernel, make_kernel, precision_of
 from autdtorch.propagators.scene_region import region_of, warn_of_ending_walls, warn_of_near_points
 from autdtorch.scene.arrays import strengths_of
 from autdtorch.scene.drive import validate_drive

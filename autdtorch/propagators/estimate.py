@@ -10,11 +10,12 @@ from dataclasses import dataclass, replace
 import torch
 
 from autdtorch.fdtd.grid import domain_extent
+from autdtorch.fdtd.grids import grid_cost
+from autdtorch.fdtd.kernels.choice import make_kernel
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stepping import assemble, drive_signal
-from autdtorch.propagators.grids import grid_cost
 from autdtorch.propagators.operator_propagator import OperatorPropagator
-from autdtorch.propagators.plan import make_kernel, plan
+from autdtorch.propagators.plan import plan
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.cpu_tensors import COMPLEX, REAL

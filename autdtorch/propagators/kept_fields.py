@@ -16,10 +16,10 @@ import torch
 from scipy.spatial import KDTree
 
 from autdtorch.fdtd.scattered_field import ScatteredField
+from autdtorch.fdtd.symmetry import Symmetry, orbits_of_array
 from autdtorch.propagators.box import BoxSimulation, Solved
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulation import Run, TransferMatrix
-from autdtorch.propagators.symmetry import Symmetry, orbits_of_array
 from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import Index

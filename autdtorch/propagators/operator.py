@@ -18,9 +18,9 @@ import torch
 
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.analytic.spherical_waves import mirrored, outgoing_waves
+from autdtorch.fdtd.kernels.choice import available_kernel
 from autdtorch.propagators.body_matrix import Solver, placed
 from autdtorch.propagators.cache import disk_cache
-from autdtorch.propagators.plan import available_kernel
 from autdtorch.scene.arrays import TransducerArray, strengths_of
 from autdtorch.scene.geometry import composed_rotation
 from autdtorch.scene.medium import Medium

@@ -13,6 +13,7 @@ import torch
 
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.grid_errors import grid_errors, hardening_errors, shape_errors, sizes
+from autdtorch.fdtd.thin_walls import warn_of_thin_walls
 from autdtorch.fdtd.turning import axes_along, flat_faces
 from autdtorch.propagators.bodies import ScatteringBodies, bodies_at, scattered_waves
 from autdtorch.propagators.body_matrix import Placed, Solver, placed
@@ -22,7 +23,6 @@ from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.scene_bodies import Body, are_outside, bodies_of
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.propagators.simulation import Run
-from autdtorch.propagators.thin_walls import warn_of_thin_walls
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import require_clear
 from autdtorch.utils.cached import cached_property

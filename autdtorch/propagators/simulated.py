@@ -14,6 +14,7 @@ import torch
 
 from autdtorch.analytic.green import PAIR_BYTES, free_space_matrix
 from autdtorch.fdtd.grid_errors import errors_by_grids, grid_errors, hardening_errors, shape_errors, sizes
+from autdtorch.fdtd.thin_walls import warn_of_thin_walls
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.cache import DiskCache, cache_key
 from autdtorch.propagators.full import DomainSimulation
@@ -22,7 +23,6 @@ from autdtorch.propagators.kept_matrices import KeptMatrices
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.scene_region import warn_of_near_points
 from autdtorch.propagators.simulation import Run, TransferMatrix
-from autdtorch.propagators.thin_walls import warn_of_thin_walls
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.cached import cached_property

@@ -12,17 +12,18 @@ from typing import cast
 
 import torch
 
+from autdtorch.fdtd.grids import USUAL_PERIODS
+from autdtorch.fdtd.kernels.choice import make_kernel
 from autdtorch.fdtd.steady_state import SILENCE, SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly
-from autdtorch.propagators.grids import USUAL_PERIODS
-from autdtorch.propagators.plan import Plan, make_kernel
-from autdtorch.propagators.symmetry import (
+from autdtorch.fdtd.symmetry import (
     Orbits,
     Symmetry,
     orbits_of_points,
     orbits_of_transducers,
     symmetries,
 )
+from autdtorch.propagators.plan import Plan
 from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.apertures import Apertures

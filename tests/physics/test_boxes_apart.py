@@ -8,8 +8,8 @@ import torch
 from small_scenes import AIR, relative_error
 
 from autdtorch.analytic.green import free_space_matrix
+from autdtorch.fdtd.grids import cheapest_boxes, one_box
 from autdtorch.propagators import SimulatedPropagator, make_propagator
-from autdtorch.propagators.grids import cheapest_boxes, one_box
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray

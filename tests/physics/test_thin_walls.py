@@ -11,8 +11,8 @@ from small_scenes import relative_error, small_scene
 
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.assembly.sheets import Thickened, thickened
+from autdtorch.fdtd.thin_walls import thin_wall
 from autdtorch.propagators import make_propagator
-from autdtorch.propagators.thin_walls import thin_wall
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere
 
 CENTER = (12.2e-3, 11.9e-3, 12.1e-3)
