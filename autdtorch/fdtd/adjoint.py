@@ -124,7 +124,7 @@ class _Neighbourhood:
 
     def correlate(self, adjoint: Tensor, first: Tensor, after: Tensor, total: Tensor) -> None:
         """Add sums of lambda_i (p_j - p_i) to `total` (n, 27), of lambda (steps, n) and `_Run.fields`."""
-        from autdtorch.fdtd.kernels.cpu_correlation import correlate  # loads numba
+        from autdtorch.fdtd.kernels.cpu import correlate  # loads numba
 
         field = after.new_empty(after.shape[::-1])
         field[:, 0], field[:, 1:] = first[0], after[:-1].T

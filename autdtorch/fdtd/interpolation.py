@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 
 from autdtorch.utils.array_types import Array, Index
 
-Shape = tuple[int, int, int]
+GridShape = tuple[int, int, int]
 WIDTHS = (4, 6, 8, 10)
 # Largest error of a centred kernel at the drive's wavenumber: small compared with the error of any grid
 WIDTH_ERROR = 3e-4
@@ -55,7 +55,7 @@ def axis_weights(offset: Array, nodes: Array, kappa: float) -> Array:
 
 
 def exclude_cells(
-    points: Interpolation, cells: Array, excluded: NDArray[np.bool_], shape: Shape, kappa: float
+    points: Interpolation, cells: Array, excluded: NDArray[np.bool_], shape: GridShape, kappa: float
 ) -> Interpolation:
     """Return kernels of points at `cells` (P, 3) without the `excluded` cells (P, n), fitted to the others.
 
@@ -80,7 +80,7 @@ def exclude_cells(
     return Interpolation(points.index, weight)
 
 
-def _places(index: Index, shape: Shape) -> Index:
+def _places(index: Index, shape: GridShape) -> Index:
     """Return positions (n, 3) of flat indices (n,)."""
     return np.stack(np.unravel_index(index, shape), axis=-1)
 
@@ -115,7 +115,7 @@ def average_nodes(nodes: Interpolation, share: Array) -> Interpolation:
 
 
 def interpolate_points(
-    positions: Array, shape: Shape, first: Shape, last: Shape, kappa: float
+    positions: Array, shape: GridShape, first: GridShape, last: GridShape, kappa: float
 ) -> Interpolation:
     """Return kernels of positions (P, 3) in cells on cells [first, last), one-sided near the rim."""
     index = np.zeros((len(positions), 1), np.int64)

@@ -14,9 +14,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from autdtorch.fdtd.assembly.slender import slender_faces
 from autdtorch.fdtd.region import Region, Shape
-from autdtorch.fdtd.turning import ALIGNED
+from autdtorch.fdtd.turning import ALIGNED, slender_faces
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.triangles import doubled_normals
 from autdtorch.utils.validation import LENGTH_TOLERANCE

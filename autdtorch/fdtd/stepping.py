@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from autdtorch.fdtd.assembly.elements import elements_of
-from autdtorch.fdtd.assembly.enclosed import sees
-from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
+from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells, sees
 from autdtorch.fdtd.boundary import layer_columns, tuned_profile
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.interpolation import Interpolation, average_nodes, exclude_cells, interpolate_points

@@ -8,8 +8,8 @@ from collections.abc import Iterable
 import numpy as np
 import torch
 
-from autdtorch.fdtd.assembly.slender import is_along
 from autdtorch.fdtd.region import Region, Shape
+from autdtorch.fdtd.turning import is_along
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.triangles import doubled_normals, extents
 

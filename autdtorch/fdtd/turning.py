@@ -1,4 +1,4 @@
-"""Turning of the grid: the axes of a box follow the flat faces of the bodies in it.
+"""The axes of a grid, which follow the flat faces of the bodies in it.
 
 The field around a box is exact, so that its grid may have any direction. A tilted cuboid is then as accurate
 as one aligned with the axes of the scene.
@@ -154,3 +154,43 @@ def _axes_with(first: Array, second: Array | None = None) -> Array:
     orders = [axes[list(order)] for order in itertools.permutations(range(3))]
     usual = max(orders, key=lambda each: np.abs(np.diag(each)).sum())
     return usual * np.where(np.diag(usual) < 0, -1.0, 1.0)[:, None]
+
+
+# Largest radius [cells] of such a cylinder: elements across it are fitted together, at most four by four
+_LARGEST_RADIUS = 1.25
+_FEWEST_CORNERS = 16  # Fewest corners of a polygon that stands for a circle
+_ROUND = 1e-6  # Largest deviation of corners from the circle, relative to the radius
+_STEPS = np.cos((np.arange(4) + 0.5) * np.pi / 8)  # Faces of the staircase, relative to its radius
+_SCALE = 0.957173  # Radius of the staircase over that of the circle of equal area
+
+
+def slender_faces(corners: Array) -> list[Array] | None:
+    """Return the places of the faces of a slender cylinder along each axis, or None for other shapes.
+
+    `corners` (V, 3) [cells] are the vertices of its surface.
+    """
+    extent = np.ptp(corners, axis=0)
+    axis = int(extent.argmax())
+    if np.delete(extent, axis).max() > 2 * _LARGEST_RADIUS:
+        return None
+    low, high = corners[:, axis].min(), corners[:, axis].max()
+    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    from_axis = np.delete(corners - middle, axis, axis=1)
+    distance = np.hypot(*from_axis.T)
+    radius, on_axis = float(distance.max()), distance < _ROUND * distance.max()
+    at_ends = (np.abs(corners[:, axis] - low) < _ROUND) | (np.abs(corners[:, axis] - high) < _ROUND)
+    round_ = np.abs(distance - radius) < _ROUND * radius
+    if not at_ends.all() or not (round_ | on_axis).all():
+        return None
+    corner_count = len(np.unique(np.arctan2(*from_axis[round_].T).round(6)))
+    if corner_count < _FEWEST_CORNERS:
+        return None
+    steps = radius * _SCALE * np.concatenate((-_STEPS, _STEPS))
+    return [np.array([low, high]) if one == axis else middle[one] + steps for one in range(3)]
+
+
+def is_along(shape: Shape, axes: Array, spacing: float) -> bool:
+    """Return whether a shape has flat faces along `axes`, one a row (3, 3), or is slender on cells [m]."""
+    if flat_faces(shape).all_aligned(axes):
+        return True
+    return slender_faces(shape.surface()[0].numpy() @ axes.T / spacing) is not None

@@ -76,7 +76,7 @@ def test_one_worker_steps_where_processors_are_busy(monkeypatch: pytest.MonkeyPa
         work()
         return next(shares)
 
-    monkeypatch.setattr("autdtorch.fdtd.kernels.cpu.share_of_processors", share)
+    monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._share_of_processors", share)
     monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._CHUNK_CELLS", 1)
     monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._CHUNK_PLANES", 15)
     monkeypatch.setattr("autdtorch.fdtd.kernels.cpu.thread_count", lambda: 2)

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 
 from autdtorch.fdtd.assembly.element import stiffness_matrix, uniform_coupling
 from autdtorch.fdtd.assembly.layers import two_port
-from autdtorch.fdtd.assembly.plane_fields import plane_fields
 from autdtorch.fdtd.assembly.prisms import Prisms, prisms, stacked
-from autdtorch.fdtd.assembly.sections import Kinds, Section
+from autdtorch.fdtd.assembly.sections import Kinds, Section, plane_fields
 from autdtorch.fdtd.stencil import tuned_stencil
 
 RATIOS = st.floats(-1.5, 5).map(lambda exponent: 10**exponent)

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from autdtorch.fdtd.assembly.distances import HALF_DIAGONAL, lattice_distances, located
 from autdtorch.fdtd.assembly.element import LATTICE
+from autdtorch.fdtd.assembly.elements import HALF_DIAGONAL, lattice_distances, located
 from autdtorch.scene.obstacles import Box, Mesh, Sphere
 from autdtorch.scene.obstacles.mesh_distance import MeshDistance
 

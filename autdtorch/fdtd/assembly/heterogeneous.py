@@ -2,16 +2,21 @@
 
 The scheme is m_i d2p_i/dt2 = sum_j K_ij (p_j - p_i). In air K holds the weights of the tuned stencil and
 m = 1. Another uniform material divides K by its density, and m by density and speed factor. Interface
-elements add their own. K is symmetric: reciprocity and a conserved energy at any contrast.
+elements add theirs. K is symmetric: reciprocity and a conserved energy at any contrast.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from scipy.ndimage import label
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from autdtorch.fdtd.assembly.element import (
     PAIRS,
@@ -21,13 +26,13 @@ from autdtorch.fdtd.assembly.element import (
     uniform_coupling,
 )
 from autdtorch.fdtd.assembly.elements import Elements
-from autdtorch.fdtd.assembly.enclosed import enclosed_cells
+from autdtorch.fdtd.region import Shape
 from autdtorch.fdtd.stencil import Stencil, flat_offsets
 from autdtorch.utils.array_types import Array, Index
 
 logger = logging.getLogger(__name__)
 
-Shape = tuple[int, int, int]
+GridShape = tuple[int, int, int]
 # Sum of coupling coefficients, relative to air, up to which a cell in a sound-hard body is sound-hard. Cells
 # at a surface have 0.3 or more, all others 0.03 or less. Vertices of finite elements stay cells in all but
 # slivers: the least sum is relative to the densest fluid, and above the 1e-5 that the body's density leaves.
@@ -92,18 +97,18 @@ def heterogeneous_cells(elements: Elements, stencil: Stencil) -> HeterogeneousCe
     return HeterogeneousCells(*rows, np.flatnonzero(hard), shell, enclosed)
 
 
-def _neighbours(index: Index, shape: Shape) -> Index:
+def _neighbours(index: Index, shape: GridShape) -> Index:
     """Return flat indices (n, 27) of cells and their neighbours."""
     return np.asarray(index[:, None] + flat_offsets(shape), np.int64)
 
 
-def _inner(index: Index, shape: Shape) -> NDArray[np.bool_]:
+def _inner(index: Index, shape: GridShape) -> NDArray[np.bool_]:
     """Return which cells (n,) are not in the outermost ring, which stays zero."""
     places = np.stack(np.unravel_index(index, shape), axis=-1)
     return np.asarray(((places > 0) & (places < np.array(shape) - 1)).all(axis=1))
 
 
-def _vertices(elements: Elements, shape: Shape) -> Index:
+def _vertices(elements: Elements, shape: GridShape) -> Index:
     """Return the cells (n, 8) at the vertices of the interface elements."""
     first = np.stack(np.unravel_index(elements.index, elements.material.shape), axis=-1)
     places = np.moveaxis(first[:, None] + VERTICES, -1, 0)
@@ -116,7 +121,7 @@ def _cell_material(elements: Elements) -> NDArray[np.int16]:
 
 
 def _without_sound_hard(
-    elements: Elements, touched: Index, shape: Shape, stencil: Stencil
+    elements: Elements, touched: Index, shape: GridShape, stencil: Stencil
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return coupling and mass of the touched cells, and which cells (k,) are sound-hard."""
     vertices, interface = _vertices(elements, shape), elements.interface
@@ -139,7 +144,7 @@ def _without_sound_hard(
         coupling[changed], mass[changed] = _assembled(elements, interface, touched[changed], shape, stencil)
 
 
-def _both_open(hard: NDArray[np.bool_], touched: Index, shape: Shape) -> NDArray[np.bool_]:
+def _both_open(hard: NDArray[np.bool_], touched: Index, shape: GridShape) -> NDArray[np.bool_]:
     """Return whether a touched cell and its neighbours (n, 27) are both open, from the `hard` of all (k,)."""
     return np.asarray(~(hard[touched, None] | hard[_neighbours(touched, shape)]))
 
@@ -163,7 +168,7 @@ def condensed(interface: InterfaceElements, out: NDArray[np.bool_]) -> Interface
 
 
 def _assembled(
-    elements: Elements, interface: InterfaceElements, touched: Index, shape: Shape, stencil: Stencil
+    elements: Elements, interface: InterfaceElements, touched: Index, shape: GridShape, stencil: Stencil
 ) -> tuple[Array, Array]:
     """Return coupling (n, 27) and mass (n,) of the touched cells, summed over their elements."""
     coupling, mass = np.zeros((len(touched), 27)), np.zeros(len(touched))
@@ -188,7 +193,7 @@ def _assembled(
 
 
 def _transferred_mass(
-    coupling: Array, mass: Array, elements: Elements, touched: Index, shape: Shape, largest: float
+    coupling: Array, mass: Array, elements: Elements, touched: Index, shape: GridShape, largest: float
 ) -> Array:
     """Return masses (n,) with which few stencil rows shorten the time step.
 
@@ -219,7 +224,7 @@ def _transferred_mass(
 
 
 def _needed_mass(
-    coupling: Array, mass: Array, elements: Elements, touched: Index, shape: Shape, largest: float
+    coupling: Array, mass: Array, elements: Elements, touched: Index, shape: GridShape, largest: float
 ) -> Array:
     """Return the masses (n,) at which Gershgorin's circles of the symmetric operator end at twice `largest`.
 
@@ -243,7 +248,7 @@ def _needed_mass(
 
 
 def _uniform_cells(
-    elements: Elements, touched: Index, hard: NDArray[np.bool_], shape: Shape, stencil: Stencil
+    elements: Elements, touched: Index, hard: NDArray[np.bool_], shape: GridShape, stencil: Stencil
 ) -> tuple[Index, Array, Array]:
     """Return index, weight and mass of cells inside obstacles with another sound speed than air."""
     factor, material = elements.materials.speed, _cell_material(elements)
@@ -252,3 +257,67 @@ def _uniform_cells(
     index = np.flatnonzero(inside)
     index = index[_inner(index, shape)]
     return index, factor[material[index], None] * stencil.weights, elements.materials.mass[material[index]]
+
+
+# Coupling relative to all of a cell's, up to which nothing passes: a thin sound-hard body leaves less than
+# 1e-5, and a heavy fluid more, relative to all of its own
+_CLOSED = 1e-4
+# Steps from a place to a cell beside it, and the distance [cells] at which a wall is met
+_STEPS, _TOUCHING = 60, 1e-3
+
+
+def enclosed_cells(
+    coupling: Array, touched: Index, hard: NDArray[np.bool_], shape: tuple[int, int, int]
+) -> Index:
+    """Return the flat indices of cells that are not connected with the outermost ones.
+
+    `coupling` (n, 27) is that of the `touched` cells (n,); all others are connected with the six beside them,
+    unless they are sound-hard.
+    """
+    free = ~hard
+    uniform = free.copy()
+    uniform[touched] = False
+    regions, count = label(uniform.reshape(shape))
+    number = regions.ravel()  # of each connected region of uniform cells, from 1 on; 32 bits
+    places = np.flatnonzero(free[touched])
+    number[touched[places]] = count + 1 + np.arange(len(places))
+    one, other = _connections(coupling, touched, places, free, shape)
+    size = count + 1 + len(places)
+    ends = number[one], number[other]
+    _, connected = connected_components(coo_array((np.ones(len(one)), ends), (size, size)), directed=False)
+    inner = np.zeros(shape, bool)
+    inner[1:-1, 1:-1, 1:-1] = True
+    rim = inner & ~np.pad(inner[2:-2, 2:-2, 2:-2], 2)
+    outside = np.zeros(size, bool)
+    outside[connected[number[rim.ravel() & free]]] = True
+    return np.flatnonzero(free & inner.ravel() & ~outside[connected][number])
+
+
+def sees(begin: Array, end: Array, walls: Sequence[Shape], spacing: float) -> NDArray[np.bool_]:
+    """Return whether no wall is between places (..., 3) and cells beside them (..., 3) [m] of `spacing` [m].
+
+    Nothing is nearer to a place than its distance: each step goes so far.
+    """
+    begin, end = np.broadcast_arrays(begin, end)
+    length = np.linalg.norm(end - begin, axis=-1)
+    gone, blocked = np.zeros(length.shape), np.zeros(length.shape, bool)
+    for _ in range(_STEPS):
+        share = np.divide(gone, length, out=np.ones_like(gone), where=length > 0)
+        places = torch.from_numpy(begin + share[..., None] * (end - begin))
+        distance = torch.stack([wall.signed_distance(places) for wall in walls]).amin(dim=0).numpy()
+        blocked |= (distance < _TOUCHING * spacing) & (gone < length)
+        gone = np.minimum(gone + np.maximum(distance, _TOUCHING * spacing), length)
+    return ~blocked
+
+
+def _connections(
+    coupling: Array, touched: Index, places: Index, free: NDArray[np.bool_], shape: tuple[int, int, int]
+) -> tuple[Index, Index]:
+    """Return the pairs of cells (k,) and (k,) between which sound passes, of the touched ones at `places`."""
+    size = np.abs(coupling)
+    row, neighbour = size.sum(axis=1), touched[places, None] + flat_offsets(shape)
+    place = np.searchsorted(touched, neighbour).clip(max=len(touched) - 1)
+    theirs = np.where(touched[place] == neighbour, row[place], np.inf)
+    passes = (size[places] > _CLOSED * np.minimum(row[places, None], theirs)) & free[neighbour]
+    first, offset = np.nonzero(passes)
+    return touched[places[first]], neighbour[first, offset]

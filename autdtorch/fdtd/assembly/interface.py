@@ -6,38 +6,43 @@ In an element of one material both are those of the tuned stencil. An interface 
 - for axis-aligned faces, a product of the direction across the faces and the two others;
 - for other surfaces of fluids, the forces or the energies of local fields (`smooth_faces.py`);
 - masses on their side of the surface, except for the share of a flow through it which reaches the other side;
-- at other surfaces of sound-hard bodies, and edges of fluids, the finite elements of `sound_hard.py` instead.
+- at other surfaces of rigid bodies, and tilted edges of dense fluids, finite elements.
+
+Finite elements have trilinear functions, integrated over the part that is no such body (a cut finite element
+method, Burman et al. 2015, doi:10.1002/nme.4823). Vertices in the body have a pressure, which continues the
+field beyond the surface. A pressure that varies linearly along the surface then causes no force at any
+vertex, wherever the surface falls between the cells. The difference of the tuned stencil from finite elements
+is added in proportion to the volume.
 
 `docs/decisions/surfaces.md` compares this treatment with others.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.assembly.coverage import (
-    distance_to_material,
-    line_coverage,
-    shares,
-    volume_coverage,
-)
 from autdtorch.fdtd.assembly.element import (
     CORNERS,
     FAR,
     PAIRS,
     SUBCELLS,
+    VERTICES,
     InterfaceElements,
     Materials,
+    distance_to_material,
+    line_coverage,
+    shares,
+    stiffness_matrix,
+    subcell_means,
     uniform_coupling,
+    volume_coverage,
 )
-from autdtorch.fdtd.assembly.flat_faces import crossed_by_layers, flat_elements, layered_axis
-from autdtorch.fdtd.assembly.layers import mean_thickness
-from autdtorch.fdtd.assembly.masses import balanced_mass, lumped_mass
-from autdtorch.fdtd.assembly.smooth_faces import Surface, smooth_stiffness, surfaces
-from autdtorch.fdtd.assembly.sound_hard import added_thickness, cut_coupling, cut_mass
+from autdtorch.fdtd.assembly.layers import crossed_by_layers, flat_elements, layered_axis, mean_thickness
+from autdtorch.fdtd.assembly.smooth_faces import Surface, fields, smooth_stiffness, surfaces
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 
@@ -181,3 +186,95 @@ def _moved_shares(surface: Surface, pair: Index, thickness: float, count: int) -
     np.put_along_axis(share, pair[:, None, :1], (1 - part)[:, :, None], axis=2)
     np.put_along_axis(share, pair[:, None, 1:], part[:, :, None], axis=2)
     return share
+
+
+_MOST_TAKEN = 0.8  # Largest share of a vertex's mass that is taken away
+
+
+def lumped_mass(vertex: Index, volumes: Array, materials: Materials) -> Array:
+    """Return masses at the vertices (n, 8).
+
+    Vertices in a material take its mass, except for the share of a flow through the surface which reaches
+    other fluids. With one face across the line between two vertices, both standing waves are then exact.
+    """
+    total = np.zeros(vertex.shape)
+    mean = volumes.mean(axis=1) @ materials.density
+    for own, mass in enumerate(materials.mass):
+        inside = vertex == own
+        beside = ~inside & ~materials.sound_hard[vertex]
+        beside[~inside.any(axis=1)] = True
+        near, far = inside @ HATS.T, beside @ HATS.T
+        passed = np.minimum(1, (materials.density[own] / mean)[:, None] * far)
+        passed[~inside.any(axis=1)] = 1
+        volume = volumes[:, :, own] / SUBCELLS**3
+        here = (volume * np.divide(1 - passed, near, out=np.zeros_like(near), where=near > 0)) @ HATS
+        there = (volume * np.divide(passed, far, out=np.zeros_like(far), where=far > 0)) @ HATS
+        total += mass * (np.where(inside, here, 0) + np.where(beside, there, 0))
+    return total
+
+
+def balanced_mass(surface: Surface, own: Array, mass: Array) -> Array:
+    """Return masses (n, 8) with the same sums, and the exact first moment with the kinked local field.
+
+    `own` (n, 2) are the masses of cells of the outer and the inner material. A wave across the surface then
+    feels no moment of the masses, as it feels no force.
+    """
+    middle, inside = subcell_means(surface.level), volume_coverage(surface.level)
+    cut = (inside > 0) & (inside < 1)
+    half = np.abs(surface.normal).sum(axis=1)[:, None] / SUBCELLS / 2
+    moment, density = np.zeros(len(mass)), surface.density * own / SUBCELLS**3
+    for side, part in enumerate((1 - inside, inside)):
+        end = middle + half if side == 0 else middle - half
+        depth = np.where(cut, end / 2, middle)
+        moment += density[:, side] * (part * depth).sum(axis=1)
+    kinked, whole = fields(surface)[:, :, 2], mass.sum(axis=1)
+    mean = np.divide((mass * kinked).sum(axis=1), whole, out=np.zeros_like(whole), where=whole > 0)
+    rise = kinked - mean[:, None]
+    square = (mass * rise**2).sum(axis=1)
+    scale = np.divide(moment - whole * mean, square, out=np.zeros_like(square), where=square > 0)
+    change = rise * scale[:, None]
+    least = change.min(axis=1, keepdims=True)
+    return np.asarray(mass * (1 + change * np.minimum(1, _MOST_TAKEN / np.maximum(-least, 1e-12))))
+
+
+_SUBCENTRES = (np.array(list(np.ndindex((SUBCELLS,) * 3))) + 0.5) / SUBCELLS
+# Linear factors of the trilinear functions of the vertices at the centres of the sub-cells (64, 8, 3)
+_FACTORS = np.where(VERTICES == 1, _SUBCENTRES[:, None], 1 - _SUBCENTRES[:, None])
+HATS = _FACTORS.prod(axis=2)  # Trilinear functions of the vertices at the centres of the sub-cells (64, 8)
+# Their gradients (64, 8, 3)
+_SLOPES = np.stack(
+    [(2 * VERTICES[:, axis] - 1) * np.delete(_FACTORS, axis, axis=2).prod(axis=2) for axis in range(3)],
+    axis=2,
+)
+_PRODUCTS = np.einsum("qix,qjx->qij", _SLOPES, _SLOPES)
+
+
+def cut_coupling(volumes: Array, materials: Materials, reductions: Array, stencil: Stencil) -> Array:
+    """Return the coupling (n, 28) of elements, from the share of each material in sub-cells (n, 64, m).
+
+    `reductions` (n, 3, 3) is the share of the stiffness that is taken away near edges.
+    """
+    mobility = volumes @ np.where(materials.sound_hard, 0, 1 / materials.density) / SUBCELLS**3
+    tuning = stiffness_matrix(uniform_coupling(stencil)[None])[0] - _PRODUCTS.mean(axis=0)
+    near = np.trace(reductions, axis1=1, axis2=2) / 2
+    matrix = np.tensordot(mobility, _PRODUCTS, axes=1)
+    matrix += ((1 - near) * mobility.sum(axis=1))[:, None, None] * tuning
+    some = np.flatnonzero(near)
+    across = _SLOPES @ reductions[some, None]
+    matrix[some] -= np.einsum("nq,nqix,qjx->nij", mobility[some], across, _SLOPES, optimize=True)
+    return np.asarray(-matrix[:, PAIRS[:, 0], PAIRS[:, 1]])
+
+
+def cut_mass(volumes: Array, materials: Materials) -> Array:
+    """Return the masses at the vertices (n, 8), from the share of each material in sub-cells (n, 64, m)."""
+    return np.asarray(volumes @ np.where(materials.sound_hard, 0, materials.mass) @ HATS / SUBCELLS**3)
+
+
+def added_thickness(kappa: float) -> float:
+    """Return the thickness [cells] by which sound-hard bodies are grown, about kappa^2 / 24.
+
+    A wave on the grid is otherwise reflected so far behind the surface, at any tilt and incidence. It is the
+    mean of kappa^2 (d^3 / 3 - d / 12) over all places d of a face between the cells, and higher terms;
+    `layers.mean_thickness` serves fluids.
+    """
+    return (math.tan(kappa / 2) / (kappa / 2) - 1) / 2

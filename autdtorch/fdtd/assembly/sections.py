@@ -1,4 +1,8 @@
-"""Sections across bodies whose faces are parallel to the grid, and their elements without edges."""
+"""Sections across bodies whose faces are parallel to the grid, and the fields of long waves in them.
+
+The fields in a window around a section are solved by finite elements, on a mesh that is graded towards the
+edges, where fields are singular. At the window's rim they are the smoothest that the materials allow.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh
 from scipy.ndimage import label
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.linalg import splu
 
 from autdtorch.fdtd.assembly.element import coupling_by_edges
 from autdtorch.fdtd.assembly.layers import long_wave_port, long_wave_shares
@@ -116,3 +124,167 @@ def mean_densities(section: Section, x: int, y: int, kinds: Kinds) -> Array:
     places = np.array((x, y)) + begin + share[:, None] * (end - begin)
     block = section.blocks_at(places[..., 0], places[..., 1])
     return np.asarray(np.array(kinds.density)[np.array(section.material)[block]].mean(axis=1))
+
+
+# Elements of the mesh on each side of a section: more than those of the window, in which fields are smoother
+_REACH = 5
+# Lines of the mesh on each side of a face: the distance of the farthest [cells], the ratio of the next, their
+# number, and the least distance from other lines, relative to that from the face
+_FARTHEST, _NEARER, _LINES, _APART = 0.5, 0.4, 6, 0.6
+_RIM_STEP = 0.25  # Distance of the points that determine the fields at the rim [cells]
+_ROUNDING = 1e-9  # Distance of lines that are one [cells]
+# Quadratic elements of unit length: stiffness, mass and integral
+_STIFFNESS = np.array([[7, -8, 1], [-8, 16, -8], [1, -8, 7]]) / 3
+_MASS = np.array([[4, 2, -1], [2, 16, 2], [-1, 2, 4]]) / 30
+_INTEGRAL = np.array([1, 4, 1]) / 6
+_ALONG_X = np.einsum("ab,cd->acbd", _STIFFNESS, _MASS).reshape(9, 9)
+_ALONG_Y = np.einsum("ab,cd->acbd", _MASS, _STIFFNESS).reshape(9, 9)
+
+
+class PlaneFields(NamedTuple):
+    """m fields of long waves in the window around a section; the first one is constant."""
+
+    values: Array  # at the vertices of the window's elements (p, q, m); zero in sound-hard materials
+    present: NDArray[np.bool_]  # which vertices are not in sound-hard materials (p, q)
+    order: Array  # power with which each field grows with the distance (m,)
+    lines: tuple[Array, Array]  # lines of the mesh, in the coordinates of the section
+    material: Index  # material of each cell of the mesh (c, d)
+    integrals: Array  # integral of each field over each cell of the mesh (c, d, m)
+
+    def over_element(self, weight: Array, x: int, y: int) -> Array:
+        """Return the integrals (m,) over the element at (x, y), with a weight for each material."""
+        (first, last), (low, high) = (
+            np.searchsorted(line, (begin - _ROUNDING, begin + 1 - _ROUNDING))
+            for line, begin in zip(self.lines, (x, y), strict=True)
+        )
+        weights = weight[self.material[first:last, low:high]]
+        return np.asarray(np.einsum("cd,cdm->m", weights, self.integrals[first:last, low:high]))
+
+
+def plane_fields(section: Section, mobility: Array, count: int) -> PlaneFields:
+    """Return the constant field and `count` others, by the mobility of each material, zero if sound-hard."""
+    x, y = (_mesh_lines(np.array(cuts), size) for cuts, size in zip(section.cuts, section.size, strict=True))
+    middles = [(line[1:] + line[:-1]) / 2 for line in (x, y)]
+    material = np.array(section.material)[np.ix_(*section.blocks_at(*middles))]
+    nodes = [np.sort(np.concatenate(pair)) for pair in zip((x, y), middles, strict=True)]
+    shape = len(nodes[0]), len(nodes[1])
+    width, height = np.diff(x)[:, None], np.diff(y)[None, :]
+    first = 2 * np.arange(len(width))[:, None] * shape[1] + 2 * np.arange(height.size)
+    number = first[:, :, None] + (np.arange(3)[:, None] * shape[1] + np.arange(3)).ravel()
+    matrix = _stiffness(number, mobility[material], width, height, shape)
+    used, rim = np.zeros(shape, bool), np.ones(shape, bool)
+    used.ravel()[number[mobility[material] > 0]] = True
+    rim[1:-1, 1:-1] = False
+    given, free = (used & rim).ravel(), (used & ~rim).ravel()
+    outside, order = _rim_fields(section, mobility, nodes, count)
+    field = np.zeros((used.size, len(order)))
+    field[:, 0] = used.ravel()
+    field[given, 1:] = outside.reshape(used.size, -1)[given]
+    field[free, 1:] = _solved(matrix[free][:, free], matrix[free][:, given] @ -field[given, 1:])
+    share = width[:, :, None] * height[:, :, None] * np.outer(_INTEGRAL, _INTEGRAL).ravel()
+    at = np.ix_(*map(_places_of_vertices, nodes, section.size))
+    return PlaneFields(
+        field.reshape(*shape, -1)[at],
+        used[at],
+        order,
+        (x, y),
+        material,
+        np.einsum("cdn,cdnm->cdm", share, field[number], optimize=True),
+    )
+
+
+def _places_of_vertices(nodes: Array, size: int) -> Index:
+    """Return the indices of the vertices of elements among the nodes along an axis."""
+    return np.searchsorted(nodes, np.arange(-RING, size + RING + 1) - _ROUNDING)
+
+
+def _mesh_lines(cuts: Array, size: int) -> Array:
+    """Return the lines of the mesh along an axis: vertices, faces, and lines graded towards the faces."""
+    fixed = np.unique(np.concatenate((np.arange(-_REACH, size + _REACH + 1.0), cuts)))
+    distance = _FARTHEST * _NEARER ** np.arange(_LINES)
+    lines = [fixed]
+    for cut in cuts:
+        graded = cut + np.concatenate((-distance, distance))
+        others = fixed[fixed != cut]
+        gap = np.abs(graded[:, None] - others).min(axis=1)
+        lines.append(graded[gap > _APART * np.abs(graded - cut)])
+    found = np.unique(np.concatenate(lines))
+    return found[np.diff(found, prepend=-np.inf) > _ROUNDING]
+
+
+def _stiffness(
+    number: Index, mobility: Array, width: Array, height: Array, shape: tuple[int, int]
+) -> csr_array:
+    """Return the stiffness matrix of biquadratic elements with nodes `number` (c, d, 9)."""
+    own = mobility > 0
+    along_x, along_y = (mobility * height / width)[own], (mobility * width / height)[own]
+    local = along_x[:, None, None] * _ALONG_X + along_y[:, None, None] * _ALONG_Y
+    rows = np.broadcast_to(number[own][:, :, None], local.shape)
+    columns = np.broadcast_to(number[own][:, None, :], local.shape)
+    size = shape[0] * shape[1]
+    return csr_array(coo_array((local.ravel(), (rows.ravel(), columns.ravel())), (size, size)))
+
+
+def _solved(matrix: csr_array, right: Array) -> Array:
+    """Return the solution of a symmetric positive system."""
+    settings = {"SymmetricMode": True}
+    solver = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=settings)
+    return np.asarray(solver.solve(right))
+
+
+def _rim_fields(section: Section, mobility: Array, nodes: list[Array], count: int) -> tuple[Array, Array]:
+    """Return values (nx, ny, count) at the nodes on the rim, and the orders (count + 1,) of all fields.
+
+    They are the smoothest eigenfunctions of the second derivative along the rim, weighted by mobility.
+    """
+    (low_x, high_x), (low_y, high_y) = ((each[0], each[-1]) for each in nodes)
+    along = [
+        np.unique(np.concatenate((np.arange(low, high + _ROUNDING, _RIM_STEP), cuts)))
+        for low, high, cuts in ((low_x, high_x, section.cuts[0]), (low_y, high_y, section.cuts[1]))
+    ]
+    along = [each[np.diff(each, prepend=-np.inf) > _ROUNDING] for each in along]
+    wide, tall = high_x - low_x, high_y - low_y
+    whole = 2 * (wide + tall)
+    up, right = along[0][:-1] - low_x, along[1][:-1] - low_y
+    back, left = high_x - along[0][:0:-1], high_y - along[1][:0:-1]
+    place = np.concatenate((up, wide + right, wide + tall + back, 2 * wide + tall + left))
+    step = np.diff(place, append=whole)
+    middle = place + step / 2
+    sides = [middle < wide, middle < wide + tall, middle < 2 * wide + tall]
+    x = np.select(sides, [low_x + middle, np.full_like(middle, high_x), high_x - middle + wide + tall], low_x)
+    y = np.select(
+        sides,
+        [np.full_like(middle, low_y), low_y + middle - wide, np.full_like(middle, high_y)],
+        high_y - middle + 2 * wide + tall,
+    )
+    own = mobility[np.array(section.material)[section.blocks_at(x, y)]]
+    value, order = _smoothest(step, own, count)
+    at = np.full((len(nodes[0]), len(nodes[1])), np.nan)
+    at[0], at[:, -1] = 2 * wide + tall + high_y - nodes[1], wide + tall + high_x - nodes[0]
+    at[-1], at[:, 0] = wide + nodes[1] - low_y, nodes[0] - low_x
+    ends, closed = np.append(place, whole), np.vstack((value, value[:1]))
+    outside = np.stack([np.interp(at, ends, each) for each in closed.T], axis=-1)
+    return outside, np.concatenate(([0.0], order * whole / (2 * np.pi)))
+
+
+def _smoothest(step: Array, mobility: Array, count: int) -> tuple[Array, Array]:
+    """Return functions (n, count) on a closed line, of least energy, and their wavenumbers (count,).
+
+    Linear elements of lengths (n,); where the mobility (n,) is zero, the line is interrupted.
+    """
+    size, here = len(step), np.arange(len(step))
+    ahead = np.roll(here, -1)
+    stiffness, mass = np.zeros((size, size)), np.zeros(size)
+    slope = mobility / step
+    for one in (here, ahead):
+        np.add.at(stiffness, (one, one), slope)
+        np.add.at(mass, one, mobility * step / 2)
+    np.add.at(stiffness, (here, ahead), -slope)
+    np.add.at(stiffness, (ahead, here), -slope)
+    some = np.flatnonzero(mass)
+    scale = 1 / np.sqrt(mass[some])
+    last = min(count, len(some) - 1)
+    square, vectors = eigh(stiffness[np.ix_(some, some)] * scale[:, None] * scale, subset_by_index=(1, last))
+    value = np.zeros((size, last))
+    value[some] = vectors * scale[:, None] * np.sqrt(mass.sum())
+    return value, np.sqrt(np.maximum(square, 0))

@@ -18,8 +18,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.assembly.coverage import subcell_means
-from autdtorch.fdtd.assembly.element import CORNERS, LATTICE, PAIRS, SUBCELLS, VERTICES, stiffness_matrix
+from autdtorch.fdtd.assembly.element import (
+    CORNERS,
+    LATTICE,
+    PAIRS,
+    SUBCELLS,
+    VERTICES,
+    stiffness_matrix,
+    subcell_means,
+)
 from autdtorch.utils.array_types import Array, Index
 
 # Smallest mean gradient of a signed distance with one normal. The two faces of a thin plate cancel.

@@ -1,4 +1,9 @@
-"""Bodies as the assembly sees them: unions of consecutive bodies of one material, and the materials."""
+"""Bodies as the assembly sees them: unions of consecutive bodies of one material, and the materials.
+
+Elements measure bodies on a lattice of points a quarter of a cell apart, so that they would miss a rigid
+sheet between these. Such sheets, oblique to the grid, are thickened (`docs/decisions/surfaces.md` has
+figures).
+"""
 
 from __future__ import annotations
 
@@ -10,12 +15,55 @@ import numpy as np
 import torch
 
 from autdtorch.fdtd.assembly.element import Materials
-from autdtorch.fdtd.assembly.sheets import thickened
-from autdtorch.fdtd.assembly.slender import is_along, slender_faces
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Fluid, Region, Shape, bounds
 from autdtorch.fdtd.stencil import Stencil
+from autdtorch.fdtd.turning import is_along, slender_faces
 from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.triangles import extents, mean_thickness
+from autdtorch.utils.validation import Vector
+
+_THINNEST = 0.32  # Least thickness [cells]
+_OPEN = 1e-9  # Thickness [cells] up to which a surface is not closed, such as that of a half-space
+_WIDE = 2.0  # Least extent [cells] of a sheet along two axes: needles would become much thicker than they are
+
+
+@dataclass(frozen=True, eq=False)
+class Thickened:
+    """A shape whose surface is moved outwards."""
+
+    shape: Shape
+    distance: float  # of the surfaces [m]
+
+    @property
+    def lower(self) -> Vector:
+        """Corner of the bounding box with the smallest coordinates (3,) [m]."""
+        x, y, z = self.shape.lower
+        return x - self.distance, y - self.distance, z - self.distance
+
+    @property
+    def upper(self) -> Vector:
+        """Corner of the bounding box with the largest coordinates (3,) [m]."""
+        x, y, z = self.shape.upper
+        return x + self.distance, y + self.distance, z + self.distance
+
+    def signed_distance(self, points: torch.Tensor, /) -> torch.Tensor:
+        """Return the distance (...) [m] of points (..., 3) to the surface, negative inside."""
+        return self.shape.signed_distance(points) - self.distance
+
+    def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the vertices (V, 3) [m] and triangles (F, 3) of the shape as it was."""
+        return self.shape.surface()
+
+
+def thickened(shape: Shape, spacing: float) -> Shape:
+    """Return a sheet of the least thickness on cells of a spacing [m], and any other shape as it is."""
+    vertices, triangles = (part.numpy() for part in shape.surface())
+    thickness = mean_thickness(vertices, triangles) / spacing
+    if not _OPEN < thickness < _THINNEST or extents(vertices)[1] < _WIDE * spacing:
+        return shape
+    return Thickened(shape, (_THINNEST - thickness) * spacing / 2)
+
 
 # Density with which sound-hard bodies are assembled. Cells that stay almost uncoupled become sound-hard.
 _SOUND_HARD_DENSITY = 1e5

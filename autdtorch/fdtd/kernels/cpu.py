@@ -2,14 +2,18 @@
 
 The shape of the grid alone determines its chunks of planes (`_cuts`), so that results do not depend on the
 number of threads. A step sweeps each chunk once (`cpu_sweep.py`). Then the outermost planes of a chunk
-receive the terms of its neighbours, and single cells are corrected. Workers claim the chunks one by one
-(`cpu_workers.py`). A small grid is one chunk, stepped by one thread: several runs can be stepped
-concurrently.
+receive the terms of its neighbours, and single cells are corrected. A small grid is one chunk, stepped by one
+thread: several runs can be stepped concurrently.
+
+Workers do these tasks, which are numbered phase by phase. A worker claims the next task, waits until all
+tasks of earlier phases are finished, and does it. A suspended worker delays the others by one task, and
+waiting workers yield to it.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -19,22 +23,34 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.kernels.compiled import INNER, entry
 from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, State
-from autdtorch.fdtd.kernels.cpu_layers import stretch
-from autdtorch.fdtd.kernels.cpu_layout import FlatMemory, plane_profiles, rows_profile
-from autdtorch.fdtd.kernels.cpu_rows import row_offsets
+from autdtorch.fdtd.kernels.cpu_intrinsics import add_to_counter, give_way, read_counter, row_offsets
+from autdtorch.fdtd.kernels.cpu_layers import FlatMemory, plane_profiles, rows_profile, stretch
 from autdtorch.fdtd.kernels.cpu_sweep import sweep_planes
-from autdtorch.fdtd.kernels.cpu_workers import COUNTERS, claim, finish, share_of_processors, wait_for
 from autdtorch.fdtd.stencil import OFFSETS
 from autdtorch.utils.array_types import AnyArray
-from autdtorch.utils.threads import thread_count
+from autdtorch.utils.threads import spread, thread_count
 
 # Fewest cells and planes of a chunk, for which a second thread and the sums at its ends pay
 _CHUNK_CELLS, _CHUNK_PLANES = 200_000, 32
-# Cells of the layers across an axis that are computed at once
-_GROUP_CELLS = 3000
+_GROUP_CELLS = 3000  # Cells of the layers across an axis that are computed at once
 # Shares of the processors' time that workers got: below the first a single worker continues, above the second
 # several again
 _CROWDED, _FREE = 0.75, 0.9
+_COUNTERS = 32  # Numbers that hold the two counters, 0 at first
+_CLAIMED, _FINISHED = 0, 16  # Their places, on separate cache lines
+_TICKS = 10  # Fewest ticks of the thread clock for a meaningful time
+# Polls of the counter before a waiting worker yields: a few microseconds, less than waking costs
+_LOOKS = 2000
+
+
+@njit(**INNER)
+def _wait_for(counters, tasks):  # type: ignore[no-untyped-def]
+    """Wait until so many tasks are finished."""
+    looks = 0
+    while read_counter(counters, _FINISHED) < tasks:
+        looks += 1
+        if looks > _LOOKS:
+            give_way()
 
 
 @njit(**INNER)
@@ -42,9 +58,9 @@ def _record(p, receivers, first, last, out):  # type: ignore[no-untyped-def]
     index, weight = receivers  # a row for each cell of a receiver
     out[first:last] = 0
     for m in range(len(index)):
-        own, share = index[m], weight[m]
+        cell, share = index[m], weight[m]
         for r in range(first, last):
-            out[r] += share[r] * p[own[r]]
+            out[r] += share[r] * p[cell[r]]
 
 
 @njit(**INNER)
@@ -52,15 +68,15 @@ def _sweep_chunk(c, p, q, medium, layers, cells, room):  # type: ignore[no-untyp
     cuts, starts = medium[0], medium[1]
     y, e_y, z, e_z, yz, e_yz, a, b, across, outermost = room
     terms = (y[c], e_y[c]), (z[c], e_z[c]), (yz[c], e_yz[c])
-    own = across[c], outermost[c], terms, (a[c], b[c])
+    room_of_chunk = across[c], outermost[c], terms, (a[c], b[c])
     psi_x, zeta_x, psi_y, zeta_y, psi_z, zeta_z, psi_yz, zeta_yz = layers
     memory = (psi_y, zeta_y), (psi_z, zeta_z), (psi_yz, zeta_yz)
     first, last = np.uint64(cuts[c]), np.uint64(cuts[c + 1])
-    shape, weights, profile = medium[4:7], medium[7:12], medium[12:14]
-    profiles = medium[14:17]
+    shape, weights, profile, profiles = medium[4:7], medium[7:12], medium[12:14], medium[14:17]
     sweep_planes(
-        p, q, first, last, shape, weights, (psi_x, zeta_x), profile, memory, profiles, cells, starts, own
-    )
+        p, q, first, last, shape, weights, (psi_x, zeta_x), profile, memory, profiles, cells, starts,
+        room_of_chunk,
+    )  # fmt: skip
 
 
 @njit(**INNER)
@@ -82,9 +98,9 @@ def _finish_chunk(c, q, medium, cells, outermost, sources, row, sound_hard):  # 
         q[index[n]] = new[n] + absorbed
     driven, force = sources
     for s in range(len(row)):
-        own, now = force[s], row[s]
+        force_of_signal, signal = force[s], row[s]
         for n in range(driven_starts[c], driven_starts[c + 1]):
-            q[driven[n]] += own[n] * now
+            q[driven[n]] += force_of_signal[n] * signal
     for n in range(hard_starts[c], hard_starts[c + 1]):
         q[sound_hard[n]] = 0
 
@@ -138,11 +154,11 @@ def _advance(  # type: ignore[no-untyped-def]
     chunks, steps, read = len(medium[0]) - 1, len(signal), recorded.shape[1]
     kinds = 3 if len(columns[0][0]) else 2
     for _ in range((kinds * steps + 1) * chunks):
-        task = claim(counters)
+        task = add_to_counter(counters, _CLAIMED, 1)
         phase, c = task // chunks, task % chunks
         if phase > kinds * steps:
             break
-        wait_for(counters, phase * chunks)
+        _wait_for(counters, phase * chunks)
         step, kind = phase // kinds, phase % kinds
         now, new = (p, q) if step % 2 == 0 else (q, p)
         if kind == 0:
@@ -157,7 +173,7 @@ def _advance(  # type: ignore[no-untyped-def]
             _finish_columns(now, new, columns, memory)
             for n in range(len(sound_hard)):
                 new[sound_hard[n]] = 0
-        finish(counters)
+        add_to_counter(counters, _FINISHED, 1)
 
 
 def _cuts(shape: tuple[int, ...]) -> NDArray[np.int64]:
@@ -197,6 +213,21 @@ def _heterogeneous_cells(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, 
     scale[np.searchsorted(index, c.layer_index.numpy())] = c.layer_scale.numpy()
     new, swept = np.empty_like(scale), np.empty_like(scale)
     return index, weight.reshape(-1), row_offsets(shape), scale, air, new, swept
+
+
+def _share_of_processors(work: Callable[[], object], workers: int) -> float:
+    """Run `work` on several workers; return the share of the time in which they had a processor, 0 to 1."""
+
+    def timed(_: int) -> float:
+        begin = time.thread_time()
+        work()
+        return time.thread_time() - begin
+
+    begin = time.perf_counter()
+    spent, took = sum(spread(timed, range(workers), workers)), time.perf_counter() - begin
+    if took < _TICKS * time.get_clock_info("thread_time").resolution:  # 16 ms on Windows
+        return 1.0
+    return spent / (workers * took)
 
 
 def _unsigned(index: torch.Tensor) -> AnyArray:
@@ -249,7 +280,7 @@ class CpuKernel:
             (_unsigned(receivers.index.mT), receivers.weight.mT.contiguous().numpy()),
             signal.contiguous().numpy(),
             recorded.numpy(),
-            np.zeros(COUNTERS, np.int64),
+            np.zeros(_COUNTERS, np.int64),
         )
         self._work(lambda: _advance(*arguments), len(cuts) - 1)
         memory.give_back()
@@ -259,6 +290,22 @@ class CpuKernel:
     def _work(self, advance: Callable[[], object], chunks: int) -> None:
         """Step on as many threads as chunks and free processors; workers that wait are slower than one."""
         workers = 1 if self._crowded else min(thread_count(), chunks)
-        share = share_of_processors(advance, workers)
+        share = _share_of_processors(advance, workers)
         if chunks > 1:
             self._crowded = share < (_FREE if self._crowded else _CROWDED)
+
+
+@entry(fastmath={"reassoc", "nsz"})  # vectorises sums of products; nothing that could be inlined is called
+def correlate(first, last, adjoint, field, index, offsets, place, total):  # type: ignore[no-untyped-def]
+    """Add sums of lambda_i (p_j - p_i) over the steps to rows `first` to `last` of `total` (n, 27).
+
+    `adjoint` is lambda (n, steps) in the cells `index` (n,), `field` is p (k, steps) in these and their
+    neighbours at `offsets` (27,). `place` is the row of a cell in `field`.
+    """
+    for i in range(first, last):
+        here = place[index[i]]
+        for j in range(len(offsets)):
+            other, product = place[index[i] + offsets[j]], total[i, j]
+            for t in range(adjoint.shape[1]):
+                product += adjoint[i, t] * (field[other, t] - field[here, t])
+            total[i, j] = product

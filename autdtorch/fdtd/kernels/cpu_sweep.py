@@ -20,8 +20,8 @@ import numpy as np
 from numba import njit
 
 from autdtorch.fdtd.kernels.compiled import INNER
+from autdtorch.fdtd.kernels.cpu_intrinsics import sum_of_rows
 from autdtorch.fdtd.kernels.cpu_layers import absorb_x, add_terms, stretch_planes
-from autdtorch.fdtd.kernels.cpu_rows import sum_of_rows
 
 _U = np.uint64
 

@@ -1,0 +1,119 @@
+"""Operations that Numba lacks: on four cells of a row at a time, and on counters of several threads.
+
+Numba vectorises neither the rows around heterogeneous cells, which are scattered and whose sums keep an
+order, nor the short ends of rows with the cells of boundary layers.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from typing import Any
+
+import llvmlite.binding
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from autdtorch.fdtd.stencil import flat_offsets
+from autdtorch.utils.array_types import Index
+
+_WIDTH = 4  # Cells of a row that are read: three neighbours, and a lane of padding with weight zero
+# Neighbour read first in each row, and the lane of padding: no read leaves the grid or the weights
+_FIRST, _PADDING = (*range(0, 24, 3), 23), (*8 * (3,), 0)
+
+
+def row_offsets(shape: tuple[int, ...]) -> Index:
+    """Return the flat offsets (9,) from a cell to the first cells read of the nine rows around it."""
+    first = np.array(flat_offsets(shape)[::3])
+    first[8] -= 1
+    return first
+
+
+def _item(context: Any, builder: Any, signature: Any, arguments: Any, array: int, index: Any) -> Any:
+    """Return the pointer to an item of the argument number `array`."""
+    kind = signature.args[array]
+    items = context.make_array(kind)(context, builder, arguments[array])
+    return cgutils.get_item_pointer(context, builder, kind, items, [index], wraparound=False)  # type: ignore[no-untyped-call]
+
+
+def _sum_of_rows(typing_context: Any, p: Any, cell: Any, offset: Any, weight: Any, at: Any) -> Any:
+    """Return the sum of weight[at + j] * (p[neighbour j] - p[cell]) over the 27 neighbours j."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        number, long = context.get_data_type(p.dtype), ir.IntType(64)
+        row, size = ir.VectorType(number, _WIDTH), context.get_abi_sizeof(number)
+        _, at_cell, _, _, first_weight = arguments
+
+        def pointer(array: int, index: Any) -> Any:
+            return _item(context, builder, signature, arguments, array, index)
+
+        def load(array: int, index: Any) -> Any:
+            return builder.load(builder.bitcast(pointer(array, index), row.as_pointer()), align=size)
+
+        def lane(j: int) -> Any:
+            return ir.Constant(ir.IntType(32), j)
+
+        pressure, here = builder.load(pointer(0, at_cell)), ir.Constant(row, None)
+        for j in range(_WIDTH):
+            here = builder.insert_element(here, pressure, lane(j))
+        total = ir.Constant(row, None)
+        for r, (first, padding) in enumerate(zip(_FIRST, _PADDING, strict=True)):
+            step = builder.load(pointer(2, ir.Constant(long, r)))
+            rise = builder.fsub(load(0, builder.add(at_cell, step)), here)
+            weights = load(3, builder.add(first_weight, ir.Constant(long, first)))
+            weights = builder.insert_element(weights, ir.Constant(number, 0.0), lane(padding))
+            total = builder.fadd(total, builder.fmul(weights, rise))
+        parts = [builder.extract_element(total, lane(j)) for j in range(_WIDTH)]
+        return builder.fadd(builder.fadd(parts[0], parts[2]), builder.fadd(parts[1], parts[3]))
+
+    return p.dtype(p, types.int64, offset, weight, types.int64), generate
+
+
+def _add_four(typing_context: Any, u: Any, at: Any, v: Any, start: Any) -> Any:
+    """Add four cells of v from `start` on to those of u from `at` on."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        number = context.get_data_type(u.dtype)
+        row, size = ir.VectorType(number, _WIDTH).as_pointer(), context.get_abi_sizeof(number)
+        here, there = (
+            builder.bitcast(_item(context, builder, signature, arguments, k, arguments[k + 1]), row)
+            for k in (0, 2)
+        )
+        total = builder.fadd(builder.load(here, align=size), builder.load(there, align=size))
+        builder.store(total, here, align=size)
+        return context.get_dummy_value()
+
+    return types.void(u, types.uint64, v, types.uint64), generate
+
+
+def _add_atomically(typing_context: Any, counters: Any, place: Any, amount: Any) -> Any:
+    """Add to a counter and return its old value."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        counter = _item(context, builder, signature, arguments, 0, arguments[1])
+        return builder.atomic_rmw("add", counter, arguments[2], "seq_cst")
+
+    return types.int64(counters, types.int64, types.int64), generate
+
+
+def _read_atomically(typing_context: Any, counters: Any, place: Any) -> Any:
+    """Return a counter, with all writes before it was last added to (acquire)."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        counter = _item(context, builder, signature, arguments, 0, arguments[1])
+        return builder.load_atomic(counter, "acquire", 8)
+
+    return types.int64(counters, types.int64), generate
+
+
+sum_of_rows: Any = intrinsic(_sum_of_rows)
+add_four: Any = intrinsic(_add_four)
+add_to_counter: Any = intrinsic(_add_atomically)
+read_counter: Any = intrinsic(_read_atomically)
+# The system's function that yields to other threads, by a name that kernels loaded from disk find
+_SYSTEM = ctypes.CDLL("kernel32").SwitchToThread if os.name == "nt" else ctypes.CDLL(None).sched_yield
+llvmlite.binding.add_symbol("autdtorch_give_way", ctypes.cast(_SYSTEM, ctypes.c_void_p).value)
+give_way = types.ExternalFunction("autdtorch_give_way", types.int32())
