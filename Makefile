@@ -6,7 +6,8 @@ ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
-INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt -e
+# Imports compile what they use: a minute less than compiling every file of every package here.
+INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet --no-compile -c constraints.txt -e
 
 # "make paper trials=50" passes trials=50 to Hydra, and so every variable of the command line except PYTHON and ARGS.
 OVERRIDES = $(strip $(foreach name,$(filter-out PYTHON ARGS,$(.VARIABLES)),$(if \
@@ -24,13 +25,15 @@ help:
 	@echo "make clean   remove .venv and the tools' caches; outputs/ stays"
 	@echo "PYTHON=python3.12 chooses the interpreter of .venv."
 
-$(INSTALLED): pyproject.toml constraints.txt
+$(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "autdtorch needs Python 3.11 or later; make PYTHON=python3.12 chooses one")'
 	$(PYTHON) -m venv $(VENV)
+
+$(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) .
 	@touch $@
 
-$(INSTALLED)-%: $(INSTALLED)
+$(INSTALLED)-%: pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) '.[$*]'
 	@touch $@
 

@@ -1,10 +1,13 @@
-"""Every test carries the marker named like its folder, so that ``pytest -m physics`` runs
-``tests/physics``. Where there is no GPU, Triton interprets the CUDA kernel on the CPU. Where pytest runs in
-several processes, these share the cores: threads that wait for each other on busy cores are many times
-slower."""
+"""Settings of all tests, and fixtures that several folders share.
+
+A test has the marker named like its folder, so that ``pytest -m physics`` runs ``tests/physics``. Without a
+GPU, Triton interprets the CUDA kernel on the CPU. Several processes of pytest share the cores: threads that
+wait for each other on busy cores are many times slower.
+"""
 
 import os
 import shutil
+import signal
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +19,14 @@ import torch
 
 TESTS = Path(__file__).parent
 
-# An example may take long where the machine has other work; pytest's own limit stays.
+# `nohup pytest &` in a script ignores signals that tests send, in this process and in those that it starts. A
+# handler of Python ends that: processes begin with the default action, and this one survives a hang-up.
+for name in ("SIGINT", "SIGQUIT", "SIGHUP"):
+    number = getattr(signal, name, None)
+    if number is not None and signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, signal.default_int_handler if name == "SIGINT" else lambda *_: None)
+
+# An example may take long on a busy machine; pytest's limit stays.
 hypothesis.settings.register_profile("autdtorch", deadline=None)
 hypothesis.settings.load_profile("autdtorch")
 
@@ -31,13 +41,13 @@ if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
 
 @pytest.fixture(autouse=True)
 def nothing_from_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tests simulate, whatever matrices the user keeps."""
+    """Simulate anew in every test, even if the user has a cache on disk."""
     monkeypatch.delenv("AUTDTORCH_CACHE_DIR", raising=False)
 
 
 @pytest.fixture(autouse=True)
 def no_timer_left_running() -> Iterator[None]:
-    """Outputs that a test leaves on are not switched off, with a warning, in the middle of another."""
+    """Cancel timers: outputs that a test leaves on would go off, with a warning, in the middle of another."""
     yield
     for thread in threading.enumerate():
         if isinstance(thread, threading.Timer):
@@ -47,11 +57,11 @@ def no_timer_left_running() -> Iterator[None]:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         item.add_marker(item.path.relative_to(TESTS).parts[0])
-    # the documentation takes longest to build: started last, it would leave the other processes idle
+    # The documentation takes longest to build: started last, it would leave the other processes idle.
     items.sort(key=lambda item: "docs" not in item.keywords)
 
 
-# of Chromium: CI runs as root, and the network is closed
+# For Chromium: CI runs as root, and the network is closed.
 SWITCHES = [
     "--no-sandbox",
     "--disable-gpu",
