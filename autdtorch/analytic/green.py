@@ -7,9 +7,9 @@ import math
 import torch
 
 from autdtorch.scene.arrays import TransducerArray, strengths_of
-from autdtorch.utils.cpu_tensors import COMPLEX
+from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.memory import require_memory
-from autdtorch.utils.neighbours import distances
+from autdtorch.utils.spatial import distances
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from scipy.special import j1
 
-from autdtorch.utils.cpu_tensors import COMPLEX
+from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.units import real_wavenumber
 from autdtorch.utils.validation import ArrayLike, Vector, points_tensor, positive, real_tensor, unit_vector
 

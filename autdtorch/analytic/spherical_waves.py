@@ -17,8 +17,7 @@ import numpy as np
 import torch
 from scipy.special import spherical_jn, spherical_yn
 
-from autdtorch.utils.array_types import ComplexArray
-from autdtorch.utils.cpu_tensors import COMPLEX, REAL
+from autdtorch.utils.array_types import COMPLEX, REAL, ComplexArray
 
 _LOST = 1e-280  # Magnitude below which j_l loses digits to underflow
 _TINY = 1e-12  # distance from the centre [m] below which a point has the direction z

@@ -18,7 +18,7 @@ from autdtorch.hardware.sensors.by_hand import typed
 from autdtorch.objectives.perturbations import random_rms
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.cpu_tensors import COMPLEX
+from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.validation import (
     boolean,

@@ -17,8 +17,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from autdtorch import hardware
 from autdtorch.cli.arguments import COMMANDS
+from autdtorch.io.yaml_file import TARGET
 from autdtorch.utils.hints import did_you_mean, with_extra
-from autdtorch.utils.trusted import TARGET
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 """Environment variable that asks for tracebacks."""

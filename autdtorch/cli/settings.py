@@ -13,13 +13,12 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from autdtorch.io.scene_file import load_scene
-from autdtorch.io.yaml_file import plain
+from autdtorch.io.yaml_file import TARGET, load_trusted, plain
 from autdtorch.methods.base import Method
 from autdtorch.methods.catalogue import METHODS
 from autdtorch.propagators import make_propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.study.run import StudyMethod
-from autdtorch.utils.trusted import TARGET, load_trusted
 from autdtorch.utils.validation import require_known
 
 _SETTINGS = (

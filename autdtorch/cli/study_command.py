@@ -25,8 +25,8 @@ from autdtorch.propagators import CACHE_VARIABLE
 from autdtorch.scene.scene import Scene
 from autdtorch.study.results import StudyResult, summary_rows
 from autdtorch.study.run import StudyMethod, name_of, run_study
+from autdtorch.utils.display import counted
 from autdtorch.utils.validation import require_one_of
-from autdtorch.utils.wording import counted
 
 _HELP = """autdtorch collect FOLDER [modules=NAME]
 

@@ -24,8 +24,7 @@ from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stencil import OFFSETS, Stencil
 from autdtorch.fdtd.stepping import Assembly, air_stencil, assembly_of
-from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL, Array, Index
 from autdtorch.utils.validation import fluid
 
 _STEP = 1e-4  # Relative step of the central differences: truncation and rounding are about 1e-8

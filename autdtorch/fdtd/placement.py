@@ -17,7 +17,7 @@ import numpy as np
 from autdtorch.fdtd.region import Region, Shape
 from autdtorch.fdtd.turning import ALIGNED, slender_faces
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.triangles import doubled_normals
+from autdtorch.utils.spatial import doubled_normals
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 # Distance of a face from a cell centre [cells] up to which the centre lies on it, and so in the obstacle

@@ -22,8 +22,7 @@ from torch import Tensor
 
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
 from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_basis, drive_signal, fourier_sum
-from autdtorch.utils.array_types import Index
-from autdtorch.utils.cpu_tensors import COMPLEX
+from autdtorch.utils.array_types import COMPLEX, Index
 
 Phasors = NDArray[np.complex128]
 # Fewest periods of a block. Shorter blocks cost more overhead, and the phasors kept cover less time.

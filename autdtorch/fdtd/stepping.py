@@ -22,7 +22,7 @@ from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, St
 from autdtorch.fdtd.region import Region, Shape
 from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import invalid
 
 logger = logging.getLogger(__name__)

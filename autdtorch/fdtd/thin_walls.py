@@ -11,7 +11,7 @@ import torch
 from autdtorch.fdtd.region import Region, Shape
 from autdtorch.fdtd.turning import is_along
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.triangles import doubled_normals, extents
+from autdtorch.utils.spatial import doubled_normals, extents
 
 logger = logging.getLogger(__name__)
 

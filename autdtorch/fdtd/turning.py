@@ -18,7 +18,7 @@ from torch import Tensor
 from autdtorch.fdtd.region import Region, Shape
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.cached import cached_property
-from autdtorch.utils.triangles import doubled_normals
+from autdtorch.utils.spatial import doubled_normals
 from autdtorch.utils.validation import Vector
 
 ALIGNED = 1 - 1e-9  # Smallest cosine between the normal of a face and an axis that is parallel to it

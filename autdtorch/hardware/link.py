@@ -18,7 +18,7 @@ from autdtorch.hardware.played import Wiring
 from autdtorch.hardware.transport.autd3_network import Autd3Port
 from autdtorch.hardware.transport.port import LinkError, Port, SerialPort, SharedPort, closed_on_error
 from autdtorch.hardware.transport.usb import find_device
-from autdtorch.utils.cpu_tensors import COMPLEX
+from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.validation import invalid, number_between, require_callable, require_kind
 
 #: Default settle time [s]. Sound goes 1.7 m in it; a T4010A1 rings up in some 30 periods, 0.75 ms, as the

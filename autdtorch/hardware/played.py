@@ -11,7 +11,7 @@ from autdtorch.hardware.devices.device import Device
 from autdtorch.objectives.objective import Objective
 from autdtorch.objectives.perturbations import Perturbation
 from autdtorch.scene.drive import AMPLITUDE_TOLERANCE, validate_drive, validate_single_drive
-from autdtorch.utils.cpu_tensors import COMPLEX, REAL
+from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.validation import indices, invalid, number_between, positive
 
 _FINEST = 2.0**-14  # resolution of the search; two levels of a device here are further apart

@@ -11,7 +11,7 @@ import torch
 
 from autdtorch.hardware.safety import LimitedLink
 from autdtorch.hardware.sensors.sensor import Sensor, checked_reading
-from autdtorch.utils.cpu_tensors import COMPLEX, REAL
+from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.validation import integer_at_least, number_between, require_callable, require_kind
 
 _DEVIATIONS = 6.0  # threshold above the noise, in standard deviations of its mean power

@@ -15,9 +15,8 @@ from autdtorch.io.ultraino_file import SUFFIX, read_ultraino
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import device_axes, in_plane
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.hints import suggesting
-from autdtorch.utils.neighbours import closest_pair
-from autdtorch.utils.numpy_file import read_arrays
+from autdtorch.utils.files import read_arrays
+from autdtorch.utils.spatial import closest_pair
 from autdtorch.utils.validation import ArrayLike, path_of, within
 
 # Columns of a CSV file with the positions of transducers and the directions of emission, and their units.
@@ -29,7 +28,6 @@ _PITCHES = {"m": (3e-3, 0.1), "mm": (3.0, 100.0)}  # of arrays for airborne ultr
 _UNIT_ROUNDING = 1e-3  # by which the length of a normal may differ from 1, in a file of few digits
 
 
-@suggesting
 def load_array(
     path: str | os.PathLike[str],
     center: ArrayLike = (0.0, 0.0, 0.0),

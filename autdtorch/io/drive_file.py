@@ -23,8 +23,7 @@ from autdtorch.scene.drive import (
     validate_drive,
 )
 from autdtorch.utils.array_types import AnyArray, Array
-from autdtorch.utils.hints import suggesting
-from autdtorch.utils.numpy_file import read_arrays, write_arrays
+from autdtorch.utils.files import read_arrays, write_arrays
 from autdtorch.utils.units import warn_user, warned_within
 from autdtorch.utils.validation import ArrayLike, path_of, real_tensor, require_kind, require_one_of, within
 
@@ -36,7 +35,6 @@ _COLUMNS = _NUMBERING | PLACE_COLUMNS | NORMAL_COLUMNS | SIZE_COLUMNS | _PLAIN_C
 _TURN = 2 * math.pi + 1e-6  # [rad], with room for rounding
 
 
-@suggesting
 def save_drive(
     path: str | os.PathLike[str], drive: ArrayLike, array: TransducerArray, device: str | None = None
 ) -> None:

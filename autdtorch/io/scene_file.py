@@ -16,13 +16,11 @@ from typing import Any
 import torch
 
 from autdtorch.io.array_file import load_array
-from autdtorch.io.yaml_file import load_yaml, plain, unresolved
+from autdtorch.io.yaml_file import TARGET, load_trusted, load_yaml, plain, unresolved
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import Plane, circle_points, sphere_points
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
 from autdtorch.scene.scene import Medium, Scene
-from autdtorch.utils.hints import suggesting
-from autdtorch.utils.trusted import TARGET, load_trusted
 from autdtorch.utils.units import warned_within
 from autdtorch.utils.validation import (
     finite_vector,
@@ -72,7 +70,6 @@ _BUILDERS: dict[str, Builder] = {  # of sections without `type`
 }
 
 
-@suggesting
 def load_scene(source: str | os.PathLike[str] | Mapping[str, Any], modules: Collection[str] = ()) -> Scene:
     """Read a scene from a YAML file, or from a mapping of the same layout such as Hydra's `cfg.scene`.
 

@@ -17,8 +17,7 @@ from autdtorch.scene.drive import amplitudes_of, phases_of
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.files import replace_file, replacing
-from autdtorch.utils.numpy_file import write_arrays
+from autdtorch.utils.files import replace_file, replacing, write_arrays
 from autdtorch.utils.validation import invalid, path_of, require_kind
 
 

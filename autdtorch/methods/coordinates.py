@@ -10,7 +10,7 @@ import torch
 
 from autdtorch.methods.base import first_of_best
 from autdtorch.scene.drive import drive_from_phases, phases_of
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import integers, invalid
 
 Search = Mapping[str, torch.Tensor]

@@ -14,7 +14,7 @@ from autdtorch.methods.solution import Solution
 from autdtorch.methods.state_file import load_state, save_state
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import Objective, Score, require_objective
-from autdtorch.utils.hints import did_you_mean, suggesting
+from autdtorch.utils.hints import did_you_mean
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.validation import invalid, path_of, require_callable, within
 
@@ -42,7 +42,6 @@ def run(
     stop: Callable[[State], bool] | None = None,
     start: torch.Tensor | None = None,
 ) -> list[Solution]: ...
-@suggesting
 def run(
     method: Method,
     objective: Objective | Sequence[Objective],

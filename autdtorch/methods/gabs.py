@@ -15,12 +15,10 @@ from autdtorch.methods.seeds import Trials, generators_of
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import Objective, Score
-from autdtorch.utils.cpu_tensors import COMPLEX
-from autdtorch.utils.hints import suggesting
+from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.validation import integer_at_least, invalid
 
 
-@suggesting
 @dataclass(frozen=True)
 class GABS(Method):
     """Switch on one transducer after the other, each with the best of several phases (Algorithm 2).
@@ -124,7 +122,6 @@ class GABS(Method):
         return coordinates.begin_ascent(alone[orders[:, 0]], orders)
 
 
-@suggesting
 def gabs(
     objective: Objective,
     levels: int = 16,

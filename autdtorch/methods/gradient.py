@@ -20,8 +20,7 @@ from autdtorch.methods.solution import Solution
 from autdtorch.objectives.bound import checked_matrix
 from autdtorch.objectives.goals import WEAKEST_FOCUS, scores_of, slope_of
 from autdtorch.objectives.objective import Objective, Score
-from autdtorch.utils.cpu_tensors import REAL
-from autdtorch.utils.hints import suggesting
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import ArrayLike, integer_at_least
 
@@ -32,7 +31,6 @@ _MOMENTUM = 0.9
 _TINY = 1e-300
 
 
-@suggesting
 @dataclass(frozen=True)
 class GradientAscent(Method):
     """Climb the goal over all drives of amplitudes <= 1, by the transfer matrix of the problem.
@@ -74,7 +72,6 @@ class GradientAscent(Method):
         return Step(torch.stack(highest)[:, None], {})
 
 
-@suggesting
 def gradient_ascent(
     objective: Objective | ArrayLike,
     starts: int = 32,

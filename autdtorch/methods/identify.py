@@ -23,7 +23,6 @@ from autdtorch.methods.seeds import Trials, generators_of, restored, states_of
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, scores_of
 from autdtorch.objectives.objective import Objective, Score
-from autdtorch.utils.hints import suggesting
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import integer_at_least, invalid
 
@@ -37,7 +36,6 @@ _WORSE = 9.0  # median deviations of scores from the fit, 6 standard deviations,
 _LEAST_WORSE = 0.05  # of the score, by which the last drive must be below another one not to be the solution
 
 
-@suggesting
 @dataclass(frozen=True)
 class Identify(Method):
     """Fit the transfer matrix to observed magnitudes, and maximise the goal on the matrix.
@@ -171,7 +169,6 @@ class Identify(Method):
         return min(max(3 * problem.transducers - 2, most // 2), most - 1)
 
 
-@suggesting
 def identify(
     objective: Objective,
     evaluations: int | None = None,

@@ -15,8 +15,7 @@ from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import Objective, Score
 from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise
-from autdtorch.utils.cpu_tensors import COMPLEX
-from autdtorch.utils.hints import suggesting
+from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.validation import integer_at_least, invalid
 
 
@@ -36,7 +35,6 @@ class LSS(Method):
         return Step(normalise(_focus_drives(problem).sum(dim=0))[None, None], {})
 
 
-@suggesting
 @dataclass(frozen=True)
 class LSSG(Method):
     """Superpose the free-space drives of the single foci, with the best offset for each (Eq. 4, 5 and 6).
@@ -97,13 +95,11 @@ class LSSG(Method):
         return Step(normalise(weights @ search["foci"]), search, goes_on)
 
 
-@suggesting
 def lss(objective: Objective, score: Score = WEAKEST_FOCUS) -> Solution:
     """Run `LSS` on an objective, with a `score` to report; see `run`."""
     return run(LSS(), objective, score=score)
 
 
-@suggesting
 def lssg(
     objective: Objective,
     levels: int = 16,

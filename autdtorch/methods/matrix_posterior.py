@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from autdtorch.methods.magnitudes import Magnitudes
-from autdtorch.utils.cpu_tensors import COMPLEX
+from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.threads import one_library_thread
 
 _STEPS = 10  # of Gauss and Newton

@@ -12,7 +12,7 @@ from autdtorch.methods.base import Problem
 from autdtorch.methods.gradient import climb, random_drives
 from autdtorch.methods.matrix_posterior import MatrixPrior
 from autdtorch.objectives.objective import validate_matrix
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import complex_tensor, invalid, number_between, require_known, within
 
 _STARTS, _CLIMB_STEPS = 16, 300  # of the climbs to the best drive of a simulation

@@ -15,13 +15,11 @@ from autdtorch.methods.seeds import Trials, generators_of, restored, states_of
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import Objective, Score
-from autdtorch.utils.hints import suggesting
 from autdtorch.utils.validation import integer_at_least
 
 _AT_ONCE = 64  # evaluations of a trial in one step, which bounds the memory of a step
 
 
-@suggesting
 @dataclass(frozen=True)
 class RandomSearch(Method):
     """Try random phases at full amplitude, and keep the best.
@@ -68,7 +66,6 @@ class RandomSearch(Method):
         return Step(drives, {"generators": states_of(generators)})
 
 
-@suggesting
 def random_search(
     objective: Objective,
     evaluations: int = 256,

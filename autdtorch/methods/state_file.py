@@ -21,8 +21,7 @@ from autdtorch.methods.solution import Solution
 from autdtorch.methods.state_origin import differences, origin_of
 from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.files import replace_file
-from autdtorch.utils.numpy_file import read_arrays
+from autdtorch.utils.files import read_arrays, replace_file
 from autdtorch.utils.validation import invalid, path_of, require_kind, within
 
 _BEST, _SEARCH, _HEADER = "best.", "search.", "header"

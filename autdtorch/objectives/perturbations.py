@@ -17,7 +17,8 @@ import torch
 from autdtorch.objectives.objective import Objective, observe_drives, require_objective, validate_drives
 from autdtorch.scene.drive import drive_from_phases, validate_drive
 from autdtorch.scene.phase_levels import PhaseLevels
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL
+from autdtorch.utils.display import counted
 from autdtorch.utils.validation import (
     boolean,
     indices,
@@ -27,7 +28,6 @@ from autdtorch.utils.validation import (
     number_between,
     positive,
 )
-from autdtorch.utils.wording import counted
 
 SNRS = (-1000.0, 1000.0)
 """Range of signal-to-noise ratios [dB]; far beyond it their powers overflow."""

@@ -21,7 +21,6 @@ from autdtorch.plot.style import TICK_SIZE, label_of, new_figure, readable, set_
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.hints import suggesting
 from autdtorch.utils.validation import (
     ArrayLike,
     boolean,
@@ -48,7 +47,6 @@ _END = 0.25  # for the half of the last tick label that is beyond its axis, and 
 
 
 @styled
-@suggesting
 def plot_plane(
     pressure: ArrayLike,
     plane: Plane,
@@ -115,7 +113,6 @@ def plot_plane(
 
 
 @styled
-@suggesting
 def plot_planes(
     pressure: Mapping[str, ByMethod] | ByMethod,
     planes: Mapping[str, Plane] | Plane,

@@ -20,7 +20,7 @@ from autdtorch.plot.style import TICK_SIZE, new_figure, styled, text_width
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.triangles import doubled_normals, sides_of
+from autdtorch.utils.spatial import doubled_normals, sides_of
 from autdtorch.utils.validation import ArrayLike, Vector, require_kind
 
 # Lengths [inch]

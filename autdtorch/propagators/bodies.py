@@ -18,7 +18,7 @@ from autdtorch.analytic.green import free_space_matrix
 from autdtorch.analytic.spherical_waves import degrees, harmonics, regular_radial
 from autdtorch.propagators.operator import ScatteringOperator, incoming_waves, parts_of, waves_at
 from autdtorch.scene.arrays import TransducerArray
-from autdtorch.utils.cpu_tensors import COMPLEX, REAL
+from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import (

@@ -24,8 +24,8 @@ from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle, Sphere
 from autdtorch.scene.obstacles.moving import at_rest, circumscribed, is_movable, shifted
 from autdtorch.scene.scene import OverlapWarning, ScaleWarning, Scene
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.cached import cached_property
-from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.digest import digest_of, package_versions, source_digest
 from autdtorch.utils.memory import require_memory
 

@@ -24,8 +24,8 @@ from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.plan import MOST_JUDGED, Plan
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.utils.apertures import Apertures
+from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.cached import cached_property
-from autdtorch.utils.cpu_tensors import COMPLEX
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.threads import one_library_thread, spread
 

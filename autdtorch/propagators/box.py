@@ -28,8 +28,8 @@ from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
 from autdtorch.scene.scene import require_clear
 from autdtorch.utils.apertures import Apertures
+from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.cached import cached_property
-from autdtorch.utils.cpu_tensors import COMPLEX, REAL
 from autdtorch.utils.threads import one_library_thread, spread
 
 logger = logging.getLogger(__name__)

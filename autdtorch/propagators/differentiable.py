@@ -16,7 +16,7 @@ from autdtorch.propagators.scene_region import region_of, warn_of_ending_walls, 
 from autdtorch.scene.arrays import strengths_of
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene, require_inside
-from autdtorch.utils.cpu_tensors import COMPLEX
+from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.validation import (
     ArrayLike,
     integer_at_least,

@@ -18,11 +18,10 @@ from autdtorch.propagators.operator_propagator import OperatorPropagator
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.cpu_tensors import COMPLEX, REAL
-from autdtorch.utils.hints import suggesting
+from autdtorch.utils.array_types import COMPLEX, REAL
+from autdtorch.utils.display import counted
 from autdtorch.utils.memory import available_memory
 from autdtorch.utils.validation import positive
-from autdtorch.utils.wording import counted
 
 _MEASURED_STEPS, _MEASURED_CELLS = 80, (300_000, 1_000_000)
 _AIR_SPACING, _AIR_RIM = 1e-3, 28
@@ -62,7 +61,6 @@ class Estimate:
         return f"Estimate({self.method}{grid}, {cost})"
 
 
-@suggesting
 def estimate(
     scene: Scene,
     spacing: float = 1e-3,

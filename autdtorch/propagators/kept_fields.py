@@ -22,9 +22,8 @@ from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulation import Run, TransferMatrix
 from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.utils.apertures import Apertures
-from autdtorch.utils.array_types import Index
+from autdtorch.utils.array_types import COMPLEX, Index
 from autdtorch.utils.cached import cached_property
-from autdtorch.utils.cpu_tensors import COMPLEX
 
 _MOST_BYTES = 1e9  # of the amplitudes of all transducers
 _DRIVES = 16  # Drives whose fields are kept

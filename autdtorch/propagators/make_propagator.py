@@ -18,13 +18,11 @@ from autdtorch.propagators.refinement import Budget, refined
 from autdtorch.propagators.scene_region import warn_of_ending_walls, warn_of_near_points
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.hints import suggesting
 from autdtorch.utils.validation import invalid, positive
 
 logger = logging.getLogger(__name__)
 
 
-@suggesting
 def make_propagator(
     scene: Scene,
     method: str = "auto",

@@ -25,8 +25,8 @@ from autdtorch.scene.arrays import TransducerArray, strengths_of
 from autdtorch.scene.geometry import composed_rotation
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle
-from autdtorch.utils.cpu_tensors import COMPLEX, REAL
-from autdtorch.utils.numpy_file import read_arrays, write_arrays
+from autdtorch.utils.array_types import COMPLEX, REAL
+from autdtorch.utils.files import read_arrays, write_arrays
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.units import turn_tensor
 from autdtorch.utils.validation import (

@@ -25,8 +25,8 @@ from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.propagators.simulation import Run
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import require_clear
+from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.cached import cached_property
-from autdtorch.utils.cpu_tensors import COMPLEX, REAL
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import ArrayLike, boolean, differentiable_points, points_grid, points_tensor
 

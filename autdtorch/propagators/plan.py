@@ -37,8 +37,8 @@ from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.cached import cached_property
 from autdtorch.utils.memory import require_memory
+from autdtorch.utils.spatial import doubled_normals
 from autdtorch.utils.threads import thread_count
-from autdtorch.utils.triangles import doubled_normals
 from autdtorch.utils.validation import (
     integer_at_least,
     invalid,

@@ -13,7 +13,7 @@ import torch
 from autdtorch.fdtd.region import Body, Fluid, Region, Shape
 from autdtorch.scene.obstacles import Box, Obstacle
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.triangles import mean_thickness
+from autdtorch.utils.spatial import mean_thickness
 
 logger = logging.getLogger(__name__)
 

@@ -25,12 +25,12 @@ from autdtorch.propagators.scene_region import warn_of_near_points
 from autdtorch.propagators.simulation import Run, TransferMatrix
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.cached import cached_property
-from autdtorch.utils.cpu_tensors import COMPLEX
+from autdtorch.utils.display import counted
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import ArrayLike, boolean, points_grid
-from autdtorch.utils.wording import counted
 
 logger = logging.getLogger(__name__)
 

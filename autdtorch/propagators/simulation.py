@@ -27,11 +27,11 @@ from autdtorch.propagators.plan import Plan
 from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.apertures import Apertures
+from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.cached import cached_property
-from autdtorch.utils.cpu_tensors import COMPLEX
+from autdtorch.utils.display import counted
 from autdtorch.utils.progress import Progress, show_progress
 from autdtorch.utils.validation import ArrayLike, invalid, points_tensor
-from autdtorch.utils.wording import counted
 
 logger = logging.getLogger(__name__)
 

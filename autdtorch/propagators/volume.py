@@ -9,8 +9,8 @@ import torch
 from autdtorch.propagators.simulated import Propagator
 from autdtorch.scene.drive import validate_single_drive
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.cpu_tensors import COMPLEX, REAL
-from autdtorch.utils.neighbours import nearest
+from autdtorch.utils.array_types import COMPLEX, REAL
+from autdtorch.utils.spatial import nearest
 from autdtorch.utils.validation import ArrayLike, invalid, positive, require_kind
 
 _CLEARANCE = 0.5  # wavelengths around a transducer, where its own 1/r would hide the field of the others

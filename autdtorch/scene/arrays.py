@@ -12,10 +12,11 @@ import torch
 from autdtorch.scene.geometry import Coordinates, in_plane, plane_basis
 from autdtorch.scene.transducer_values import disc_radius, for_each, unit_normals
 from autdtorch.utils.apertures import Apertures
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL
+from autdtorch.utils.display import counted
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.memory import require_memory
-from autdtorch.utils.neighbours import require_distinct
+from autdtorch.utils.spatial import require_distinct
 from autdtorch.utils.validation import (
     ArrayLike,
     points_tensor,
@@ -24,7 +25,6 @@ from autdtorch.utils.validation import (
     real_tensor,
     require_kind,
 )
-from autdtorch.utils.wording import counted
 
 PAPER_SOURCE_STRENGTH = 1 / (4 * math.pi)
 """Source strength in the paper's Eq. 2: on-axis pressure at full drive times distance [Pa m]."""
@@ -65,7 +65,6 @@ class Recipe(NamedTuple):
     arguments: dict[str, Any]
 
 
-@suggesting
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class TransducerArray:
     """An array of M transducers. Its tensors are copies on the CPU.

@@ -7,8 +7,7 @@ import math
 import numpy as np
 import torch
 
-from autdtorch.utils.hints import suggesting
-from autdtorch.utils.neighbours import distances
+from autdtorch.utils.spatial import distances
 from autdtorch.utils.units import real_wavenumber, warn_user
 from autdtorch.utils.validation import (
     ArrayLike,
@@ -24,7 +23,6 @@ AMPLITUDE_TOLERANCE = 1e-6
 _LEAST_WAVENUMBER = 1.0  # [rad/m], at 55 Hz in air; wavelengths in m are below
 
 
-@suggesting
 def drive_from_phases(phases: ArrayLike, amplitudes: ArrayLike | None = None) -> torch.Tensor:
     """Return the drive q = a e^{-i phi} (Eq. 1); differentiable in both arguments.
 
@@ -84,7 +82,6 @@ def amplitudes_of(drive: ArrayLike) -> torch.Tensor:
     return drive_tensor(drive).abs()
 
 
-@suggesting
 def focus_phases(positions: ArrayLike, focus: ArrayLike, wavenumber: float) -> torch.Tensor:
     """Return phases that focus on a point in free space: phi_i = k |r_f - r_i| (Eq. 3), not wrapped.
 

@@ -12,8 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from autdtorch.utils.cpu_tensors import REAL
-from autdtorch.utils.hints import suggesting
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.units import angle as checked_angle
 from autdtorch.utils.validation import (
@@ -120,7 +119,6 @@ def composed_rotation(
     return matrix
 
 
-@suggesting
 def circle_points(
     center: ArrayLike, radius: float, count: int, normal: ArrayLike, angle: float = 0.0
 ) -> torch.Tensor:
@@ -146,7 +144,6 @@ def circle_points(
     return origin + radius * (angles.cos()[:, None] * u + angles.sin()[:, None] * v)
 
 
-@suggesting
 def sphere_points(center: ArrayLike, radius: float, count: int) -> torch.Tensor:
     """Return evenly spread points on a sphere: a Fibonacci lattice.
 
@@ -179,7 +176,6 @@ def _round(center: ArrayLike, radius: float, count: int) -> tuple[torch.Tensor, 
     return origin, radius, count
 
 
-@suggesting
 @dataclass(frozen=True)
 class Plane:
     """A rectangle on which a field is sampled.

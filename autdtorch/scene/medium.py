@@ -27,7 +27,6 @@ _GAS_CONSTANT = 8.314462618  # J/(mol K)
 _DRY_AIR, _WATER = 28.9647e-3, 18.01528e-3  # kg/mol
 
 
-@suggesting
 @dataclass(frozen=True)
 class Medium:
     """A uniform fluid.

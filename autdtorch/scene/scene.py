@@ -17,10 +17,10 @@ from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.moving import moved
 from autdtorch.scene.obstacles.overlaps import overlap, shared_box
 from autdtorch.scene.plausibility import extent_of, unit_hint, warn_of_implausible
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL
+from autdtorch.utils.display import counted, html_facts
 from autdtorch.utils.hints import suggesting
-from autdtorch.utils.html import html_facts
-from autdtorch.utils.neighbours import nearest, require_distinct
+from autdtorch.utils.spatial import nearest, require_distinct
 from autdtorch.utils.units import ScaleWarning as ScaleWarning
 from autdtorch.utils.units import angles, warn_user
 from autdtorch.utils.validation import (
@@ -36,7 +36,6 @@ from autdtorch.utils.validation import (
     real_tensor,
     require_kind,
 )
-from autdtorch.utils.wording import counted
 
 _DEFAULT_MARGIN = 2.0  # [wavelengths] of air on each side, where no domain is given
 _FARTHEST = 1e6  # [m] along an axis; far beyond any simulation, and volumes do not overflow
@@ -76,7 +75,6 @@ class Scene:
     domain: tuple[Vector, Vector]
     name: str
 
-    @suggesting
     def __init__(
         self,
         array: TransducerArray,

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from autdtorch.scene.geometry import Coordinates
-from autdtorch.utils.neighbours import closest_pair
+from autdtorch.utils.spatial import closest_pair
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,

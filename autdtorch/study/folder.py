@@ -15,8 +15,8 @@ from autdtorch.study.provenance import PROVENANCE_FILE, Provenance, load_provena
 from autdtorch.study.results import SceneResult, StudyResult
 from autdtorch.study.results_file import RESULTS_FILE, load_results, save_results
 from autdtorch.study.trial_file import TRIALS_FILE, TrialFile
+from autdtorch.utils.display import counted
 from autdtorch.utils.files import held
-from autdtorch.utils.wording import counted
 
 logger = logging.getLogger(__name__)
 

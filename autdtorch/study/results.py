@@ -18,9 +18,8 @@ from autdtorch.objectives.metrics import FocusMetrics
 from autdtorch.objectives.objective import validate_drives
 from autdtorch.propagators import Run
 from autdtorch.study.provenance import Provenance
-from autdtorch.utils.html import html_table
+from autdtorch.utils.display import counted, decimals_of, html_table
 from autdtorch.utils.validation import invalid, real_tensor
-from autdtorch.utils.wording import counted, decimals_of
 
 
 @dataclass(frozen=True)

@@ -33,10 +33,11 @@ from autdtorch.study.folder import open_folder
 from autdtorch.study.provenance import provenance_now
 from autdtorch.study.results import MethodResult, SceneResult, Simulation, StudyResult, median_trial
 from autdtorch.study.trial_file import TrialFile
-from autdtorch.utils.cpu_tensors import COMPLEX
+from autdtorch.utils.array_types import COMPLEX
+from autdtorch.utils.display import counted
 from autdtorch.utils.memory import require_memory
-from autdtorch.utils.neighbours import nearest
 from autdtorch.utils.progress import Progress, show_progress
+from autdtorch.utils.spatial import nearest
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     integer_at_least,
@@ -47,7 +48,6 @@ from autdtorch.utils.validation import (
     require_name,
     within,
 )
-from autdtorch.utils.wording import counted
 
 logger = logging.getLogger(__name__)
 

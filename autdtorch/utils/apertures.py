@@ -8,8 +8,7 @@ from typing import NamedTuple, Self
 import numpy as np
 import torch
 
-from autdtorch.utils.array_types import AnyArray, Array
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL, AnyArray, Array
 
 PATTERN_TERMS = 13
 """Powers of the square of the sine of an angle in a far-field pattern."""

@@ -1,13 +1,21 @@
-"""Types of NumPy arrays."""
+"""Types of NumPy arrays, and keywords of tensors on the CPU."""
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 Array: TypeAlias = NDArray[np.float64]
 ComplexArray: TypeAlias = NDArray[np.complex128]
 Index: TypeAlias = NDArray[np.int64]
 AnyArray: TypeAlias = NDArray[Any]
+
+
+REAL: Final[dict[str, Any]] = {"dtype": torch.float64, "device": "cpu"}
+"""REAL: float64 on the CPU."""
+
+COMPLEX: Final[dict[str, Any]] = {"dtype": torch.complex128, "device": "cpu"}
+"""COMPLEX: complex128 on the CPU."""

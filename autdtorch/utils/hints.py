@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import lazy_loader
 
-Named = TypeVar("Named", bound=Callable[..., Any])
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 _UNEXPECTED = re.compile(r"got an unexpected keyword argument '(\w+)'")
 _SUGGESTS = "_suggests"  # attribute of functions that are decorated by `suggesting`
@@ -45,15 +45,12 @@ def with_extra(extra: str) -> str:
     return f"pip install -c constraints.txt '.[{extra}]' in the clone"
 
 
-def suggesting(function: Named) -> Named:
-    """Decorate a function, or a class, whose error of an unknown keyword then names the accepted ones.
+def suggesting(function: Function) -> Function:
+    """Decorate a function or method: its error of an unknown keyword names the accepted ones.
 
-    Python does so from 3.13 on, where one of them is alike.
+    Python does so from 3.13 on, where one of them is alike. Public functions and classes are decorated by
+    `lazy_names`.
     """
-    if isinstance(function, type):
-        kind: Any = function
-        kind.__init__ = suggesting(kind.__init__)
-        return function
 
     @functools.wraps(function)
     def call(*arguments: Any, **keywords: Any) -> Any:
@@ -76,7 +73,7 @@ def suggesting(function: Named) -> Named:
 def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
     """Return `__getattr__`, `__dir__` and `__all__` of a package whose stub beside `file` lists its names.
 
-    A name is imported when it is first used. Every public function is `suggesting`.
+    A name is imported when it is first used. Its function, or the constructor of its class, is `suggesting`.
     """
     load, names, public = lazy_loader.attach_stub(package, file)
 
@@ -92,6 +89,12 @@ def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callab
             home, value = sys.modules[value.__module__], suggesting(value)
             setattr(home, value.__name__, value)  # where pickle looks for it
             setattr(sys.modules[package], name, value)
+        elif inspect.isclass(value):
+            kind: Any = value
+            start = vars(kind).get("__init__")
+            # That of a protocol is of `typing`, which needs it as it is.
+            if getattr(start, "__module__", "") == kind.__module__ and not hasattr(start, _SUGGESTS):
+                kind.__init__ = suggesting(start)
         return value
 
     return attribute, names, public

@@ -1,13 +1,44 @@
-"""Signals from this program to its main thread, whose waits they interrupt."""
+"""Signals: their handlers saved and restored, and signals of this program to its main thread."""
 
 from __future__ import annotations
 
 import _thread
+import contextlib
 import signal
 import threading
 import time
+from collections.abc import Iterable, Iterator
+from typing import Any
 
 _LATER = 1e-3  # [s]
+
+
+def saved_handlers(numbers: Iterable[int]) -> dict[int, Any]:
+    """Return the handlers of signals by number; none outside the main thread, which alone may set them."""
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    return {number: signal.getsignal(number) for number in numbers}
+
+
+def restore_handlers(handlers: dict[int, Any]) -> None:
+    """Set handlers of `saved_handlers` again, and empty the dictionary."""
+    while handlers:
+        number, handler = handlers.popitem()
+        signal.signal(number, handler or signal.SIG_DFL)  # None where it is not Python's
+
+
+@contextlib.contextmanager
+def signals_restored() -> Iterator[None]:
+    """Restore the handlers of SIGINT and SIGTERM, and the descriptor that wakes the main thread."""
+    if not (handlers := saved_handlers((signal.SIGINT, signal.SIGTERM))):
+        yield
+        return
+    signal.set_wakeup_fd(descriptor := signal.set_wakeup_fd(-1))
+    try:
+        yield
+    finally:
+        restore_handlers(handlers)
+        signal.set_wakeup_fd(descriptor)
 
 
 def send_again(number: int) -> None:

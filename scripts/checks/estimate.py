@@ -26,7 +26,7 @@ from shared.scenes import paper_scene
 
 import autdtorch as at
 from autdtorch.propagators.moved_boxes import forget_assemblies
-from autdtorch.utils.triangles import doubled_normals
+from autdtorch.utils.spatial import doubled_normals
 
 
 class Cost(NamedTuple):

@@ -17,7 +17,7 @@ from shared.document import fill_in, measured, table
 from shared.scenes import MIDDLE, autd3_array, paper_scene, with_array
 
 import autdtorch as at
-from autdtorch.utils.wording import in_digits
+from autdtorch.utils.display import in_digits
 
 DOCUMENT = "methods.md"
 

@@ -13,7 +13,7 @@ from autdtorch.analytic import piston_directivity, piston_field
 from autdtorch.analytic.green import free_space_matrix, green
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import drive_from_phases, focus_phases
-from autdtorch.utils.neighbours import distances
+from autdtorch.utils.spatial import distances
 
 WAVELENGTH = 8.5e-3
 WAVENUMBER = 2 * math.pi / WAVELENGTH

@@ -6,7 +6,7 @@ import torch
 
 from autdtorch.scene.arrays import AUTD3_UNIT, PAPER_SOURCE_STRENGTH, TransducerArray
 from autdtorch.scene.geometry import circle_points
-from autdtorch.utils.neighbours import distances
+from autdtorch.utils.spatial import distances
 
 PITCH = 10.16e-3
 ROUNDING = 1e-12  # of lengths below 1 m in float64, with margin

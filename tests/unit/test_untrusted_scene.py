@@ -239,7 +239,7 @@ def test_arrays_in_files_are_checked_before_they_are_allocated(tmp_path, monkeyp
 
 
 def test_a_small_file_of_many_zeros_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("autdtorch.utils.numpy_file._LARGEST", 10**6)
+    monkeypatch.setattr("autdtorch.utils.files._LARGEST", 10**6)
     np.savez_compressed(tmp_path / "zeros.npz", mask=np.ones((100, 100, 101), bool))
     with pytest.raises(ValueError, match=r"zeros\.npz.*1010128 bytes"):
         VoxelMask.load(tmp_path / "zeros.npz", 1e-3, rigid=True)

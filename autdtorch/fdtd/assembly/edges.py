@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from autdtorch.fdtd.region import Shape
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.triangles import doubled_normals, sides_of
+from autdtorch.utils.spatial import doubled_normals, sides_of
 
 _SHARP = np.radians(20)  # Smallest angle between the normals of two faces that meet in an edge
 _REACH = 1.2  # Distance from an edge within which the stiffness is reduced [cells]

@@ -18,8 +18,7 @@ from torch import Tensor
 
 from autdtorch.fdtd.kernels.compiled import INNER, entry
 from autdtorch.utils.apertures import PATTERN_TERMS, Discs
-from autdtorch.utils.array_types import AnyArray
-from autdtorch.utils.cpu_tensors import COMPLEX
+from autdtorch.utils.array_types import COMPLEX, AnyArray
 from autdtorch.utils.threads import even_parts, spread
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 

@@ -12,7 +12,7 @@ import torch
 from autdtorch.hardware.devices.device import Device, Firmware
 from autdtorch.scene.arrays import AUTD3_TRANSDUCERS
 from autdtorch.scene.phase_levels import PhaseLevels
-from autdtorch.utils.cpu_tensors import COMPLEX
+from autdtorch.utils.array_types import COMPLEX
 
 
 class _Autd3(Device):

@@ -14,7 +14,7 @@ from autdtorch.hardware.devices.device import Device, Firmware
 from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
 from autdtorch.hardware.transport.serial_chips import FT232H
 from autdtorch.scene.phase_levels import PhaseLevels
-from autdtorch.utils.cpu_tensors import COMPLEX
+from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid, members
 
 _BOARD = 256

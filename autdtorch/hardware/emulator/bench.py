@@ -15,7 +15,7 @@ from autdtorch.hardware.transport.autd3_network import Autd3Port, autd3_kit
 from autdtorch.hardware.transport.port import Port
 from autdtorch.objectives.perturbations import SNRS, random_rms
 from autdtorch.scene.drive import amplitudes_of, phases_of
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import (
     complex_tensor,
     indices,

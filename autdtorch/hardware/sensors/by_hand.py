@@ -10,7 +10,7 @@ from collections.abc import Callable
 import torch
 
 from autdtorch.hardware.sensors.sensor import Sensor, SensorError, checked_reading
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.progress import is_terminal
 from autdtorch.utils.validation import ArrayLike, not_negative, points_tensor, require_callable, require_kind
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import torch
 
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import invalid
 
 

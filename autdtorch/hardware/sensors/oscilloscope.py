@@ -18,7 +18,7 @@ from autdtorch.hardware.sensors.sensor import SensorError
 from autdtorch.hardware.transport.port import LinkError, closed_on_error
 from autdtorch.hardware.transport.usb import find_device
 from autdtorch.hardware.transport.usbtmc import UsbtmcPort
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import (
     integer_at_least,
     invalid,

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from autdtorch.hardware.sensors.sensor import SensorError
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import (
     integer_at_least,
     invalid,

@@ -20,8 +20,7 @@ from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, scores_of
 from autdtorch.objectives.objective import Objective, Score
 from autdtorch.scene.drive import drive_from_phases, phases_of
-from autdtorch.utils.cpu_tensors import REAL
-from autdtorch.utils.hints import suggesting
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import integer_at_least, invalid, number_between, require_one_of
 
@@ -57,7 +56,6 @@ def _defaults_of_processes() -> Iterator[None]:
 _PAPERS_FIXED = 6  # Transducer whose phase is fixed in the paper, its 7th
 
 
-@suggesting
 @dataclass(frozen=True)
 class BayesOpt(Method):
     """Maximise the score over the phases by Bayesian optimisation (Algorithm 1), all amplitudes being 1.
@@ -276,7 +274,6 @@ class BayesOpt(Method):
         return FocusAcquisition(processes, points, goal, None if rows is None else rows.best)
 
 
-@suggesting
 def bayes_opt(
     objective: Objective,
     evaluations: int = 256,

@@ -15,7 +15,7 @@ from autdtorch.methods.bayes.packages import (
     ZeroMean,
     fit_gpytorch_mll,
 )
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL
 
 KernelName: TypeAlias = Literal["phases", "circle", "phasor"]
 """The space in which a process measures phases: as numbers, on the circle, or by the phasors they make."""

@@ -27,8 +27,7 @@ import torch
 from autdtorch.methods.base import Method, Problem, Step, known_matrix
 from autdtorch.objectives.goals import Goal
 from autdtorch.objectives.objective import Objective, Score
-from autdtorch.utils.cpu_tensors import REAL
-from autdtorch.utils.hints import suggesting
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import (
     ArrayLike,
     boolean,
@@ -52,7 +51,6 @@ DAMPING = 0.5
 UNREACHED = 1e-6  # Pressure, relative to the loudest point, below which a point gets no more weight
 
 
-@suggesting
 @dataclass(frozen=True)
 class Holography(Method):
     """Compute one drive from the transfer matrix of the problem, by an algorithm of holography.
@@ -98,7 +96,6 @@ class Holography(Method):
         return Step(drive[None, None], {})
 
 
-@suggesting
 def holography(
     G: ArrayLike | Objective,
     targets: ArrayLike | None = None,

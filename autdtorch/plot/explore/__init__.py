@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from autdtorch.plot.explore.situation import checked_drive
 from autdtorch.plot.view3d.opengl import require_rendering
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.hints import suggesting, with_extra
+from autdtorch.utils.hints import with_extra
 from autdtorch.utils.validation import ArrayLike, boolean, integer_at_least, invalid, positive, require_kind
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ _OPENING = (
 )  # PyVista is not imported, nor a trame application made, by several threads at once
 
 
-@suggesting
 def explore(
     scene: Scene,
     drive: ArrayLike | None = None,

@@ -15,8 +15,7 @@ from autdtorch.plot.explore.situation import Situation
 from autdtorch.plot.view3d import meshes
 from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.geometry import Plane
-from autdtorch.utils.array_types import Array
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL, Array
 from autdtorch.utils.validation import Vector
 
 _INK = {False: ("black", "white"), True: ("#e6e6e6", "#14171c")}  # lines and background, by dark

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
 import json
-import signal
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +16,7 @@ from autdtorch.plot.view3d.still_axes import STILL_AXES
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.files import in_folder
 from autdtorch.utils.hints import with_extra
+from autdtorch.utils.signals import signals_restored
 from autdtorch.utils.validation import path_of
 
 if TYPE_CHECKING:
@@ -91,28 +89,12 @@ def _write_html(plotter: pyvista.Plotter, path: Path, caption: Sequence[str]) ->
     drawn = "".join(_html_bar(title.strip(), bar.lookup_table) for title, bar in bars.items())
     for bar in bars.values():
         bar.SetVisibility(False)
-    with _signals_kept():
+    with signals_restored():  # trame starts a server for the page, which would ignore Ctrl-C for good
         page: str = plotter.trame.export_html(None).getvalue()
     for bar in bars.values():
         bar.SetVisibility(True)
     legend = _LEGEND.format(bars=drawn, caption="<br>".join(caption))
     path.write_text(page.replace("</body>", legend), encoding="utf-8")
-
-
-@contextlib.contextmanager
-def _signals_kept() -> Iterator[None]:
-    """Keep the handlers of signals: the server that trame starts for a page would ignore Ctrl-C for good."""
-    if threading.current_thread() is not threading.main_thread():  # which alone may set them
-        yield
-        return
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    signal.set_wakeup_fd(descriptor := signal.set_wakeup_fd(-1))
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler or signal.SIG_DFL)  # None where it is not Python's
-        signal.set_wakeup_fd(descriptor)
 
 
 def _html_bar(title: str, table: pyvista.LookupTable) -> str:

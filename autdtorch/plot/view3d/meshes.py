@@ -20,7 +20,7 @@ from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.overlaps import inside_any
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.neighbours import closest_pair, distances
+from autdtorch.utils.spatial import closest_pair, distances
 from autdtorch.utils.validation import ArrayLike, Vector, magnitude_tensor
 
 if TYPE_CHECKING:

@@ -43,7 +43,6 @@ class _Source(str):
         return {name: value for name, value in vars(self).items() if name != "distance"}
 
 
-@suggesting
 @dataclass(frozen=True)
 class Mesh(Obstacle):
     """The inside of a watertight triangle mesh, from an STL, OBJ or PLY file or by `from_surface`.

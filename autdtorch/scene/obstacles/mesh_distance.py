@@ -8,7 +8,7 @@ from weakref import WeakSet
 import numpy as np
 
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.triangles import doubled_normals
+from autdtorch.utils.spatial import doubled_normals
 
 _ON_SIDE = 1e-9  # barycentric coordinate of a nearest point that lies on a side of its triangle
 _FINE = 2.0  # accuracy of winding numbers as libigl counts it: errors are below 0.05

@@ -25,7 +25,7 @@ from autdtorch.scene.obstacles.mesh_solid import (
     winding_number,
 )
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.triangles import areas_of, paired_sides, sides_of
+from autdtorch.utils.spatial import areas_of, paired_sides, sides_of
 
 _FARTHEST = 1.0001e-3  # distance between vertices that are taken as one, relative to the extent
 _STRAY = 1e-3  # share of all area below which an open piece is no part of the body

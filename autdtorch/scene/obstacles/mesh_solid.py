@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from autdtorch.scene.obstacles.mesh_polygons import FARTHEST
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.triangles import areas_of, doubled_normals, paired_sides, sides_of
+from autdtorch.utils.spatial import areas_of, doubled_normals, paired_sides, sides_of
 
 Triangles: TypeAlias = tuple[Array, Index]
 """Vertices (V, 3) and the indices of each triangle's vertices (F, 3)."""

@@ -15,7 +15,7 @@ from autdtorch.scene.obstacles.base import Obstacle
 from autdtorch.scene.obstacles.mesh import Mesh
 from autdtorch.scene.obstacles.primitives import Box, Cylinder, Sphere
 from autdtorch.scene.obstacles.voxel_mask import VoxelMask
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import Vector, invalid
 
 # The fields that place and turn an obstacle. A class of the user's own may have others, and is not moved

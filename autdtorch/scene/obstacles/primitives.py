@@ -11,8 +11,7 @@ import torch
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.base import Obstacle
 from autdtorch.scene.obstacles.triangles import BOX_TRIANGLES, SEGMENTS, revolved
-from autdtorch.utils.cpu_tensors import REAL
-from autdtorch.utils.hints import suggesting
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.units import angles
 from autdtorch.utils.validation import Vector, finite_vector, positive, positive_entries, unit_vector
 
@@ -50,7 +49,6 @@ class _Centred(Obstacle):
         return points - points.new_tensor(self.center)
 
 
-@suggesting
 @dataclass(frozen=True)
 class Box(_Centred):
     """A cuboid.
@@ -101,7 +99,6 @@ class Box(_Centred):
         return self._from_center(points) @ rotation_matrix(self.rotation).to(points)
 
 
-@suggesting
 @dataclass(frozen=True)
 class Sphere(_Centred):
     """A sphere.
@@ -136,7 +133,6 @@ class Sphere(_Centred):
         return from_center - self.radius
 
 
-@suggesting
 @dataclass(frozen=True)
 class Cylinder(_Centred):
     """A circular cylinder with flat ends.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from autdtorch.scene.geometry import circle_points
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import Vector
 
 SEGMENTS = 48

@@ -19,8 +19,8 @@ from autdtorch.scene.obstacles.voxel_surface import ThinError, VoxelSurface
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.cached import cached_property
 from autdtorch.utils.digest import digest_of
+from autdtorch.utils.files import read_arrays
 from autdtorch.utils.hints import suggesting
-from autdtorch.utils.numpy_file import read_arrays
 from autdtorch.utils.validation import (
     Vector,
     boolean,
@@ -41,7 +41,6 @@ _UNCERTAIN_CUBES = (
 )
 
 
-@suggesting
 @dataclass(frozen=True)
 class VoxelMask(Obstacle):
     """A body of voxels, such as a segmented scan.

@@ -21,7 +21,7 @@ from scipy.sparse import coo_array, csr_array
 from autdtorch.scene.obstacles.mesh_distance import MeshDistance
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.cached import cached_property
-from autdtorch.utils.triangles import doubled_normals
+from autdtorch.utils.spatial import doubled_normals
 
 _BLUR = 0.5  # Standard deviation of the first smoothing [voxels]
 # Rounds of the filter, and in each the averages of normals and the moves of vertices

@@ -21,9 +21,9 @@ from autdtorch.objectives.objective import Objective
 from autdtorch.plot.trials import plot_convergence
 from autdtorch.study.report import alt_texts
 from autdtorch.study.report.document import code, picture, rendered
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL
+from autdtorch.utils.display import in_digits
 from autdtorch.utils.files import naming, replace_file
-from autdtorch.utils.wording import in_digits
 
 REPORT_FILE = "report.md"
 _FIGURE = "convergence.png"
