@@ -10,8 +10,7 @@ import numpy as np
 import torch
 
 from autdtorch.scene.obstacles.base import Obstacle
-from autdtorch.utils.array_types import Array
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL, Array
 from autdtorch.utils.validation import LENGTH_TOLERANCE, Vector
 
 _SAMPLES = 16  # along each axis of the intersection of two bounding boxes
