@@ -20,7 +20,7 @@ from autdtorch.fdtd.region import Fluid, Region, Shape, bounds
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.turning import is_along, slender_faces
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.triangles import extents, mean_thickness
+from autdtorch.utils.spatial import extents, mean_thickness
 from autdtorch.utils.validation import Vector
 
 _THINNEST = 0.32  # Least thickness [cells]
