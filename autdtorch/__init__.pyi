@@ -5,7 +5,7 @@ from .io.array_file import load_array
 from .io.drive_file import load_drive, save_drive
 from .io.field_file import save_field
 from .io.scene_file import load_scene
-from .io.scene_sections import save_scene
+from .io.scene_writer import save_scene
 from .methods.base import Method, Problem, State
 from .methods.bayes.bayes import BayesOpt, bayes_opt
 from .methods.bayes.focus_problem import FocusProblem

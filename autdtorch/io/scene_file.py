@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 import operator
 import os
+from collections import ChainMap
 from collections.abc import Callable, Collection, Mapping
 from functools import partial, reduce
 from pathlib import Path
@@ -16,10 +17,10 @@ from typing import Any
 import torch
 
 from autdtorch.io.array_file import load_array
-from autdtorch.io.yaml_file import TARGET, load_trusted, load_yaml, plain, unresolved
-from autdtorch.scene.arrays import TransducerArray
+from autdtorch.io.yaml_file import load_yaml, plain, unresolved
+from autdtorch.scene.arrays import FORMS
 from autdtorch.scene.geometry import Plane, circle_points, sphere_points
-from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
+from autdtorch.scene.obstacles import KINDS
 from autdtorch.scene.scene import Medium, Scene
 from autdtorch.utils.units import warned_within
 from autdtorch.utils.validation import (
@@ -35,15 +36,8 @@ from autdtorch.utils.validation import (
 
 Builder = Callable[..., Any]
 
-_KINDS: dict[str, dict[str, Builder]] = {  # what the key `type` of a section names
-    "array": {
-        "grid": TransducerArray.grid,
-        "positions": TransducerArray,
-        "autd3": TransducerArray.autd3,
-        "sonicsurface": TransducerArray.sonicsurface,
-        "openmpd": TransducerArray.openmpd,
-        "file": load_array,
-    },
+_TYPES: dict[str, Mapping[str, Builder]] = {  # builders by the key `type` of a section
+    "array": ChainMap({"file": load_array}, FORMS),
     "control_points": {
         "circle": circle_points,
         "sphere": sphere_points,
@@ -52,13 +46,7 @@ _KINDS: dict[str, dict[str, Builder]] = {  # what the key `type` of a section na
         ),
         "points": lambda positions: points_tensor("positions", positions),
     },
-    "obstacle": {
-        "box": Box,
-        "sphere": Sphere,
-        "cylinder": Cylinder,
-        "mesh": Mesh,
-        "voxel_mask": VoxelMask.load,
-    },
+    "obstacle": KINDS,
 }
 _JOINED: dict[str, tuple[str, Builder]] = {  # an example of an entry, and how a list of entries is joined
     "array": ("{type: autd3, center: [0, 0, 0]}", partial(reduce, operator.add)),
@@ -144,7 +132,7 @@ def _part(
         parts = [_part(place, key, entry, air, folder, modules) for place, entry in groups]
         with within(where):
             return _JOINED[key][1](parts)
-    if key not in ("medium", *_KINDS, *_BUILDERS):
+    if key not in ("medium", *_TYPES, *_BUILDERS):
         return value
     section = _mapping(where, value)
     if isinstance(path := section.get("path"), str):
@@ -157,8 +145,8 @@ def _part(
         builder = load_trusted(f"{where}.{TARGET}", section.pop(TARGET), modules)
     else:
         kind = section.pop("type", None)
-        require_one_of(f"{where}: type", kind, _KINDS[key])
-        builder = _KINDS[key][kind]
+        require_one_of(f"{where}: type", kind, _TYPES[key])
+        builder = KINDS[kind].maker() if key == "obstacle" else _TYPES[key][kind]
     return _build(where, section, builder)
 
 

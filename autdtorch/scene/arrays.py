@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -144,7 +145,7 @@ class TransducerArray:
         pitch = positive("pitch", pitch, "m")
         places = torch.cartesian_prod(pitch * _centred(count_u), pitch * _centred(count_v)).reshape(-1, 2)
         more = {"shape": [count_u, count_v], "pitch": pitch}
-        return cls._placed("grid", places, center, normal, angle, source_strength, radius, **more)
+        return flat_array("grid", places, center, normal, angle, source_strength, radius, **more)
 
     @classmethod
     @suggesting
@@ -175,7 +176,7 @@ class TransducerArray:
         require_memory("units", units, _TRANSDUCER_BYTES * AUTD3_TRANSDUCERS * count_x * count_y)
         places = _autd3_places(count_x, count_y)
         units = count_x, count_y
-        return cls._placed("autd3", places, center, normal, angle, source_strength, radius, units=list(units))
+        return flat_array("autd3", places, center, normal, angle, source_strength, radius, units=list(units))
 
     @classmethod
     @suggesting
@@ -195,7 +196,7 @@ class TransducerArray:
         """
         across = _SQUARE_PITCH * _centred(_SQUARE_PLACES)
         places = torch.cartesian_prod(-across, across).flip(1)
-        return cls._placed("sonicsurface", places, center, normal, angle, source_strength, radius)
+        return flat_array("sonicsurface", places, center, normal, angle, source_strength, radius)
 
     @classmethod
     @suggesting
@@ -214,25 +215,7 @@ class TransducerArray:
         """
         across = _SQUARE_PITCH * _centred(_SQUARE_PLACES)
         places = torch.cartesian_prod(across, -across)
-        return cls._placed("openmpd", places, center, normal, angle, source_strength, radius)
-
-    @classmethod
-    def _placed(
-        cls,
-        kind: str,
-        places: torch.Tensor,
-        center: ArrayLike,
-        normal: ArrayLike,
-        angle: float,
-        source_strength: ArrayLike,
-        radius: ArrayLike | None,
-        **more: Any,
-    ) -> TransducerArray:
-        """Return the array of `places` (M, 2) [m] in a plane, which remembers how it was made."""
-        array = cls(in_plane(places, center, normal, angle), normal, source_strength, radius)
-        pose = {"center": _numbers(center), "normal": _numbers(normal), "angle": float(angle)}
-        object.__setattr__(array, "_recipes", (Recipe(kind, more | pose | _sizes(array)),))
-        return array
+        return flat_array("openmpd", places, center, normal, angle, source_strength, radius)
 
     def __add__(self, other: TransducerArray) -> TransducerArray:
         """Return both arrays as one, the transducers of `other` after those of this one.
@@ -279,11 +262,38 @@ class TransducerArray:
         )
 
 
+FORMS: dict[str, Callable[..., TransducerArray]] = {
+    "grid": TransducerArray.grid,
+    "positions": TransducerArray,
+    "autd3": TransducerArray.autd3,
+    "sonicsurface": TransducerArray.sonicsurface,
+    "openmpd": TransducerArray.openmpd,
+}
+"""The functions that make an array, by its `type` in scene files."""
+
+
+def flat_array(
+    form: str,
+    places: torch.Tensor,
+    center: ArrayLike,
+    normal: ArrayLike,
+    angle: float,
+    source_strength: ArrayLike,
+    radius: ArrayLike | None,
+    **arguments: Any,
+) -> TransducerArray:
+    """Return the array of `places` (M, 2) [m] in a plane, with the recipe of a form and its arguments."""
+    array = TransducerArray(in_plane(places, center, normal, angle), normal, source_strength, radius)
+    pose = {"center": _numbers(center), "normal": _numbers(normal), "angle": float(angle)}
+    object.__setattr__(array, "_recipes", (Recipe(form, arguments | pose | _sizes(array)),))
+    return array
+
+
 def recipes_of(array: TransducerArray) -> tuple[Recipe, ...]:
-    """Return the recipes of the arrays that were joined to an array; of one that was not, its own."""
-    known: tuple[Recipe, ...] | None = vars(array).get("_recipes")
-    if known is not None:
-        return known
+    """Return the recipes of the arrays that were joined to an array, or the one of a single array."""
+    recipes: tuple[Recipe, ...] | None = vars(array).get("_recipes")
+    if recipes is not None:
+        return recipes
     normals = array.normals.tolist()
     alike = all(normal == normals[0] for normal in normals)
     places = {"positions": array.positions.tolist(), "normals": normals[0] if alike else normals}

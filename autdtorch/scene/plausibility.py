@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from autdtorch.scene.arrays import radii_of
-from autdtorch.scene.obstacles import Mesh, Obstacle, VoxelMask
-from autdtorch.utils.spatial import closest_pair
+from autdtorch.scene.obstacles import Obstacle
+from autdtorch.utils.neighbours import closest_pair
 from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
@@ -53,7 +53,7 @@ def unit_hint(scene: Scene, obstacle: Obstacle) -> str:
     """Return what to do about a refused obstacle far larger or farther than array and foci; else nothing."""
     points = _observed(scene)
     both = torch.cat([points, points.new_tensor([obstacle.lower, obstacle.upper])])
-    return _unit_question(obstacle) if _diagonal(both) > _usual_reach(scene, points) else ""
+    return f"; {obstacle.unit_question}" if _diagonal(both) > _usual_reach(scene, points) else ""
 
 
 def extent_of(obstacle: Obstacle) -> str:
@@ -61,14 +61,6 @@ def extent_of(obstacle: Obstacle) -> str:
     bounds = obstacle.lower, obstacle.upper
     low, high = (tuple(float(f"{entry:.9g}") for entry in corner) for corner in bounds)
     return f"{low} to {high} m"
-
-
-def _unit_question(obstacle: Obstacle) -> str:
-    if isinstance(obstacle, Mesh):
-        return "; take scale=1e-3 for a file in millimetres"
-    if isinstance(obstacle, VoxelMask):
-        return "; is its spacing in m, 1 mm as 1e-3?"
-    return "; are its lengths in m, 16 mm as 16e-3?"
 
 
 def _too_large(scene: Scene) -> Iterator[tuple[str, str]]:
@@ -82,7 +74,7 @@ def _too_large(scene: Scene) -> Iterator[tuple[str, str]]:
         corners = points.new_tensor([obstacle.lower, obstacle.upper])
         everything.append(corners)
         if _is_too_large(scene, points, _without_slabs(corners, points)):
-            told = f"{type(obstacle).__name__} of {extent_of(obstacle)}{_unit_question(obstacle)}"
+            told = f"{type(obstacle).__name__} of {extent_of(obstacle)}; {obstacle.unit_question}"
             yield f"obstacles[{index}]", f": {told}"
     ask = "is it in m, 100 mm as 100e-3?"
     if (plane := scene.observation_plane) is not None:

@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 from autdtorch.fdtd.assembly.element import LATTICE
 from autdtorch.fdtd.assembly.elements import HALF_DIAGONAL, lattice_distances, located
 from autdtorch.scene.obstacles import Box, Mesh, Sphere
-from autdtorch.scene.obstacles.mesh_distance import MeshDistance
+from autdtorch.scene.obstacles.mesh import MeshDistance
 
 CUBOID = Box((0, 0, 0), (2.0, 3.0, 1.0), rigid=True)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from autdtorch.hardware.devices import DEVICES
 from autdtorch.io.drive_file import save_drive
-from autdtorch.io.scene_sections import save_scene, scene_lines
+from autdtorch.io.scene_writer import save_scene, scene_lines
 from autdtorch.plot.explore.situation import Situation
 from autdtorch.utils.files import replace_file
 

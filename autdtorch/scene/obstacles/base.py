@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Self
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, Self
 
 import torch
 
@@ -35,6 +38,16 @@ class Obstacle(ABC):
         ValueError: a density or sound speed out of range; both a material and rigid, or neither.
     """
 
+    position_field: ClassVar[str] = ""
+    """Name of the field (3,) [m] that moves along with the body; empty for a class that is not moved."""
+
+    orientation_field: ClassVar[str | None] = None
+    """Name of the field that turns along with the body: "rotation", angles (3,) as of `rotation_matrix`, or
+    "axis", a direction (3,). Empty where the shape has no direction; None for a class that is not turned."""
+
+    unit_question: ClassVar[str] = "are its lengths in m, 16 mm as 16e-3?"
+    """Question to the user about an obstacle that is far too large."""
+
     density: float | None = None
     sound_speed: float | None = None
     rigid: bool = False
@@ -56,15 +69,6 @@ class Obstacle(ABC):
         object.__setattr__(self, "sound_speed", sound_speed)
 
     @property
-    def uncertainty(self) -> float:
-        """Distance [m] by which its surface may be off (rms); 0 where it is exact."""
-        return 0.0
-
-    def filled(self) -> Self:
-        """Return the obstacle without its cavities, which no sound enters if it is rigid."""
-        return self
-
-    @property
     @abstractmethod
     def lower(self) -> Vector:
         """Corner of the bounding box with the smallest coordinates (3,) [m]."""
@@ -73,6 +77,23 @@ class Obstacle(ABC):
     @abstractmethod
     def upper(self) -> Vector:
         """Corner of the bounding box with the largest coordinates (3,) [m]."""
+
+    @property
+    def fills_bounds(self) -> bool:
+        """Whether the obstacle is all of its bounding box, as a wall along the axes is."""
+        return False
+
+    @property
+    def uncertainty(self) -> float:
+        """Distance [m] by which the surface may be off (rms); 0 where it is exact."""
+        return 0.0
+
+    @abstractmethod
+    def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return vertices (V, 3) [m], float64, and triangles of their indices (F, 3), int64.
+
+        Triangles are counter-clockwise as seen from outside.
+        """
 
     def contains(self, points: ArrayLike, margin: float = 0.0) -> torch.Tensor:
         """Return whether each point lies inside, bool (...).
@@ -86,11 +107,10 @@ class Obstacle(ABC):
         """
         points = _points(points)
         margin = not_negative("margin", margin, "m")
-        flat = points.reshape(-1, 3)
-        near = self.near(flat, margin)  # distances to meshes are slow
-        inside = torch.zeros(len(flat), dtype=torch.bool, device=flat.device)
-        inside[near] = self._inside(flat[near], margin)
-        return inside.reshape(points.shape[:-1])
+        near = self.near(points, margin)  # distances to meshes are slow
+        inside = torch.zeros_like(near)
+        inside[near] = self._inside(points[near], margin)
+        return inside
 
     def near(self, points: torch.Tensor, margin: float = 0.0) -> torch.Tensor:
         """Return whether each of the points (..., 3) [m] is at most `margin` [m] from the bounding box."""
@@ -111,12 +131,36 @@ class Obstacle(ABC):
         points = _points(points)
         return self._distance(points.reshape(-1, 3)).reshape(points.shape[:-1])
 
-    @abstractmethod
-    def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return vertices (V, 3) [m], float64, and triangles of their indices (F, 3), int64.
+    def farthest(self, center: torch.Tensor) -> float:
+        """Return the distance [m] of the farthest point of the surface from a point (3,) [m]."""
+        return float((self.surface()[0] - center).norm(dim=1).max())
 
-        Triangles are counter-clockwise as seen from outside.
-        """
+    def at(self, position: Vector) -> Self:
+        """Return the obstacle with another value (3,) [m] of its `position_field`."""
+        field: dict[str, Any] = {self.position_field: position}
+        return replace(self, **field)
+
+    def filled(self) -> Self:
+        """Return the obstacle without its cavities, which no sound enters if it is rigid."""
+        return self
+
+    @classmethod
+    def maker(cls) -> Callable[..., Obstacle]:
+        """Return the function whose arguments are the keys of an obstacle's section in a scene file."""
+        return cls
+
+    def section(self, name: str) -> dict[str, Any]:
+        """Return the section of the obstacle in a scene file, without defaults; `name` is of `write_file`."""
+        defaults = {key: entry.default for key, entry in inspect.signature(self.maker()).parameters.items()}
+        values = {key: getattr(self, key, default) for key, default in defaults.items()}
+        return {
+            key: list(value) if isinstance(value, tuple) else value
+            for key, value in values.items()
+            if value != defaults[key]
+        }
+
+    def write_file(self, path: Path) -> None:  # noqa: B027 (most obstacles need no file)
+        """Write what is too large for a section to a file of this path, to which a suffix is added."""
 
     def _inside(self, points: torch.Tensor, margin: float) -> torch.Tensor:
         return self._distance(points) < margin
@@ -126,8 +170,8 @@ class Obstacle(ABC):
         """Return the signed distances (N,) [m] of checked `points` (N, 3) [m]."""
 
 
-def _points(given: ArrayLike) -> torch.Tensor:
-    points = real_tensor("points", given, "m")
+def _points(values: ArrayLike) -> torch.Tensor:
+    points = real_tensor("points", values, "m")
     if points.ndim == 0 or points.shape[-1] != 3:
         raise ValueError(f"points: shape {tuple(points.shape)}; must be (..., 3)")
     return points

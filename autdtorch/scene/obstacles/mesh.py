@@ -2,29 +2,36 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 from dataclasses import InitVar, dataclass, field, replace
-from typing import Any, Self
+from pathlib import Path
+from typing import Any, ClassVar, Self
+from weakref import WeakSet
 
 import numpy as np
 import torch
 
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.base import Obstacle
-from autdtorch.scene.obstacles.mesh_distance import MeshDistance
 from autdtorch.scene.obstacles.mesh_file import read_mesh
 from autdtorch.scene.obstacles.mesh_repair import repaired
 from autdtorch.scene.obstacles.mesh_solid import Triangles, outer_parts, solid_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.cached import cached_property
 from autdtorch.utils.digest import digest_of
+from autdtorch.utils.files import replacing
 from autdtorch.utils.hints import suggesting
+from autdtorch.utils.triangles import doubled_normals
 from autdtorch.utils.units import angles
 from autdtorch.utils.validation import Vector, boolean, finite_vector, invalid, positive, real_tensor, within
 
 logger = logging.getLogger(__name__)
 
 _MOST = 2**53  # largest whole number that is exact in double precision
+_ON_SIDE = 1e-9  # barycentric coordinate of a nearest point that lies on a side of its triangle
+_FINE = 2.0  # accuracy of winding numbers as libigl counts it: errors are below 0.05
+_alive: WeakSet[MeshDistance] = WeakSet()
 
 
 class _Source(str):
@@ -68,6 +75,10 @@ class Mesh(Obstacle):
             attribute that is not finite, has the wrong shape or is out of range; see also `Obstacle`. The
             message names the place in the mesh.
     """
+
+    position_field: ClassVar[str] = "offset"
+    orientation_field: ClassVar[str | None] = "rotation"
+    unit_question: ClassVar[str] = "take scale=1e-3 for a file in millimetres"
 
     path: str = field(compare=False)
     scale: float = field(default=1.0, compare=False)
@@ -137,15 +148,27 @@ class Mesh(Obstacle):
         """Vertices (V, 3) in the coordinates and units of the file, and `faces`; not to be changed."""
         return self._source.vertices, self._source.faces
 
+    def section(self, name: str) -> dict[str, Any]:
+        """Return the section, with the path of `write_file`; see `Obstacle.section`."""
+        section = super().section(name) | {"path": f"{name}.obj"}
+        section.pop("repair", None)  # the file has the triangles of the body
+        return section
+
+    def write_file(self, path: Path) -> None:
+        """Write the triangles, in the coordinates of the file, to an .obj file; see `Obstacle.write_file`."""
+        with replacing(path.with_name(f"{path.name}.obj")) as partial, partial.open("wb") as file:
+            np.savetxt(file, self.triangles[0], fmt="v %.17g %.17g %.17g")
+            np.savetxt(file, self.triangles[1] + 1, fmt="f %d %d %d")
+
     @property
     def lower(self) -> Vector:
-        """Corner of the bounding box with the smallest coordinates (3,) [m]."""
+        """Lower corner of the bounding box (3,) [m]."""
         x, y, z = self.vertices.amin(dim=0).tolist()
         return x, y, z
 
     @property
     def upper(self) -> Vector:
-        """Corner of the bounding box with the largest coordinates (3,) [m]."""
+        """Upper corner of the bounding box (3,) [m]."""
         x, y, z = self.vertices.amax(dim=0).tolist()
         return x, y, z
 
@@ -155,9 +178,9 @@ class Mesh(Obstacle):
 
     def _distance(self, points: torch.Tensor) -> torch.Tensor:
         """Measure in the coordinates of the file, whose search structures serve every place of the mesh."""
-        moved = points.detach().cpu() - points.new_tensor(self.offset).cpu()
-        own = moved @ rotation_matrix(self.rotation) / self.scale
-        return torch.from_numpy(self.scale * self._source.distance(own.numpy())).to(points)
+        from_origin = points.detach().cpu() - points.new_tensor(self.offset).cpu()
+        in_file = from_origin @ rotation_matrix(self.rotation) / self.scale
+        return torch.from_numpy(self.scale * self._source.distance(in_file.numpy())).to(points)
 
     @property
     def _source(self) -> _Source:
@@ -175,9 +198,9 @@ def _solid(triangles: Triangles, repair: bool) -> Triangles:
     return vertices, faces
 
 
-def _read(given: object, repair: bool) -> _Source:
+def _read(path: object, repair: bool) -> _Source:
     """Check the path of a mesh file and read it."""
-    path, triangles = read_mesh(given)
+    path, triangles = read_mesh(path)
     source = _Source(path)
     try:
         source.vertices, source.faces = _solid(triangles, repair)
@@ -200,3 +223,77 @@ def _triangles(surface: Any) -> Triangles:
     if (triangles != np.trunc(triangles)).any():
         raise ValueError("triangles that are not whole numbers; must be indices of vertices, counted from 0")
     return vertices, triangles.clip(-1, _MOST).astype(np.int64)  # an index beyond is refused
+
+
+@atexit.register
+def _drop_all() -> None:
+    """Drop the search structures: libigl warns of any that outlive the interpreter."""
+    for each in tuple(_alive):
+        vars(each).clear()
+
+
+class MeshDistance:
+    """The distance to a closed surface, negative inside.
+
+    The nearest point of the surface is on a triangle, an edge or at a vertex. A point is outside if it is on
+    the side of its normal: that of the triangle, the mean of two at an edge, the mean by angles at a vertex
+    (Baerentzen and Aanaes 2005, doi:10.1109/TVCG.2005.49). Where more than two triangles meet at an edge, or
+    parts at a vertex, the winding number decides.
+    """
+
+    def __init__(self, vertices: Array, faces: Index) -> None:
+        """Build the structures for vertices (V, 3) and outward triangles (F, 3)."""
+        import igl
+
+        _alive.add(self)
+        self._vertices, self._faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces)
+        self._tree = igl.AABB()
+        self._tree.init(self._vertices, self._faces)
+        self._winding = None
+        if igl.is_edge_manifold(self._faces)[0] and igl.is_vertex_manifold(self._faces).all():
+            by_angle = igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE
+            uniform = igl.PER_EDGE_NORMALS_WEIGHTING_TYPE_UNIFORM
+            self._face_normals = _unit(doubled_normals(self._vertices[self._faces]))
+            self._vertex_normals = igl.per_vertex_normals(self._vertices, self._faces, by_angle)
+            self._edge_normals, _, self._edge = igl.per_edge_normals(self._vertices, self._faces, uniform)
+        else:
+            lower, upper = self._vertices.min(axis=0), self._vertices.max(axis=0)
+            self._middle, self._extent = (lower + upper) / 2, float((upper - lower).max())
+            self._winding = igl.FastWindingNumberBVH()  # in single precision
+            self._winding.init((self._vertices - self._middle) / self._extent, self._faces)
+
+    def __call__(self, points: Array) -> Array:
+        """Return the signed distances (N,) of points (N, 3)."""
+        points = np.ascontiguousarray(points)
+        if len(points) == 0:
+            return np.zeros(0)
+        square, face, nearest = self._tree.squared_distance(self._vertices, self._faces, points)
+        if self._winding is None:
+            inside = ((points - nearest) * self._normals(face, nearest)).sum(axis=1) < 0
+        else:
+            inside = self._winding.winding_number((points - self._middle) / self._extent, _FINE) > 0.5
+        return np.asarray(np.where(inside, -np.sqrt(square), np.sqrt(square)))
+
+    def _normals(self, face: Index, nearest: Array) -> Array:
+        """Return the normals (N, 3) of the surface at points on triangles `face` (N,)."""
+        normal = self._face_normals[face]
+        first, second, third = (self._vertices[corner] for corner in self._faces[face].T)
+        opposite = zip((second, third, first), (third, first, second), strict=True)
+        whole = np.linalg.norm(np.cross(second - first, third - first), axis=1)
+        # the share of the triangle opposite each corner, zero for a point on the side opposite it
+        area = [(np.cross(b - nearest, c - nearest) * normal).sum(axis=1) for b, c in opposite]
+        share = np.stack(area, axis=1) / np.where(whole > 0, whole, 1)[:, None]
+        on_side = np.abs(share) < _ON_SIDE
+        at_edge = np.flatnonzero(on_side.sum(axis=1) == 1)
+        side = on_side[at_edge].argmax(axis=1)
+        normal[at_edge] = self._edge_normals[self._edge[face[at_edge] + len(self._faces) * side]]
+        at_vertex = np.flatnonzero(on_side.sum(axis=1) > 1)
+        corner = share[at_vertex].argmax(axis=1)
+        normal[at_vertex] = self._vertex_normals[self._faces[face[at_vertex], corner]]
+        return np.asarray(normal)
+
+
+def _unit(vectors: Array) -> Array:
+    """Return vectors (n, 3) divided by their length, where it is not zero."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors / np.where(length > 0, length, 1))

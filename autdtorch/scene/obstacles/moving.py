@@ -11,19 +11,13 @@ from typing import Any
 import torch
 
 from autdtorch.scene.geometry import rotation_matrix
+from autdtorch.scene.obstacles import KINDS
 from autdtorch.scene.obstacles.base import Obstacle
-from autdtorch.scene.obstacles.mesh import Mesh
-from autdtorch.scene.obstacles.primitives import Box, Cylinder, Sphere
-from autdtorch.scene.obstacles.voxel_mask import VoxelMask
-from autdtorch.utils.array_types import REAL
+from autdtorch.utils.cpu_tensors import REAL
 from autdtorch.utils.validation import Vector, invalid
 
-# The fields that place and turn an obstacle. A class of the user's own may have others, and is not moved
-_PLACES = {Box: "center", Sphere: "center", Cylinder: "center", Mesh: "offset", VoxelMask: "origin"}
-_TURNS = {Box: "rotation", Mesh: "rotation", Cylinder: "axis", Sphere: ""}
-
-# Decimals of a place [m], and of an angle [rad] or direction: far above rounding, far below what an element
-# can show. Fewer at rest, after two turns
+# Decimals of a position [m], and of an angle [rad] or direction: far above rounding, far below what an
+# element can show. Fewer at rest, after two turns
 _DIGITS, _ANGLE_DIGITS = 14, 12
 _DIGITS_AT_REST, _ANGLE_DIGITS_AT_REST = 12, 10
 
@@ -34,12 +28,12 @@ def moved(obstacles: Sequence[Obstacle], offset: torch.Tensor, rotation: Vector)
     Raises:
         ValueError: an obstacle that cannot be moved or turned.
     """
-    if fixed := [one for one in obstacles if not is_movable(one)]:
+    if fixed := [obstacle for obstacle in obstacles if not is_movable(obstacle)]:
         raise invalid("obstacles", type(fixed[0]).__name__, "must be of autdtorch's own kinds to be moved")
     if obstacles and any(rotation):
         (center, _), turn = circumscribed(obstacles), rotation_matrix(rotation)
-        obstacles = [turned(one, turn, center) for one in obstacles]
-    return tuple(shifted(one, offset) for one in obstacles)
+        obstacles = [turned(obstacle, turn, center) for obstacle in obstacles]
+    return tuple(shifted(obstacle, offset) for obstacle in obstacles)
 
 
 def circumscribed(obstacles: Sequence[Obstacle]) -> tuple[torch.Tensor, float]:
@@ -49,36 +43,27 @@ def circumscribed(obstacles: Sequence[Obstacle]) -> tuple[torch.Tensor, float]:
     """
     still, turn = at_rest(obstacles)
     lower, upper = (
-        torch.tensor([getattr(one, side) for one in still], **REAL) for side in ("lower", "upper")
+        torch.tensor([getattr(obstacle, side) for obstacle in still], **REAL) for side in ("lower", "upper")
     )
     center = (lower.amin(dim=0) + upper.amax(dim=0)) / 2
-    reach = [
-        float((center - center.new_tensor(one.center)).norm()) + one.radius
-        if isinstance(one, Sphere)
-        else float((one.surface()[0] - center).norm(dim=1).max())
-        for one in still
-    ]
-    return turn @ center, max(reach)
+    return turn @ center, max(obstacle.farthest(center) for obstacle in still)
 
 
 def is_movable(obstacle: object) -> bool:
     """Return whether an obstacle can be shifted."""
-    return type(obstacle) in _PLACES
+    return (
+        isinstance(obstacle, Obstacle) and type(obstacle) in KINDS.values() and bool(obstacle.position_field)
+    )
 
 
 def is_turnable(obstacle: object) -> bool:
     """Return whether turning an obstacle changes it; a sphere stays what it is."""
-    return bool(_TURNS.get(type(obstacle)))  # type: ignore[call-overload]
+    return isinstance(obstacle, Obstacle) and is_movable(obstacle) and bool(obstacle.orientation_field)
 
 
 def shifted(obstacle: Obstacle, offset: torch.Tensor, digits: int = _DIGITS) -> Obstacle:
-    """Return an obstacle shifted by an offset (3,) [m], its place rounded to decimals."""
-    name = _PLACES[type(obstacle)]
-    place = _rounded(offset.new_tensor(getattr(obstacle, name)) + offset, digits)
-    if isinstance(obstacle, VoxelMask):
-        return obstacle.at(place)
-    there: dict[str, Any] = {name: place}
-    return replace(obstacle, **there)
+    """Return an obstacle shifted by an offset (3,) [m], its position rounded to decimals."""
+    return obstacle.at(_rounded(_position(obstacle, offset) + offset, digits))
 
 
 def turned(
@@ -93,14 +78,17 @@ def turned(
     Raises:
         ValueError: an obstacle that cannot be turned, such as a `VoxelMask`.
     """
-    if (kind := type(obstacle)) not in _TURNS:
-        raise invalid("rotation", kind.__name__, "must be (0, 0, 0): this kind of obstacle cannot be turned")
-    place = turn.new_tensor(getattr(obstacle, _PLACES[kind]))
-    fields: dict[str, Any] = {_PLACES[kind]: _rounded(pivot + turn @ (place - pivot), digits)}
-    if name := _TURNS[kind]:
-        own = getattr(obstacle, name)
-        found = angles_of(turn @ rotation_matrix(own)) if name == "rotation" else turn @ turn.new_tensor(own)
-        fields[name] = _rounded(found, angle_digits)
+    if not is_movable(obstacle) or obstacle.orientation_field is None:
+        accepted = "must be (0, 0, 0): this kind of obstacle cannot be turned"
+        raise invalid("rotation", type(obstacle).__name__, accepted)
+    position = pivot + turn @ (_position(obstacle, turn) - pivot)
+    fields: dict[str, Any] = {obstacle.position_field: _rounded(position, digits)}
+    if field := obstacle.orientation_field:
+        before = getattr(obstacle, field)
+        after = (
+            turn @ turn.new_tensor(before) if field == "axis" else angles_of(turn @ rotation_matrix(before))
+        )
+        fields[field] = _rounded(after, angle_digits)
     return replace(obstacle, **fields)
 
 
@@ -113,21 +101,23 @@ def at_rest(obstacles: Sequence[Obstacle]) -> tuple[tuple[Obstacle, ...], torch.
     turn = _first_turn(obstacles)
     if torch.equal(turn, torch.eye(3, **REAL)):
         return tuple(obstacles), turn
-    if any(type(one) not in _TURNS for one in obstacles):
+    if not all(is_movable(obstacle) and obstacle.orientation_field is not None for obstacle in obstacles):
         return tuple(obstacles), torch.eye(3, **REAL)
     digits = _DIGITS_AT_REST, _ANGLE_DIGITS_AT_REST
-    return tuple(turned(one, turn.mT, torch.zeros_like(turn[0]), *digits) for one in obstacles), turn
+    return tuple(
+        turned(obstacle, turn.mT, torch.zeros_like(turn[0]), *digits) for obstacle in obstacles
+    ), turn
 
 
 def _first_turn(obstacles: Sequence[Obstacle]) -> torch.Tensor:
     """Return the turn (3, 3) of the first box or mesh, or from z to the axis of the first cylinder."""
-    for one in obstacles:
-        if isinstance(one, Box | Mesh):
-            return rotation_matrix(one.rotation)
-    for one in obstacles:
-        if isinstance(one, Cylinder):
-            x, y, z = one.axis
-            return rotation_matrix((0.0, math.acos(max(-1.0, min(1.0, z))), math.atan2(y, x)))
+    turnable = [obstacle for obstacle in obstacles if is_turnable(obstacle)]
+    for obstacle in sorted(turnable, key=lambda obstacle: obstacle.orientation_field == "axis"):
+        orientation: Vector = getattr(obstacle, str(obstacle.orientation_field))
+        if obstacle.orientation_field != "axis":
+            return rotation_matrix(orientation)
+        x, y, z = orientation
+        return rotation_matrix((0.0, math.acos(max(-1.0, min(1.0, z))), math.atan2(y, x)))
     return torch.eye(3, **REAL)
 
 
@@ -138,6 +128,10 @@ def angles_of(turn: torch.Tensor) -> torch.Tensor:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # where the angles are not unique, any will do
         return torch.from_numpy(Rotation.from_matrix(turn.numpy()).as_euler("xyz"))
+
+
+def _position(obstacle: Obstacle, like: torch.Tensor) -> torch.Tensor:
+    return like.new_tensor(getattr(obstacle, obstacle.position_field))
 
 
 def _rounded(vector: torch.Tensor, digits: int) -> Vector:

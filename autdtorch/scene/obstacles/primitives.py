@@ -5,20 +5,31 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from dataclasses import InitVar, dataclass, field
+from typing import ClassVar
 
 import torch
 
-from autdtorch.scene.geometry import rotation_matrix
+from autdtorch.scene.geometry import circle_points, rotation_matrix
 from autdtorch.scene.obstacles.base import Obstacle
-from autdtorch.scene.obstacles.triangles import BOX_TRIANGLES, SEGMENTS, revolved
-from autdtorch.utils.array_types import REAL
+from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.hints import suggesting
 from autdtorch.utils.units import angles
 from autdtorch.utils.validation import Vector, finite_vector, positive, positive_entries, unit_vector
+
+SEGMENTS = 48
+"""Sides of the polygon drawn for a circle: corners on the circle, sides up to 0.2 % of the radius inside."""
+
+_BOX = "013 032 467 475 045 051 237 276 026 064 157 173"
+BOX_TRIANGLES = torch.tensor([[*map(int, face)] for face in _BOX.split()], dtype=torch.int64, device="cpu")
+"""Triangles of a box with corners in the order of `torch.cartesian_prod`, two for each face
+from -x, +x, -y to +z."""
 
 
 @dataclass(frozen=True)
 class _Centred(Obstacle):
     """A body that is symmetric about its centre (3,) [m]."""
+
+    position_field: ClassVar[str] = "center"
 
     center: Vector
 
@@ -30,13 +41,13 @@ class _Centred(Obstacle):
 
     @property
     def lower(self) -> Vector:
-        """Corner of the bounding box with the smallest coordinates (3,) [m]."""
+        """Lower corner of the bounding box (3,) [m]."""
         (x, y, z), (a, b, c) = self.center, self._half_extents
         return x - a, y - b, z - c
 
     @property
     def upper(self) -> Vector:
-        """Corner of the bounding box with the largest coordinates (3,) [m]."""
+        """Upper corner of the bounding box (3,) [m]."""
         (x, y, z), (a, b, c) = self.center, self._half_extents
         return x + a, y + b, z + c
 
@@ -63,6 +74,8 @@ class Box(_Centred):
         ValueError: an attribute is not finite, has the wrong shape or is out of range; see also `Obstacle`.
     """
 
+    orientation_field: ClassVar[str | None] = "rotation"
+
     size: Vector
     rotation: Vector = (0.0, 0.0, 0.0)
     rotation_degrees: InitVar[Vector | None] = field(default=None, kw_only=True)
@@ -72,6 +85,11 @@ class Box(_Centred):
         super().__post_init__()
         object.__setattr__(self, "size", positive_entries("Box.size", self.size, 3))
         object.__setattr__(self, "rotation", angles("Box.rotation", self.rotation, rotation_degrees))
+
+    @property
+    def fills_bounds(self) -> bool:
+        """Whether the edges are along the axes; see `Obstacle.fills_bounds`."""
+        return self.rotation == (0.0, 0.0, 0.0)
 
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return two triangles for each face; see `Obstacle.surface`."""
@@ -111,6 +129,8 @@ class Sphere(_Centred):
         ValueError: an attribute is not finite, has the wrong shape or is out of range; see also `Obstacle`.
     """
 
+    orientation_field: ClassVar[str | None] = ""
+
     radius: float
 
     def __post_init__(self) -> None:
@@ -123,6 +143,10 @@ class Sphere(_Centred):
         angles = torch.linspace(0, math.pi, SEGMENTS // 2 + 1, **REAL)
         profile = self.radius * torch.stack([angles.sin(), -angles.cos()], dim=-1)
         return revolved(profile, self.center, (0.0, 0.0, 1.0))
+
+    def farthest(self, center: torch.Tensor) -> float:
+        """Return the distance [m] of the farthest point; see `Obstacle.farthest`."""
+        return float((center - center.new_tensor(self.center)).norm()) + self.radius
 
     @property
     def _half_extents(self) -> Vector:
@@ -146,6 +170,8 @@ class Cylinder(_Centred):
     Raises:
         ValueError: an attribute is not finite, has the wrong shape or is out of range; see also `Obstacle`.
     """
+
+    orientation_field: ClassVar[str | None] = "axis"
 
     radius: float
     height: float
@@ -186,3 +212,28 @@ def _distance_from_excess(excess: torch.Tensor) -> torch.Tensor:
     """Return signed distances (N,) from the distances (N, K) of points beyond K perpendicular faces."""
     outside: torch.Tensor = torch.linalg.vector_norm(excess.clamp(min=0), dim=-1)
     return outside + excess.amax(dim=-1).clamp(max=0)
+
+
+def revolved(profile: torch.Tensor, center: Vector, axis: Vector) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the surface, vertices (V, 3) [m] and triangles (F, 3), of a body of revolution.
+
+    Args:
+        profile: (K, 2) [m], distance from the axis and position along it, upwards; both ends on the axis.
+        center: origin of the positions along the axis (3,) [m].
+        axis: unit vector (3,).
+    """
+    rings, count = len(profile) - 2, SEGMENTS
+    circle = circle_points((0.0, 0.0, 0.0), 1.0, count, axis)
+    upwards = torch.tensor(axis, **REAL)
+    bottom, top = (profile[end, 1] * upwards for end in (0, -1))
+    sides = profile[1:-1, :1, None] * circle + profile[1:-1, 1:, None] * upwards
+    vertices = torch.cat([bottom[None], sides.reshape(-1, 3), top[None]])
+    ring = 1 + torch.arange(rings * count, device="cpu").reshape(rings, count)
+    turned = ring.roll(-1, dims=1)
+    triangles = [
+        torch.stack([torch.zeros_like(ring[0]), turned[0], ring[0]], dim=-1),
+        torch.stack([ring[:-1], turned[:-1], turned[1:]], dim=-1).reshape(-1, 3),
+        torch.stack([ring[:-1], turned[1:], ring[1:]], dim=-1).reshape(-1, 3),
+        torch.stack([torch.full_like(ring[0], rings * count + 1), ring[-1], turned[-1]], dim=-1),
+    ]
+    return torch.tensor(center, **REAL) + vertices, torch.cat(triangles)

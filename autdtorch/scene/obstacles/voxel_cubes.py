@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.scene.obstacles.triangles import BOX_TRIANGLES
+from autdtorch.scene.obstacles.primitives import BOX_TRIANGLES
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.cached import cached_property
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import math
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from autdtorch.utils.cached import cached_property
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import read_arrays
 from autdtorch.utils.hints import suggesting
+from autdtorch.utils.numpy_file import read_arrays, write_arrays
 from autdtorch.utils.validation import (
     Vector,
     boolean,
@@ -36,9 +38,8 @@ from autdtorch.utils.validation import (
 logger = logging.getLogger(__name__)
 
 _MOST_UNEQUAL = 20  # Ratio of a voxel's edges: smoothing over the longest takes so many of the shortest
-_UNCERTAIN_CUBES = (
-    0.3  # Distance by which faces of cuboids may be off that stand for something smooth [voxels]
-)
+# Distance [voxels] by which the faces of cuboids may be off where the body is smooth
+_UNCERTAIN_CUBES = 0.3
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,9 @@ class VoxelMask(Obstacle):
             out of range; see also `Obstacle`.
     """
 
+    position_field: ClassVar[str] = "origin"
+    unit_question: ClassVar[str] = "is its spacing in m, 1 mm as 1e-3?"
+
     mask: NDArray[Any] = field(repr=False, compare=False)
     spacing: float | Vector
     origin: Vector = (0.0, 0.0, 0.0)
@@ -83,6 +87,7 @@ class VoxelMask(Obstacle):
             if not self.smooth:
                 raise invalid("VoxelMask.smooth", False, "must be True where a level is given")
         values = _checked_mask(self.mask) if self.level is None else _checked_grey(self.mask, self.level)
+        values.flags.writeable = False
         object.__setattr__(self, "mask", values)
         object.__setattr__(self, "digest", digest_of(self.mask)[:16])
 
@@ -144,21 +149,21 @@ class VoxelMask(Obstacle):
     @property
     def uncertainty(self) -> float:
         """Distance [m] by which the surface may be off (rms): voxels do not say where it is between them."""
-        return self._shape.uncertainty
+        return self._body.uncertainty
 
     @property
     def lower(self) -> Vector:
-        """Corner of the body's bounding box with the smallest coordinates (3,) [m]."""
-        return self._moved(self._shape.bounds[0])
+        """Lower corner of the body's bounding box (3,) [m]."""
+        return self._in_scene(self._body.bounds[0])
 
     @property
     def upper(self) -> Vector:
-        """Corner of the body's bounding box with the largest coordinates (3,) [m]."""
-        return self._moved(self._shape.bounds[1])
+        """Upper corner of the body's bounding box (3,) [m]."""
+        return self._in_scene(self._body.bounds[1])
 
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the surface, of cubes the faces between voxels of body and air; see `Obstacle.surface`."""
-        vertices, triangles = self._shape.surface()
+        vertices, triangles = self._body.surface()
         return torch.from_numpy(vertices + self.origin), torch.from_numpy(triangles)
 
     def filled(self) -> Self:
@@ -169,27 +174,40 @@ class VoxelMask(Obstacle):
         holes = binary_fill_holes(body) & ~body
         return replace(self, mask=np.where(holes, self.mask[body].max(), self.mask)) if holes.any() else self
 
-    def at(self, origin: Vector) -> Self:
-        """Return the body with another origin (3,) [m]; both share their shape."""
-        copy = replace(self, origin=origin)
-        vars(copy)["_shape"] = self._shape
+    def at(self, position: Vector) -> Self:
+        """Return the obstacle with another origin (3,) [m]; both share their body."""
+        copy = super().at(position)
+        vars(copy)["_body"] = self._body
         return copy
 
+    @classmethod
+    def maker(cls) -> Callable[..., VoxelMask]:
+        """Return `load`: a scene file has the path of the voxels; see `Obstacle.maker`."""
+        return cls.load
+
+    def section(self, name: str) -> dict[str, Any]:
+        """Return the section, with the path of `write_file`; see `Obstacle.section`."""
+        return {"path": f"{name}.npz"} | super().section(name)
+
+    def write_file(self, path: Path) -> None:
+        """Write the mask to an .npz file; see `Obstacle.write_file`."""
+        write_arrays(path.with_name(f"{path.name}.npz"), {"mask": self.mask})
+
     @cached_property
-    def _shape(self) -> VoxelSurface | VoxelCubes:
+    def _body(self) -> VoxelSurface | VoxelCubes:
         edges = np.broadcast_to(np.array(self.spacing, np.float64), 3)
         if not self.smooth:
             return VoxelCubes(self.mask, edges)
         try:
-            found = VoxelSurface(self.mask, edges, self.level)
+            body = VoxelSurface(self.mask, edges, self.level)
         except ThinError:
             logger.warning("a body of %d voxels is too thin to be smooth: taken as cuboids", self.mask.sum())
             return VoxelCubes(self.mask, edges, _UNCERTAIN_CUBES * float(edges.max()))
-        if found.lost:
-            logger.warning("%d voxels are too small to be smooth: left out of a body, or filled", found.lost)
-        return found
+        if body.lost:
+            logger.warning("%d voxels are too small to be smooth: left out of a body, or filled", body.lost)
+        return body
 
-    def _moved(self, corner: Array) -> Vector:
+    def _in_scene(self, corner: Array) -> Vector:
         x, y, z = (float(low + place) for low, place in zip(self.origin, corner, strict=True))
         return x, y, z
 
@@ -197,55 +215,50 @@ class VoxelMask(Obstacle):
         return np.asarray(points.detach().cpu().numpy() - self.origin, np.float64)
 
     def _inside(self, points: torch.Tensor, margin: float) -> torch.Tensor:
-        inside = torch.from_numpy(self._shape.inside(self._from_origin(points))).to(points.device)
+        inside = torch.from_numpy(self._body.inside(self._from_origin(points))).to(points.device)
         return inside | (self._distance(points) < margin) if margin > 0 else inside
 
     def _distance(self, points: torch.Tensor) -> torch.Tensor:
-        return torch.from_numpy(self._shape.distance(self._from_origin(points))).to(points)
+        return torch.from_numpy(self._body.distance(self._from_origin(points))).to(points)
 
 
-def _checked_spacing(given: object) -> float | Vector:
+def _checked_spacing(spacing: object) -> float | Vector:
     """Return the edge of a voxel, or its three edges."""
-    if isinstance(given, list | tuple) or (isinstance(given, np.ndarray | torch.Tensor) and given.ndim == 1):
-        x, y, z = positive_entries("VoxelMask.spacing", given, 3)
-        if max(x, y, z) > _MOST_UNEQUAL * min(x, y, z):
-            accepted = f"edges must be within a factor of {_MOST_UNEQUAL} of each other; resample the voxels"
-            raise invalid("VoxelMask.spacing", (x, y, z), accepted, "m")
-        return x if x == y == z else (x, y, z)
-    return positive("VoxelMask.spacing", given, "m")
+    if not isinstance(spacing, list | tuple) and getattr(spacing, "ndim", 0) != 1:
+        return positive("VoxelMask.spacing", spacing, "m")
+    x, y, z = positive_entries("VoxelMask.spacing", spacing, 3)
+    if max(x, y, z) > _MOST_UNEQUAL * min(x, y, z):
+        accepted = f"edges must be within a factor of {_MOST_UNEQUAL} of each other; resample the voxels"
+        raise invalid("VoxelMask.spacing", (x, y, z), accepted, "m")
+    return x if x == y == z else (x, y, z)
 
 
-def _checked_values(given: object, accepted: str) -> NDArray[Any]:
+def _checked_values(mask: object, accepted: str) -> NDArray[Any]:
     """Return a copy of an array (nx, ny, nz) of real numbers or booleans."""
-    if not isinstance(given, torch.Tensor | np.ndarray) or not is_dense(given) or given.ndim != 3:
-        raise invalid("VoxelMask.mask", given, accepted)
-    values = given.cpu().numpy() if isinstance(given, torch.Tensor) else given
+    if not isinstance(mask, torch.Tensor | np.ndarray) or not is_dense(mask) or mask.ndim != 3:
+        raise invalid("VoxelMask.mask", mask, accepted)
+    values = mask.cpu().numpy() if isinstance(mask, torch.Tensor) else mask
     if values.dtype.kind not in "buif" or not np.isfinite(values).all():
-        raise invalid("VoxelMask.mask", given, accepted)
+        raise invalid("VoxelMask.mask", mask, accepted)
     return np.array(values)
 
 
-def _checked_mask(given: object) -> NDArray[np.bool_]:
-    values = _checked_values(given, "must be an array (nx, ny, nz) of booleans or of whole numbers")
+def _checked_mask(mask: object) -> NDArray[np.bool_]:
+    values = _checked_values(mask, "must be an array (nx, ny, nz) of booleans or of whole numbers")
     if values.dtype != np.bool_:
-        found = np.unique(values)
-        if values.dtype.kind not in "ui" or len(found) > 2 or (len(found) == 2 and found[0] != 0):
+        numbers = np.unique(values)
+        if values.dtype.kind not in "ui" or len(numbers) > 2 or (len(numbers) == 2 and numbers[0] != 0):
             accepted = "must be booleans, or whole numbers that are 0 and one other; grey values need a level"
-            raise ValueError(f"VoxelMask.mask: {values.dtype} array with {len(found)} values; {accepted}")
-    return _read_only(values != 0)
+            raise ValueError(f"VoxelMask.mask: {values.dtype} array with {len(numbers)} values; {accepted}")
+    if not values.any():
+        raise ValueError(f"VoxelMask.mask: array of shape {values.shape}; must be True somewhere")
+    return np.asarray(values != 0)
 
 
-def _checked_grey(given: object, level: float) -> NDArray[np.float64]:
-    values = _checked_values(given, "must be an array (nx, ny, nz) of real numbers").astype(np.float64)
+def _checked_grey(mask: object, level: float) -> NDArray[np.float64]:
+    values = _checked_values(mask, "must be an array (nx, ny, nz) of real numbers").astype(np.float64)
     if not (values > level).any():
         raise invalid("VoxelMask.level", level, f"must be below the largest grey value, {values.max():g}")
-    return _read_only(values)
-
-
-def _read_only(values: NDArray[Any]) -> NDArray[Any]:
-    if values.dtype == np.bool_ and not values.any():
-        raise ValueError(f"VoxelMask.mask: array of shape {values.shape}; must be True somewhere")
-    values.flags.writeable = False
     return values
 
 

@@ -4,28 +4,25 @@ from __future__ import annotations
 
 import os
 import pprint
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import yaml
 
-from autdtorch.scene.arrays import recipes_of
-from autdtorch.scene.drive import amplitudes_of, phases_of
+from autdtorch.scene.arrays import FORMS, recipes_of
+from autdtorch.scene.drive import amplitudes_of, drive_from_phases, phases_of
 from autdtorch.scene.geometry import Plane
-from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
-from autdtorch.scene.scene import Scene
-from autdtorch.utils.files import replace_file, replacing, write_arrays
+from autdtorch.scene.obstacles import KINDS, Obstacle
+from autdtorch.scene.scene import Medium, Scene
+from autdtorch.utils.files import replace_file
 from autdtorch.utils.validation import invalid, path_of, require_kind
 
 
 class _Code(str):
     """An expression in Python."""
-
-
-_KINDS = {Box: "box", Sphere: "sphere", Cylinder: "cylinder", Mesh: "mesh", VoxelMask: "voxel_mask"}
 
 
 def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
@@ -83,36 +80,16 @@ def scene_sections(scene: Scene, name: str) -> dict[str, Any]:
 def write_files(scene: Scene, path: Path) -> None:
     """Write the meshes and masks of a scene, beside the scene file of this path without its suffix."""
     for number, obstacle in enumerate(scene.obstacles):
-        name = f"{path.name}_{number}"
-        if isinstance(obstacle, Mesh):
-            vertices, faces = obstacle.triangles
-            with (
-                replacing(path.with_name(f"{name}.obj")) as partial,
-                partial.open("w", encoding="utf-8") as file,
-            ):
-                np.savetxt(file, vertices, fmt="v %.17g %.17g %.17g")
-                np.savetxt(file, faces + 1, fmt="f %d %d %d")
-        elif isinstance(obstacle, VoxelMask):
-            write_arrays(path.with_name(f"{name}.npz"), {"mask": obstacle.mask})
+        obstacle.write_file(path.with_name(f"{path.name}_{number}"))
 
 
 def _obstacle(obstacle: Obstacle, name: str, where: str) -> dict[str, Any]:
     """Return the section of an obstacle, whose file, if any, has a name."""
-    if (kind := type(obstacle)) not in _KINDS:
-        accepted = f"must be one of {', '.join(known.__name__ for known in _KINDS)} to be saved"
-        raise invalid(where, kind.__name__, accepted)
-    section: dict[str, Any] = {"type": _KINDS[kind]}
-    known = {one.name: one.default for one in fields(obstacle) if one.init}
-    given = {name: getattr(obstacle, name) for name in known}
-    if isinstance(obstacle, Mesh):
-        given |= {"path": f"{name}.obj", "repair": False}  # its triangles are those of the body
-    elif isinstance(obstacle, VoxelMask):
-        section["path"] = f"{name}.npz"
-        del given["mask"]
-    for name, value in given.items():
-        if value != known.get(name):
-            section[name] = list(value) if isinstance(value, tuple) else value
-    return section
+    types = {kind: name for name, kind in KINDS.items()}
+    if type(obstacle) not in types:
+        accepted = f"must be one of {', '.join(kind.__name__ for kind in types)} to be saved"
+        raise invalid(where, type(obstacle).__name__, accepted)
+    return {"type": types[type(obstacle)]} | obstacle.section(name)
 
 
 def scene_lines(scene: Scene, drive: torch.Tensor, name: str, beside: bool = False) -> str:
@@ -134,25 +111,20 @@ def scene_lines(scene: Scene, drive: torch.Tensor, name: str, beside: bool = Fal
     lines += ["import autdtorch as at", ""]
     arrays = ["array"] if len(boards) == 1 else [f"array_{number}" for number in range(len(boards))]
     for array, board in zip(arrays, boards, strict=True):
-        kind = board["type"]
-        function = "TransducerArray" if kind == "positions" else f"TransducerArray.{kind}"
-        lines.append(_call(array, function, {key: value for key, value in board.items() if key != "type"}))
+        lines.append(_call(array, FORMS[board.pop("type")], board))
     if len(boards) > 1:
         lines.append(f"array = {' + '.join(arrays)}")
-    obstacles = []
-    for number, section in enumerate(sections["obstacles"]):
-        obstacles.append(f"obstacle_{number}")
-        kind = next(known.__name__ for known, name in _KINDS.items() if name == section["type"])
-        function = f"{kind}.load" if kind == "VoxelMask" else kind
-        own = {key: value for key, value in section.items() if key != "type"}
-        if beside and "path" in own:
-            own["path"] = _Code(f"Path(__file__).with_name({own['path']!r})")
-        lines.append(_call(obstacles[-1], function, own))
+    obstacles = [f"obstacle_{number}" for number in range(len(scene.obstacles))]
+    for obstacle, section in zip(obstacles, sections["obstacles"], strict=True):
+        maker = KINDS[section.pop("type")].maker()
+        if beside and "path" in section:
+            section["path"] = _Code(f"Path(__file__).with_name({section['path']!r})")
+        lines.append(_call(obstacle, maker, section))
     plane = "None"
     if scene.observation_plane is not None:
         plane = "plane"
-        lines.append(_call(plane, "Plane", sections["observation_plane"]))
-    lines.append(_call("medium", "Medium", sections["medium"]))
+        lines.append(_call(plane, Plane, sections["observation_plane"]))
+    lines.append(_call("medium", Medium, sections["medium"]))
     lines.append(f"points = {_value(sections['control_points']['positions'], 9)}")
     domain = [sections["domain"]["lower"], sections["domain"]["upper"]]
     lines.append(
@@ -163,13 +135,16 @@ def scene_lines(scene: Scene, drive: torch.Tensor, name: str, beside: bool = Fal
     amplitudes = amplitudes_of(drive).clamp(max=1.0)  # rounding may exceed 1
     if not torch.allclose(amplitudes, torch.ones_like(amplitudes), rtol=0, atol=1e-12):
         values["amplitudes"] = amplitudes.tolist()
-    lines.append(_call("drive", "drive_from_phases", values))
+    lines.append(_call("drive", drive_from_phases, values))
     return "\n".join(lines) + "\n"
 
 
-def _call(name: str, function: str, arguments: dict[str, Any]) -> str:
+def _call(name: str, function: Callable[..., Any], arguments: dict[str, Any]) -> str:
+    """Return the line that calls a function of autdtorch, or another one after its import."""
+    home, called = function.__module__, function.__qualname__
+    before, place = ("", "at") if home.startswith("autdtorch.") else (f"import {home}\n", home)
     parts = "".join(f"    {key}={_value(value, 5 + len(key))},\n" for key, value in arguments.items())
-    return f"{name} = at.{function}(\n{parts})"
+    return f"{before}{name} = {place}.{called}(\n{parts})"
 
 
 def _value(value: Any, indent: int) -> str:
