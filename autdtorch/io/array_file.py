@@ -65,10 +65,10 @@ def load_array(
     """
     kind = path_of("path", path, suffixes=tuple(_READERS)).suffix.lower()
     parts = _READERS[kind if kind != ".gz" else SUFFIX](path)
-    given = {"source_strength": source_strength, "radius": radius}
+    sizes = {"source_strength": source_strength, "radius": radius}
     with within(path):
-        file = TransducerArray(**{name: part for name, part in parts.items() if given.get(name) is None})
-    sizes = {name: getattr(file, name) if value is None else value for name, value in given.items()}
+        file = TransducerArray(**{name: part for name, part in parts.items() if sizes.get(name) is None})
+    sizes = {name: getattr(file, name) if value is None else value for name, value in sizes.items()}
     positions = in_plane(file.positions, center, normal, angle)
     return TransducerArray(positions, file.normals @ device_axes(normal, angle), **sizes)
 
@@ -108,9 +108,11 @@ def _names(values: Array) -> list[str]:
         raise ValueError(f"{values.shape[1]} columns without names; {accepted}")
     lengths = np.linalg.norm(values[:, 3:], axis=1)
     if values.shape[1] == 6 and (wrong := np.abs(lengths - 1) > _UNIT_ROUNDING).any():
-        found = f"columns 4 to 6 without names, of length {lengths[wrong][0]:.4g} in row {wrong.argmax() + 1}"
+        length = (
+            f"columns 4 to 6 without names, of length {lengths[wrong][0]:.4g} in row {wrong.argmax() + 1}"
+        )
         fix = "write decimals with a point, or separate cells by semicolons, or name the columns"
-        raise ValueError(f"{found}; must be normals of length 1: {fix}")
+        raise ValueError(f"{length}; must be normals of length 1: {fix}")
     return names[: values.shape[1]]
 
 

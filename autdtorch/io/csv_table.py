@@ -147,7 +147,7 @@ def table_of(
 
 
 def _unit(rows: Rows, kind: str, table: Mapping[str, Array], guess: Guess) -> str | None:
-    """Return the unit of columns whose names have none: that of the comments, or a guess that fits them."""
+    """Return the unit of columns whose names have none, from the comments or a guess that agrees."""
     with within(rows.path), warned_within(rows.path):
         if (stated := stated_unit(rows.comments, kind)) is not None:
             return stated
@@ -155,9 +155,9 @@ def _unit(rows: Rows, kind: str, table: Mapping[str, Array], guess: Guess) -> st
             return None
         unit, why = guessed
         if others := mentioned_units(rows.comments, kind) - {unit}:
-            found = f"columns {', '.join(table)} seem to be in {unit}"
+            guess_text = f"columns {', '.join(table)} seem to be in {unit}"
             accepted = f"the header must be as {next(iter(table))} [{unit}]"
-            raise ValueError(f"{found}, but a comment has {', '.join(sorted(others))}; {accepted}")
+            raise ValueError(f"{guess_text}, but a comment has {', '.join(sorted(others))}; {accepted}")
         if why:
             warn_user(f"no unit of {why}")
         return unit

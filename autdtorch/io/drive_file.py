@@ -149,8 +149,8 @@ def _openmpd_frames(rows: Rows) -> Array | None:
         return None
     frames = rows.numbers(1)
     if list(frames.shape) != counts:
-        found = f"{frames.shape[0]} rows of {frames.shape[1]} phases"
-        raise ValueError(f"{rows.path}: {found}; must be {counts[0]} of {counts[1]}, as in the first line")
+        size = f"{frames.shape[0]} rows of {frames.shape[1]} phases"
+        raise ValueError(f"{rows.path}: {size}; must be {counts[0]} of {counts[1]}, as in the first line")
     return frames
 
 

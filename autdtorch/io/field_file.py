@@ -41,10 +41,9 @@ def save_field(
     """Write the complex pressure on a regular grid or plane of points.
 
     - `.vti`: VTK image data, for ParaView and PyVista. Point data pressure_real, pressure_imag and
-      pressure_magnitude [Pa], field data frequency [Hz]; lengths in m. A grid along x, y and z has VTK's own
-      axes, a tilted grid a direction matrix (VTK 9 and later).
-    - `.h5`, `.hdf5`: the dataset `pressure`, complex128, of the shape given; its attributes: units "Pa",
-      origin (3,), the first point; spacing (n,) and axes (n, 3), unit vectors, of its n axes; length_units
+      pressure_magnitude [Pa], field data frequency [Hz]; lengths in m. A tilted grid
+      has a direction matrix (VTK 9 and later).
+    - `.h5`, `.hdf5`: the dataset `pressure`, complex128; its attributes: units "Pa", origin (3,), the first point; spacing (n,) and axes (n, 3), unit vectors, of its n axes; length_units
       "m"; frequency; frequency_units "Hz"; time_convention "exp(-i omega t)".
 
     Args:

@@ -62,7 +62,7 @@ def load_scene(source: str | os.PathLike[str] | Mapping[str, Any], modules: Coll
     """Read a scene from a YAML file, or from a mapping of the same layout such as Hydra's `cfg.scene`.
 
     Control points and array are a section each, or a list of sections, whose points or transducers follow one
-    another. An obstacle has a `type`, or the `_target_` of a class of the user's own, such as
+    another. An obstacle has a `type`, or the `_target_` of a user's class, such as
     `mymodule.MyObstacle`. The section `pose`, with the keys `offset` and `rotation`, or `rotation_degrees`,
     moves all obstacles as one body; see `Scene.moved`.
 

@@ -29,8 +29,8 @@ def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
     """Write a scene to a YAML file that `load_scene` reads.
 
     Numbers keep their full precision. An array that was made by a method such as `TransducerArray.autd3`, or
-    joined of such arrays, keeps that form. A mesh becomes an .obj file in its own coordinates, a voxel mask
-    an .npz file, beside the YAML file and with its name. Files that are there are replaced. A medium becomes
+    joined of such arrays, keeps that form. A mesh becomes an .obj file, a voxel mask an .npz file, beside the YAML file
+    and with its name. Files that are there are replaced. A medium becomes
     its numbers, without `Medium.absorption_frequency`.
 
     Args:
@@ -38,7 +38,7 @@ def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
         scene: the scene.
 
     Raises:
-        ValueError: another suffix, or an obstacle of a class of the user's own.
+        ValueError: another suffix, or an obstacle of a user's class.
         OSError: the files cannot be written.
     """
     path = path_of("path", path, suffixes=(".yaml", ".yml"))
@@ -53,7 +53,7 @@ def scene_sections(scene: Scene, name: str) -> dict[str, Any]:
     """Return the sections of a scene file called `name`, which may name files of `write_files`.
 
     Raises:
-        ValueError: an obstacle of a class of the user's own.
+        ValueError: an obstacle of a user's class.
     """
     medium = scene.medium
     boards = [{"type": recipe.kind, **recipe.arguments} for recipe in recipes_of(scene.array)]
@@ -102,7 +102,7 @@ def scene_lines(scene: Scene, drive: torch.Tensor, name: str, beside: bool = Fal
         beside: True for lines in a file, and a path from there; False for one from the working directory.
 
     Raises:
-        ValueError: an obstacle of a class of the user's own.
+        ValueError: an obstacle of a user's class.
     """
     sections = scene_sections(scene, name)
     boards = sections["array"] if isinstance(sections["array"], list) else [sections["array"]]

@@ -76,16 +76,16 @@ def read_ultraino(path: str | os.PathLike[str]) -> UltrainoFile:
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     lists = [one.fields.get("transducers") for one in reader.simulations]
-    found = [one for each in lists if isinstance(each, _Record) for one in each.entries]
-    if not found:
+    transducers = [one for each in lists if isinstance(each, _Record) for one in each.entries]
+    if not transducers:
         raise ValueError(f"{path}: no transducers; must be a simulation saved by Ultraino with some")
     with within(path):
-        return _transducers(found)
+        return _transducers(transducers)
 
 
-def _transducers(found: list[Any]) -> UltrainoFile:
-    order = np.argsort(_values("transducer", found, _TRANSDUCER)["orderNumber"], kind="stable")
-    records = [found[index] for index in order]
+def _transducers(unsorted: list[Any]) -> UltrainoFile:
+    order = np.argsort(_values("transducer", unsorted, _TRANSDUCER)["orderNumber"], kind="stable")
+    records = [unsorted[index] for index in order]
     values = _values("transducer", records, _TRANSDUCER)
     poses = [_inner(record, "transform") for record in records]
     places = np.stack(

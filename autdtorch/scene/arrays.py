@@ -31,7 +31,7 @@ PAPER_SOURCE_STRENGTH = 1 / (4 * math.pi)
 """Source strength in the paper's Eq. 2: on-axis pressure at full drive times distance [Pa m]."""
 
 # Source strengths [Pa m] in programs for the devices. They differ by nearly a factor of 2 for similar
-# transducers, and not all say whether peak or RMS: measure your own.
+# transducers, and not all say whether they are peak or RMS values: measure yours.
 AUTD3_SOURCE_STRENGTH = 4.386  # AUTD3 SDK
 OPENMPD_SOURCE_STRENGTH = 3.4  # AcousTools
 SONICSURFACE_SOURCE_STRENGTH = 2.53  # Ultraino
@@ -191,8 +191,8 @@ class TransducerArray:
         """Return the array of a SonicSurface: 16 x 16 transducers row by row from the largest y, x fastest.
 
         Arguments and errors as for `TransducerArray.autd3`; the default source strength is Ultraino's.
-        The order is that of the table of emitters in the device's Python program. The order by channel, which
-        the firmware needs, is applied when frames are encoded.
+        The order follows the table of emitters in the device's Python program. Frames are encoded in the
+        order of channels, which the firmware needs.
         """
         across = _SQUARE_PITCH * _centred(_SQUARE_PLACES)
         places = torch.cartesian_prod(-across, across).flip(1)

@@ -87,7 +87,7 @@ def focus_phases(positions: ArrayLike, focus: ArrayLike, wavenumber: float) -> t
 
     Args:
         positions: transducers (M, 3) [m].
-        focus: (3,), or P foci (P, 3), each with its own phases [m].
+        focus: (3,), or P foci (P, 3), each with phases [m].
         wavenumber: k [rad/m], > 0.
 
     Returns:

@@ -32,7 +32,7 @@ _POINT_BYTES = 100.0  # for each generated point
 class Coordinates(torch.Tensor):
     """A tensor on the CPU that `numpy.array` takes without a warning. Operations return plain tensors.
 
-    NumPy 2 warns that PyTorch's own `__array__` does not accept `copy`.
+    NumPy 2 warns that the `__array__` of plain tensors does not accept `copy`.
     """
 
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]

@@ -35,7 +35,7 @@ class Medium:
         density: [kg/m^3], 1e-9 to 1e9.
         sound_speed: [m/s], 1e-3 to 1e6.
         absorption: of a plane wave at the drive frequency [dB/m], >= 0.
-        absorption_frequency: [Hz] for which `air` computed the absorption, None where a number was given. A
+        absorption_frequency: [Hz] for which `air` computed the absorption, None if it was set by hand. A
             scene of another frequency warns; results do not depend on it. It does not count in comparisons,
             and neither `dataclasses.replace` nor `save_scene` keeps it.
 
@@ -93,7 +93,7 @@ class Medium:
                 f"{dry}; a share of {relative_humidity:g} is relative_humidity={100 * relative_humidity:g}"
             )
         medium = cls(density, sound_speed, absorption)
-        # No argument of Medium: an absorption that is given, or replaced, is of no known frequency.
+        # No argument of Medium: the frequency of an absorption set by hand, or replaced, is not known.
         object.__setattr__(medium, "absorption_frequency", float(frequency))
         return medium
 

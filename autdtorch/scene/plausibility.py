@@ -33,9 +33,9 @@ def warn_of_implausible(scene: Scene) -> None:
     extent, wavelength, places = _diagonal(_observed(scene)), scene.wavelength, scene.array.positions
     is_absorbed = scene.medium.density < _DENSEST_GAS and scene.frequency > _HIGHEST
     if is_absorbed or not _SHORTEST * wavelength**2 <= extent <= max(_LONGEST * wavelength, _FAR):
-        found = f"{extent:.4g} m from end to end of array and control points, but a wavelength of"
+        size = f"{extent:.4g} m from end to end of array and control points, but a wavelength of"
         ask = "are lengths in m and the frequency in Hz, 40 kHz as 40e3?"
-        warn_user(f"Scene: {found} {wavelength:.4g} m; {ask}")
+        warn_user(f"Scene: {size} {wavelength:.4g} m; {ask}")
     elif len(places) > 1 and (pitch := closest_pair(places)[0]) > max(_WIDEST, _WIDEST_WAVES * wavelength):
         warn_user(f"Scene.array: neighbours are {pitch:.4g} m apart; are positions in m, 10 mm as 10e-3?")
     for name, hint in _too_large(scene):

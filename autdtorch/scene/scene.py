@@ -37,7 +37,7 @@ from autdtorch.utils.validation import (
     require_kind,
 )
 
-_DEFAULT_MARGIN = 2.0  # [wavelengths] of air on each side, where no domain is given
+_DEFAULT_MARGIN = 2.0  # [wavelengths] of air on each side, by default
 _FARTHEST = 1e6  # [m] along an axis; far beyond any simulation, and volumes do not overflow
 _FREQUENCIES = 1e-3, 1e12  # [Hz]
 _DECIBELS = 20 / math.log(10)  # in a neper

@@ -20,24 +20,24 @@ from autdtorch.utils.validation import (
 
 
 def for_each(
-    name: str, given: ArrayLike, count: int, check: Callable[[str, object, str], float], unit: str
+    name: str, values: ArrayLike, count: int, check: Callable[[str, object, str], float], unit: str
 ) -> float | torch.Tensor:
     """Return a checked number, or the checked numbers (count,) of each transducer if they differ."""
-    if isinstance(given, str | bytes) or not (
-        hasattr(given, "__len__") and getattr(given, "shape", (0,)) != ()
+    if isinstance(values, str | bytes) or not (
+        hasattr(values, "__len__") and getattr(values, "shape", (0,)) != ()
     ):
-        return check(name, given, unit)
-    each = real_tensor(name, given, unit).detach().cpu()
+        return check(name, values, unit)
+    each = real_tensor(name, values, unit).detach().cpu()
     if each.shape != (count,):
         raise ValueError(f"{name}: shape {tuple(each.shape)}; must be a number or ({count},) as positions")
     numbers = [check(f"{name}[{index}]", value, unit) for index, value in enumerate(each.tolist())]
     return numbers[0] if len(set(numbers)) == 1 else each.clone().as_subclass(Coordinates)
 
 
-def disc_radius(given: ArrayLike | None, positions: torch.Tensor) -> float | torch.Tensor:
+def disc_radius(values: ArrayLike | None, positions: torch.Tensor) -> float | torch.Tensor:
     """Return the radius or radii (M,) of discs, after checking that the discs at (M, 3) [m] are apart."""
     name = "TransducerArray.radius"
-    radius = 0.0 if given is None else for_each(name, given, len(positions), not_negative, "m")
+    radius = 0.0 if values is None else for_each(name, values, len(positions), not_negative, "m")
     if isinstance(radius, torch.Tensor):
         _require_apart(name, radius, positions)
     elif radius > 0:

@@ -35,17 +35,17 @@ def triangulated(polygons: Polygons) -> Index:
         raise ValueError(f"face {short[0]} has {lengths[short[0]]} vertices; must have at least 3")
     if len(wrong := np.flatnonzero((corners < 0) | (corners >= len(vertices)))):
         face = np.searchsorted(np.cumsum(lengths), wrong[0], side="right")
-        found = f"face {face} has vertex {corners[wrong[0]]}"
-        raise ValueError(f"{found}; must be one of the {len(vertices)} vertices, counted from 0")
+        wrong_face = f"face {face} has vertex {corners[wrong[0]]}"
+        raise ValueError(f"{wrong_face}; must be one of the {len(vertices)} vertices, counted from 0")
     if (lengths > 3).any() and len(far := np.flatnonzero(~(np.abs(vertices) <= FARTHEST).all(axis=1))):
         raise ValueError(f"vertex {far[0]} at {vertices[far[0]]}; must be finite, none beyond {FARTHEST:g}")
     begin = np.cumsum(lengths) - lengths
     parts, order = [], []
     for length in np.unique(lengths):
-        own = np.flatnonzero(lengths == length)
-        fans = _fans(vertices, corners[begin[own, None] + np.arange(length)], own)
+        chosen = np.flatnonzero(lengths == length)
+        fans = _fans(vertices, corners[begin[chosen, None] + np.arange(length)], chosen)
         parts.append(fans.reshape(-1, 3))
-        order.append(np.repeat(own, length - 2))
+        order.append(np.repeat(chosen, length - 2))
     if not parts:
         return np.zeros((0, 3), np.int64)
     return np.concatenate(parts)[np.argsort(np.concatenate(order), kind="stable")]
@@ -55,11 +55,11 @@ def _fans(vertices: Array, faces: Index, number: Index) -> Index:
     """Return the triangles (n, k - 2, 3) of polygons (n, k) of these numbers: fans of convex ones."""
     count = faces.shape[1]
     around = np.arange(1, count - 1)
-    found = np.stack(
+    fans = np.stack(
         [np.broadcast_to(faces[:, :1], (len(faces), count - 2)), faces[:, around], faces[:, around + 1]], -1
     )
     if count == 3:
-        return found
+        return fans
     places = vertices[faces] - vertices[faces[:, :1]]
     normal = np.cross(places, np.roll(places, -1, axis=1)).sum(axis=1)  # twice the area (Newell)
     size = np.linalg.norm(normal, axis=1)
@@ -67,11 +67,11 @@ def _fans(vertices: Array, faces: Index, number: Index) -> Index:
     turns = np.einsum("nki,ni->nk", np.cross(ahead, np.roll(ahead, -1, axis=1)), normal)
     rounding = _OVERLAP * size[:, None] ** 2
     # each corner turns left, and all of them once around: a star turns twice
-    fan = np.einsum("nki,ni->nk", np.cross(places[:, 1:-1], places[:, 2:]), normal)
-    convex = (turns >= -rounding).all(axis=1) & (fan >= -rounding).all(axis=1)
+    fan_areas = np.einsum("nki,ni->nk", np.cross(places[:, 1:-1], places[:, 2:]), normal)
+    convex = (turns >= -rounding).all(axis=1) & (fan_areas >= -rounding).all(axis=1)
     for row in np.flatnonzero(~convex):
-        found[row] = faces[row][_cut(places[row], normal[row], int(number[row]))]
-    return found
+        fans[row] = faces[row][_cut(places[row], normal[row], int(number[row]))]
+    return fans
 
 
 def _cut(places: Array, normal: Array, number: int) -> Index:
@@ -87,7 +87,10 @@ def _cut(places: Array, normal: Array, number: int) -> Index:
     flat = places @ np.stack([first, np.cross(axis, first)], axis=1)
     triangles = np.asarray(triangulate([flat]), np.int64)
     one, two, three = flat[triangles].transpose(1, 0, 2)
-    own = (two - one)[:, 0] * (three - one)[:, 1] - (two - one)[:, 1] * (three - one)[:, 0]
-    if len(triangles) != len(places) - 2 or abs(np.abs(own).sum() - own.sum()) > _OVERLAP * np.abs(own).sum():
+    areas = (two - one)[:, 0] * (three - one)[:, 1] - (two - one)[:, 1] * (three - one)[:, 0]
+    if (
+        len(triangles) != len(places) - 2
+        or abs(np.abs(areas).sum() - areas.sum()) > _OVERLAP * np.abs(areas).sum()
+    ):
         raise ValueError(f"face {number} of {len(places)} vertices crosses itself; must be a simple polygon")
     return triangles

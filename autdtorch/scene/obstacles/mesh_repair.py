@@ -100,9 +100,9 @@ def _oriented(vertices: Array, faces: Index, done: list[str]) -> Index:
             turned[face] = turned[before[face]] ^ (against[before[face], face] == 2)
     faces = np.where(turned[:, None], faces[:, ::-1], faces)
     for piece in range(number):
-        own = label == piece
-        if _signed_volume(vertices, faces[own]) < 0:
-            faces[own], turned[own] = faces[own, ::-1], ~turned[own]
+        in_piece = label == piece
+        if _signed_volume(vertices, faces[in_piece]) < 0:
+            faces[in_piece], turned[in_piece] = faces[in_piece, ::-1], ~turned[in_piece]
     if turned.any():
         place = place_of(vertices[faces[turned][0]].mean(axis=0))
         done.append(f"turned {turned.sum()} triangles over, the first at {place}")
@@ -115,18 +115,18 @@ def _closed(vertices: Array, faces: Index, done: list[str]) -> Triangles:
     for loop in _outlines(faces):
         rim = vertices[loop]
         try:
-            own = loop[triangulated(Polygons(rim, np.array([len(loop)]), np.arange(len(loop))))]
+            patch = loop[triangulated(Polygons(rim, np.array([len(loop)]), np.arange(len(loop))))]
         except ValueError:  # its outline crosses itself when flat
             vertices = np.concatenate([vertices, rim.mean(axis=0)[None]])
-            own = np.stack([loop, np.roll(loop, -1), np.full(len(loop), len(vertices) - 1)], axis=1)
-        share = areas_of(vertices[own]).sum() / area
+            patch = np.stack([loop, np.roll(loop, -1), np.full(len(loop), len(vertices) - 1)], axis=1)
+        share = areas_of(vertices[patch]).sum() / area
         size = f"{len(loop)} edges and {float(np.ptp(rim, axis=0).max()):.3g}"
-        found = f"a hole of {size} at {place_of(rim.mean(axis=0))}"
+        hole = f"a hole of {size} at {place_of(rim.mean(axis=0))}"
         if share > _LARGEST_HOLE:
             most = f"must be at most {_LARGEST_HOLE:.0%} of that of a body"
-            raise ValueError(f"{found}, {share:.0%} of all area; {most}")
-        faces = np.concatenate([faces, own])
-        closed.append((share, found))
+            raise ValueError(f"{hole}, {share:.0%} of all area; {most}")
+        faces = np.concatenate([faces, patch])
+        closed.append((share, hole))
     if closed:
         largest = max(closed)[1]
         many = f"{len(closed)} holes, the largest {largest.removeprefix('a hole ')}"
@@ -175,13 +175,13 @@ def _anew(vertices: Array, faces: Index, done: list[str], reason: str) -> Triang
     near = grown & ~shrunk
     distance = np.full(len(places), 4 * cell)
     distance[near] = np.sqrt(igl.point_mesh_squared_distance(places[near], vertices, faces)[0])
-    found, triangles, _ = igl.marching_cubes(np.where(inside, -distance, distance), places, *counts, 0.0)
+    corners, triangles, _ = igl.marching_cubes(np.where(inside, -distance, distance), places, *counts, 0.0)
     if not len(triangles):
         raise ValueError(
             f"{reason}; it has no inside that winding numbers would tell; must be a body, not a sheet"
         )
     done.append(f"made the surface anew on cells of {cell:.3g}, as {reason.split(';')[0]}")
-    return solid_of(found, triangles)
+    return solid_of(corners, triangles)
 
 
 def _pieces(faces: Index) -> Index:

@@ -69,7 +69,7 @@ def solid_of(corners: Array, triangles: Index) -> Triangles:
     if _part(vertices, faces).volume < 0:
         faces = faces[:, ::-1]
     whole = _part(vertices, faces)
-    parts = [_part(vertices, own) for own in _split(faces, label)]
+    parts = [_part(vertices, part) for part in _split(faces, label)]
     for part in parts:
         _require_simple(part)
     solids = [part for part in parts if abs(part.volume) > _EMPTY * part.area * _extent(part.vertices)]
@@ -132,15 +132,15 @@ def _near(vertices: Array, some: Index, distance: float) -> Index:
     graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(some),) * 2)
     label = connected_components(graph, directed=False)[1]
     _, first = np.unique(label, return_index=True)
-    found = np.arange(len(vertices))
-    found[some] = some[first[label]]
-    return found
+    nearest = np.arange(len(vertices))
+    nearest[some] = some[first[label]]
+    return nearest
 
 
 def outer_parts(vertices: Array, faces: Index) -> NDArray[np.bool_]:
     """Return which faces (F,) of a solid bound it from outside: not those of cavities and bodies in these."""
     label = _labels(vertices, faces)
-    parts = [_part(vertices, own) for own in _split(faces, label)]
+    parts = [_part(vertices, part) for part in _split(faces, label)]
     if all(part.volume >= 0 for part in parts):
         return np.ones(len(faces), bool)
     outer = np.array([part.volume > 0 for part in parts])
@@ -157,12 +157,12 @@ def winding_number(vertices: Array, faces: Index, points: Array) -> Array:
 
     lower, upper = _bounds(vertices)
     within = ((points >= lower) & (points <= upper)).all(axis=1)
-    found = np.zeros(len(points))
+    winding = np.zeros(len(points))
     if within.any():
         middle, extent = (lower + upper) / 2, _extent(vertices)  # libigl computes in single precision
         around = np.ascontiguousarray((vertices - middle) / extent)
-        found[within] = igl.fast_winding_number(around, faces, (points[within] - middle) / extent)
-    return found
+        winding[within] = igl.fast_winding_number(around, faces, (points[within] - middle) / extent)
+    return winding
 
 
 def _require_triangles(corners: Array, triangles: Index) -> None:
@@ -172,11 +172,11 @@ def _require_triangles(corners: Array, triangles: Index) -> None:
     if corners.ndim != 2 or corners.shape[1] != 3:
         raise ValueError(f"vertices of shape {corners.shape}; must be (V, 3)")
     if len(far := np.flatnonzero(~(np.abs(corners) <= FARTHEST).all(axis=1))):
-        found = f"vertex {far[0]} at {place_of(corners[far[0]])}"
-        raise ValueError(f"{found}; must be triangles with finite vertices, none beyond {FARTHEST:g}")
+        vertex = f"vertex {far[0]} at {place_of(corners[far[0]])}"
+        raise ValueError(f"{vertex}; must be triangles with finite vertices, none beyond {FARTHEST:g}")
     if len(wrong := np.flatnonzero(((triangles < 0) | (triangles >= len(corners))).any(axis=1))):
-        found = f"triangle {wrong[0]} of vertices {', '.join(map(str, triangles[wrong[0]]))}"
-        raise ValueError(f"{found}; must be triangles of the {len(corners)} vertices, counted from 0")
+        triangle = f"triangle {wrong[0]} of vertices {', '.join(map(str, triangles[wrong[0]]))}"
+        raise ValueError(f"{triangle}; must be triangles of the {len(corners)} vertices, counted from 0")
 
 
 def _without_sheets(faces: Index) -> Index:
@@ -203,11 +203,11 @@ def _labels(vertices: Array, faces: Index) -> Index:
     if len(wrong := np.flatnonzero(up != down)):
         first = wrong[0]
         place = " to ".join(map(place_of, vertices[list(divmod(edges[first], len(vertices)))]))
-        found = f"{len(wrong)} of its {len(edges)} edges do not join two triangles of one orientation"
+        open_sides = f"{len(wrong)} of its {len(edges)} edges do not join two triangles of one orientation"
         where = f"the first, {place}, has {up[first]} of one and {down[first]} of the other"
         turned = (up + down == 2).all()
         why = "no hole, but triangles are turned over" if turned else "must be watertight"
-        raise ValueError(f"{found} ({where}); {why}; repair=True may mend it")
+        raise ValueError(f"{open_sides} ({where}); {why}; repair=True may mend it")
     owner = np.tile(np.arange(len(faces)), 3)
     one, other = (owner[chosen][np.lexsort((owner[chosen], edge[chosen]))] for chosen in (upwards, ~upwards))
     graph = coo_array((np.ones(len(one)), (one, other)), shape=(len(faces),) * 2)
@@ -223,9 +223,9 @@ def _split(faces: Index, label: Index) -> list[Index]:
 def _part(vertices: Array, faces: Index) -> _Part:
     """Return the surface of faces, with the vertices that they use."""
     used, index = np.unique(faces, return_inverse=True)
-    own, index = vertices[used], index.reshape(-1, 3)
-    corners = own[index] - own.mean(axis=0)
-    return _Part(own, index, float(np.linalg.det(corners).sum() / 6), float(areas_of(corners).sum()))
+    corners, index = vertices[used], index.reshape(-1, 3)
+    centred = corners[index] - corners.mean(axis=0)
+    return _Part(corners, index, float(np.linalg.det(centred).sum() / 6), float(areas_of(centred).sum()))
 
 
 def _require_unfolded(vertices: Array, faces: Index) -> None:
@@ -302,8 +302,9 @@ def _require_air_beside(whole: _Part) -> None:
 
 def _refuse_crossing(places: Array) -> None:
     if len(places):
-        found = f"the surface crosses itself at {place_of(places[0])}"
-        raise ValueError(f"{found}; parts may overlap, but each must be simple")
+        raise ValueError(
+            f"the surface crosses itself at {place_of(places[0])}; parts may overlap, but each must be simple"
+        )
 
 
 def _touches_itself(part: _Part) -> bool:
@@ -330,7 +331,11 @@ def _union(parts: Sequence[_Part]) -> _Part:
     solids = []
     for number, body in enumerate(bodies):
         whole = _manifold(body)
-        if holes := [_manifold(cavity) for cavity, own in zip(cavities, owner, strict=True) if own == number]:
+        if holes := [
+            _manifold(cavity)
+            for cavity, body_number in zip(cavities, owner, strict=True)
+            if body_number == number
+        ]:
             hollow = Manifold.batch_boolean(holes, OpType.Add)
             beyond = hollow - whole
             if beyond.volume() > _EQUAL * hollow.volume():

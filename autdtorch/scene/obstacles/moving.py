@@ -29,7 +29,11 @@ def moved(obstacles: Sequence[Obstacle], offset: torch.Tensor, rotation: Vector)
         ValueError: an obstacle that cannot be moved or turned.
     """
     if fixed := [obstacle for obstacle in obstacles if not is_movable(obstacle)]:
-        raise invalid("obstacles", type(fixed[0]).__name__, "must be of autdtorch's own kinds to be moved")
+        raise invalid(
+            "obstacles",
+            type(fixed[0]).__name__,
+            "must be of a kind in autdtorch.scene.obstacles.KINDS to be moved",
+        )
     if obstacles and any(rotation):
         (center, _), turn = circumscribed(obstacles), rotation_matrix(rotation)
         obstacles = [turned(obstacle, turn, center) for obstacle in obstacles]
@@ -135,5 +139,5 @@ def _position(obstacle: Obstacle, like: torch.Tensor) -> torch.Tensor:
 
 
 def _rounded(vector: torch.Tensor, digits: int) -> Vector:
-    x, y, z = (vector.round(decimals=digits) + 0.0).tolist()  # no -0, which has a digest of its own
+    x, y, z = (vector.round(decimals=digits) + 0.0).tolist()  # no -0, whose digest differs
     return x, y, z

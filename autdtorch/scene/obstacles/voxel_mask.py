@@ -85,7 +85,7 @@ class VoxelMask(Obstacle):
         if self.level is not None:
             object.__setattr__(self, "level", finite_number("VoxelMask.level", self.level))
             if not self.smooth:
-                raise invalid("VoxelMask.smooth", False, "must be True where a level is given")
+                raise invalid("VoxelMask.smooth", False, "must be True with a level")
         values = _checked_mask(self.mask) if self.level is None else _checked_grey(self.mask, self.level)
         values.flags.writeable = False
         object.__setattr__(self, "mask", values)

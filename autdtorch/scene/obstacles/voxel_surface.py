@@ -5,7 +5,7 @@ have more than its surface, and a tilted face has stairs. The surface of a mask 
 mask is smoothed and becomes a level set; its normals are averaged among those of nearby triangles that are
 nearly parallel (bilateral filter: Zheng et al. 2011, doi:10.1109/TVCG.2010.264), so that flat faces become
 flat and edges stay sharp; vertices follow the normals (Sun et al. 2007, doi:10.1109/TVCG.2007.1065). The
-volume is kept. Grey values, as those of a scan, have their surface at a level between voxels.
+volume is preserved. Grey values, as those of a scan, have their surface at a level between voxels.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _ROUNDS, _AVERAGED, _MOVED = 3, 12, 12
 # difference of these normals: with 0.3 spheres get facets, with 0.5 edges are rounded
 _NEAR, _PARALLEL = 1.8, 0.38
 _REACH = 1.7  # Distance of the farthest of them, in the former
-_VOLUME_STEPS, _KEPT = 20, 1e-9  # Most steps until the volume is kept, and the relative error at which it is
+_VOLUME_STEPS, _VOLUME_ERROR = 20, 1e-9  # Most steps that restore the volume, and the relative error left
 # Standard deviations of the levels of smoothing that are compared [voxels], and the difference from the mask
 # at which a level is too smooth
 _LEVELS, _MISSED = (0.5, 0.8, 1.2, 1.8, 2.6), 0.15
@@ -39,9 +39,9 @@ _LEVELS, _MISSED = (0.5, 0.8, 1.2, 1.8, 2.6), 0.15
 _UNCERTAIN = 0.5
 _UNCERTAIN_SMOOTH, _UNCERTAIN_GREY = 0.1, 0.02  # Those of the smoother surface and of grey values [voxels]
 # Depth [voxels] by which a surface may have the centre of a voxel on the wrong side. Sharpened surfaces of
-# balls and boxes reach 0.2; more is a body of few voxels, a thin part or a hole that was not kept
+# balls and boxes reach 0.2; more is a body of few voxels, a thin part or a hole that is lost
 _WRONG_SIDE = 0.25
-_MOST_WRONG = 0.05  # Share of the voxels beside a surface from which it is not that of the mask
+_MOST_WRONG = 0.05  # Share of the voxels beside a surface from which the surface does not belong to the mask
 _LEAST = 1e-7  # Share of a smoothed mask that is rounding
 
 
@@ -122,10 +122,10 @@ class VoxelSurface:
         """Yield the surfaces that may count, each with its uncertainty [m], made when it is asked for."""
         uncertain = _UNCERTAIN_SMOOTH * float(np.cbrt(np.prod(self._edges)))
         sharpened = _sharpened(rough, rough_faces, float(self._edges.max()))
-        sharp = _volume_kept(sharpened, rough_faces, self._volume)
+        sharp = _with_volume(sharpened, rough_faces, self._volume)
         off = math.sqrt(float((MeshDistance(*sharp)(smooth) ** 2).mean()))
         yield *sharp, _UNCERTAIN * off
-        yield *_volume_kept(smooth, smooth_faces, self._volume), uncertain
+        yield *_with_volume(smooth, smooth_faces, self._volume), uncertain
         yield smooth, smooth_faces, uncertain
 
     @property
@@ -175,7 +175,7 @@ def _smoothed(mask: NDArray[np.bool_], edges: Array, blur: float) -> tuple[Array
     """Return the level set of a mask smoothed by `blur` [voxels], the edges, and the voxels around.
 
     The share p of a flat body after smoothing by s is Phi(-d / s) at a distance d from it. A curved surface
-    moves inwards by s^2 times its mean curvature, which is given back.
+    moves inwards by s^2 times its mean curvature, which is added back.
     """
     from scipy.ndimage import gaussian_filter
     from scipy.special import ndtri
@@ -201,11 +201,11 @@ def _smoothest(mask: NDArray[np.bool_], edges: Array) -> tuple[Array, Array, int
     pad = levels[-1][2]
     sign = np.where(np.pad(mask, pad), -1.0, 1.0)
     total, rest = np.zeros(sign.shape), np.ones(sign.shape)
-    for blur, (level, _, own) in zip(_LEVELS[::-1], levels[::-1], strict=True):
-        level = np.pad(level, pad - own, mode="edge")
+    for blur, (level, _, around) in zip(_LEVELS[::-1], levels[::-1], strict=True):
+        level = np.pad(level, pad - around, mode="edge")
         missed = np.maximum(0, -sign * level).clip(max=2 * blur * longest)
-        around = maximum_filter(missed, 2 * math.ceil(2 * blur) + 1)
-        weight = np.exp(-((around / (_MISSED * longest)) ** 2)) if blur > _LEVELS[0] else np.ones(sign.shape)
+        missed = maximum_filter(missed, 2 * math.ceil(2 * blur) + 1)
+        weight = np.exp(-((missed / (_MISSED * longest)) ** 2)) if blur > _LEVELS[0] else np.ones(sign.shape)
         weight = gaussian_filter(weight, max(0.7, 0.7 * blur))
         total += rest * weight * np.clip(level, -3 * longest, 3 * longest)
         rest *= 1 - weight
@@ -250,20 +250,20 @@ def _averaged(normals: Array, area: Array, near: csr_array) -> Array:
     single = normals.astype(np.float32)
     rows = np.repeat(np.arange(len(normals)), np.diff(near.indptr))
     cosine = np.einsum("ij,ij->i", single[rows], single[near.indices])
-    own = near.data * np.exp((cosine - 1) / np.float32(_PARALLEL**2))
-    weights = csr_array((own, near.indices, near.indptr), near.shape)
+    alike = near.data * np.exp((cosine - 1) / np.float32(_PARALLEL**2))
+    weights = csr_array((alike, near.indices, near.indptr), near.shape)
     weighted = area[:, None] * normals
     mean = weighted + weights @ weighted + weights.T @ weighted
     return np.asarray(mean / np.linalg.norm(mean, axis=1, keepdims=True))
 
 
-def _volume_kept(vertices: Array, faces: Index, volume: float) -> tuple[Array, Index]:
+def _with_volume(vertices: Array, faces: Index, volume: float) -> tuple[Array, Index]:
     """Return a surface moved along its normals until it encloses a volume [m^3]."""
     for _ in range(_VOLUME_STEPS):
         corners = vertices[faces]
         doubled = doubled_normals(corners)
         missing = volume - np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
-        if abs(missing) < _KEPT * volume:
+        if abs(missing) < _VOLUME_ERROR * volume:
             break
         area = np.linalg.norm(doubled, axis=1).sum() / 2
         normals = np.zeros_like(vertices)
