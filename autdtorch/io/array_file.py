@@ -65,10 +65,10 @@ def load_array(
     """
     kind = path_of("path", path, suffixes=tuple(_READERS)).suffix.lower()
     parts = _READERS[kind if kind != ".gz" else SUFFIX](path)
-    sizes = {"source_strength": source_strength, "radius": radius}
+    chosen = {"source_strength": source_strength, "radius": radius}
     with within(path):
-        file = TransducerArray(**{name: part for name, part in parts.items() if sizes.get(name) is None})
-    sizes = {name: getattr(file, name) if value is None else value for name, value in sizes.items()}
+        file = TransducerArray(**{name: part for name, part in parts.items() if chosen.get(name) is None})
+    sizes = {name: getattr(file, name) if value is None else value for name, value in chosen.items()}
     positions = in_plane(file.positions, center, normal, angle)
     return TransducerArray(positions, file.normals @ device_axes(normal, angle), **sizes)
 

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from autdtorch.io.array_file import load_array
-from autdtorch.io.yaml_file import load_yaml, plain, unresolved
+from autdtorch.io.yaml_file import TARGET, load_trusted, load_yaml, plain, unresolved
 from autdtorch.scene.arrays import FORMS
 from autdtorch.scene.geometry import Plane, circle_points, sphere_points
 from autdtorch.scene.obstacles import KINDS

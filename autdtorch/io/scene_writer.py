@@ -29,9 +29,9 @@ def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
     """Write a scene to a YAML file that `load_scene` reads.
 
     Numbers keep their full precision. An array that was made by a method such as `TransducerArray.autd3`, or
-    joined of such arrays, keeps that form. A mesh becomes an .obj file, a voxel mask an .npz file, beside the YAML file
-    and with its name. Files that are there are replaced. A medium becomes
-    its numbers, without `Medium.absorption_frequency`.
+    joined of such arrays, keeps that form. A mesh becomes an .obj file, a voxel mask an
+    .npz file, beside the YAML file and with its name. Files that are there are replaced. A medium becomes its
+    numbers, without `Medium.absorption_frequency`.
 
     Args:
         path: of the file, ``.yaml`` or ``.yml``.

@@ -9,7 +9,7 @@ import torch
 
 from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.obstacles import Obstacle
-from autdtorch.utils.neighbours import closest_pair
+from autdtorch.utils.spatial import closest_pair
 from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 

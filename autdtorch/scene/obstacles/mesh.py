@@ -22,7 +22,7 @@ from autdtorch.utils.cached import cached_property
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import replacing
 from autdtorch.utils.hints import suggesting
-from autdtorch.utils.triangles import doubled_normals
+from autdtorch.utils.spatial import doubled_normals
 from autdtorch.utils.units import angles
 from autdtorch.utils.validation import Vector, boolean, finite_vector, invalid, positive, real_tensor, within
 

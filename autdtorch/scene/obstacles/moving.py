@@ -13,7 +13,7 @@ import torch
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles import KINDS
 from autdtorch.scene.obstacles.base import Obstacle
-from autdtorch.utils.cpu_tensors import REAL
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import Vector, invalid
 
 # Decimals of a position [m], and of an angle [rad] or direction: far above rounding, far below what an

@@ -11,8 +11,7 @@ import torch
 
 from autdtorch.scene.geometry import circle_points, rotation_matrix
 from autdtorch.scene.obstacles.base import Obstacle
-from autdtorch.utils.cpu_tensors import REAL
-from autdtorch.utils.hints import suggesting
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.units import angles
 from autdtorch.utils.validation import Vector, finite_vector, positive, positive_entries, unit_vector
 

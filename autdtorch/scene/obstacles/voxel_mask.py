@@ -20,9 +20,8 @@ from autdtorch.scene.obstacles.voxel_surface import ThinError, VoxelSurface
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.cached import cached_property
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.files import read_arrays
+from autdtorch.utils.files import read_arrays, write_arrays
 from autdtorch.utils.hints import suggesting
-from autdtorch.utils.numpy_file import read_arrays, write_arrays
 from autdtorch.utils.validation import (
     Vector,
     boolean,
