@@ -1,6 +1,6 @@
 from . import analytic, hardware
 from .analytic.green import green
-from .hardware.devices.openmpd_board import OpenMPDBoard
+from .hardware.devices.openmpd import OpenMPDBoard
 from .io.array_file import load_array
 from .io.drive_file import load_drive, save_drive
 from .io.field_file import save_field

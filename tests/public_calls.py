@@ -191,7 +191,7 @@ ARGUMENTS: dict[str, Any] = {
     "chip": CHIP,
     "control_points": SCENE.control_points,
     "costs": {"time [s]": {"size": {"gabs": [[1.0, 1.0], [2.0, 3.0]]}}},
-    "dead": [1],
+    "failed": [1],
     "density": 100.0,
     "density_ratio": 2.0,
     "dialect": hardware.KEYSIGHT,

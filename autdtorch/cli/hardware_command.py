@@ -169,21 +169,21 @@ class _Trial:
                 1 if self._bench.by_hand else 32,
                 watch=lambda what: show(f"pre-flight check: {what}"),
             )
-        if len(check.dead) == count:
+        if len(check.failed) == count:
             loudest = ", and try a lower loudest" if self._settings["sensor"] == "scope" else ""
             strongest = f"{float(check.pressure.max()):.3g} Pa from the strongest transducer"
             accepted = f"above {check.threshold:.3g} Pa; check the device's power, and the sensor{loudest}"
             raise ValueError(f"hardware.sensor: {strongest}; must be {accepted}")
-        logger.info("%d of %d transducers work", count - len(check.dead), count)
-        if check.dead:
-            logger.warning("failed transducers, counted from 0: %s", ", ".join(map(str, check.dead)))
+        logger.info("%d of %d transducers work", count - len(check.failed), count)
+        if check.failed:
+            logger.warning("failed transducers, counted from 0: %s", ", ".join(map(str, check.failed)))
         return check
 
 
 @contextlib.contextmanager
 def _silence_expected() -> Iterator[None]:
     """Keep an oscilloscope from warning of silence."""
-    scope = logging.getLogger("autdtorch.hardware.sensors.oscilloscope")
+    scope = logging.getLogger("autdtorch.hardware.sensors.scope_sensor")
     scope.setLevel(logging.ERROR)
     try:
         yield

@@ -15,16 +15,15 @@ from autdtorch.hardware.devices import require_device
 from autdtorch.hardware.devices.autd3 import AUTD3
 from autdtorch.hardware.devices.device import Device
 from autdtorch.hardware.played import Wiring
-from autdtorch.hardware.transport.autd3_network import Autd3Port
-from autdtorch.hardware.transport.port import LinkError, Port, SerialPort, SharedPort, closed_on_error
-from autdtorch.hardware.transport.usb import find_device
+from autdtorch.hardware.transport.port import LinkError, Port, closed_on_error
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.validation import invalid, number_between, require_callable, require_kind
+from autdtorch.utils.validation import number_between, require_callable, require_kind
 
 #: Default settle time [s]. Sound goes 1.7 m in it; a T4010A1 rings up in some 30 periods, 0.75 ms, as the
 #: emulator of AUTD3's kit models it.
 SETTLE = 5e-3
 _LONGEST_SETTLE = 60.0  # [s]
+_ATTEMPTS = 10  # to switch off, each after a signal
 
 
 class OffError(LinkError):
@@ -48,15 +47,14 @@ class Link(contextlib.AbstractContextManager["Link"]):
         settle: float = SETTLE,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Switch the outputs off.
+        """Switch the outputs off; the port is closed if that fails, or with the link.
 
         Args:
             device: the device at the port.
             port: takes the bytes for the device.
             transducers: the device's transducer for each of the scene's (M,); others stay off. By default
                 the scene has all, in the order of the device.
-            settle: time that `play` waits, after the frame has gone over the wire, for steady sound [s]; 0
-                to 60.
+            settle: time that `play` waits, after the frame has been sent, for steady sound [s]; 0 to 60.
             sleep: waits for a number of seconds.
 
         Raises:
@@ -70,10 +68,11 @@ class Link(contextlib.AbstractContextManager["Link"]):
         self.device, self._port, self._sleep = device, port, sleep
         self._lock = threading.RLock()
         self._open = True
-        self.off()
-        self.wiring = Wiring(device, transducers)
-        self.transducers = self.wiring.transducers
-        self.settle = number_between("settle", settle, 0.0, _LONGEST_SETTLE, "s")
+        with closed_on_error(port.close):
+            self.off()
+            self.wiring = Wiring(device, transducers)
+            self.transducers = self.wiring.transducers
+            self.settle = number_between("settle", settle, 0.0, _LONGEST_SETTLE, "s")
         atexit.register(self.close)
 
     def play(self, drive: torch.Tensor) -> None:
@@ -113,25 +112,26 @@ class Link(contextlib.AbstractContextManager["Link"]):
     def close(self) -> None:
         """Switch all outputs off and release the device, which happens even on an error."""
         with self._lock:
-            if not self._open:
-                return
-            try:
-                self.off()
-            except LinkError:
-                with contextlib.suppress(LinkError):  # the first error says more
-                    self._release()
-                raise
-            except BaseException:  # a signal, which may come before anything is sent, or amid a recovery
-                self.close()
-                raise
-            self._release()
+            if self._open:
+                with closed_on_error(self._release):
+                    self._off_despite_signals(_ATTEMPTS)
+                self._release()
+
+    def _off_despite_signals(self, attempts: int) -> None:
+        """Switch off, again after a signal: it may come before anything is sent, or amid a recovery."""
+        try:
+            self.off()
+        except BaseException as error:
+            if attempts > 1 and not isinstance(error, Exception):
+                self._off_despite_signals(attempts - 1)
+            raise
 
     def _recover(self) -> None:
         try:
             with contextlib.suppress(LinkError):  # of several boards one may be gone, and the others play on
                 self._port.recover()
             self._send_silence()
-        except LinkError as error:
+        except Exception as error:
             raise OffError(f"{error}; the outputs may still be on: switch the device's power off") from error
 
     def _send_silence(self) -> None:
@@ -171,8 +171,8 @@ def open_link(
         device: the device to find.
         transducers: the device's transducer for each of the scene's (M,); by default all in order.
         serial: serial number of the USB chip, where several such devices are plugged in.
-        backend: of pyusb; by default libusb. On that of an emulated bench waiting takes no time.
-        settle: time that a drive plays before its pressure is read [s], without the frame's own time.
+        backend: of pyusb; by default libusb. With an emulated bench's backend waiting takes no time.
+        settle: time that a drive plays before its pressure is read [s], after the frame has been sent.
         port: name of a serial port of the system, such as "COM3" or "/dev/ttyUSB0"; by default the chips of
             the device are looked for over pyusb.
 
@@ -182,28 +182,8 @@ def open_link(
             `serial` for a device of several boards; or a `port` for one without a serial line.
     """
     require_device(device)
-    if port is None:
-        opened = _usb_port(device, serial, backend)
-    elif device.baud is None:
-        raise invalid("port", port, f"must be None, as {device.name} has no serial line")
-    else:
-        opened = SerialPort(port, device.baud)
-    with closed_on_error(opened.close):
-        if port is not None:
-            time.sleep(device.boot_time)
-        return Link(device, opened, transducers, settle, getattr(backend, "sleep", time.sleep))
-
-
-def _usb_port(device: Device, serial: str | None, backend: Any) -> Port:
-    if serial is not None and len(device.serials) > 1:
-        raise invalid("serial", serial, f"must be None, as {device.name} has {len(device.serials)} boards")
-    openers = {(vendor, product): open_port for vendor, product, open_port in device.adapters}
-    ports: list[Port] = []
-    with closed_on_error(SharedPort(ports).close):
-        for own in device.serials if serial is None else (serial,):
-            found = find_device(openers, own, backend)
-            ports.append(openers[found.idVendor, found.idProduct](found))
-    return ports[0] if len(ports) == 1 else SharedPort(ports)
+    opened = device.open_port({"serial": serial, "port": port}, backend)
+    return Link(device, opened, transducers, settle, getattr(backend, "sleep", time.sleep))
 
 
 def open_autd3(
@@ -229,6 +209,4 @@ def open_autd3(
             out of range.
     """
     device = AUTD3.with_boards(boards)
-    port = Autd3Port(boards, network)
-    with closed_on_error(port.close):
-        return Link(device, port, transducers, settle)
+    return Link(device, device.open_port({"network": network}), transducers, settle)

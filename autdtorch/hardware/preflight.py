@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -35,9 +36,15 @@ class Preflight:
     threshold: float
 
     @property
-    def dead(self) -> list[int]:
+    def failed(self) -> list[int]:
         """The failed transducers, whose pressure is not above the threshold."""
         return torch.nonzero(self.pressure <= self.threshold)[:, 0].tolist()
+
+    @property
+    def dead(self) -> list[int]:
+        """The former name of `failed`."""
+        warnings.warn("Preflight.dead is now Preflight.failed", DeprecationWarning, stacklevel=2)
+        return self.failed
 
 
 def check_transducers(

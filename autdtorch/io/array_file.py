@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
+from autdtorch.hardware.devices.openmpd import OpenMPDBoard
 from autdtorch.io.csv_table import Guessed, read_rows, table_of
 from autdtorch.io.ultraino_file import SUFFIX, read_ultraino
 from autdtorch.scene.arrays import TransducerArray

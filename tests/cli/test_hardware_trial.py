@@ -1,11 +1,13 @@
 """Hardware trials from the command line: what they leave and show, and how they end."""
 
+import contextlib
 import errno
 import io
 import json
 import math
 import re
 import signal
+from dataclasses import dataclass, replace
 from pathlib import Path
 from unittest import mock
 
@@ -17,13 +19,25 @@ from filelock import FileLock
 import autdtorch.cli.hardware_command
 from autdtorch.cli.bench_config import Bench, indices_of
 from autdtorch.cli.main import CONFIGS
-from autdtorch.hardware import LinkError, MovedMicrophone, OffError, Oscilloscope, ScopeSensor
+from autdtorch.hardware import (
+    DEVICES,
+    SENSORS,
+    Device,
+    LinkError,
+    MovedMicrophone,
+    OffError,
+    Oscilloscope,
+    ScopeSensor,
+)
+from autdtorch.hardware.sensors.sensor import SensorConfig
 from autdtorch.io.drive_file import load_drive
 from autdtorch.io.scene_file import load_scene
 from autdtorch.objectives.goals import TargetPressures, WeakestFocus
 from autdtorch.objectives.quiet import QuietPoints
 from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.phase_levels import PhaseLevels
 from autdtorch.study.report.hardware_report import compare
+from autdtorch.utils.validation import integer_at_least
 
 SCENE = """
 name: two
@@ -74,7 +88,7 @@ def test_a_trial_leaves_log_drive_and_report_and_is_not_repeated(trial, tmp_path
 
 def test_the_log_of_a_running_trial_is_refused_before_a_device_is_touched(trial, tmp_path, monkeypatch):
     (tmp_path / "out").mkdir()
-    monkeypatch.setattr("autdtorch.hardware.open_link", None)
+    monkeypatch.setattr("autdtorch.hardware.Link", None)
     with FileLock(tmp_path / "out" / ".trial.jsonl.lock"):  # as another process has it
         status, _, log = trial(*GABS)
     assert (status, "another process has it open for a trial" in log) == (2, True)
@@ -142,8 +156,11 @@ OPENMPD = ("hardware=openmpd", "hardware.limits.amplitude=1", "hardware.transduc
             (*GABS, "hardware.transducers='0-99999999999'"),
             "must be numbers from 0 to 255, each once, and ranges",
         ),
-        ((*GABS, "hardware.boards=2"), "hardware.boards: 2; must be null: it is for openmpd"),
-        ((*GABS, "hardware.network=eth0"), "hardware.network: 'eth0'; must be null: it is for AUTD3"),
+        (
+            (*GABS, "hardware.boards=2"),
+            "hardware.boards: 2; must be null: it is for autd3, openmpd and",
+        ),
+        ((*GABS, "hardware.network=eth0"), "hardware.network: 'eth0'; must be null: it is for autd3"),
         ((*GABS, "hardware.sensor.snr=nan"), "hardware.sensor.snr: nan; must be"),
         ((*GABS, "hardware.device=openmpd", "hardware.boards=[a.pat]"), "hardware.boards: 'a.pat'; no such"),
         ((*GABS, "hardware.device=autd3", "hardware.boards=two"), "hardware.boards: 'two'; must be an int"),
@@ -198,7 +215,7 @@ def test_a_limit_ends_a_trial_with_a_status_of_its_own(trial):
 @pytest.mark.parametrize(
     ("bench", "message"),
     [
-        ("device: openmpd\n", "hardware: no emulated, boards, "),
+        ("device: openmpd\n", "hardware: no emulated, transducers, "),
         ("defaults: [base, _self_]\nsensor: {kind: scope}\n", "hardware.sensor: no chip, maker, "),
     ],
 )
@@ -233,30 +250,113 @@ def test_devices_of_boards_find_the_drive_of_the_simulation(trial, tmp_path, dev
         assert (status, "of another trial, whose boards is ['left " in log) == (2, True)
 
 
+class Row(Device):
+    """A device with a key `phases` in its config; a frame is a phase level a byte, 255 for off."""
+
+    keys = ("phases",)
+    port_keys = ("line",)
+
+    def configured(self, section):
+        phases = integer_at_least("hardware.phases", section.get("phases"), 2)
+        return replace(self, phase_levels=PhaseLevels(phases, amplitudes=1))
+
+    def open_port(self, place, backend=None):
+        raise LinkError(f"nothing at {place['line']}")
+
+    @property
+    def settings(self):
+        return {"phases": self.phase_levels.phases}
+
+    def pack(self, phase, on):
+        return bytes(torch.where(on > 0, phase, 255).tolist())
+
+    def firmware(self, transducers):
+        return RowFirmware(self.phase_levels.phases)
+
+
+class RowFirmware:
+    baud = None
+
+    def __init__(self, phases):
+        self.phases, self.levels = phases, [255] * 9
+
+    def receive(self, data):
+        self.levels = list(data)
+
+    def drive(self):
+        levels = torch.tensor(self.levels, dtype=torch.float64)
+        return torch.polar((levels < 255).double(), 2 * torch.pi * levels / self.phases)
+
+
+@dataclass(frozen=True)
+class DeafConfig(SensorConfig):
+    """The config of a sensor that reads a fraction of the pressure on an emulated bench."""
+
+    fraction: float
+
+    @property
+    def settings(self):
+        return {"fraction": self.fraction}
+
+    @contextlib.contextmanager
+    def open(self, setup):
+        yield mock.Mock(read=lambda: self.fraction * setup.bench.pressure().abs())
+
+
+def test_a_device_and_a_sensor_are_one_entry_each(trial, write, tmp_path, monkeypatch):
+    monkeypatch.setitem(DEVICES, "row", Row("Row", 9, PhaseLevels(8, amplitudes=1), ("phase", "on")))
+    monkeypatch.setitem(SENSORS, "deaf", DeafConfig)
+    bench = "device: row\nphases: 12\nlimits: {amplitude: 1}\nsensor: {kind: deaf, fraction: 0.25}\n"
+    write("ours/hardware/mine.yaml", f"defaults: [base, _self_]\n{bench}")
+    assert trial("hardware=mine", "hardware.emulated=true", "method.levels=4")[0] == 0
+    report = (tmp_path / "out" / "report.md").read_text()
+    assert "transducers driven as in the simulated trial: 9 of 9" in report
+    origin = json.loads((tmp_path / "out" / "trial.jsonl").read_text().splitlines()[0])["origin"]
+    assert (origin["device"], origin["phases"], origin["sensor"], origin["fraction"]) == (
+        "Row",
+        12,
+        "deaf",
+        0.25,
+    )
+    readings = load_drive(tmp_path / "out" / "drive.npz")
+    assert len({round(12 * float(phase) / (2 * math.pi), 6) % 1 for phase in readings.angle()}) == 1
+    for words, message in [
+        (("+hardware.line=A",), "nothing at A"),
+        (
+            ("hardware.emulated=true", "+hardware.line=A"),
+            "hardware.line: 'A'; must be null: it is for a real device",
+        ),
+        (("hardware.phases=1",), "hardware.phases: 1; must be an integer >= 2"),
+        (("~hardware.sensor.fraction",), "hardware.sensor: no fraction; must be there"),
+        (
+            ("hardware.device=ultraino", "hardware.emulated=true"),
+            "hardware.phases: 12; must be null: it is for row",
+        ),
+    ]:
+        status, _, log = trial("hardware=mine", "method=lssg", *words, folder="output=other")
+        assert (status, message in log) == (2, True)
+
+
 REAL = ("hardware.limits.amplitude=1", "hardware.transducers='0-8'")
 
 
 @pytest.mark.parametrize(
-    ("words", "opener", "given"),
+    ("words", "place"),
     [
-        (("hardware=sonicsurface", "hardware.port=COM3"), "open_link", {"port": "COM3", "settle": 0.005}),
-        (("hardware=ultraino", "hardware.boards=2", "hardware.settle=0.1"), "open_link", {"settle": 0.1}),
-        (("hardware=autd3",), "open_autd3", {}),
+        (("hardware=sonicsurface", "hardware.port=COM3"), {"port": "COM3"}),
+        (("hardware=ultraino", "hardware.boards=2", "hardware.serial=7"), {"serial": "7"}),
+        (("hardware=autd3", "hardware.network='server:8080'"), {"network": "server:8080"}),
     ],
 )
-def test_the_settings_of_a_real_bench_reach_its_device(trial, monkeypatch, words, opener, given):
-    calls = []
-
-    def nothing_there(*arguments, **named):
-        calls.append((arguments, named))
+def test_the_settings_of_a_real_bench_reach_its_device(trial, monkeypatch, words, place):
+    def nothing_there(device, at, backend=None):
+        assert (device.boards, at) == (2 if "hardware.boards=2" in words else 1, place)
         raise LinkError("nothing there")
 
-    monkeypatch.setattr(f"autdtorch.hardware.{opener}", nothing_there)
+    for device in DEVICES.values():
+        monkeypatch.setattr(type(device), "open_port", nothing_there)
     status, _, log = trial(*REAL, *words, "hardware/sensor=file", "hardware.sensor.path=readings.csv")
     assert (status, log.splitlines()[-1]) == (2, "autdtorch: nothing there")
-    ((arguments, named),) = calls
-    assert list(range(9)) in arguments
-    assert given.items() <= named.items()
 
 
 @pytest.mark.parametrize("moved", [False, True])
@@ -269,7 +369,7 @@ def test_the_settings_of_an_oscilloscope_reach_it(write, tmp_path, monkeypatch, 
     instrument = mock.MagicMock(spec=Oscilloscope)
     instrument.__enter__.return_value = instrument
     opened = mock.Mock(return_value=instrument)
-    monkeypatch.setattr("autdtorch.hardware.open_scope", opened)
+    monkeypatch.setattr("autdtorch.hardware.sensors.scope_sensor.open_scope", opened)
     with Bench(section, load_scene(tmp_path / "two.yaml"), 0).sensor() as found:
         assert isinstance(found, MovedMicrophone if moved else ScopeSensor)
     assert opened.call_args.args[0] == (0x2A8D, 0x1770)

@@ -28,7 +28,7 @@ class Trial:
 
     def bench(self, device: hw.Device = hw.SONICSURFACE, failed: Sequence[int] = ()) -> hw.EmulatedBench:
         assert self.simulated.transfer_matrix is not None
-        return hw.EmulatedBench(device, self.simulated.transfer_matrix, TRANSDUCERS, dead=failed)
+        return hw.EmulatedBench(device, self.simulated.transfer_matrix, TRANSDUCERS, failed=failed)
 
     def link(self, bench: hw.EmulatedBench, device: hw.Device = hw.SONICSURFACE) -> hw.Link:
         return hw.open_link(device, TRANSDUCERS, backend=bench.bus)

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from autdtorch.hardware import AUTD3, LimitedLink, LimitError, Limits, LinkError, open_autd3
+from autdtorch.hardware.devices import autd3 as module
+from autdtorch.hardware.devices.autd3 import Autd3Port
 from autdtorch.hardware.safety import Signalled, ended_by_signals
-from autdtorch.hardware.transport import autd3_network as module
-from autdtorch.hardware.transport.autd3_network import Autd3Port
 from autdtorch.scene.drive import drive_from_phases
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from autdtorch.hardware import EmulatedBench, LinkError, open_link, openmpd_boards
-from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
+from autdtorch.hardware.devices.openmpd import OpenMPDBoard
 from autdtorch.hardware.played import Wiring
 from autdtorch.scene.drive import drive_from_phases
 

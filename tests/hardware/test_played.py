@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autdtorch import hardware as hw
-from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
+from autdtorch.hardware.devices.openmpd import OpenMPDBoard
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.scene import Medium, Scene
 

@@ -309,7 +309,7 @@ def test_the_check_finds_the_failed_transducers(trial, snr):
     with limited(trial, failed=[3, 9]) as (bench, link):
         sensor = hw.EmulatedSensor(bench, snr)
         check = hw.check_transducers(link, sensor, points=2, watch=read.append)
-        assert check.dead == [3, 9]
+        assert check.failed == [3, 9]
         assert read == ["silence, outputs off", *(f"transducer {n} of 16" for n in range(1, 17))]
         assert bench.firmware.drive().abs().max() == 0
         assert hw.hears_silence(sensor, check, points=2)
@@ -330,7 +330,7 @@ def test_a_transducer_20_db_below_the_others_has_failed_where_silence_is_read_as
         for share, failed in ((0.05, [3]), (0.2, [])):  # of the amplitude; 20 dB are 0.1
             sensor.leak = share * typical
             check = hw.check_transducers(link, sensor, points=2)
-            assert (check.silence, check.dead) == (0, failed)
+            assert (check.silence, check.failed) == (0, failed)
 
 
 class Slow:

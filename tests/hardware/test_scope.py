@@ -12,7 +12,6 @@ import torch
 from autdtorch import hardware as hw
 from autdtorch.hardware.emulator.bus import EmulatedBus, stall, time_out
 from autdtorch.hardware.emulator.emulated_scope import EmulatedInstrument
-from autdtorch.hardware.sensors.scpi import Dialect
 from autdtorch.methods.gabs import gabs
 from autdtorch.objectives.perturbations import random_rms
 from autdtorch.scene.drive import drive_from_phases
@@ -48,7 +47,7 @@ class FaultyInstrument(EmulatedInstrument):
 class Bench:
     """A field that does not change, and an oscilloscope in it."""
 
-    def __init__(self, pressure, dialect: Dialect = hw.KEYSIGHT, points=(0, 1), **properties):
+    def __init__(self, pressure, dialect: hw.Dialect = hw.KEYSIGHT, points=(0, 1), **properties):
         maker = dialect.name.partition(" ")[0]
         self.field = torch.tensor(pressure, dtype=torch.complex128)
         self.scope = hw.EmulatedScope(lambda: self.field, FREQUENCY, SENSITIVITY, points, maker, **properties)
@@ -157,7 +156,7 @@ def test_silence_is_a_warning_that_names_input_and_noise(caplog):
     bench = Bench([0.1, 0.0], noise=0.1 * SENSITIVITY, seed=0)
     with caplog.at_level(logging.WARNING):
         bench.sensor(captures=10).read()
-    warnings = [record.getMessage() for record in caplog.records if record.name.endswith(".oscilloscope")]
+    warnings = [record.getMessage() for record in caplog.records if record.name.endswith(".scope_sensor")]
     assert [text[:8] for text in warnings] == ["input 2:"]
     assert "the noise of 0.0078 Pa" in warnings[0]  # sqrt(6 / N) of the noise of a sample
 

@@ -10,8 +10,14 @@ import torch
 from usb.core import USBError, USBTimeoutError
 
 from autdtorch.hardware import OPENMPD, SONICSURFACE, ULTRAINO, Device, EmulatedBench, LinkError
-from autdtorch.hardware.emulator.bus import EmulatedBus, time_out
-from autdtorch.hardware.emulator.chips import CHIPS, EmulatedCdc, EmulatedChip, EmulatedFtdi
+from autdtorch.hardware.emulator.bus import (
+    CHIPS,
+    EmulatedBus,
+    EmulatedCdc,
+    EmulatedChip,
+    EmulatedFtdi,
+    time_out,
+)
 from autdtorch.hardware.link import open_autd3, open_link
 from autdtorch.hardware.transport.serial_chips import BAUD_RATE, CdcUart, FtdiUart, baud_divisor
 from autdtorch.hardware.transport.usb import UDEV_RULES, find_device

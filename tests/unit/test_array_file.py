@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
+from autdtorch.hardware.devices.openmpd import OpenMPDBoard
 from autdtorch.io.array_file import load_array
 from autdtorch.io.scene_file import load_scene
 from autdtorch.scene.arrays import OPENMPD_SOURCE_STRENGTH, PAPER_SOURCE_STRENGTH, TransducerArray

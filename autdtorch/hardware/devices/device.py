@@ -1,17 +1,24 @@
-"""A device that a link can drive: phase levels, frames, the USB chips it hangs on, and emulated firmware."""
+"""A device that a link can drive: phase levels, frames, keys of its config, port and emulated firmware."""
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 import torch
 
+from autdtorch.hardware.transport.port import Port, SerialPort, SharedPort, closed_on_error
 from autdtorch.hardware.transport.serial_chips import Adapter
+from autdtorch.hardware.transport.usb import find_device
 from autdtorch.scene.drive import drive_tensor, validate_drive
 from autdtorch.scene.phase_levels import PhaseLevels
 from autdtorch.utils.validation import ArrayLike, integer_at_least, invalid
+
+if TYPE_CHECKING:
+    from autdtorch.hardware.emulator.bench import EmulatedBench
 
 _BITS = 10  # of a byte on a serial line: start, 8, stop
 
@@ -32,18 +39,24 @@ class Firmware(Protocol):
 class Device(ABC):
     """The properties of a device that a link needs; a subclass adds its frames and its firmware.
 
+    In the section `hardware` of a config, `keys` describe the device, for `configured`, and `port_keys` say
+    where a real one is, for `open_port`.
+
     Attributes:
         name: of the device.
         board: number of transducers of one board.
         phase_levels: phases and amplitudes that it can emit.
         columns: names of its integer levels, as files of drives have them.
-        adapters: USB chips that it may hang on, for pyusb; the first is the usual one.
+        adapters: USB chips that it may be connected by, for pyusb; the first is the usual one.
         baud: rate of its serial line [bits/s]; None without one.
         boot_time: time that it needs after its serial port was opened by name [s].
         most_boards: largest number of boards; None for any number.
         boards: number of boards.
         serials: serial number of each USB chip; None takes any. Several chips share a frame evenly.
     """
+
+    keys: ClassVar[tuple[str, ...]] = ()
+    port_keys: ClassVar[tuple[str, ...]] = ("serial", "port")
 
     name: str
     board: int
@@ -63,6 +76,56 @@ class Device(ABC):
     @abstractmethod
     def firmware(self, transducers: int) -> Firmware:
         """Return the emulated firmware behind one chip, with so many `transducers`."""
+
+    def configured(self, section: Mapping[str, Any]) -> Device:
+        """Return the device that a section `hardware` describes; by default with its number of `boards`."""
+        boards = section.get("boards")
+        return self if boards is None else self.with_boards(integer_at_least("hardware.boards", boards, 1))
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings that identify a trial, beside the device's name and transducers; values of JSON."""
+        return {}
+
+    def as_built(
+        self, transfer_matrix: torch.Tensor, transducers: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return matrix (P, M) and `transducers` (M,) for an emulated bench.
+
+        A device whose files correct deviations of its transducers has these deviations there.
+        """
+        return transfer_matrix, transducers
+
+    def open_port(self, place: Mapping[str, Any], backend: Any = None) -> Port:
+        """Return the port of the real device at a `place`, by `port_keys`; `backend` is pyusb's.
+
+        `LinkError` if none or several are there; `ValueError` if the device cannot be at such a place.
+        """
+        serial, name = place.get("serial"), place.get("port")
+        if name is not None:
+            if self.baud is None:
+                raise invalid("port", name, f"must be None, as {self.name} has no serial line")
+            port = SerialPort(name, self.baud)
+            with closed_on_error(port.close):
+                time.sleep(self.boot_time)
+            return port
+        if serial is not None and len(self.serials) > 1:
+            raise invalid("serial", serial, f"must be None, as {self.name} has {len(self.serials)} boards")
+        openers = {(vendor, product): open_chip for vendor, product, open_chip in self.adapters}
+        ports: list[Port] = []
+        with closed_on_error(SharedPort(ports).close):
+            for number in self.serials if serial is None else (serial,):
+                chip = find_device(openers, number, backend)
+                ports.append(openers[chip.idVendor, chip.idProduct](chip))
+        return ports[0] if len(ports) == 1 else SharedPort(ports)
+
+    def emulated_port(self, bench: EmulatedBench) -> Port:
+        """Return the port of the emulated device on a bench: its chip's, or one without USB."""
+        if self.adapters:
+            return self.open_port({}, bench.bus)
+        from autdtorch.hardware.emulator.bench import BenchPort  # needs pyusb
+
+        return BenchPort(bench)
 
     @property
     def transducers(self) -> int:

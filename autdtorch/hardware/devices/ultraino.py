@@ -30,6 +30,8 @@ class _Ultraino(Device):
     half, each above the number of the board, from 1.
     """
 
+    keys = ("boards",)
+
     def pack(self, *levels: torch.Tensor) -> bytes:
         phase, duty = levels
         tenth = torch.arange(_TENTHS, device="cpu")[:, None]
@@ -105,8 +107,8 @@ class _UltrainoFirmware:
             duration * self._fundamentals(self._playing[size * number :][:size])
             for number, duration in enumerate(durations)
         ]
-        own = torch.stack(cycle).sum(dim=0) / sum(durations)
-        return own if self._next is None else torch.cat([own, self._next.drive()])
+        drive = torch.stack(cycle).sum(dim=0) / sum(durations)
+        return drive if self._next is None else torch.cat([drive, self._next.drive()])
 
     def _fundamentals(self, pattern: bytearray) -> torch.Tensor:
         bits = np.unpackbits(np.frombuffer(pattern, np.uint8), bitorder="little")
@@ -132,7 +134,7 @@ def ultraino_pins() -> NDArray[np.intp]:
 
 
 #: One board; the first is on USB, and each passes on the bytes of the next, numbered from 1 in four bits.
-#: Ultraino's own program stops at 14 boards. It makes the duty proportional to the amplitude, and lets the
+#: The program of Ultraino stops at 14 boards. It makes the duty proportional to the amplitude, and lets the
 #: centre of a pulse move with its duty.
 ULTRAINO = _Ultraino(
     name="Ultraino",

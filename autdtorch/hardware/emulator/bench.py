@@ -1,29 +1,19 @@
-"""A bench without hardware: a device behind its USB chip or port, the air before it, and microphones."""
+"""A bench without hardware: a device behind its USB chip or port, and the pressure that it makes."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 
-import numpy as np
 import torch
 
 from autdtorch.hardware.devices.device import Device
-from autdtorch.hardware.emulator.bus import EmulatedBus, EmulatedDevice
-from autdtorch.hardware.emulator.chips import CHIPS
+from autdtorch.hardware.emulator.bus import CHIPS, EmulatedBus, EmulatedDevice
 from autdtorch.hardware.played import Wiring
-from autdtorch.hardware.transport.autd3_network import Autd3Port, autd3_kit
 from autdtorch.hardware.transport.port import Port
-from autdtorch.objectives.perturbations import SNRS, random_rms
 from autdtorch.scene.drive import amplitudes_of, phases_of
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.validation import (
-    complex_tensor,
-    indices,
-    integer_at_least,
-    integers,
-    number_between,
-    require_kind,
-)
+from autdtorch.utils.validation import complex_tensor, indices, integers
 
 
 class EmulatedBench:
@@ -40,7 +30,9 @@ class EmulatedBench:
         device: Device,
         transfer_matrix: torch.Tensor,
         transducers: Sequence[int] | torch.Tensor | None = None,
-        dead: Sequence[int] = (),
+        failed: Sequence[int] = (),
+        *,
+        dead: Sequence[int] | None = None,
     ) -> None:
         """Plug the device in, on its usual chip.
 
@@ -48,19 +40,23 @@ class EmulatedBench:
             device: the device to emulate.
             transfer_matrix: (P, M) of the scene on the bench [Pa].
             transducers: the device's transducer for each of the scene's (M,); by default all in order.
-            dead: failed transducers of the scene, which stay silent.
+            failed: transducers of the scene that stay silent.
+            dead: the former name of `failed`.
 
         `ValueError` for `transducers` that the device does not have, or not as many as the matrix has, or
-        `dead` ones that the scene does not have.
+        `failed` ones that the scene does not have.
         """
+        if dead is not None:
+            warnings.warn("dead= is now failed=", DeprecationWarning, stacklevel=2)
+            failed = dead
         self._transducers = Wiring(device, transducers).transducers
         self.transfer_matrix = complex_tensor("transfer_matrix", transfer_matrix).to("cpu", torch.complex128)
         if self.transfer_matrix.ndim != 2 or self.transfer_matrix.shape[1] != len(self._transducers):
             shape = tuple(self.transfer_matrix.shape)
             raise ValueError(f"transfer_matrix: shape {shape}; must be (P, {len(self._transducers)})")
         self._working = torch.ones(len(self._transducers), **REAL)
-        if failed := integers("dead", dead, 0, "must be indices of transducers"):
-            self._working[indices("dead", failed, len(self._transducers))] = 0
+        if silent := integers("failed", failed, 0, "must be indices of transducers"):
+            self._working[indices("failed", silent, len(self._transducers))] = 0
         each = device.transducers // len(device.serials)
         self._firmwares = [device.firmware(each) for _ in device.serials]
         self.firmware = self._firmwares[0]
@@ -96,59 +92,19 @@ class EmulatedBench:
         return self.transfer_matrix @ self.drive()
 
 
-class DryPort(Port):
-    """A port that shows each frame in hexadecimal, and the drive that an emulated device emits for it."""
+class BenchPort(Port):
+    """A port without USB: an emulated device takes its frames, each of which may be shown."""
 
-    def __init__(self, bench: EmulatedBench, show: Callable[[str], object]) -> None:
-        """Open no device: the `bench` takes the frames, and `show` takes a text for each."""
+    def __init__(self, bench: EmulatedBench, show: Callable[[str], object] | None = None) -> None:
+        """Set the `bench` that takes the frames, and the function that takes a text for each."""
         self._bench, self._show = bench, show
 
     def write(self, data: bytes) -> None:
-        """Show the frame; amplitude and phase [deg] of each of the device's transducers below it."""
+        """Have the device take a frame; show it in hexadecimal, with amplitudes and phases [deg]."""
         self._bench.receive(data)
+        if self._show is None:
+            return
         drive = self._bench.emitted()
         pairs = zip(amplitudes_of(drive).tolist(), phases_of(drive).rad2deg().tolist(), strict=True)
         emitted = [f"{number}: {a:.3g} at {phase:.4g}" for number, (a, phase) in enumerate(pairs) if a > 0]
         self._show(f"{data.hex(' ')}\n  {', '.join(emitted) or 'all off'}")
-
-
-class EmulatedAutd3Port(Autd3Port):
-    """The port of AUTD3 boards that the kit emulates on this machine, silently; a bench plays for them."""
-
-    def __init__(self, boards: int, bench: EmulatedBench) -> None:
-        """Start the emulator of `boards` boards, and connect to it."""
-        self._emulator = autd3_kit().UdpEmulator(boards)
-        self._bench = bench
-        super().__init__(boards, self._emulator.option())
-
-    def write(self, data: bytes) -> None:
-        """Play a frame, on boards and bench."""
-        super().write(data)
-        self._bench.receive(data)
-
-
-class EmulatedSensor:
-    """A microphone at each control point of an emulated bench, with the noise of `perturbations.Noise`."""
-
-    def __init__(self, bench: EmulatedBench, snr: float | None = None, seed: int = 0) -> None:
-        """Set the microphones up.
-
-        Args:
-            bench: the bench to measure on.
-            snr: 20 log10(reference / sigma) [dB], -1000 to 1000, where the reference is the rms pressure over
-                control points and random phases, all transducers fully on; None for no noise.
-            seed: of the noise, >= 0.
-
-        `ValueError` for an argument out of range.
-        """
-        require_kind("bench", bench, EmulatedBench)
-        self._bench = bench
-        self._generator = np.random.default_rng(integer_at_least("seed", seed, 0))
-        rms = random_rms(bench.transfer_matrix)
-        self._sigma = 0.0 if snr is None else rms * 10 ** (-number_between("snr", snr, *SNRS, "dB") / 20)
-
-    def read(self) -> torch.Tensor:
-        """Return the magnitudes (P,) [Pa]."""
-        pressure = self._bench.pressure()
-        parts = torch.from_numpy(self._generator.standard_normal((len(pressure), 2)))
-        return (pressure + torch.view_as_complex(self._sigma / 2**0.5 * parts)).abs()

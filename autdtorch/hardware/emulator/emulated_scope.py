@@ -1,7 +1,7 @@
 """An oscilloscope without hardware: USBTMC, its commands, and the waveforms of microphones on a bench.
 
-Written from the makers' programming guides and the specification of USBTMC, not from `scpi` and `usbtmc`, so
-that one checks the other.
+Written from the makers' programming guides and the specification of USBTMC, not from `oscilloscope` and
+`usbtmc`, so that one checks the other.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 
 from autdtorch.hardware.emulator.bench import EmulatedBench
 from autdtorch.hardware.emulator.bus import EmulatedDevice, stall, time_out
-from autdtorch.hardware.sensors.oscilloscope import FREQUENCIES, SENSITIVITIES
+from autdtorch.hardware.sensors.scope_sensor import FREQUENCIES, SENSITIVITIES
 from autdtorch.utils.validation import (
     integer_at_least,
     integers,
@@ -128,9 +128,9 @@ class EmulatedScope:
         """Execute a line, and return its answer, if it has one."""
         header, _, argument = line.partition(" ")
         header = _short(header)
-        found = re.fullmatch(r"CHAN(\d):(\w+)", header)
-        number = int(found[1]) - 1 if found and 1 <= int(found[1]) <= len(self.points) else None
-        setting = found[2] if found and number is not None else ""
+        match = re.fullmatch(r"CHAN(\d):(\w+)", header)
+        number = int(match[1]) - 1 if match and 1 <= int(match[1]) <= len(self.points) else None
+        setting = match[2] if match and number is not None else ""
         if header == self._maker.time_scale:
             self._time_scale = float(argument)
         elif number is not None and setting == "SCAL":
@@ -225,13 +225,13 @@ class EmulatedInstrument(EmulatedDevice):
     def read(self, most: int) -> bytes:
         """Return at most `most` bytes of a requested transfer."""
         transfer = self._transfer() if self._sending is None else self._sending
-        given, rest = transfer[:most], transfer[most:]
-        whole = len(given) % _PACKET == 0
-        if whole and len(given) < most and not self.sends_empty_packets:
+        piece, rest = transfer[:most], transfer[most:]
+        whole = len(piece) % _PACKET == 0
+        if whole and len(piece) < most and not self.sends_empty_packets:
             raise time_out()  # the host waits for more
-        empty_is_due = whole and len(given) == most and self.sends_empty_packets
+        empty_is_due = whole and len(piece) == most and self.sends_empty_packets
         self._sending = rest if rest or empty_is_due else None
-        return given
+        return piece
 
     def _transfer(self) -> bytes:
         """Return the next transfer of the answer."""

@@ -1,1 +1,19 @@
-"""Sensors of the pressure at the control points: an oscilloscope, a person, a file."""
+"""Sensors of the pressure at the control points: an oscilloscope, a person, a file.
+
+A sensor is its class, with that of its config, in a module, and a line in `SENSORS`.
+"""
+
+from autdtorch.hardware.sensors.by_hand import ManualConfig
+from autdtorch.hardware.sensors.reading_file import FileConfig
+from autdtorch.hardware.sensors.scope_sensor import ScopeConfig
+from autdtorch.hardware.sensors.sensor import EmulatedConfig, SensorConfig
+
+__all__ = ["SENSORS"]
+
+#: The config of every kind of sensor, by the kind.
+SENSORS: dict[str, type[SensorConfig]] = {
+    "emulated": EmulatedConfig,
+    "scope": ScopeConfig,
+    "file": FileConfig,
+    "manual": ManualConfig,
+}

@@ -6,10 +6,12 @@ import os
 import select
 import sys
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 
 import torch
 
-from autdtorch.hardware.sensors.sensor import Sensor, SensorError, checked_reading
+from autdtorch.hardware.sensors.sensor import Sensor, SensorConfig, SensorError, Setup, checked_reading
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.progress import is_terminal
 from autdtorch.utils.validation import ArrayLike, not_negative, points_tensor, require_callable, require_kind
@@ -100,3 +102,17 @@ def _asked(ask: Callable[[str], str], question: str) -> str:
 def _place(number: int, points: torch.Tensor) -> str:
     x, y, z = (1e3 * points[number]).tolist()
     return f"control point {number + 1} of {len(points)} at ({x:.1f}, {y:.1f}, {z:.1f}) mm"
+
+
+@dataclass(frozen=True)
+class ManualConfig(SensorConfig):
+    """The config of a `ManualSensor`."""
+
+    @property
+    def by_hand(self) -> bool:
+        """True: a person types every reading."""
+        return True
+
+    def open(self, setup: Setup) -> AbstractContextManager[Sensor]:
+        """Return a context with the sensor."""
+        return nullcontext(ManualSensor(setup.control_points, setup.ask))

@@ -1,86 +1,139 @@
-"""Microphones at an oscilloscope: voltages captured, pressures by a lock-in at the drive frequency."""
+"""Oscilloscopes on USB: SCPI commands by maker, captures, and volts from their samples.
+
+From the makers' programming guides; none was tried on a device.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 
-from autdtorch.hardware.sensors import scpi
-from autdtorch.hardware.sensors.lock_in import LockIn
-from autdtorch.hardware.sensors.scpi import KEYSIGHT, Dialect, Waveform
-from autdtorch.hardware.sensors.sensor import SensorError
 from autdtorch.hardware.transport.port import LinkError, closed_on_error
 from autdtorch.hardware.transport.usb import find_device
 from autdtorch.hardware.transport.usbtmc import UsbtmcPort
-from autdtorch.utils.array_types import REAL
-from autdtorch.utils.validation import (
-    integer_at_least,
-    invalid,
-    members,
-    number_between,
-    positive,
-    positive_integers,
-    require_kind,
-)
+from autdtorch.utils.validation import positive_integers, require_kind
 
 logger = logging.getLogger(__name__)
 
-#: Sensitivities of microphones with their amplifiers that are taken for true [V/Pa].
-SENSITIVITIES = (1e-9, 1e3)
-#: Frequencies that an oscilloscope may capture [Hz].
-FREQUENCIES = (1.0, 1e9)
-_PERIODS_A_DIVISION = 5  # 50 or 60 on a screen, 20 samples each
+#: Finest vertical scale of both makers [V/division].
+FINEST = 1e-3
+#: Coarsest vertical scale that both makers have [V/division].
+COARSEST = 5.0
 _CAPTURE_TIME = 2.0  # time limit of a capture [s]
-_QUIET = 5  # standard errors
-# Vertical scales. A sound twice or half as loud as the last needs no change.
-_DIVISIONS = 3.5  # of a full screen, above and below the middle; there are 4 or more
-_KEPT = 0.25  # share of the screen below which a waveform gets a finer scale
-_TARGET = 0.5  # share that it then fills
-_COARSER = 4.0  # a waveform that clips fills at least a quarter of a scale so much coarser
+# Commands of both makers: of an input, with its vertical scale, and for its waveform.
+_SET_UP_INPUT = (
+    ":CHANnel{input}:DISPlay ON",
+    ":CHANnel{input}:PROBe 1",
+    ":CHANnel{input}:COUPling AC",
+    ":CHANnel{input}:OFFSet 0",
+    ":CHANnel{input}:VERNier ON",  # else some scales would be rounded to 1, 2 or 5
+)
+_SCALE = ":CHANnel{input}:SCALe {scale:.6g}"
+_SOURCE = ":WAVeform:SOURce CHANnel{input}"
+# Question for ten numbers: the fifth is the time step, the last are step, origin, reference of the voltage.
+_PREAMBLE = ":WAVeform:PREamble?"
+# Question for the samples, a byte each, as a definite-length block.
+_SAMPLES = ":WAVeform:DATA?"
 
 
 @dataclass(frozen=True)
-class Microphone:
-    """A microphone at a control point, and its path into the oscilloscope.
+class Waveform:
+    """The samples of one input.
 
     Attributes:
-        input: number of the oscilloscope's input, from 1.
-        sensitivity: of the microphone at the drive frequency [V/Pa]; with the amplifier 1e-9 to 1e3.
-        loudest: largest amplitude that the input must take [Pa]; up to 17.5 V.
-        gain: of the amplifier between, as a factor.
-
-    `ValueError` for an attribute out of range.
+        volts: (S,) [V], float64.
+        time_step: from sample to sample [s].
+        resolution: a step of the converter [V].
+        clipped: number of samples beyond the converter's range.
     """
 
-    input: int
-    sensitivity: float
-    loudest: float
-    gain: float = 1.0
+    volts: torch.Tensor
+    time_step: float
+    resolution: float
+    clipped: int
 
-    def __post_init__(self) -> None:
-        """Check the attributes."""
-        integer_at_least("input", self.input, 1)
-        positive("sensitivity", self.sensitivity, "V/Pa")
-        positive("loudest", self.loudest, "Pa")
-        positive("gain", self.gain)
-        number_between("sensitivity * gain", self._volts, *SENSITIVITIES, "V/Pa")
-        most = _DIVISIONS * scpi.COARSEST
-        if self._volts * self.loudest > most:
-            accepted = (
-                f"must be <= {most / self._volts:.3g}, which gives {most:g} V at the input; lower the gain"
-            )
-            raise invalid("loudest", self.loudest, accepted, "Pa")
 
-    @property
-    def _volts(self) -> float:
-        """Voltage at the input for 1 Pa [V/Pa]."""
-        return self.sensitivity * self.gain
+@dataclass(frozen=True)
+class Dialect:
+    """The commands of a maker, beside those of all makers.
+
+    Attributes:
+        name: of the oscilloscopes that take them.
+        set_up: sent once, with the time scale ``{time}`` [s/division].
+        capture: starts a capture of all inputs at once, without a trigger signal.
+        status: question for the end of the capture.
+        ready: answer to it at the end.
+        lowest: lowest code of a sample that is not clipped; the highest is 254.
+        origin_in_codes: the voltage's origin is a number of codes, not of volts.
+    """
+
+    name: str
+    set_up: tuple[str, ...]
+    capture: tuple[str, ...]
+    status: str
+    ready: str
+    lowest: int
+    origin_in_codes: bool
+
+    def waveform(self, preamble: str, codes: bytes) -> Waveform:
+        """Return the waveform of the answers to the questions for preamble and samples.
+
+        `LinkError` if the preamble is not ten numbers, with steps above 0, or there are no samples.
+        """
+        try:
+            numbers = [float(number) for number in preamble.split(",")]
+            time_step, resolution, origin, reference = numbers[4], *numbers[7:]
+        except (ValueError, IndexError) as error:
+            raise LinkError(f"oscilloscope: preamble {preamble[:80]!r}; must be ten numbers") from error
+        if not (time_step > 0 and resolution > 0 and codes):
+            answers = f"preamble {preamble[:80]!r} and {len(codes)} samples"
+            raise LinkError(f"oscilloscope: {answers} make no waveform")
+        values = torch.frombuffer(bytearray(codes), dtype=torch.uint8)
+        clipped = int(((values < self.lowest) | (values > 254)).sum())
+        steps = values.to(torch.float64) - reference
+        volts = (steps - origin) * resolution if self.origin_in_codes else steps * resolution + origin
+        return Waveform(volts, time_step, resolution, clipped)
+
+
+#: InfiniiVision 2000, 3000 and 4000 X-Series Programmer's Guides.
+KEYSIGHT = Dialect(
+    "Keysight InfiniiVision",
+    set_up=(
+        ":ACQuire:TYPE NORMal",
+        ":TIMebase:SCALe {time:.6g}",
+        ":TRIGger:SWEep AUTO",
+        ":WAVeform:FORMat BYTE",
+        ":WAVeform:UNSigned ON",
+        ":WAVeform:POINts 1000",
+    ),
+    capture=(":DIGitize",),
+    status="*OPC?",
+    ready="1",
+    lowest=2,  # 0 is a hole, 1 clipped
+    origin_in_codes=False,
+)
+
+#: MSO1000Z/DS1000Z Programming Guide; the samples are those of the screen.
+RIGOL = Dialect(
+    "Rigol DS1000Z",
+    set_up=(
+        ":ACQuire:TYPE NORMal",
+        ":TIMebase:MAIN:SCALe {time:.6g}",
+        ":WAVeform:MODE NORMal",
+        ":WAVeform:FORMat BYTE",
+    ),
+    capture=(":CLEar", ":SINGle", ":TFORce"),  # cleared, so that no old capture is taken for the new
+    status=":TRIGger:STATus?",
+    ready="STOP",
+    lowest=1,
+    origin_in_codes=True,
+)
 
 
 class Oscilloscope(contextlib.AbstractContextManager["Oscilloscope"]):
@@ -102,7 +155,7 @@ class Oscilloscope(contextlib.AbstractContextManager["Oscilloscope"]):
         for command in self._dialect.set_up:
             self._port.tell(command.format(time=time_scale))
         for number in inputs:
-            for command in scpi.SET_UP_INPUT:
+            for command in _SET_UP_INPUT:
                 self._port.tell(command.format(input=number))
 
     def capture(self, scales: Mapping[int, float]) -> list[Waveform]:
@@ -129,7 +182,7 @@ class Oscilloscope(contextlib.AbstractContextManager["Oscilloscope"]):
     def _capture(self, scales: Mapping[int, float]) -> list[Waveform]:
         for number, scale in scales.items():
             if self._scales.get(number) != scale:
-                self._port.tell(scpi.SCALE.format(input=number, scale=scale))
+                self._port.tell(_SCALE.format(input=number, scale=scale))
                 self._scales[number] = scale
         for command in self._dialect.capture:
             self._port.tell(command)
@@ -141,125 +194,8 @@ class Oscilloscope(contextlib.AbstractContextManager["Oscilloscope"]):
         return [self._waveform(number) for number in scales]
 
     def _waveform(self, number: int) -> Waveform:
-        self._port.tell(scpi.SOURCE.format(input=number))
-        return self._dialect.waveform(self._port.ask(scpi.PREAMBLE), self._port.ask_block(scpi.SAMPLES))
-
-
-class ScopeSensor:
-    """Microphones at an oscilloscope, one for each control point.
-
-    A lock-in takes the amplitude at the drive frequency from captures, without hum, other tones and most of
-    the noise. Captures are averaged as powers, less the power of the noise there, since their phases are
-    unknown.
-
-    Each input keeps the vertical scale of its last capture. A waveform that is clipped on it, or too small,
-    is captured again on another scale, up to the scale of the loudest sound; `recaptures` counts these.
-    """
-
-    def __init__(
-        self, scope: Oscilloscope, frequency: float, microphones: Sequence[Microphone], captures: int = 1
-    ) -> None:
-        """Set the oscilloscope up.
-
-        Args:
-            scope: takes the captures.
-            frequency: of the drive [Hz].
-            microphones: in the order of the control points.
-            captures: number of captures that a reading averages.
-
-        Raises:
-            ValueError: an argument out of range, no microphone, or two at one input.
-            LinkError: the oscilloscope does not take the commands.
-        """
-        require_kind("scope", scope, Oscilloscope)
-        self._scope = scope
-        self._frequency = number_between("frequency", frequency, *FREQUENCIES, "Hz")
-        self._microphones = members("microphones", microphones, Microphone)
-        self._captures = integer_at_least("captures", captures, 1)
-        volts = [one._volts for one in self._microphones]
-        self._volts_per_pascal = torch.tensor(volts, **REAL)
-        self._coarsest = {
-            one.input: max(one.loudest * one._volts / _DIVISIONS, scpi.FINEST) for one in self._microphones
-        }
-        self._scales = self._coarsest
-        self.recaptures = 0
-        if not self._scales or len(self._scales) < len(self._microphones):
-            inputs = [one.input for one in self._microphones]
-            raise invalid("microphones", inputs, "must be at inputs of their own, at least one")
-        scope.set_up(self._scales.keys(), _PERIODS_A_DIVISION / self._frequency)
-
-    def read(self) -> torch.Tensor:
-        """Return magnitudes (P,) [Pa]; one within the noise is logged as a warning.
-
-        Raises:
-            SensorError: a capture is clipped on the coarsest scale, or too coarse or short for the frequency.
-            LinkError: the oscilloscope does not answer.
-        """
-        captures = torch.stack([self._capture() for _ in range(self._captures)])
-        power, noise = captures.mean(dim=0).unbind(dim=-1)
-        pressure = (power - noise).clamp(min=0).sqrt()
-        # The power of noise alone has a standard error of its own size, over the root of the captures.
-        quiet = power - noise < _QUIET * noise / self._captures**0.5
-        for place in quiet.nonzero().flatten().tolist():
-            values = self._microphones[place].input, float(pressure[place]), float(noise[place].sqrt())
-            logger.warning("input %d: %.3g Pa is within the noise of %.2g Pa", *values)
-        return pressure
-
-    def _capture(self) -> torch.Tensor:
-        """Return powers (P, 2) [Pa^2] at the frequency, and of the noise in them, on fitting scales."""
-        once_clipped: set[int] = set()  # not on a finer scale again in this reading, so that it ends
-        while True:
-            waveforms = self._scope.capture(self._scales)
-            lock_in = self._lock_in(waveforms)
-            fit = lock_in(torch.stack([one.volts for one in waveforms]))
-            fitted = dict(self._scales)
-            for number, waveform, noise in zip(fitted, waveforms, fit.residual.tolist(), strict=True):
-                if waveform.clipped:
-                    once_clipped.add(number)
-                if waveform.clipped or number not in once_clipped:
-                    wanted = max(_fitted(self._scales[number], waveform, noise), scpi.FINEST)
-                    fitted[number] = min(wanted, self._coarsest[number])
-            if fitted == self._scales:
-                break
-            self._scales = fitted
-            self.recaptures += 1
-        self._require_unclipped(waveforms)
-        # Samples that all have the same code do not show the noise of their rounding.
-        steps = torch.tensor([one.resolution for one in waveforms], **REAL)
-        variance = fit.residual.square().maximum(steps.square() / 12)
-        powers = torch.stack([fit.phasor.abs().square(), lock_in.noise_gain * variance], dim=1)
-        return powers / self._volts_per_pascal[:, None].square()
-
-    def _lock_in(self, waveforms: Sequence[Waveform]) -> LockIn:
-        """Return the lock-in for waveforms, which must be sampled at the same moments."""
-        moments = {(one.time_step, len(one.volts)) for one in waveforms}
-        if len(moments) > 1:
-            raise SensorError(f"inputs differ in time step and number of samples: {sorted(moments)}")
-        try:
-            return LockIn(self._frequency, *moments.pop())
-        except ValueError as error:
-            raise SensorError(f"capture does not suit the frequency: {error}") from error
-
-    def _require_unclipped(self, waveforms: Sequence[Waveform]) -> None:
-        for microphone, waveform in zip(self._microphones, waveforms, strict=True):
-            if waveform.clipped:
-                clipped = f"{waveform.clipped} of {len(waveform.volts)} samples are clipped"
-                loudest = f"by more than {microphone.loudest:g} Pa: raise `loudest`"
-                raise SensorError(f"input {microphone.input}: {clipped}, {loudest}")
-
-
-def _fitted(scale: float, waveform: Waveform, noise: float) -> float:
-    """Return the scale for the next waveform, from one on a `scale` [V/division] with noise of an rms [V].
-
-    The scale is not made finer if the noise exceeds a step of the converter: rounding then adds at most 1/12
-    to its variance, and no bias.
-    """
-    if waveform.clipped:
-        return scale * _COARSER
-    peak = float(waveform.volts.abs().max()) + waveform.resolution
-    if peak < _KEPT * _DIVISIONS * scale and noise < waveform.resolution:
-        return peak / (_TARGET * _DIVISIONS)
-    return scale
+        self._port.tell(_SOURCE.format(input=number))
+        return self._dialect.waveform(self._port.ask(_PREAMBLE), self._port.ask_block(_SAMPLES))
 
 
 def open_scope(
@@ -271,7 +207,7 @@ def open_scope(
         chip: idVendor and idProduct, as ``lsusb`` shows them.
         dialect: commands of its maker.
         serial: serial number, where several such are plugged in.
-        backend: backend of pyusb; by default libusb. An emulated bench has its own.
+        backend: backend of pyusb; by default libusb. An emulated bench has one in `bus`.
 
     Raises:
         ValueError: `chip` is not two numbers.

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import time
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from autdtorch.hardware.sensors.sensor import SensorError
+from autdtorch.hardware.sensors.sensor import Sensor, SensorConfig, SensorError, Setup
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import (
     integer_at_least,
@@ -66,10 +69,10 @@ class FileSensor:
 
     def _stamp(self) -> tuple[int, int, int] | None:
         try:
-            found = self._path.stat()
+            status = self._path.stat()
         except FileNotFoundError:
             return None
-        return found.st_mtime_ns, found.st_size, found.st_ino
+        return status.st_mtime_ns, status.st_size, status.st_ino
 
     def _pressure(self) -> torch.Tensor:
         text = self._path.read_text(encoding="utf-8")
@@ -79,3 +82,19 @@ class FileSensor:
         if len(numbers) != self._points:
             raise invalid("pressure", numbers, f"must be {self._points} numbers", "Pa")
         return torch.tensor(numbers, **REAL)
+
+
+@dataclass(frozen=True)
+class FileConfig(SensorConfig):
+    """The config of a `FileSensor`."""
+
+    path: Any
+
+    def check(self, emulated: bool) -> None:
+        """Require a path."""
+        if self.path is None:
+            raise invalid("hardware.sensor.path", None, "must be the file that holds the readings")
+
+    def open(self, setup: Setup) -> AbstractContextManager[Sensor]:
+        """Return a context with the sensor."""
+        return nullcontext(FileSensor(self.path, len(setup.control_points)))

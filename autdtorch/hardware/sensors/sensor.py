@@ -1,16 +1,32 @@
-"""The sensor of a bench: pressure magnitudes at the control points."""
+"""The sensor of a bench: pressure magnitudes at the control points, its config, and an emulated one."""
 
 from __future__ import annotations
 
 import signal
 import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from types import FrameType
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 
 from autdtorch.objectives.objective import validate_magnitudes
+from autdtorch.objectives.perturbations import SNRS, random_rms
 from autdtorch.utils.signals import send
+from autdtorch.utils.validation import (
+    finite_number,
+    integer_at_least,
+    invalid,
+    number_between,
+    require_kind,
+)
+
+if TYPE_CHECKING:
+    from autdtorch.hardware.emulator.bench import EmulatedBench
 
 #: Time limit of a reading while the outputs are off [s]: a person may take minutes, a hung sensor forever.
 LONGEST = 600.0
@@ -64,24 +80,120 @@ def _reading(sensor: Sensor, seconds: float) -> object:
         try:
             signal.signal(_WAKE, interrupt)
             threading.Thread(target=_wake, args=(seconds, done, is_late), daemon=True).start()
-            found = sensor.read()
+            reading = sensor.read()
         finally:
             done.set()
             signal.signal(_WAKE, before)
     except _Overdue:
         signal.signal(_WAKE, before)  # it may have come amid the lines above
-        if not is_late.is_set():  # that of a reading around this one
+        if not is_late.is_set():  # another reading, around this one, is overdue
             raise
     if is_late.is_set():
         raise SensorError(f"the sensor gives no reading within {seconds:.3g} s")
-    return found
+    return reading
 
 
 def _wake(seconds: float, done: threading.Event, is_late: threading.Event) -> None:
-    """Interrupt the main thread after some time, again and again: what a `__del__` raises is dropped."""
+    """Interrupt the main thread after some time, repeatedly, as Python drops what a `__del__` raises."""
     if done.wait(seconds):
         return
     is_late.set()
     while not done.is_set():
         send(_WAKE)
         done.wait(_AGAIN)
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """The bench that a configured sensor is opened on.
+
+    Attributes:
+        control_points: (P, 3) [m].
+        frequency: of the drive [Hz].
+        ask: shows a person a question, and returns the answer.
+        bench: the emulated bench; None for a real one.
+        seed: of emulated noise.
+    """
+
+    control_points: torch.Tensor
+    frequency: float
+    ask: Callable[[str], str]
+    bench: EmulatedBench | None
+    seed: int
+
+
+class SensorConfig(ABC):
+    """The section `hardware.sensor` of a config for a kind of sensor.
+
+    The keys are `kind`, by which `SENSORS` finds the class, and the fields of a subclass, which is a
+    dataclass. A field `snr` [dB] is for emulated benches alone.
+
+    `for_real` is true if a real bench can have the sensor.
+    """
+
+    for_real: ClassVar[bool] = True
+
+    @property
+    def by_hand(self) -> bool:
+        """True if a person takes part in every reading."""
+        return False
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings that identify a trial, values of JSON."""
+        return {}
+
+    def check(self, emulated: bool) -> None:
+        """Check the values, for an `emulated` or a real bench; `ValueError` for a value out of range."""
+        if (snr := getattr(self, "snr", None)) is None:
+            return
+        if not emulated:
+            raise invalid("hardware.sensor.snr", snr, "must be null: it is for an emulated device")
+        finite_number("hardware.sensor.snr", snr)
+
+    @abstractmethod
+    def open(self, setup: Setup) -> AbstractContextManager[Sensor]:
+        """Return a context with the sensor."""
+
+
+class EmulatedSensor:
+    """A microphone at each control point of an emulated bench, with the noise of `perturbations.Noise`."""
+
+    def __init__(self, bench: EmulatedBench, snr: float | None = None, seed: int = 0) -> None:
+        """Set the microphones up.
+
+        Args:
+            bench: the bench to measure on.
+            snr: 20 log10(reference / sigma) [dB], -1000 to 1000, where the reference is the rms pressure over
+                control points and random phases, all transducers fully on; None for no noise.
+            seed: of the noise, >= 0.
+
+        `ValueError` for an argument out of range.
+        """
+        from autdtorch.hardware.emulator.bench import EmulatedBench  # needs pyusb
+
+        require_kind("bench", bench, EmulatedBench)
+        self._bench = bench
+        self._generator = np.random.default_rng(integer_at_least("seed", seed, 0))
+        rms = random_rms(bench.transfer_matrix)
+        self._sigma = 0.0 if snr is None else rms * 10 ** (-number_between("snr", snr, *SNRS, "dB") / 20)
+
+    def read(self) -> torch.Tensor:
+        """Return the magnitudes (P,) [Pa]."""
+        pressure = self._bench.pressure()
+        parts = torch.from_numpy(self._generator.standard_normal((len(pressure), 2)))
+        return (pressure + torch.view_as_complex(self._sigma / 2**0.5 * parts)).abs()
+
+
+@dataclass(frozen=True)
+class EmulatedConfig(SensorConfig):
+    """The config of an `EmulatedSensor`."""
+
+    for_real = False
+
+    snr: float | None
+
+    def open(self, setup: Setup) -> AbstractContextManager[Sensor]:
+        """Return a context with the sensor on the emulated bench."""
+        assert setup.bench is not None
+        return nullcontext(EmulatedSensor(setup.bench, self.snr, setup.seed))

@@ -62,7 +62,7 @@ def write_hardware_report(
     """
     evaluations, scene = log.evaluations, simulated.scene
     working = torch.ones(len(scene.array), **REAL)
-    working[preflight.dead] = 0
+    working[preflight.failed] = 0
     measured = torch.stack([one.pressure for one in evaluations])
     predicted = simulated(working * torch.stack([one.drive for one in evaluations]))
     fit = compare(measured, predicted)
