@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -17,7 +18,7 @@ _USED = re.compile(r"\+*(scene|modules|explore|hydra)\b|\+*solver\.spacing=")
 
 
 def explore_scene(settings: dict[str, Any], modules: list[Any]) -> None:
-    """Show the scene of the settings until Ctrl+C is pressed.
+    """Show the scene of the settings until Ctrl+C or SIGTERM, which a job in the background gets, ends it.
 
     Raises:
         ValueError: a setting of `explore` that is unknown or out of range, or one that has no effect here.
@@ -36,9 +37,13 @@ def explore_scene(settings: dict[str, Any], modules: list[Any]) -> None:
             drive = load_drive(path_of("drive", file))
     scene = scene_of("scene", section_of(settings, "scene"), modules)
     spacing, port, browser = solver_of(settings)["spacing"], section["port"], section["browser"]
-    explorer = explore(scene, drive, spacing=spacing, port=port, open_browser=browser)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        print(f"The live view is at {explorer.address}\nCtrl+C ends it.", flush=True)
-        explorer.wait()
-    except KeyboardInterrupt:
-        explorer.close()
+        explorer = explore(scene, drive, spacing=spacing, port=port, open_browser=browser)
+        try:
+            print(f"The live view is at {explorer.address}\nCtrl+C ends it.", flush=True)
+            explorer.wait()
+        except KeyboardInterrupt:
+            explorer.close()
+    finally:
+        signal.signal(signal.SIGTERM, before)

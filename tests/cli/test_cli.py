@@ -554,7 +554,7 @@ def test_explore_shows_the_scene_and_drive_of_the_settings(run, write, monkeypat
         address = "http://127.0.0.1:1/token/index.html"
 
         def wait(self):
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGTERM)
 
         def close(self):
             shown["closed"] = True
