@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from small_scenes import AIR, small_scene
 
 import autdtorch as at
-from autdtorch.plot.explore import history as history_module
+from autdtorch.plot.explore import situation as situation_module
 from autdtorch.plot.explore.catalogue import offered
-from autdtorch.plot.explore.history import History
 from autdtorch.plot.explore.picture import followed
-from autdtorch.plot.explore.situation import OWN_PLANE, Body, Situation
+from autdtorch.plot.explore.situation import SCENE_PLANE, Body, History, Situation
 
 PLACE = st.tuples(*[st.floats(-0.1, 0.1)] * 3)
 ANGLES = st.tuples(*[st.floats(-math.pi, math.pi)] * 3)
@@ -70,7 +69,7 @@ def test_a_plane_without_observation_plane_passes_through_the_foci():
         torch.tensor(part, dtype=torch.float64) for part in (situation.sheet.normal, situation.sheet.center)
     )
     assert float((scene.control_points.mean(dim=0) - center) @ normal) == pytest.approx(0, abs=1e-9)
-    assert OWN_PLANE not in situation.planes
+    assert SCENE_PLANE not in situation.planes
 
 
 @pytest.mark.parametrize("plane", ["x", "y", "z"])
@@ -85,11 +84,11 @@ def test_planes_stay_in_the_domain(plane, height):
 
 def test_an_oblique_observation_plane_moves_along_its_normal():
     situation = Situation.of(oblique_scene(), DRIVE)
-    assert situation.plane == OWN_PLANE
-    moved = situation.with_plane(OWN_PLANE, 2e-3)
+    assert situation.plane == SCENE_PLANE
+    moved = situation.with_plane(SCENE_PLANE, 2e-3)
     steps = torch.tensor(moved.sheet.center) - torch.tensor(situation.sheet.center)
     assert steps.tolist() == pytest.approx([2e-3 / math.sqrt(2), 2e-3 / math.sqrt(2), 0], abs=1e-9)
-    assert moved.with_plane("x").with_plane(OWN_PLANE).sheet == situation.sheet
+    assert moved.with_plane("x").with_plane(SCENE_PLANE).sheet == situation.sheet
 
 
 def test_unknown_planes_are_refused():
@@ -141,7 +140,7 @@ def test_few_steps_are_kept_of_large_meshes(monkeypatch):
     scene = small_scene()
     mesh = at.Mesh.from_surface(WEDGE.triangles, offset=(10e-3, 10e-3, 10e-3), rigid=True)
     scene = at.Scene(scene.array, AIR, scene.frequency, scene.control_points, (mesh,), None, scene.domain)
-    monkeypatch.setattr(history_module, "_MOST_BYTES", 3 * mesh.vertices.nbytes)
+    monkeypatch.setattr(situation_module, "_MOST_BYTES", 3 * mesh.vertices.nbytes)
     first = Situation.of(scene, DRIVE)
     history = History(first)
     for step in range(5):

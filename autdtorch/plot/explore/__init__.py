@@ -1,4 +1,4 @@
-"""A live view of a scene, in a notebook or a browser (optional extra ``explore``)."""
+"""A live view of a scene, in a notebook or a browser (extra ``explore``)."""
 
 from __future__ import annotations
 
@@ -17,9 +17,7 @@ if TYPE_CHECKING:
     from autdtorch.plot.explore.explorer import Explorer
 
 _LAST_PORT = 65535
-_OPENING = (
-    threading.Lock()
-)  # PyVista is not imported, nor a trame application made, by several threads at once
+_OPENING = threading.Lock()  # one thread at a time imports PyVista and makes a trame application
 
 
 def explore(
@@ -30,26 +28,26 @@ def explore(
     port: int = 0,
     open_browser: bool = False,
 ) -> Explorer:
-    """Show a scene in a live view: in a notebook, or in a browser at the address of what is returned.
+    """Show a scene in a live view: in a notebook, or in a browser at the view's address.
 
-    Obstacles and foci are moved by mouse, sliders or numbers, drives found by any method or edited, and the
-    field is shown on a plane and in the volume: with cells twice as large while something is dragged, finely
-    and with its error when it is let go. Undo goes back step by step. Scene and drive are saved as files and
-    as lines of Python. The view answers on this machine's local interface alone, to whom knows its address.
+    The user moves obstacles and foci by mouse, sliders or numbers, and edits the drive or searches it by any
+    method. The field is shown on a plane and in the volume: coarsely (cells twice as large) during a drag,
+    then finely and with its error. Steps can be undone. Scene and drive are saved as files and as lines of
+    Python. The server listens on the local interface alone, and the address includes a secret token.
 
     Args:
         scene: the scene.
-        drive: complex (M,), |q| <= 1, to begin with; by default what gradient ascent finds.
+        drive: the first drive, complex (M,), |q| <= 1; by default gradient ascent searches one.
         spacing: edge of a cell [m] when nothing is dragged; see `make_propagator`.
-        port: of the server, 0 to 65535; 0 for one that is free.
+        port: port of the server, 0 to 65535; 0 for any free one.
         open_browser: True to open the page in this machine's browser.
 
     Returns:
-        The live view. Its `scene` and `drive` are those that it shows, and can be set; `ready` waits for the
+        The live view. Its `scene` and `drive` are the present ones, and can be set; `ready` waits for the
         calculation, and `close` ends the view.
 
     Raises:
-        ValueError: an argument out of range, or not a drive of the scene.
+        ValueError: an argument is out of range, or `drive` does not fit the array.
         RuntimeError: this machine cannot render in 3D, or the extra ``explore`` is not installed; the message
             names the cause.
         OSError: the port is taken.

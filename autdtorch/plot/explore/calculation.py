@@ -1,4 +1,4 @@
-"""The calculations of an explorer, in a thread of their own: fields, coarse and fine, and methods.
+"""The calculations of a live view, in a separate thread: fields, coarse and fine, and methods.
 
 The newest request counts. An older one ends at its next step, so that the picture follows a drag.
 """
@@ -40,9 +40,9 @@ logger = logging.getLogger(__name__)
 
 _MOST_CELLS = 10_000  # of the plane of a fine field: 0.1 to 0.2 s for the paper's cubes
 _CELLS_A_WAVELENGTH = 8
-_MOST_PAIRS = 2e8  # of cells of the plane and cells that radiate, in the first fine field: 0.5 s on two cores
-_LAYERS = 2  # of cells around a body that radiate
-_COARSER = 2  # Ratio of the spacings of a coarse and a fine calculation
+_MOST_PAIRS = 2e8  # of cells of plane and Huygens surfaces, in the first fine field: 0.5 s on two cores
+_LAYERS = 2  # of cells in a Huygens surface
+_COARSER = 2  # ratio of the spacings of a coarse and a fine calculation
 _COARSE_TOLERANCE = 1e-2  # half the time of the default, where the grid errs by 2 to 5 %
 _REST = 1.0  # s without a request before a volume is calculated, which a request does not end
 _COARSEST = 0.24  # wavelengths; the error of larger cells rises steeply, and each would log a warning
@@ -53,13 +53,13 @@ class Request:
     """A request to calculate.
 
     Attributes:
-        number: of the request; results carry it.
-        situation: what is asked for.
+        number: its number, which results carry.
+        situation: the situation to calculate.
         fine: True for the fine spacing, with an error estimate; False while something is dragged.
-        follow: whether the drive is found again first.
-        volume: whether the field in the domain is wanted.
-        method: to be run first, if any.
-        seed: of its random choices.
+        follow: True to search the drive again first.
+        volume: True for the field in the domain, too.
+        method: the method to run first, if any.
+        seed: seed of the method.
     """
 
     number: int
@@ -77,13 +77,13 @@ class Result:
 
     Attributes:
         request: the request.
-        drive: the drive (M,), found again where the request says so.
-        spacing: of the simulation [m]; None where it has a closed form.
+        drive: the drive (M,), that of the situation or of a search.
+        spacing: edge of a cell of the simulation [m]; None for a closed form.
         pressure: magnitude at the control points (P,) [Pa].
         field: complex pressure on the plane (Nu, Nv) [Pa], NaN in obstacles and next to transducers.
-        bound: no drive has a weakest focus above [Pa]; None while it is coarse.
-        error: relative error of the transfer matrix; None while it is not known.
-        volume: pressure in the domain (Nx, Ny, Nz) [Pa]; None where not asked for, or not yet there.
+        bound: upper bound of the weakest focus over all drives [Pa]; None if coarse.
+        error: relative error of the transfer matrix; None while it is unknown.
+        volume: pressure in the domain (Nx, Ny, Nz) [Pa]; None while it is unknown, or if not requested.
         seconds: time since the request [s].
     """
 
@@ -141,13 +141,13 @@ class Calculator:
         self._thread.start()
 
     def ask(self, request: Request) -> None:
-        """Calculate this next, and end what is under way."""
+        """Calculate this next, and end the present calculation."""
         with self._changed:
             self._wanted = request
             self._changed.notify()
 
     def close(self) -> None:
-        """End the thread at its next step; keep no propagator, as trame has a global with its last server."""
+        """End the thread at its next step; drop the propagators, as trame keeps its last server."""
         with self._changed:
             self._closed = True
             self._changed.notify()
@@ -157,9 +157,9 @@ class Calculator:
     def _work(self) -> None:
         while (request := self._next()) is not None:
             # while something is dragged, each field is shown, so that the picture follows
-            asked = self._is_old if request.fine else self._is_closed
+            ends = self._is_old if request.fine else lambda: self._closed
             try:
-                with stopping_when(asked):
+                with stopping_when(ends):
                     for result in self._results(request):
                         self._report(result)
                         if self._is_old():
@@ -180,19 +180,15 @@ class Calculator:
     def _is_old(self) -> bool:
         return self._wanted is not None or self._closed
 
-    def _is_closed(self) -> bool:
-        return self._closed
-
     def _rests(self) -> bool:
-        """Return whether nothing is asked for within a while."""
+        """Return whether no request comes within a while."""
         with self._changed:
             return not self._changed.wait_for(self._is_old, _REST)
 
     def _results(self, request: Request) -> Iterator[Result | Progress]:
         """Yield ever more complete results of a request."""
         begun = time.monotonic()
-        situation = request.situation
-        fine = request.fine
+        situation, fine = request.situation, request.fine
         propagator = self._propagator(situation, fine)
         drive = situation.drive
         if request.method is not None:
@@ -213,11 +209,10 @@ class Calculator:
         if not fine or self._is_old():
             return
         matrix, error = propagator.transfer_matrix(return_error=True)
-        # The pressure of the matrix, which is one for all planes
-        pressure = (matrix @ drive).abs()
+        pressure = (matrix @ drive).abs()  # of the matrix, so that it does not depend on the plane
         result = replace(result, pressure=pressure, bound=float(focus_bound(matrix)), error=error)
         yield replace(result, seconds=time.monotonic() - begun)
-        if first > step and self._rests():  # the readings come first, then a sharper picture
+        if first > step and self._rests():  # readings first, then a sharper picture
             result = replace(result, field=_field(request, propagator, drive, cells, step).field)
             yield replace(result, seconds=time.monotonic() - begun)
         if request.volume and self._rests():
@@ -225,16 +220,16 @@ class Calculator:
             yield replace(result, volume=volume, seconds=time.monotonic() - begun)
 
     def _propagator(self, situation: Situation, fine: bool) -> Propagator:
-        """Return the propagator of a situation; it is kept while the scene stays."""
-        found = self._propagators.get(fine)
-        if found is None or found.scene is not situation.scene:
+        """Return the propagator of a situation: the last one, if it has the same scene."""
+        propagator = self._propagators.get(fine)
+        if propagator is None or propagator.scene is not situation.scene:
             if fine:
-                found = make_propagator(situation.scene, spacing=self._spacing)
+                propagator = make_propagator(situation.scene, spacing=self._spacing)
             else:
                 coarse = self._coarse(situation)
-                found = make_propagator(situation.scene, spacing=coarse, tolerance=_COARSE_TOLERANCE)
-            self._propagators[fine] = found
-        return found
+                propagator = make_propagator(situation.scene, spacing=coarse, tolerance=_COARSE_TOLERANCE)
+            self._propagators[fine] = propagator
+        return propagator
 
     def _coarse(self, situation: Situation) -> float:
         """Return the edge of a cell [m] while something is dragged."""
@@ -264,7 +259,7 @@ def _progress(request: Request, state: State) -> Progress:
 
 
 def _followed(propagator: Propagator, drive: torch.Tensor) -> torch.Tensor:
-    """Return the drive that gradient ascent finds on the transfer matrix, beginning at a drive (M,), too."""
+    """Return the drive of gradient ascent on the transfer matrix, with a drive (M,) among its starts."""
     objective = SimulatedObjective(propagator.scene, propagator)
     method = GradientAscent()
     state = method.start(Problem.of(objective, start=drive), 0)
@@ -281,8 +276,7 @@ def _field(
     Cells of the simulation have an edge of `spacing` [m], those of the plane one of `step` [m].
     """
     situation = request.situation
-    grid = situation.sheet.points(step)
-    foci = situation.scene.control_points
+    grid, foci = situation.sheet.points(step), situation.scene.control_points
     shown = are_shown(situation.scene, grid.reshape(-1, 3))
     points = torch.cat([foci, grid.reshape(-1, 3)[shown]])
     (pressure,) = propagator.field(drive, points[None])  # a grid, which may cross obstacles without a warning
@@ -298,9 +292,9 @@ def plane_spacing(sheet: Plane, wavelength: float, fine: bool) -> float:
 
 
 def quick_spacing(situation: Situation, cells: float) -> float:
-    """Return the edge of a cell of the plane [m] that bodies in cells of an edge `cells` [m] allow.
+    """Return the edge of a cell of the plane [m] for bodies in cells of an edge `cells` [m].
 
-    Each cell around a body radiates to each of the plane: large bodies before a large plane take seconds.
+    Each cell of a Huygens surface radiates to each cell of the plane: large bodies and planes take seconds.
     """
     area = 0.0
     for body in situation.bodies:

@@ -1,33 +1,38 @@
-"""The controls of a live view: what follows when the page changes its state or calls an action.
+"""The controls of a live view: its page and the mouse in the picture.
 
-What the page sends is checked here: numbers, indices, names of lists. All else is set back.
+Values from the page (numbers, indices, names of lists) are checked here; others are set back.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
 
-from autdtorch.plot.explore.display import FOCUS, PLACE, TURN
-from autdtorch.plot.explore.page import CAMERA, first_state
-from autdtorch.plot.explore.readings import MM, four_digits, in_mm
+import numpy as np
+
+from autdtorch.plot.explore.display import ANGLES, FOCUS, MM, POSITION, first_state, four_digits, in_mm
+from autdtorch.plot.explore.page import CAMERA
 from autdtorch.plot.explore.session import DIGITS, Session
 
-_LOWEST = -60.0  # of the level of the surface in the volume [dB]
+_LOWEST = -60.0  # level of the isosurface in the volume [dB]
+_BEFORE_CAMERA = 10.0  # priority of the mouse; the camera's is lower
+_ANGLE = math.radians(0.5)  # for each pixel
+_KEYS = "CharEvent", "KeyPressEvent", "KeyReleaseEvent"  # VTK would change the picture, such as to stereo
 
 
 class Controls:
-    """The controls of a session."""
+    """The controls of the page: they follow changes of its state, and its actions."""
 
     def __init__(self, trame: Any, session: Session) -> None:
-        """Set the state of the page, and what follows when it changes."""
+        """Set the state of the page, and listen to it."""
         self._state, self._session, self._display = trame.state, session, session.display
         self._settled: object = 0
         trame.state.update(first_state(session.now, session.methods))
-        followed: list[tuple[tuple[str, ...], Callable[[], None]]] = [
+        listeners: list[tuple[tuple[str, ...], Callable[[], None]]] = [
             (("body", "focus", "transducer"), self._choose),
-            ((*PLACE, *TURN), self._move_body),
+            ((*POSITION, *ANGLES), self._move_body),
             (FOCUS, self._move_focus),
             (("phase", "amplitude"), self._edit_drive),
             (("plane",), self._choose_plane),
@@ -38,8 +43,8 @@ class Controls:
             (("dark",), self._choose_dark),
             (("settled",), self._let_go),  # the last, as it follows changes that come with it
         ]
-        for names, changed in followed:
-            trame.state.change(*names)(lambda changed=changed, **_: changed())
+        for names, listener in listeners:
+            trame.state.change(*names)(lambda listener=listener, **_: listener())
         for action in (
             session.undo, session.redo, session.add_focus, session.remove_focus, session.in_phase,
             session.find, session.cancel, session.write_python, session.save, self.rescale,
@@ -49,7 +54,7 @@ class Controls:
             trame.controller.trigger(name)(lambda name=name: self._look(name))
 
     def rescale(self) -> None:
-        """Fit the colours to the field."""
+        """Fit the colours to the field; the page cannot give a pressure."""
         self._session.rescale()
 
     def _look(self, name: str) -> None:
@@ -65,9 +70,9 @@ class Controls:
         if not now.bodies:
             return
         index = self._display.chosen("body", len(now.bodies))
-        if entered := self._entered((*PLACE, *TURN), self._display.body_values(now, index)):
-            x, y, z = (round(MM * one, DIGITS) for one in entered[:3])
-            a, b, c = (math.radians(one) for one in entered[3:])
+        if entered := self._entered((*POSITION, *ANGLES), self._display.body_values(now, index)):
+            x, y, z = (round(MM * number, DIGITS) for number in entered[:3])
+            a, b, c = map(math.radians, entered[3:])
             self._attempt(lambda: now.with_body(index, (x, y, z), (a, b, c)))
 
     def _move_focus(self) -> None:
@@ -75,7 +80,7 @@ class Controls:
         points = now.scene.control_points.clone()
         index = self._display.chosen("focus", len(points))
         if entered := self._entered(FOCUS, self._display.focus_values(now, index)):
-            points[index] = points.new_tensor([round(MM * one, DIGITS) for one in entered])
+            points[index] = points.new_tensor([round(MM * number, DIGITS) for number in entered])
             self._attempt(lambda: now.with_points(points))
 
     def _edit_drive(self) -> None:
@@ -115,21 +120,80 @@ class Controls:
         self._display.update()
 
     def _attempt(self, changed: Callable[[], Any]) -> None:
-        """Change the situation; where a slider was let go, the fine calculation follows at once."""
+        """Change the situation. When a slider is let go, the fine calculation follows at once."""
         self._session.attempt(changed, moving=self._state.settled == self._settled)
 
     def _let_go(self) -> None:
-        """Calculate finely, if a slider was let go or a number entered."""
+        """Calculate finely when a slider is let go or a number entered."""
         if self._state.settled != self._settled:
             self._settled = self._state.settled
             self._session.settle()
 
     def _entered(self, names: tuple[str, ...], shown: tuple[float, ...]) -> tuple[float, ...] | None:
-        """Return numbers of the page, or None where they are those shown; what is no number is set back."""
-        given = tuple(self._state[name] for name in names)
-        if given == shown:
+        """Return numbers of the page, or None where they are those shown; other values are set back."""
+        values = tuple(self._state[name] for name in names)
+        if values == shown:
             return None
-        if not all(type(one) in (int, float) and math.isfinite(one) for one in given):  # bool is an int
+        if not all(type(value) in (int, float) and math.isfinite(value) for value in values):  # no bool
             self._choose()
             return None
-        return tuple(map(float, given))
+        return tuple(map(float, values))
+
+
+class Mouse:
+    """The mouse in the picture: it drags bodies and foci, and turns bodies; elsewhere it turns the camera.
+
+    VTK's interactor brings its events.
+    """
+
+    def __init__(self, session: Session) -> None:
+        """Listen to the window of the picture."""
+        self._session, self._picture = session, session.display.picture
+        self._place = np.zeros(3)  # of the grip in the last move [m]
+        self._from, self._upright = 0.0, False
+        self._interactor: Any = self._picture.plotter.iren.interactor
+        self._commands: dict[str, Any] = {}
+        for event, listener in (
+            *((event, functools.partial(self._stop, event)) for event in _KEYS),
+            ("LeftButtonPressEvent", self._press),
+            ("MouseMoveEvent", self._move),
+            ("LeftButtonReleaseEvent", self._release),
+        ):
+            tag = self._interactor.AddObserver(event, listener, _BEFORE_CAMERA)
+            self._commands[event] = self._interactor.GetCommand(tag)
+
+    def _press(self, *_: object) -> None:
+        x, y = self._interactor.GetEventPosition()
+        if (grip := self._picture.grip(x, y)) is None:
+            return
+        self._session.choose(grip)
+        if grip.kind != "transducer":
+            self._session.grip, self._place = grip, grip.place
+            self._from, self._upright = x, False
+            self._stop("LeftButtonPressEvent")
+
+    def _move(self, *_: object) -> None:
+        if (grip := self._session.grip) is None:
+            return
+        x, y = self._interactor.GetEventPosition()
+        if self._interactor.GetShiftKey():
+            self._session.turn(grip, _ANGLE * (x - self._from))
+        else:
+            upright = bool(self._interactor.GetControlKey() or self._interactor.GetAltKey())
+            if upright != self._upright:  # continue from the present place
+                origin = grip.origin + self._place - grip.place
+                self._session.grip = grip = grip._replace(place=self._place, origin=origin)
+                self._upright = upright
+            self._place = self._picture.moved(grip, x, y, upright)
+            self._session.drag(grip, self._place)
+        self._stop("MouseMoveEvent")
+
+    def _release(self, *_: object) -> None:
+        if self._session.grip is not None:
+            self._session.grip = None
+            self._stop("LeftButtonReleaseEvent")
+            self._session.settle()
+
+    def _stop(self, event: str, *_: object) -> None:
+        """Hide the event from the camera."""
+        self._commands[event].SetAbortFlag(1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import weakref
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
@@ -14,7 +13,7 @@ from trame.ui.html import DivLayout
 from trame.widgets import rca
 from trame_rca.utils import RcaRenderScheduler, RcaViewAdapter
 
-from autdtorch.plot.explore.controls import Controls
+from autdtorch.plot.explore.controls import Controls, Mouse
 from autdtorch.plot.explore.page import page
 from autdtorch.plot.explore.server import Defer, End, Server
 from autdtorch.plot.explore.session import FIRST_METHOD, Session
@@ -33,60 +32,59 @@ _QUALITY = {"interactive_quality": 75, "still_quality": 90}  # of JPEG; the seco
 class Explorer:
     """A live view of a scene, as `explore` returns it. A notebook shows it in a frame.
 
-    It ends with `close`, or when nothing refers to it any more. Until the first drive is found, all
-    transducers are in phase.
+    It ends with `close` or when it is garbage-collected. Until the first search has ended, all transducers
+    are in phase.
 
     Attributes:
-        address: of the page, with the token that opens it; for browsers on this machine.
+        address: address of the page, with the token that opens it; for browsers on this machine.
     """
 
     def __init__(self, scene: Scene, drive: torch.Tensor | None, spacing: float, port: int) -> None:
         """Use `explore`, which checks its arguments."""
         self._spacing = spacing
-        self._shown = _Shown(Situation.of(scene, in_phase(scene) if drive is None else drive))
-        first_method = FIRST_METHOD if drive is None else None
-        self._server = Server(functools.partial(_build, self._shown, first_method, spacing), port)
+        self._application = application = _Application(scene, drive, spacing)
+        self._server = Server(application.build, port)
         self.address = self._server.address
-        # When nobody has it any more, or at exit: OpenGL must end in its thread, before the interpreter does
+        # On garbage collection or at exit: OpenGL must end in its thread, before the interpreter does
         self._end = weakref.finalize(self, self._server.close)
 
     @property
     def scene(self) -> Scene:
-        """The scene as it is now.
+        """The present scene.
 
-        Another one may be assigned, such as the same with other obstacles. The drive stays while the array
-        does; for another array, gradient ascent finds one.
+        Another one may be assigned. The drive stays if the array is equal; for another array, gradient ascent
+        searches one.
         """
-        return self._shown.situation.scene
+        return self._application.session.now.scene
 
     @scene.setter
     def scene(self, scene: Scene) -> None:
         require_kind("scene", scene, Scene)
         plan(scene, spacing=self._spacing)  # refuses a scene too fine for the spacing
-        self._server.call(lambda: self._shown.session.show(scene))
+        self._server.call(lambda: self._application.session.show(scene))
 
     @property
     def drive(self) -> torch.Tensor:
-        """The drive (M,) as it is now. Another one may be assigned, |q| <= 1; that ends a search."""
-        return self._shown.situation.drive.clone()
+        """The present drive (M,). Another one may be assigned, |q| <= 1; that ends a search."""
+        return self._application.session.now.drive.clone()
 
     @drive.setter
     def drive(self, drive: ArrayLike) -> None:
-        played = checked_drive(drive, self.scene)
-        self._server.call(lambda: self._shown.session.play(played))
+        checked = checked_drive(drive, self.scene)
+        self._server.call(lambda: self._application.session.play(checked))
 
     def ready(self) -> None:
-        """Wait until what was asked for is calculated: the drive, if one is searched, field and error.
+        """Wait until the drive (if one is searched), the field and its error are calculated.
 
         A notebook that runs all its cells needs this before it uses `drive`.
 
         Raises:
             RuntimeError: the view is closed.
-            Exception: what ended the calculation, which the page shows, too.
+            Exception: the error that ended the calculation; the page shows it too.
         """
         self._server.require_running()
-        session = self._shown.session
-        while not session.ready.wait(0.2):  # in steps that let Ctrl+C through
+        session = self._application.session
+        while not session.ready.wait(0.2):  # in steps that let Ctrl+C interrupt
             self._server.require_running()
         if session.failure is not None:
             raise session.failure
@@ -111,46 +109,48 @@ class Explorer:
 
 
 class _AtOnce(Executor):
-    """Encodes frames in the thread that renders; a pool of threads ends before the views do, at exit."""
+    """An executor that works in the calling thread; at exit, pools of threads end before views do."""
 
     def submit(self, function: Callable[..., T], /, *arguments: Any, **options: Any) -> Future[T]:
         """Call a function at once."""
-        done: Future[T] = Future()
-        done.set_result(function(*arguments, **options))
-        return done
+        future: Future[T] = Future()
+        future.set_result(function(*arguments, **options))
+        return future
 
 
-class _Shown:
-    """The situation that is shown, and the session in the server's thread."""
+class _Application:
+    """The application of a live view on trame's server, in the thread of the server."""
 
     session: Session
 
-    def __init__(self, situation: Situation) -> None:
-        self.situation = situation
+    def __init__(self, scene: Scene, drive: torch.Tensor | None, spacing: float) -> None:
+        """Prepare the application; without a drive, a search begins."""
+        self._situation = Situation.of(scene, in_phase(scene) if drive is None else drive)
+        self._method = FIRST_METHOD if drive is None else None
+        self._spacing = spacing
 
-    def note(self, situation: Situation) -> None:
-        self.situation = situation
+    def build(self, trame: Any, defer: Defer) -> End:
+        """Make the application; return the function that ends it."""
+        self.session = session = Session(trame, self._situation, self._spacing, defer)
+        Controls(trame, session)
+        Mouse(session)
+        session.begin(self._method)
+        view = rca.RemoteControlledArea(
+            name="view", display="image", event_throttle_ms=30, trame_server=trame
+        )
+        window = session.display.picture.plotter.render_window
+        scheduler = RcaRenderScheduler(window, target_fps=_FRAMES, encode_pool=_AtOnce(), **_QUALITY)
+        handler = RcaViewAdapter(scheduler.rca, "view", scheduler=scheduler)
+        view.add_view_handler(handler)
+        session.display.update = handler.update
+        layout = DivLayout(trame)  # without `with`, which would keep the server until another is made
+        layout.root.classes = "explore"
+        layout.root.add_child(page(view.html))
+        layout.flush_content()
 
+        async def end() -> None:
+            session.close()
+            await handler.close()  # before its window, which a frame would open again for ever
+            session.display.picture.close()
 
-def _build(shown: _Shown, method: str | None, spacing: float, trame: Any, defer: Defer) -> End:
-    """Make the application on a trame server; return what ends it."""
-    shown.session = session = Session(trame, shown.situation, spacing, defer, shown.note)
-    Controls(trame, session)
-    session.begin(method)
-    view = rca.RemoteControlledArea(name="view", display="image", event_throttle_ms=30, trame_server=trame)
-    window = session.display.picture.plotter.render_window
-    scheduler = RcaRenderScheduler(window, target_fps=_FRAMES, encode_pool=_AtOnce(), **_QUALITY)
-    handler = RcaViewAdapter(scheduler.rca, "view", scheduler=scheduler)
-    view.add_view_handler(handler)
-    session.display.update = handler.update
-    layout = DivLayout(trame)  # without `with`, which would keep the server until another is made
-    layout.root.classes = "explore"
-    layout.root.add_child(page(view.html))
-    layout.flush_content()
-
-    async def end() -> None:
-        session.close()
-        await handler.close()  # before its window, which a frame would open again for ever
-        session.display.picture.close()
-
-    return end
+        return end

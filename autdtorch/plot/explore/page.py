@@ -1,24 +1,18 @@
 """The page of a live view, as a template of Vue, which trame compiles in the browser.
 
-Names in the template are those of the state that page and server share. `trigger('name')` calls the action of
-that name; `explorer` has both.
+Names in the template are those of the state that page and server share (`display` sets it).
+`trigger('name')` calls the action of that name (`controls` lists them).
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from autdtorch.methods.base import Method
-from autdtorch.plot import colours
-from autdtorch.plot.explore import saving
-from autdtorch.plot.explore.catalogue import choices
-from autdtorch.plot.explore.picture import gradient
-from autdtorch.plot.explore.readings import COLUMNS, in_mm
-from autdtorch.plot.explore.situation import OWN_PLANE, Situation
+from autdtorch.plot.explore.situation import SCENE_PLANE
 
 
 class Look(NamedTuple):
-    """A button that moves the camera: its label, its name, and what `Picture.move_camera` takes."""
+    """A button that moves the camera: its label, its title, and the arguments of `Picture.move_camera`."""
 
     label: str
     title: str
@@ -35,9 +29,6 @@ CAMERA = {
     "look_first": Look("First view", "first view", (0.0, 0.0, 0.0)),
 }
 """Buttons of the camera, by action."""
-
-FIRST_SURFACE = -6.0
-"""The level of the surface in the volume at first [dB]."""
 
 _SLIDER = """
 <label class="slider"><span>{label}</span>
@@ -74,7 +65,7 @@ def _slider(
 
 
 def _place(name: str, disabled: str = "false") -> str:
-    """Return sliders of the coordinates of a body or a focus."""
+    """Return sliders for the coordinates of a body or a focus."""
     return "".join(
         _slider(f"{name}_{axis}", f"{axis} [mm]", f"range_{axis}[0]", f"range_{axis}[1]", 0.1, disabled)
         for axis in "xyz"
@@ -98,9 +89,9 @@ def _button(name: str, label: str, disabled: str = "false") -> str:
 
 
 def page(view: str) -> str:
-    """Return the template of the page around the picture's, `view`."""
+    """Return the template of the page around the template of the picture, `view`."""
     height = _slider(
-        "height", f"{{{{ plane === '{OWN_PLANE}' ? 'shifted by' : 'at' }}}} [mm]", "range_height[0]",
+        "height", f"{{{{ plane === '{SCENE_PLANE}' ? 'shifted by' : 'at' }}}} [mm]", "range_height[0]",
         "range_height[1]", 0.5, spoken="place of the plane [mm]",
     )  # fmt: skip
     looks = "".join(_LOOK.format(name=name, **look._asdict()) for name, look in CAMERA.items())
@@ -187,36 +178,3 @@ def page(view: str) -> str:
     </fieldset>
   </section>
 </main>"""
-
-
-def first_state(situation: Situation, methods: dict[str, Method]) -> dict[str, Any]:
-    """Return the state of the page at first, without what `Display.place` sets."""
-    return scene_state(situation) | {
-        "message": "", "status": "", "summary": "", "saved": "", "python": "", "rows": [], "columns": COLUMNS,
-        "methods": choices(methods), "method": "gradient_ascent", "follow": False, "busy": False,
-        "progress": 0,
-        "units": [("dB", "dB"), ("Pa", "Pa")], "unit": "dB", "reference": 1.0,
-        "volume": False, "surface": FIRST_SURFACE, "dark": False, "scale_low": "", "scale_high": "",
-        "scale_style": gradient(colours.PRESSURE_MAP), "phase_style": gradient(colours.PHASE_MAP),
-        "folder": saving.free_folder(), "shown": -1, "wanted": 0, "settled": 0,
-    }  # fmt: skip
-
-
-def scene_state(situation: Situation) -> dict[str, Any]:
-    """Return the part of the state that stays while obstacles and foci move."""
-    scene = situation.scene
-    lower, upper = scene.domain
-    obstacles = [
-        f"{index}: {type(body.first).__name__.lower()}" for index, body in enumerate(situation.bodies)
-    ]
-    devices = [("", "no device"), *((name, name) for name in saving.devices_of(situation))]
-    planes = [(name, "as in the scene" if name == OWN_PLANE else name) for name in situation.planes]
-    return {
-        "trame__title": f"autdtorch explore: {scene.name}", "name": scene.name,
-        "bodies": list(enumerate(obstacles)), "body": 0, "body_moves": False, "body_turns": False,
-        "focus": 0, "transducers": len(scene.array), "transducer": 0,
-        "planes": planes, "devices": devices, "device": "",
-    } | {
-        f"range_{axis}": [in_mm(low), in_mm(high)]
-        for axis, low, high in zip("xyz", lower, upper, strict=True)
-    }  # fmt: skip

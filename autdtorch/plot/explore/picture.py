@@ -1,4 +1,4 @@
-"""The picture of a situation: bodies, foci, transducers and the field, which move and are not made again."""
+"""The picture of a situation: meshes of bodies, foci, transducers and the field, which are moved."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from autdtorch.plot.explore.situation import Situation
 from autdtorch.plot.view3d import meshes
 from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.geometry import Plane
-from autdtorch.utils.array_types import REAL, Array
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import Vector
 
 _INK = {False: ("black", "white"), True: ("#e6e6e6", "#14171c")}  # lines and background, by dark
@@ -31,14 +31,14 @@ _SURFACE_NAME = "isosurface"
 
 
 class Grip(NamedTuple):
-    """A hold of the mouse on something in the picture.
+    """A hold of the mouse on an object in the picture.
 
     Attributes:
         kind: "body", "focus" or "transducer".
-        number: its index.
-        place: where it is held (3,) [m].
-        origin: its centre at this moment (3,) [m].
-        angles: of a body at this moment (3,) [rad].
+        number: index of the object.
+        place: the point of the object under the mouse (3,) [m].
+        origin: centre of the object when it was gripped (3,) [m].
+        angles: angles of a body when it was gripped (3,) [rad].
     """
 
     kind: str
@@ -55,7 +55,7 @@ class Scale(NamedTuple):
     decibels: bool
 
     def values(self, magnitude: Array) -> Array:
-        """Return what is drawn of |p| (Nu, Nv) [Pa], between the limits; NaN stays."""
+        """Return the values that colour |p| (Nu, Nv) [Pa], at least the lower limit; NaN stays."""
         if self.decibels:
             return np.maximum(in_decibels(magnitude, self.reference), colours.FLOOR)
         return magnitude
@@ -79,16 +79,16 @@ class Picture:
 
     def shows(self, situation: Situation) -> bool:
         """Return whether bodies, array and domain of a situation are those of the picture."""
-        one, other = situation, self._situation
-        firsts = [[body.first for body in each.bodies] for each in (one, other)]
-        same_bodies = len(firsts[0]) == len(firsts[1]) and all(map(operator.is_, *firsts))
-        return same_bodies and one.scene.array is other.scene.array and one.scene.domain == other.scene.domain
+        scene, drawn = situation.scene, self._situation
+        bodies, others = ([body.original for body in each.bodies] for each in (situation, drawn))
+        same_bodies = len(bodies) == len(others) and all(map(operator.is_, bodies, others))
+        return same_bodies and scene.array is drawn.scene.array and scene.domain == drawn.scene.domain
 
     def draw(self, situation: Situation) -> None:
-        """Draw a situation in place of another, as yet without a field; in one domain the camera stays."""
+        """Draw another situation, as yet without a field. The camera stays if the domain is equal."""
         scene, self._situation = situation.scene, situation
         self.plotter.clear_actors()
-        self._bodies = [meshes.add_obstacle(self.plotter, body.first) for body in situation.bodies]
+        self._bodies = [meshes.add_obstacle(self.plotter, body.original) for body in situation.bodies]
         self._foci: list[Any] = []
         self._faces = meshes.add_transducers(
             self.plotter, scene, meshes.emitted_phases(situation.drive, len(scene.array)), bar=False
@@ -116,7 +116,7 @@ class Picture:
             camera.parallel_scale = self._fitted = _AROUND * radius * max(1.0, height / width)
 
     def move_camera(self, azimuth: float, elevation: float, zoom: float) -> None:
-        """Turn the camera [degrees] around the domain, and zoom by a factor; 0 sets both back."""
+        """Turn the camera [degrees] around the domain, and zoom by a factor; a factor of 0 sets both back."""
         camera = self.plotter.camera
         if zoom:
             camera.Azimuth(azimuth)
@@ -129,7 +129,7 @@ class Picture:
         self.plotter.renderer.ResetCameraClippingRange()
 
     def set_dark(self, dark: bool) -> None:
-        """Take light lines on a dark background, or dark on light."""
+        """Choose light lines on a dark background, or dark on light."""
         self._dark = dark
         ink, paper = _INK[dark]
         self.plotter.set_background(paper)
@@ -180,8 +180,7 @@ class Picture:
 
     def show_field(self, plane: Plane, magnitude: Array, scale: Scale) -> None:
         """Colour a plane by |p| (Nu, Nv) [Pa]; grey where it is NaN."""
-        sheet = meshes.plane_mesh(plane, scale.values(magnitude))
-        self._sheet.copy_from(sheet)
+        self._sheet.copy_from(meshes.plane_mesh(plane, scale.values(magnitude)))
         self._actor.mapper.scalar_range = scale.limits
 
     def show_volume(self, volume: torch.Tensor | None, scale: Scale, height: float) -> bool:
@@ -196,20 +195,16 @@ class Picture:
         return meshes.add_isosurface(self.plotter, self._situation.scene, level, height, name=_SURFACE_NAME)
 
     def grip(self, x: float, y: float) -> Grip | None:
-        """Return what lies at a point of the window [pixels from its lower left corner]."""
+        """Return a hold on the object at a point of the window [pixels from its lower left corner]."""
         near, far = (self.at(x, y, depth) for depth in (0.0, 1.0))
         scene = self._situation.scene
         ray = torch.from_numpy(near + np.linspace(0, 1, _SAMPLES)[:, None] * (far - near))
         hits: list[tuple[int, Grip]] = []
-        spots = {
-            "focus": (
-                scene.control_points,
-                torch.tensor(scene.wavelength / 4, **REAL),
-            )
-        }
         radii = radii_of(scene.array)
-        spots["transducer"] = scene.array.positions, torch.where(radii > 0, radii, scene.wavelength / 3)
-        for kind, (places, radius) in spots.items():
+        for kind, places, radius in (
+            ("focus", scene.control_points, scene.wavelength / 4),
+            ("transducer", scene.array.positions, torch.where(radii > 0, radii, scene.wavelength / 3)),
+        ):
             gaps = torch.cdist(ray, places) - radius
             if gaps.min() < 0:
                 index = int(gaps.min(dim=0).values.argmin())
@@ -228,12 +223,12 @@ class Picture:
         renderer = self.plotter.renderer
         renderer.SetDisplayPoint(x, y, depth)
         renderer.DisplayToWorld()
-        *place, weight = renderer.GetWorldPoint()
-        found: Array = np.array(place) / weight / MM
-        return found
+        *point, weight = renderer.GetWorldPoint()
+        place: Array = np.array(point) / weight / MM
+        return place
 
     def moved(self, grip: Grip, x: float, y: float, upright: bool) -> Array:
-        """Return the place (3,) [m] of a grip that follows the mouse: at its height, or `upright` over it."""
+        """Return the place (3,) [m] of a grip that follows the mouse, horizontally or `upright`."""
         near, far = (self.at(x, y, depth) for depth in (0.0, 1.0))
         return followed(grip.place, near, far - near, upright)
 
@@ -243,16 +238,16 @@ class Picture:
 
 
 def followed(place: Array, near: Array, sight: Array, upright: bool) -> Array:
-    """Return the place (3,) [m] below the mouse to which something is dragged from a place (3,) [m].
+    """Return the point (3,) [m] under the mouse to which an object is dragged from a place (3,) [m].
 
-    It stays in the horizontal plane or, `upright`, on the vertical through the place. Where one looks along
-    that plane or that vertical, it follows the mouse as far as it can be seen to.
+    The point is in the horizontal plane of the place or, `upright`, on its vertical. If the line of sight is
+    nearly parallel to these, the step is limited.
 
     Args:
-        place: where it was.
+        place: the place before.
         near: a point on the line of sight.
         sight: the direction of this line.
-        upright: whether the height changes.
+        upright: True to change the height.
     """
     sight = sight / np.linalg.norm(sight)
     offset = near - place
@@ -265,13 +260,8 @@ def followed(place: Array, near: Array, sight: Array, upright: bool) -> Array:
         slope = math.copysign(max(abs(sight[2]), _SLANTING), sight[2])
         step = offset - offset[2] / slope * sight
         step[2] = 0.0
-    found: Array = place + step
-    return found
-
-
-def gradient(name: str, count: int = 9) -> str:
-    """Return the colours of a map, from its lower end on, as a background of a legend."""
-    return f"background: linear-gradient(to right, {', '.join(meshes.map_colours(name, count))})"
+    point: Array = place + step
+    return point
 
 
 def _matrix(turn: torch.Tensor, pivot: torch.Tensor, offset: torch.Tensor) -> Array:

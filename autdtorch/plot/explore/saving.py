@@ -1,4 +1,4 @@
-"""The scene and the drive of an explorer as files and as lines of Python."""
+"""The scene and the drive of a live view as files and as lines of Python."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ from autdtorch.utils.files import replace_file
 SCENE = "scene"
 """Name of the scene file and, with a number, of meshes beside it."""
 
-
 _FOLDER = Path("outputs/explore")
 
 
 def free_folder() -> str:
-    """Return a folder to save into that is not there yet."""
+    """Return the name of a folder that does not exist yet."""
     names = (f"{_FOLDER}_{number}" if number > 1 else str(_FOLDER) for number in itertools.count(1))
     return next(name for name in names if not Path(name).exists())
 
@@ -28,7 +27,7 @@ def python_of(situation: Situation, folder: str) -> str:
     """Return the lines of Python that make scene and drive; meshes are read from files saved in a folder.
 
     Raises:
-        ValueError: an obstacle of a class of the user's own.
+        ValueError: an obstacle of a user's class.
     """
     return scene_lines(situation.scene, situation.drive, str(Path(folder) / SCENE))
 

@@ -8,6 +8,7 @@ import functools
 import secrets
 import threading
 import weakref
+from collections import deque
 from collections.abc import Awaitable, Callable
 from concurrent.futures import Future, wait
 from pathlib import Path
@@ -18,14 +19,14 @@ from trame.app import get_server
 from trame.app.core import AVAILABLE_SERVERS
 from trame_client.module.vue3 import www
 
-from autdtorch.plot.explore.outbox import Outboxes
-
 HOST = "127.0.0.1"
 
-_NAMES = HOST, "localhost"  # by which a browser may call this machine; others are those of an attack
+_NAMES = HOST, "localhost"  # of this machine in a browser; another name is a sign of an attack
 _ASSETS = Path(__file__).with_name("assets")
 _PATIENCE = 60.0  # s until the server must have started
-_STEP = 0.2  # s between looks whether it still runs, while something is waited for
+_STEP = 0.2  # s between checks that the server still runs, in a wait
+_FRAME = b"publish:trame.rca.topic.stream:"  # in the head of a message that is a frame of the picture
+_HEAD = 80  # bytes
 
 Defer = Callable[..., None]
 End = Callable[[], Awaitable[None]]
@@ -33,7 +34,7 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 class Server:
-    """A thread with an event loop, in which a trame application runs; VTK renders in it, too.
+    """A thread with an event loop, in which a trame application runs and VTK renders.
 
     Attributes:
         port: the port that it listens on.
@@ -41,9 +42,10 @@ class Server:
     """
 
     def __init__(self, build: Callable[[Any, Defer], End], port: int = 0) -> None:
-        """Start the server; `build` makes the application, in the thread, and returns what ends it.
+        """Start the server.
 
-        It is given a trame server, and a function that calls others in the thread, soon.
+        In the thread, `build` makes the application and returns the function that ends it. Its arguments are
+        a trame server and a function that queues calls in the thread.
 
         Raises:
             OSError: the port is taken.
@@ -79,31 +81,31 @@ class Server:
             raise RuntimeError("explore: the live view is closed")
 
     def wait(self) -> None:
-        """Wait until it is closed, in steps that let Ctrl+C through."""
+        """Wait until it is closed, in steps that let Ctrl+C interrupt."""
         while not self._ended.wait(_STEP):
             pass
 
     def call(self, function: Callable[[], object]) -> None:
-        """Call a function in the thread, and wait for its end.
+        """Call a function in the thread and wait for its end.
 
         Raises:
             RuntimeError: it is closed.
         """
-        done: Future[None] = Future()
+        future: Future[None] = Future()
 
         def called() -> None:
             try:
                 function()
             except Exception as error:
-                done.set_exception(error)
+                future.set_exception(error)
             else:
-                done.set_result(None)
+                future.set_result(None)
 
         self.require_running()
         self._call(called)
-        while not wait([done], _STEP).done:  # it may be closed before it comes to the call
+        while not wait([future], _STEP).done:  # it may be closed before it comes to the call
             self.require_running()
-        done.result()
+        future.result()
 
     def close(self) -> None:
         """Stop the server and end the thread."""
@@ -134,8 +136,8 @@ class Server:
 
     async def _serve(self) -> None:
         self._trame = trame = get_server(f"explore-{self.token}", client_type="vue3")
-        del AVAILABLE_SERVERS[f"explore-{self.token}"]  # which would keep it, and all that it shows, for ever
-        # trame would read the arguments of the user's own program, among them the host
+        del AVAILABLE_SERVERS[f"explore-{self.token}"]  # a global reference to all that is shown
+        # trame would read the arguments of the calling program, among them the host
         trame.cli.parse_known_args = functools.partial(trame.cli.parse_known_args, [])
         trame.cli.set_defaults(ws=f"{self.token}/ws", host=HOST, nowscompress=True)
         trame.enable_module({"serve": {"__explore": str(_ASSETS)}, "styles": ["__explore/explore.css"],
@@ -152,7 +154,7 @@ class Server:
             await end()
 
     def _call(self, function: Callable[..., object], *arguments: object) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody looks any more
+        with contextlib.suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(function, *arguments)
 
     def _note(self, **_: Any) -> None:
@@ -160,7 +162,7 @@ class Server:
         self._started.set()
 
     def _guard(self, server: Any) -> None:
-        """Serve the pages below the token alone, and refuse what does not come from them."""
+        """Serve the pages below the token alone, and refuse requests from elsewhere."""
         app: web.Application = server.app
         for handler in server._ws_handlers:
             handler.connections = Outboxes()
@@ -189,14 +191,77 @@ class Server:
         return response
 
 
+class Outbox:
+    """The messages to a page, sent in order by one task.
+
+    trame's server sends a message to one page after another, so that a page that does not read, such as one
+    of a sleeping browser, would delay all others. A frame of the picture replaces an unsent one.
+    """
+
+    def __init__(self, socket: web.WebSocketResponse) -> None:
+        """Send through a socket, in the running event loop."""
+        self._socket = socket
+        self._messages: deque[bytes] = deque()
+        self._filled = asyncio.Event()
+        self._task = asyncio.get_running_loop().create_task(self._send())
+
+    @property
+    def closed(self) -> bool:
+        """True once the socket is closed."""
+        return self._socket.closed
+
+    async def send_bytes(self, message: bytes) -> None:
+        """Queue a message."""
+        if _is_frame(message):
+            self._messages = deque(one for one in self._messages if not _is_frame(one))
+        self._messages.append(message)
+        self._filled.set()
+
+    async def close(self, **reason: Any) -> None:
+        """Close the socket."""
+        self.end()
+        await self._socket.close(**reason)
+
+    def end(self) -> None:
+        """Send no more."""
+        self._task.cancel()
+
+    async def _send(self) -> None:
+        while True:
+            await self._filled.wait()
+            while self._messages:
+                try:
+                    await self._socket.send_bytes(self._messages.popleft())
+                except ConnectionResetError:  # the page was closed
+                    return
+            self._filled.clear()
+
+
+class Outboxes(dict[str, Outbox]):
+    """Outboxes of the open pages, by page; their sockets are assigned."""
+
+    def __setitem__(self, page: str, socket: Any) -> None:
+        """Make the outbox of a page."""
+        super().__setitem__(page, Outbox(socket))
+
+    def __delitem__(self, page: str) -> None:
+        """End the outbox of a page."""
+        self[page].end()
+        super().__delitem__(page)
+
+
+def _is_frame(message: bytes) -> bool:
+    return _FRAME in message[:_HEAD]
+
+
 def _note_failure(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Log what failed in the loop, but not that a page was closed while something was sent to it."""
+    """Log an error of the loop, but not that a page was closed while a message was sent to it."""
     if not isinstance(context.get("exception"), ConnectionResetError):
         loop.default_exception_handler(context)
 
 
 def _end_tasks(loop: asyncio.AbstractEventLoop) -> None:
-    """Cancel what still runs in a loop."""
+    """Cancel the tasks of a loop."""
     tasks = asyncio.all_tasks(loop)
     for task in tasks:
         task.cancel()

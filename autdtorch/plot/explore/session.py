@@ -1,4 +1,4 @@
-"""The session of a live view: its situation, what is calculated for it, and what follows from results.
+"""The session of a live view: it asks for calculations of its situation and shows their results.
 
 All methods are called in the thread of the server, which also renders.
 """
@@ -16,21 +16,11 @@ import torch
 
 from autdtorch.plot.data import largest
 from autdtorch.plot.explore import saving
-from autdtorch.plot.explore.calculation import (
-    Calculator,
-    Failure,
-    Finished,
-    Report,
-    Request,
-    Result,
-)
+from autdtorch.plot.explore.calculation import Calculator, Failure, Finished, Report, Request, Result
 from autdtorch.plot.explore.catalogue import offered
-from autdtorch.plot.explore.display import Display
-from autdtorch.plot.explore.history import History
-from autdtorch.plot.explore.mouse import Mouse
+from autdtorch.plot.explore.display import MM, Display, refusal
 from autdtorch.plot.explore.picture import Grip
-from autdtorch.plot.explore.readings import MM, refusal
-from autdtorch.plot.explore.situation import Situation, in_phase, same_array
+from autdtorch.plot.explore.situation import History, Situation, in_phase, same_array
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.moving import angles_of
 from autdtorch.scene.scene import Scene
@@ -47,43 +37,37 @@ FIRST_METHOD = "gradient_ascent"
 
 
 class Session:
-    """A situation that page, mouse and calculations share.
+    """The situation that page, mouse and calculations share.
 
-    A search for a drive, once it is asked for, is part of every fine calculation until one has ended: moving
-    an obstacle begins it again, for the new scene. A change of the view alone waits for its end.
+    A search for a drive is part of every fine calculation until it has ended: a move of an obstacle begins it
+    again, for the new scene. A change of the view alone waits for its end.
 
     Attributes:
         display: page and picture.
         methods: the methods that the page offers, by name.
+        grip: the hold of the mouse on a body or a focus, while it drags one.
         ready: set while nothing is calculated; threads may wait for it.
-        failure: what ended the last calculation.
+        failure: the error that ended the last calculation, if any.
     """
 
-    def __init__(
-        self,
-        trame: Any,
-        situation: Situation,
-        spacing: float,
-        defer: Callable[..., None],
-        note: Callable[[Situation], None],
-    ) -> None:
+    def __init__(self, trame: Any, situation: Situation, spacing: float, defer: Callable[..., None]) -> None:
         """Begin with a situation; cells have a `spacing` [m] when nothing is dragged.
 
-        `defer` calls a function in this thread, soon. `note` takes every situation.
+        `defer` queues a call of a function in this thread.
         """
-        self._state, self._note = trame.state, note
+        self._state = trame.state
         self._history = History(situation)
         self.display = Display(trame.state, situation)
         self.methods = offered()
-        self._calculator = Calculator(spacing, lambda found: defer(self._receive, found))
-        self._mouse = Mouse(self.display.picture, self)
+        self._calculator = Calculator(spacing, lambda report: defer(self._receive, report))
+        self.grip: Grip | None = None
         self._numbers, self._seeds = itertools.count(1), itertools.count()
         self._request = Request(0, situation)  # the newest
         self._search: str | None = None  # a method, or to follow the obstacles
         self._seed = 0
         self._running = False  # a method
-        self._waits = False  # a change of the view, for the end of the method
-        self._ended = ""  # a text about a method that did not end
+        self._view_waits = False  # for the end of the method
+        self._cancelled = ""  # a text about a cancelled method
         self._saved: set[str] = set()
         self._closed = False
         self.ready = threading.Event()
@@ -96,7 +80,7 @@ class Session:
         return self._history.now
 
     def begin(self, method: str | None) -> None:
-        """Show the first situation; run a method first, if given."""
+        """Show the first situation; run a method first, if any."""
         self._search = method
         self.place()
         self._ask()
@@ -104,10 +88,9 @@ class Session:
     def place(self) -> None:
         """Show the situation in the page and the picture, as yet without its field."""
         self.display.place(self._history)
-        self._note(self.now)
 
     def close(self) -> None:
-        """End calculations; what comes of them later is not shown."""
+        """End calculations; later results are not shown."""
         self._closed = True
         self._waiting.cancel()
         self._calculator.close()
@@ -127,12 +110,12 @@ class Session:
                 self._ask(fine=False)
 
     def settle(self) -> None:
-        """Calculate finely what was changed, if anything was: the mouse or a slider was let go."""
+        """Calculate a change finely, if there is one: the mouse or a slider was let go."""
         if self._history.settle():
             self._show()
 
     def refuse(self, error: Exception) -> None:
-        """Say why something cannot be, and set the page back."""
+        """Show why a change is not possible, and set the page back."""
         self.place()
         self._state.message = f"Not possible: {refusal(error)}"
 
@@ -141,7 +124,7 @@ class Session:
         offset = np.round((place - grip.place) / MM, 1) * MM
         if grip.kind == "body":
             body = self.now.bodies[grip.number]
-            x, y, z = (round(one, DIGITS) for one in (grip.origin + offset).tolist())
+            x, y, z = (grip.origin + offset).round(DIGITS).tolist()
             self.attempt(lambda: self.now.with_body(grip.number, (x, y, z), body.angles))
         else:
             points = self.now.scene.control_points.clone()
@@ -149,7 +132,7 @@ class Session:
             self.attempt(lambda: self.now.with_points(points))
 
     def turn(self, grip: Grip, angle: float) -> None:
-        """Turn a body about the vertical by an angle [rad] from where it was gripped."""
+        """Turn a body about the vertical by an angle [rad] from its angles when it was gripped."""
         if grip.kind == "body":
             body = self.now.bodies[grip.number]
             turn = rotation_matrix((0.0, 0.0, angle)) @ rotation_matrix(grip.angles)
@@ -157,15 +140,15 @@ class Session:
             self.attempt(lambda: self.now.with_body(grip.number, body.center, (a, b, c)))
 
     def choose(self, grip: Grip) -> None:
-        """Choose what was gripped in the lists of the page."""
+        """Choose the gripped object in the lists of the page."""
         with self._state:
             self._state[grip.kind] = grip.number
 
     # Changes by the program
 
     def show(self, scene: Scene) -> None:
-        """Show another scene, as a step; a search that runs goes on there, and another array begins one."""
-        self._mouse.let_go()
+        """Show another scene, as a step. A search continues there; another array begins one."""
+        self.grip = None
         before = self.now
         self._history.step(before.with_scene(scene))
         if not same_array(scene.array, before.scene.array):
@@ -185,14 +168,14 @@ class Session:
 
     def undo(self) -> None:
         """Go a step back."""
-        self._mouse.let_go()
+        self.grip = None
         self._end_search()
         self._history.undo()
         self._show()
 
     def redo(self) -> None:
-        """Take a step again."""
-        self._mouse.let_go()
+        """Repeat a step."""
+        self.grip = None
         self._end_search()
         self._history.redo()
         self._show()
@@ -202,7 +185,7 @@ class Session:
         scene, sheet = self.now.scene, self.now.sheet
         points = scene.control_points
         chosen, away = self.display.chosen("focus", len(points)), _NEW_FOCUS * scene.wavelength
-        for direction in (*sheet.basis, *(-one for one in sheet.basis)):
+        for direction in (*sheet.basis, *(-axis for axis in sheet.basis)):
             new = points[chosen] + away * direction
             try:
                 self._change(self.now.with_points(torch.cat([points, new[None]])))
@@ -216,11 +199,11 @@ class Session:
 
     def remove_focus(self) -> None:
         """Remove the chosen focus."""
-        self._mouse.let_go()
+        self.grip = None
         points = self.now.scene.control_points
         if len(points) > 1:
-            kept = torch.arange(len(points), device="cpu") != self.display.chosen("focus", len(points))
-            self._change(self.now.with_points(points[kept]))
+            index = self.display.chosen("focus", len(points))
+            self._change(self.now.with_points(torch.cat([points[:index], points[index + 1 :]])))
             self._state.focus = 0
             self.settle()
 
@@ -243,7 +226,7 @@ class Session:
         self._ask()
 
     def look(self) -> None:
-        """Calculate the field again, since the page wants more of it."""
+        """Calculate the field again, for an option of the page."""
         self._ask()
 
     def rescale(self, reference: float | None = None) -> None:
@@ -273,7 +256,7 @@ class Session:
     # Calculations
 
     def _change(self, situation: Situation) -> None:
-        """Show another situation; a drive of the user's ends a search, and a new scene may begin one."""
+        """Show another situation. A new drive ends a search; a new scene begins one if phases follow."""
         before = self.now
         self._history.change(situation)
         if situation.drive is not before.drive:
@@ -283,28 +266,28 @@ class Session:
 
     def _end_search(self) -> None:
         if self._running:
-            self._ended = f"{self.methods[str(self._search)].label} cancelled, "
-        self._search, self._running, self._waits = None, False, False
+            self._cancelled = f"{self.methods[str(self._search)].label} cancelled, "
+        self._search, self._running, self._view_waits = None, False, False
 
     def _show(self) -> None:
         self.place()
         self._ask()
 
     def redraw(self) -> None:
-        """Draw the field; the first one decides the colours."""
+        """Draw the field; the first field decides the colours."""
         if (result := self.display.result) is not None:
             reference = self.now.reference or largest(np.abs(result.field)) or 1.0
-            self._history.amend(self.now.with_reference(reference))  # first, as the page tells it back
+            self._history.amend(self.now.with_reference(reference))  # first, as the page sends it back
             self.display.redraw(result, reference)
 
     def _ask(self, fine: bool = True) -> None:
-        """Ask for the field of the situation, and show the picture with it, or without if that takes long."""
+        """Ask for the field of the situation, and show the picture with it or, if it takes long, without."""
         self.display.picture.smooth(fine)
         self.ready.clear()
         self._waiting.cancel()
         self._waiting = asyncio.get_running_loop().call_later(_PATIENCE, self._show_wait, fine)
         if self._running and self.now.scene is self._request.situation.scene:
-            self._waits = True
+            self._view_waits = True
             return
         method = self.methods.get(self._search or "") if fine else None
         self._running = method is not None
@@ -324,37 +307,33 @@ class Session:
     def _show_wait(self, fine: bool) -> None:
         if fine and not self._running:
             with self._state:
-                self._state.status = f"{self._ended}calculating ..."
+                self._state.status = f"{self._cancelled}calculating ..."
         self.display.update()
 
-    def _receive(self, found: Report) -> None:
-        """Show what was calculated."""
+    def _receive(self, report: Report) -> None:
+        """Show a result, or the progress of a method."""
         if self._closed:
             return
-        is_newest = found.request.number == self._request.number
+        is_newest = report.request.number == self._request.number
         with self._state:
-            if isinstance(found, Result):
-                self._take(found, is_newest)
+            if isinstance(report, Result):
+                self._take(report, is_newest)
             elif not is_newest:
                 return
-            elif isinstance(found, Finished):
+            elif isinstance(report, Finished):
                 self.ready.set()
-            elif isinstance(found, Failure):
+            elif isinstance(report, Failure):
                 self._search, self._running = None, False
                 self._state.update(
-                    {
-                        "message": refusal(found.error),
-                        "status": "",
-                        "busy": False,
-                        "shown": found.request.number,
-                    }
-                )
+                    {"message": refusal(report.error), "status": "", "busy": False,
+                     "shown": report.request.number}
+                )  # fmt: skip
                 self._ask_waiting()
-                self.failure = found.error
+                self.failure = report.error
             elif self._running:
-                text = f"{found.label}: {found.evaluations} of at most {found.most} evaluations"
-                self._state.progress = 100 * found.evaluations / max(found.most, 1)
-                self._state.status = f"{text}, weakest focus {found.score:.3g} Pa"
+                text = f"{report.label}: {report.evaluations} of at most {report.most} evaluations"
+                self._state.progress = 100 * report.evaluations / max(report.most, 1)
+                self._state.status = f"{text}, weakest focus {report.score:.3g} Pa"
 
     def _take(self, result: Result, is_newest: bool) -> None:
         request = result.request
@@ -369,20 +348,20 @@ class Session:
         self._waiting.cancel()
         self.display.result = result
         self.redraw()
-        what = "calculated" if request.fine else "coarse, calculated"
-        self._state.status = f"{self._ended}{what} in {result.seconds:.2g} s"
-        self._ended = "" if request.fine else self._ended
+        coarse = "" if request.fine else "coarse, "
+        self._state.status = f"{self._cancelled}{coarse}calculated in {result.seconds:.2g} s"
+        self._cancelled = "" if request.fine else self._cancelled
         if is_newest:
             self._ask_waiting()
 
     def _ask_waiting(self) -> None:
-        """Ask for what waited for the end of a method, if anything did."""
-        if self._waits:
-            self._waits = False
+        """Ask for a change of the view that waited for the end of a method."""
+        if self._view_waits:
+            self._view_waits = False
             self._ask()
 
     def _take_drive(self, result: Result) -> None:
-        """Take the drive of a search: a step of its own, or a part of the move that it follows."""
+        """Take the drive of a search: a new step, or a part of the move that it follows."""
         situation, is_first = self.now.with_drive(result.drive), result.request.number == 1
         if result.request.method is not None:
             situation = situation.with_reference(None)

@@ -1,4 +1,4 @@
-"""The situation that an explorer shows: where bodies and foci are, the drive, and the plane of the field."""
+"""The situation that a live view shows (bodies, foci, drive, plane of the field), and its history."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import drive_from_phases, validate_single_drive
 from autdtorch.scene.geometry import Plane, rotation_matrix
-from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.obstacles import Mesh, Obstacle
 from autdtorch.scene.obstacles.moving import is_movable, is_turnable, shifted, turned
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
@@ -17,8 +17,11 @@ from autdtorch.utils.cached import cached_property
 from autdtorch.utils.validation import ArrayLike, Vector, finite_vector, require_one_of
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-OWN_PLANE = "scene"
-"""Name of the plane that is parallel to the scene's own observation plane."""
+SCENE_PLANE = "scene"
+"""Name of the plane that is parallel to the scene's observation plane."""
+
+_MOST_STEPS = 200  # in the history
+_MOST_BYTES = 100_000_000  # of the vertices of meshes in the history; all else is small, or shared
 
 
 @dataclass(frozen=True)
@@ -26,58 +29,63 @@ class Body:
     """An obstacle that is moved and turned about its centre.
 
     Attributes:
-        first: the obstacle where it was at first.
-        center: of its bounding box before turning (3,) [m].
-        angles: about the axes x, y, z (3,) [rad], as of `rotation_matrix`. Those of boxes and meshes are
-            theirs, those of cylinders begin at 0.
+        original: the obstacle in its original pose.
+        center: centre of its bounding box before turning (3,) [m].
+        angles: about the axes x, y, z (3,) [rad], as of `rotation_matrix`. For boxes and meshes they are the
+            obstacle's `rotation`; for cylinders they begin at 0.
     """
 
-    first: Obstacle
+    original: Obstacle
     center: Vector
     angles: Vector
 
     @classmethod
     def of(cls, obstacle: Obstacle) -> Body:
-        """Return the body of an obstacle where it is."""
+        """Return the body of an obstacle in its original pose."""
         return cls(obstacle, _middle(obstacle), getattr(obstacle, "rotation", (0.0, 0.0, 0.0)))
+
+    @property
+    def name(self) -> str:
+        """The kind of the obstacle, in lower case."""
+        return type(self.original).__name__.lower()
 
     @property
     def moves(self) -> bool:
         """True for an obstacle that can be moved."""
-        return is_movable(self.first)
+        return is_movable(self.original)
 
     @property
     def turns(self) -> bool:
         """True for an obstacle that can be turned."""
-        return is_turnable(self.first)
+        return is_turnable(self.original)
 
     @cached_property
     def pose(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Turn (3, 3) about a pivot (3,) [m], and offset (3,) [m] after it, from where it was at first."""
-        pivot = torch.tensor(_middle(self.first), **REAL)
-        turn = rotation_matrix(self.angles) @ rotation_matrix(Body.of(self.first).angles).mT
+        """Rotation (3, 3) about a pivot (3,) [m], then offset (3,) [m], from the original pose."""
+        pivot = torch.tensor(_middle(self.original), **REAL)
+        turn = rotation_matrix(self.angles) @ rotation_matrix(Body.of(self.original).angles).mT
         return turn, pivot, pivot.new_tensor(self.center) - pivot
 
     @cached_property
     def obstacle(self) -> Obstacle:
-        """The obstacle where it is now."""
-        if self == Body.of(self.first):
-            return self.first
+        """The obstacle in its present pose."""
+        if self == Body.of(self.original):
+            return self.original
         turn, pivot, offset = self.pose
-        return shifted(turned(self.first, turn, pivot) if self.turns else self.first, offset)
+        return shifted(turned(self.original, turn, pivot) if self.turns else self.original, offset)
 
 
 @dataclass(frozen=True, eq=False)
 class Situation:
-    """A situation: all that is shown, and undone step by step.
+    """All that a live view shows and that is undone step by step.
 
     Attributes:
         bodies: the obstacles of the scene.
-        scene: the scene; its obstacles are those of the bodies.
+        scene: the scene, with the obstacles of the bodies.
         drive: complex (M,).
         plane: name of the plane of the field: "x", "y" or "z" for a section of the domain across this axis,
-            "scene" for the scene's own.
-        height: of the plane along its normal [m]; for the scene's own from where it was.
+            "scene" for the scene's observation plane.
+        height: place of the plane along its normal [m]; shift of the scene's observation plane.
         reference: pressure of the brightest colour [Pa]; None to fit it to the next field.
     """
 
@@ -86,16 +94,15 @@ class Situation:
     drive: torch.Tensor
     plane: str
     height: float
-    _own: Plane | None = field(repr=False)
+    _scene_plane: Plane | None = field(repr=False)
     reference: float | None = None
 
     @classmethod
     def of(cls, scene: Scene, drive: torch.Tensor) -> Situation:
-        """Return the situation of a scene at first."""
+        """Return the first situation of a scene."""
         bodies = tuple(map(Body.of, scene.obstacles))
-        own = scene.observation_plane
-        if own is not None:
-            return cls(bodies, scene, drive, OWN_PLANE, 0.0, own)
+        if (plane := scene.observation_plane) is not None:
+            return cls(bodies, scene, drive, SCENE_PLANE, 0.0, plane)
         middle = scene.control_points.mean(dim=0)
         axis = int((middle - scene.array.positions.mean(dim=0)).abs().argmax())
         return cls(bodies, scene, drive, "xyz"[axis], float(middle[axis]), None)
@@ -103,7 +110,7 @@ class Situation:
     @property
     def planes(self) -> tuple[str, ...]:
         """Names that `plane` can have."""
-        return (*_AXES, OWN_PLANE) if self._own is not None else tuple(_AXES)
+        return (*_AXES, SCENE_PLANE) if self._scene_plane is not None else tuple(_AXES)
 
     @property
     def heights(self) -> tuple[float, float]:
@@ -112,8 +119,8 @@ class Situation:
         if self.plane in _AXES:
             axis = "xyz".index(self.plane)
             return lower[axis], upper[axis]
-        assert self._own is not None
-        normal, middle = self._own.normal, self._own.center
+        assert self._scene_plane is not None
+        normal, middle = self._scene_plane.normal, self._scene_plane.center
         steps = [
             sorted(((low - at) / along, (high - at) / along))
             for along, at, low, high in zip(normal, middle, lower, upper, strict=True)
@@ -124,11 +131,11 @@ class Situation:
     @cached_property
     def sheet(self) -> Plane:
         """The plane of the field."""
-        if self.plane == OWN_PLANE:
-            assert self._own is not None
-            along = zip(self._own.center, self._own.normal, strict=True)
+        if self.plane == SCENE_PLANE:
+            assert self._scene_plane is not None
+            along = zip(self._scene_plane.center, self._scene_plane.normal, strict=True)
             x, y, z = (at + self.height * step for at, step in along)
-            return replace(self._own, center=(x, y, z))
+            return replace(self._scene_plane, center=(x, y, z))
         axis = "xyz".index(self.plane)
         lower, upper = self.scene.domain
         center = [(low + high) / 2 for low, high in zip(lower, upper, strict=True)]
@@ -159,7 +166,7 @@ class Situation:
         return replace(self, bodies=bodies, scene=replace(self.scene, obstacles=obstacles))
 
     def with_scene(self, scene: Scene) -> Situation:
-        """Return the situation of another scene: with the drive where its array stays, else all in phase."""
+        """Return the situation of another scene, with this drive for an equal array, else all in phase."""
         stays = same_array(scene.array, self.scene.array)
         drive = self.drive if stays else in_phase(scene)
         changed = replace(Situation.of(scene, drive), reference=self.reference if stays else None)
@@ -206,6 +213,70 @@ class Situation:
         return self if (plane, height) == (self.plane, self.height) else replace(changed, height=height)
 
 
+class History:
+    """The present situation, and those before and after it; a drag is one step of many situations.
+
+    Attributes:
+        now: the situation that is shown.
+    """
+
+    def __init__(self, situation: Situation) -> None:
+        """Begin at a situation."""
+        self.now = situation
+        self._done: list[Situation] = []
+        self._undone: list[Situation] = []
+        self._before: Situation | None = None
+
+    @property
+    def can_undo(self) -> bool:
+        """True if there is a step to undo."""
+        return bool(self._done) or self._before is not None
+
+    @property
+    def can_redo(self) -> bool:
+        """True if there is a step to repeat."""
+        return bool(self._undone)
+
+    def change(self, situation: Situation) -> None:
+        """Show another situation; the step ends with `settle`."""
+        if situation is self.now:
+            return
+        if self._before is None:
+            self._before = self.now
+        self.now = situation
+
+    def amend(self, situation: Situation) -> None:
+        """Replace the present situation without a step."""
+        self.now = situation
+
+    def step(self, situation: Situation) -> None:
+        """Show another situation, as a complete step."""
+        self.settle()
+        self.change(situation)
+        self.settle()
+
+    def settle(self) -> bool:
+        """End a step; return False if none has begun."""
+        if self._before is None:
+            return False
+        self._done = [*self._done, self._before][-_most_steps(self.now) :]
+        self._undone, self._before = [], None
+        return True
+
+    def undo(self) -> None:
+        """Go back to the situation before the last step."""
+        self.settle()
+        if self._done:
+            self._undone.append(self.now)
+            self.now = self._done.pop()
+
+    def redo(self) -> None:
+        """Repeat a step that was undone."""
+        if self._undone:
+            self._done.append(self.now)
+            self.now = self._undone.pop()
+
+
 def in_phase(scene: Scene) -> torch.Tensor:
     """Return the drive (M,) with phase 0 and amplitude 1."""
     return torch.ones(len(scene.array), **COMPLEX)
@@ -217,10 +288,16 @@ def checked_drive(drive: ArrayLike, scene: Scene) -> torch.Tensor:
 
 
 def same_array(one: TransducerArray, other: TransducerArray) -> bool:
-    """Return whether two arrays have their transducers at the same places."""
+    """Return whether two arrays have equal positions and normals."""
     return torch.equal(one.positions, other.positions) and torch.equal(one.normals, other.normals)
 
 
 def _middle(obstacle: Obstacle) -> Vector:
     x, y, z = ((low + high) / 2 for low, high in zip(obstacle.lower, obstacle.upper, strict=True))
     return getattr(obstacle, "center", (x, y, z))
+
+
+def _most_steps(situation: Situation) -> int:
+    """Return the number of steps in a history."""
+    size = sum(one.vertices.nbytes for one in situation.scene.obstacles if isinstance(one, Mesh))
+    return max(1, min(_MOST_STEPS, _MOST_BYTES // max(size, 1)))
