@@ -1,9 +1,15 @@
-"""Walls thinner than a cell and oblique to the grid, whose errors are larger than grids tell."""
+"""Walls thinner than a cell and oblique to the grid: rigid sheets are thickened, and a warning is logged.
+
+Elements measure bodies on a lattice of points a quarter of a cell apart, so that they would miss a rigid
+sheet between these (`docs/decisions/surfaces.md` has figures). Errors at such walls are larger than
+estimated.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -11,14 +17,56 @@ import torch
 from autdtorch.fdtd.region import Region, Shape
 from autdtorch.fdtd.turning import is_along
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.spatial import doubled_normals, extents
+from autdtorch.utils.spatial import doubled_normals, extents, mean_thickness
+from autdtorch.utils.validation import Vector
 
 logger = logging.getLogger(__name__)
 
 _PLACES, _DEPTHS = 200, 16  # Places of a surface where the thickness is measured, and depths below each
 _LEAST_SHARE = 0.05  # Least share of a surface that is a thin wall; at sharp edges less is
 _PARALLEL = 0.85  # Least cosine of the angle between the faces of a wall
-_ALIKE = 2.0  # Ratio of densities up to which a thin wall of fluid causes little
+_ALIKE = 2.0  # Ratio of densities up to which a thin wall of fluid causes only a small error
+
+_THINNEST = 0.32  # Least thickness of a rigid sheet [cells]
+_OPEN = 1e-9  # Thickness [cells] up to which a surface is not closed, such as that of a half-space
+_WIDE = 2.0  # Least extent [cells] of a sheet along two axes: needles would become much thicker than they are
+
+
+@dataclass(frozen=True, eq=False)
+class Thickened:
+    """A shape whose surface is moved outwards."""
+
+    shape: Shape
+    distance: float  # of the surfaces [m]
+
+    @property
+    def lower(self) -> Vector:
+        """Corner of the bounding box with the smallest coordinates (3,) [m]."""
+        x, y, z = self.shape.lower
+        return x - self.distance, y - self.distance, z - self.distance
+
+    @property
+    def upper(self) -> Vector:
+        """Corner of the bounding box with the largest coordinates (3,) [m]."""
+        x, y, z = self.shape.upper
+        return x + self.distance, y + self.distance, z + self.distance
+
+    def signed_distance(self, points: torch.Tensor, /) -> torch.Tensor:
+        """Return the distance (...) [m] of points (..., 3) to the surface, negative inside."""
+        return self.shape.signed_distance(points) - self.distance
+
+    def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the vertices (V, 3) [m] and triangles (F, 3) of the original shape."""
+        return self.shape.surface()
+
+
+def thickened(shape: Shape, spacing: float) -> Shape:
+    """Return a thinner sheet with the least thickness on cells of a spacing [m], other shapes unchanged."""
+    vertices, triangles = (part.numpy() for part in shape.surface())
+    thickness = mean_thickness(vertices, triangles) / spacing
+    if not _OPEN < thickness < _THINNEST or extents(vertices)[1] < _WIDE * spacing:
+        return shape
+    return Thickened(shape, (_THINNEST - thickness) * spacing / 2)
 
 
 def warn_of_thin_walls(region: Region, spacing: float, grids: Iterable[tuple[Iterable[int], Array]]) -> None:

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from small_scenes import relative_error, small_scene
 
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.fdtd.assembly.unions import Thickened, thickened
-from autdtorch.fdtd.thin_walls import thin_wall
+from autdtorch.fdtd.thin_walls import Thickened, thickened, thin_wall
 from autdtorch.propagators import make_propagator
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from autdtorch.fdtd.assembly.element import stiffness_matrix, uniform_coupling
 from autdtorch.fdtd.assembly.layers import two_port
 from autdtorch.fdtd.assembly.prisms import Prisms, prisms, stacked
-from autdtorch.fdtd.assembly.sections import Kinds, Section, plane_fields
+from autdtorch.fdtd.assembly.sections import MaterialKey, Section, plane_fields
 from autdtorch.fdtd.stencil import tuned_stencil
 
 RATIOS = st.floats(-1.5, 5).map(lambda exponent: 10**exponent)
@@ -102,8 +102,8 @@ def end_of_plate(end: float, low: float, thickness: float) -> Section:
     return Section((1, math.ceil(low + thickness)), ((end,), (low, low + thickness)), ((0, 1, 0), (0, 0, 0)))
 
 
-def kinds(density: float) -> Kinds:
-    return Kinds((1.0, density), (1.0, 1 / density), (False, density >= RIGID))
+def materials(density: float) -> MaterialKey:
+    return MaterialKey((1.0, density), (1.0, 1 / density), (False, density >= RIGID))
 
 
 @pytest.mark.parametrize("place", [(0.5, 0.5), (0.2, 0.7), (0.05, 0.9)])
@@ -142,27 +142,27 @@ def whole_element(found: Prisms) -> np.ndarray:
 def test_elements_at_an_edge_have_a_positive_energy_and_the_mass_of_their_volume(
     section: Section, density: float
 ) -> None:
-    found = prisms(section, kinds(density), STENCIL)
+    found = prisms(section, materials(density), STENCIL)
     matrix = whole_element(found)
     assert np.linalg.eigvalsh(matrix).min() > -1e-9 * np.abs(matrix).max()  # rounding
     x, y = (np.diff(np.concatenate(([0.0], cuts, [1.0]))) for cuts in section.cuts)
-    own = np.array(kinds(density).masses)[np.array(section.material)]
+    own = np.array(materials(density).masses)[np.array(section.material)]
     # the sum of the masses weighs a hundred times as much as their moments
     assert found.mass[0, 0].sum() == pytest.approx(x @ own @ y, rel=1e-3)
 
 
 @pytest.mark.parametrize("density", [RIGID, 77.0, 0.1])
 def test_images_of_an_edge_have_images_of_its_elements(density: float) -> None:
-    here = prisms(corner((0.2, 0.7)), kinds(density), STENCIL)
-    exchanged = prisms(corner((0.7, 0.2)), kinds(density), STENCIL)
+    here = prisms(corner((0.2, 0.7)), materials(density), STENCIL)
+    exchanged = prisms(corner((0.7, 0.2)), materials(density), STENCIL)
     assert np.array_equal(here.coupling[0, 0], exchanged.coupling[0, 0].transpose(1, 0, 3, 2))
     mirrored = Section((1, 1), ((0.8,), (0.7,)), ((0, 0), (1, 0)))
-    assert np.array_equal(here.mass[0, 0], prisms(mirrored, kinds(density), STENCIL).mass[0, 0, ::-1])
+    assert np.array_equal(here.mass[0, 0], prisms(mirrored, materials(density), STENCIL).mass[0, 0, ::-1])
 
 
 def test_an_edge_of_air_in_air_is_none() -> None:
     """The fit ends where it starts: the stencil's coupling reproduces long waves."""
-    found = prisms(corner((0.3, 0.8)), kinds(1.0), STENCIL)
+    found = prisms(corner((0.3, 0.8)), materials(1.0), STENCIL)
     # fields at the rim of the mesh are no polynomials: 1.3e-3 measured
     assert whole_element(found) == pytest.approx(
         stiffness_matrix(uniform_coupling(STENCIL)[None])[0], abs=2e-2

@@ -16,7 +16,7 @@ from scipy.ndimage import label
 from autdtorch.fdtd.assembly.element import VERTICES, InterfaceElements, Materials, uniform_coupling
 from autdtorch.fdtd.assembly.layers import layered_elements, two_port
 from autdtorch.fdtd.assembly.prisms import Prisms, prisms, stacked
-from autdtorch.fdtd.assembly.sections import Kinds, Section
+from autdtorch.fdtd.assembly.sections import MaterialKey, Section
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.cached import cached_property
@@ -28,9 +28,9 @@ _OFF_VERTICES = 1e-5
 
 @dataclass(frozen=True)
 class Planes:
-    """The planes across one axis, and the elements by their place among them.
+    """The planes across one axis, and the elements between them.
 
-    A kind of elements is the run of those that touch the same blocks.
+    A kind is a run of elements that touch equal blocks.
     """
 
     places: Array  # ascending coordinates of the planes (f,) [cells]
@@ -41,7 +41,7 @@ class Planes:
 
     @classmethod
     def among(cls, places: Array, elements: int) -> Planes:
-        """Divide elements, from vertex i to vertex i + 1, among planes."""
+        """Divide elements, from vertex i to vertex i + 1, among planes at `places` [cells]."""
         near = np.round(places)
         outward = np.where(near < elements / 2, -_OFF_VERTICES, _OFF_VERTICES)
         places = np.unique(np.where(np.abs(places - near) < _OFF_VERTICES, near + outward, places))
@@ -100,18 +100,18 @@ class Blocks:
 
     @cached_property
     def varied(self) -> NDArray[np.bool_]:
-        """Whether elements of each kind (3, k, l, m) vary along each axis."""
+        """Mask (3, k, l, m) of the kinds of elements that vary along each axis."""
         return np.stack([varies(self.material, self.planes, axis) for axis in range(3)])
 
     @property
     def kinds(self) -> tuple[Index, Index, Index]:
-        """Kinds of the elements along each axis, to index arrays of kinds (k, l, m) with."""
+        """Kinds of the elements along each axis, as indices of arrays of kinds (k, l, m)."""
         x, y, z = np.ix_(*(each.kind for each in self.planes))
         return x, y, z
 
     def kinds_of(self, first: Index) -> Index:
         """Return the kinds (n, 3) of elements by their first cells (n, 3)."""
-        return np.stack([each.kind[own] for each, own in zip(self.planes, first.T, strict=True)], axis=-1)
+        return np.stack([each.kind[cells] for each, cells in zip(self.planes, first.T, strict=True)], axis=-1)
 
     @property
     def at_centers(self) -> Index:
@@ -138,29 +138,26 @@ def varies(material: Index, planes: Sequence[Planes], axis: int) -> NDArray[np.b
 
 # Most elements along an axis of those that are fitted together; edges farther apart are fitted as if alone
 _TOGETHER = 4
-_CLOSED_DENSITY = 1e12
-# Stiffness that elements at corners get beyond the mean of their slices, relative to what the slices lack
+_RIGID_DENSITY = 1e12
+# Stiffness added to elements at corners, relative to the difference of the mean of their slices from air
 _STIFFER = 0.2
 
 
 def aligned_elements(
     first: Index, blocks: Blocks, materials: Materials, stencil: Stencil
 ) -> InterfaceElements:
-    """Return elements, by their first cells (n, 3), that vary among blocks.
-
-    Elements of one kind are equal: each kind is assembled once.
-    """
+    """Return elements, by their first cells (n, 3), that vary among blocks."""
     kinds, place = np.unique(blocks.kinds_of(first), axis=0, return_inverse=True)
     varied = np.stack([each[tuple(kinds.T)] for each in blocks.varied], axis=1)
     coupling, mass = np.zeros((len(kinds), 28)), np.zeros((len(kinds), 8))
     for axis in range(3):
-        for make, own in (
+        for make, mask in (
             (_layered, varied[:, axis] & (varied.sum(axis=1) == 1)),
             (_prismatic, ~varied[:, axis] & (varied.sum(axis=1) == 2)),
         ):
-            coupling[own], mass[own] = make(axis, kinds[own], blocks, materials, stencil)
-    own = varied.all(axis=1)
-    coupling[own], mass[own] = _cornered(kinds[own], blocks, materials, stencil)
+            coupling[mask], mass[mask] = make(axis, kinds[mask], blocks, materials, stencil)
+    corners = varied.all(axis=1)
+    coupling[corners], mass[corners] = _cornered(kinds[corners], blocks, materials, stencil)
     vertex = blocks.at_vertices(first[:, None] + VERTICES)
     place = place.ravel()
     return InterfaceElements(coupling[place], mass[place], vertex, np.zeros(len(first), bool))
@@ -175,12 +172,9 @@ def _layered(
     most = int((planes.last - planes.first)[kinds[:, axis]].max(initial=0)) + 1
     width, layer = np.zeros((len(kinds), most)), np.zeros((len(kinds), most), np.int64)
     for number, kind in enumerate(kinds):
-        own, (one, other) = kind[axis], kind[across]
-        first, last = planes.first[own], planes.last[own]
-        place = tuple(
-            blocks.planes[each].first[part] for each, part in zip(across, (one, other), strict=True)
-        )
-        ends = np.concatenate(([0.0], planes.cuts(own), [1.0]))
+        first, last = planes.first[kind[axis]], planes.last[kind[axis]]
+        place = tuple(blocks.planes[other].first[kind[other]] for other in across)
+        ends = np.concatenate(([0.0], planes.cuts(kind[axis]), [1.0]))
         width[number, : last - first + 1] = np.diff(ends)
         layer[number] = columns[place][np.minimum(first + np.arange(most), last)]
     wavenumber = stencil.kappa * materials.slowness[layer]
@@ -192,7 +186,7 @@ def _prismatic(
     axis: int, kinds: Index, blocks: Blocks, materials: Materials, stencil: Stencil
 ) -> tuple[Array, Array]:
     """Return coupling (n, 28) and mass (n, 8) of kinds of elements (n, 3) that do not vary along an axis."""
-    number = _numbers(materials)
+    key = _key(materials)
     coupling, mass = np.zeros((len(kinds), 28)), np.zeros((len(kinds), 8))
     planes = blocks.planes[axis]
     levels = planes.centers[planes.begin[kinds[:, axis]]]
@@ -201,19 +195,19 @@ def _prismatic(
         sections = _Sections(blocks, axis, int(level))
         for row in np.flatnonzero(levels == level):
             section, place = sections.around(kinds[row, across])
-            own = Prisms(*(part[place] for part in prisms(section, number, stencil)))
-            coupling[row], mass[row] = stacked(np.ones(1), [own], axis, stencil)
+            prism = Prisms(*(part[place] for part in prisms(section, key, stencil)))
+            coupling[row], mass[row] = stacked(np.ones(1), [prism], axis, stencil)
     return coupling, mass
 
 
 def _densities(materials: Materials) -> Array:
-    """Return the densities (m,) with sound-hard ones so large that the thinnest sheet lets nothing pass."""
-    return np.where(materials.sound_hard, _CLOSED_DENSITY, materials.density)
+    """Return the densities (m,); rigid materials have one with which the thinnest sheet lets nothing pass."""
+    return np.where(materials.sound_hard, _RIGID_DENSITY, materials.density)
 
 
-def _numbers(materials: Materials) -> Kinds:
-    """Return materials as numbers that can be keys."""
-    return Kinds(
+def _key(materials: Materials) -> MaterialKey:
+    """Return materials as a key of caches."""
+    return MaterialKey(
         tuple(_densities(materials).tolist()),
         tuple(materials.mass.tolist()),
         tuple(materials.sound_hard.tolist()),
@@ -223,9 +217,10 @@ def _numbers(materials: Materials) -> Kinds:
 def _cornered(kinds: Index, blocks: Blocks, materials: Materials, stencil: Stencil) -> tuple[Array, Array]:
     """Return coupling (n, 28) and mass (n, 8) of kinds of elements (n, 3) that vary along all axes.
 
-    Along each axis an element is a stack of slices that do not vary along it; the mean over the axes counts.
+    Along each axis an element is a stack of slices that do not vary along it. The element is the mean of the
+    three stacks.
     """
-    number = _numbers(materials)
+    key = _key(materials)
     coupling, mass = np.zeros((len(kinds), 28)), np.zeros((len(kinds), 8))
     sections = {}
     for axis, planes in enumerate(blocks.planes):
@@ -236,7 +231,7 @@ def _cornered(kinds: Index, blocks: Blocks, materials: Materials, stencil: Stenc
                 if (axis, level) not in sections:
                     sections[axis, level] = _Sections(blocks, axis, level)
                 section, place = sections[axis, level].around(kind[across])
-                slices.append(Prisms(*(part[place] for part in prisms(section, number, stencil))))
+                slices.append(Prisms(*(part[place] for part in prisms(section, key, stencil))))
             width = np.diff(np.concatenate(([0.0], planes.cuts(kind[axis]), [1.0])))
             for total, part in zip((coupling, mass), stacked(width, slices, axis, stencil), strict=True):
                 total[row] += part / 3
@@ -245,10 +240,10 @@ def _cornered(kinds: Index, blocks: Blocks, materials: Materials, stencil: Stenc
 
 
 class _Sections:
-    """Sections across an axis, at the level of one block, around the elements that vary along both axes."""
+    """Sections across an axis, at the level of one block, around elements that vary along both other axes."""
 
     def __init__(self, blocks: Blocks, axis: int, level: int) -> None:
-        """Find the elements, and which of them touch."""
+        """Find the elements, and the groups that touch."""
         self._material = np.take(blocks.material, [level], axis=axis).squeeze(axis)
         self._planes = [planes for other, planes in enumerate(blocks.planes) if other != axis]
         varied = [varies(self._material, self._planes, each) for each in (0, 1)]
@@ -260,7 +255,7 @@ class _Sections:
         ends = [(x, x), (y, y)]
         if self._group[x, y]:
             group = np.nonzero(self._group == self._group[x, y])
-            together = [(int(own.min()), int(own.max())) for own in group]
+            together = [(int(places.min()), int(places.max())) for places in group]
             ends = together if max(b - a for a, b in together) < _TOGETHER else ends
         runs = list(zip(self._planes, ends, strict=True))
         rows, columns = (slice(planes.first[a], planes.last[b] + 1) for planes, (a, b) in runs)

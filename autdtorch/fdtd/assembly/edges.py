@@ -1,8 +1,8 @@
 """Convex edges of bodies, at which the field is singular.
 
 At an edge with the angle w of air around it, the pressure varies as r^(pi / w). Finite elements overestimate
-the energy next to it, which would cost the whole field an order of accuracy. A reduced stiffness there makes
-up for it (energy-corrected finite elements: Egger, Rüde and Wohlmuth 2014, doi:10.1137/120871377).
+the energy next to it, which would cost the whole field an order of accuracy. A reduced stiffness near the
+edge corrects this (energy-corrected finite elements: Egger, Rüde and Wohlmuth 2014, doi:10.1137/120871377).
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ _REACH = 1.2  # Distance from an edge within which the stiffness is reduced [cel
 # Reduction of the stiffness at an edge of a cuboid. With 0.25, 0.3 and 0.35 a tilted rigid cube of 15 mm has
 # errors of up to 1.6, 1.5 and 2.1 % at 1 mm and 0.7, 0.5 and 0.3 % at 0.5 mm.
 _REDUCTION = 0.3
-_FEWEST_SIDES = 16  # Fewest sides of a polygon that stands for a circle
+_FEWEST_SIDES = 16  # Fewest sides of a polygon that represents a circle
 _ROUND = 1e-6  # Largest relative deviation of its corners from the circle
-_OUTSIDE = 1e-6  # Distance from a face of the point that is looked for in other bodies [m]
+_OUTSIDE = 1e-6  # Distance from a face of the point that shows whether another body covers it [m]
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Segment:
 
     begin: Array  # its ends (3,) [m]
     end: Array
-    reduction: float  # share of the stiffness that is taken away next to it
+    reduction: float  # relative reduction of the stiffness next to it
 
     @property
     def bounds(self) -> tuple[Array, Array]:
@@ -57,7 +57,7 @@ class Circle:
     center: Array  # (3,) [m]
     normal: Array  # unit vector (3,)
     radius: float  # [m]
-    reduction: float  # share of the stiffness that is taken away next to it
+    reduction: float  # relative reduction of the stiffness next to it
 
     @property
     def bounds(self) -> tuple[Array, Array]:
@@ -76,10 +76,10 @@ class Circle:
 
 
 def reductions(edges: Sequence[Segment | Circle], centers: Array, spacing: float) -> Array:
-    """Return the shares (n, 3, 3) of the stiffness to take away from elements at `centers` (n, 3) [m].
+    """Return the relative reductions (n, 3, 3) of the stiffness of elements at `centers` (n, 3) [m].
 
-    A share falls to zero with the square of the distance from an edge; of several edges the mean counts. The
-    stiffness along an edge is kept, as the field is not singular in this direction.
+    A reduction falls to zero with the square of the distance from an edge; several edges are averaged. The
+    stiffness along an edge is unchanged, as the field is not singular in this direction.
     """
     total, weights = np.zeros((len(centers), 3, 3)), np.zeros(len(centers))
     reach = _REACH * spacing
@@ -107,30 +107,30 @@ def edges_of(shape: Shape, others: Sequence[Shape] = ()) -> list[Segment | Circl
     for other in others:
         covered |= (other.signed_distance(torch.from_numpy(beside)) < 0).any(dim=1).numpy()
     corners = ends.reshape(-1, 3)
-    _, known, number = np.unique(corners.round(9), axis=0, return_index=True, return_inverse=True)
-    places = corners[known]
+    _, once, number = np.unique(corners.round(9), axis=0, return_index=True, return_inverse=True)
+    places = corners[once]
     first, second = number.reshape(-1, 2).T
     graph = coo_array((np.ones(len(ends)), (first, second)), shape=(len(places),) * 2)
     _, part = connected_components(graph, directed=False)
     edges: list[Segment | Circle] = []
     # 1 - pi / w is a third for a cuboid, whose normals are pi / 2 apart
     shares = _REDUCTION * 3 * angles / (np.pi + angles)
-    for own in range(part.max(initial=-1) + 1):
-        chosen = part[first] == own
+    for polygon in range(part.max(initial=-1) + 1):
+        chosen = part[first] == polygon
         free = chosen & ~covered
-        circle = _circle(places[part == own], float(shares[chosen].mean()), int(chosen.sum()))
+        circle = _circle(places[part == polygon], float(shares[chosen].mean()), int(chosen.sum()))
         if circle and free.any():  # whole: sides of a polygon would depend on its corners
             edges.append(circle)
         elif not circle:
             edges += [
-                Segment(side[0], side[1], float(share))
-                for side, share in zip(ends[free], shares[free], strict=True)
+                Segment(begin, end, float(share))
+                for (begin, end), share in zip(ends[free], shares[free], strict=True)
             ]
     return edges
 
 
 def _circle(corners: Array, reduction: float, sides: int) -> Circle | None:
-    """Return the circle of a regular polygon with `corners` (n, 3) [m], or nothing for other corners."""
+    """Return the circle through `corners` (n, 3) [m] if these form a regular polygon, else None."""
     if not _FEWEST_SIDES <= sides == len(corners):
         return None
     center = corners.mean(axis=0)
@@ -142,12 +142,12 @@ def _circle(corners: Array, reduction: float, sides: int) -> Circle | None:
 
 
 def _sharp_sides(vertices: Array, triangles: Index) -> tuple[Array, Array, Array]:
-    """Return the ends (n, 2, 3) [m] of the sides at convex edges of a surface.
+    """Return ends, angles and outside points of the sides at convex edges of a surface.
 
-    Also return the angles (n,) [rad] between the normals of the two faces, and points (n, 2, 3) [m] just
-    outside each face, next to the middle of the edge.
+    Ends are (n, 2, 3) [m], angles between the normals of the two faces (n,) [rad]. The points (n, 2, 3) [m]
+    are just outside each face, next to the middle of the edge.
     """
-    _, number = np.unique(vertices.round(9), axis=0, return_inverse=True)  # corners may be there twice
+    _, number = np.unique(vertices.round(9), axis=0, return_inverse=True)  # corners may be listed twice
     corners, place = vertices[triangles], number.ravel()[triangles]
     normal = doubled_normals(corners)
     double = np.linalg.norm(normal, axis=1)

@@ -24,7 +24,7 @@ VERTICES = np.array(list(itertools.product((0, 1), repeat=3)))
 PAIRS = np.array(list(itertools.combinations(range(8), 2)))  # The 28 pairs of vertices that are coupled
 # Number of edges along each axis between the vertices of a pair (28, 3)
 EDGES_BETWEEN = np.abs(VERTICES[PAIRS[:, 0]] - VERTICES[PAIRS[:, 1]])
-# Points of an element at which signed distances are needed (125, 3), from its first vertex [cells]
+# Points of an element at which signed distances are measured (125, 3), from its first vertex [cells]
 LATTICE = np.array(list(itertools.product(range(SUBCELLS + 1), repeat=3))) / SUBCELLS
 # Indices of the vertices in `LATTICE`
 CORNERS = np.ravel_multi_index((VERTICES * SUBCELLS).T, (SUBCELLS + 1,) * 3)
@@ -36,8 +36,8 @@ class Materials:
 
     density: Array  # density (m,)
     mass: Array  # mass of a cell (m,)
-    slowness: Array  # wavenumber (m,), of sound-hard materials that of air
-    sound_hard: NDArray[np.bool_]  # whether the material is sound-hard (m,)
+    slowness: Array  # wavenumber (m,), 1 for rigid materials
+    sound_hard: NDArray[np.bool_]  # mask of the rigid materials (m,)
 
     @property
     def speed(self) -> Array:
@@ -51,7 +51,7 @@ class InterfaceElements(NamedTuple):
     coupling: Array  # coupling coefficients of the `PAIRS` (n, 28)
     mass: Array  # lumped mass at the vertices (n, 8)
     material: Index  # number of the material at each vertex (n, 8)
-    finite: NDArray[np.bool_]  # whether it is a finite element, whose sound-hard vertices stay cells (n,)
+    finite: NDArray[np.bool_]  # mask of finite elements, whose rigid vertices remain cells (n,)
 
     @classmethod
     def joined(cls, parts: Sequence[InterfaceElements]) -> InterfaceElements:
@@ -104,20 +104,20 @@ def subcell_means(values: Array) -> Array:
 
 
 def volume_coverage(distance: Array) -> Array:
-    """Return the share of each sub-cell (..., 64) inside a body: exact for axis-aligned faces."""
+    """Return the share of each sub-cell (..., 64) inside a body, exact for axis-aligned faces."""
     mean, *slopes = _over_subcells(distance)
     width = np.abs(slopes).sum(axis=0)
     return np.asarray(np.clip(0.5 - mean / np.maximum(width, 1e-12), 0, 1))
 
 
 def _over_subcells(values: Array) -> Array:
-    """Return means (4, ..., 64) over the corners of sub-cells: of lattice values (..., 125) and slopes."""
-    found = [values.reshape(*values.shape[:-1], *(SUBCELLS + 1,) * 3)]
+    """Return means (4, ..., 64) of lattice values (..., 125) and of their slopes over sub-cells' corners."""
+    parts = [values.reshape(*values.shape[:-1], *(SUBCELLS + 1,) * 3)]
     for axis in (-3, -2, -1):
-        ends = [np.moveaxis(each, axis, 0) for each in found]
-        means = [np.moveaxis((each[:-1] + each[1:]) / 2, 0, axis) for each in ends]
-        found = [*means, np.moveaxis(ends[0][1:] - ends[0][:-1], 0, axis)]
-    return np.stack(found).reshape(4, *values.shape[:-1], SUBCELLS**3)
+        ends = [np.moveaxis(part, axis, 0) for part in parts]
+        means = [np.moveaxis((part[:-1] + part[1:]) / 2, 0, axis) for part in ends]
+        parts = [*means, np.moveaxis(ends[0][1:] - ends[0][:-1], 0, axis)]
+    return np.stack(parts).reshape(4, *values.shape[:-1], SUBCELLS**3)
 
 
 def line_coverage(distance: Array) -> Array:
@@ -132,8 +132,8 @@ def line_coverage(distance: Array) -> Array:
 def shares(coverage: Callable[[Array], Array], distance: Array, material: Index, count: int) -> Array:
     """Return the share of each material (n, q, count) in the q parts that `coverage` divides an element into.
 
-    Touching bodies, with distances (K, n, 125) [cells], leave no air between them: their union decides its
-    share.
+    Distances are (K, n, 125) [cells]. Bodies that touch leave no air between them: the union of all decides
+    the share of air.
     """
     covered = coverage(distance)
     share = np.zeros((*covered.shape[1:], count))

@@ -29,13 +29,13 @@ from autdtorch.utils.progress import show_progress
 from autdtorch.utils.threads import spread
 
 _CHUNK = 8192  # Interface elements assembled at a time
-# Depths below its surface at which a body must be there to be thick [cells]. Sound would pass through thinner
-# walls of finite elements, whose vertices can belong to both sides.
+# Depths below its surface [cells]: a body that contains points this deep is thick. Sound would pass through
+# thinner walls of finite elements, whose vertices can belong to both sides.
 _DEPTHS = np.array([1.0, 1.6, 2.2])
 # Deviation [cells] of a signed distance from a quadratic one at which a second face is near
 _ROUGH = 0.01
-# Share of a rigid edge's reduction that edges of fluids have. With 0.15 and 0.3, tilted cubes of ratio
-# 77 have errors of up to 2.4 and 2.7 % (15 mm) and 2.8 and 2.1 % (8 mm) at 1 mm.
+# Reduction of the stiffness at edges of fluids over that at rigid edges. With 0.15 and 0.3, tilted cubes of
+# density ratio 77 have errors of up to 2.4 and 2.7 % (15 mm) and 2.8 and 2.1 % (8 mm) at 1 mm.
 _FLUID_REDUCTION = 0.3
 _SAME = 1e-9  # Difference of distances [cells] up to which elements are alike
 _LEAST_GRADIENT = 0.3  # Least mean gradient of a signed distance in an element with one surface
@@ -53,17 +53,15 @@ class Elements:
 
 
 def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
-    """Return the material of every element, set by the last body there, and the interface elements."""
+    """Return the material of every element, that of the last body there, and the interface elements."""
     bodies, materials = unions_of(region, grid, stencil)
     blocks = _blocks(bodies, grid)
     bodies = [body.measured(grid.spacing) for body in bodies]
-    material, cut, beside = _located(bodies, grid)
+    material, cut, beside = _measured(bodies, grid)
     material = np.where(beside, material, blocks.at_centers).astype(np.int16)
-    axes = sum(each[blocks.kinds].astype(np.int64) for each in blocks.varied)  # along which elements vary
-    cut = np.where(beside, cut, axes > 0)
+    cut = np.where(beside, cut, np.any([varied[blocks.kinds] for varied in blocks.varied], axis=0))
     whole = np.where(cut, -1, material)
-    simple = cut & ~beside
-    index = np.flatnonzero(simple), np.flatnonzero(cut & ~simple)
+    index = np.flatnonzero(cut & ~beside), np.flatnonzero(cut & beside)
     parts = (
         aligned_elements(
             np.stack(np.unravel_index(index[0], cut.shape), axis=-1), blocks, materials, stencil
@@ -82,36 +80,36 @@ def _blocks(bodies: Sequence[Union], grid: Grid) -> Blocks:
     faces = [np.zeros((3, 0)), *(body.faces(grid) for body in aligned)]
 
     def material(cells: Array) -> Index:
-        found = np.zeros(cells.shape[:-1], np.int64)
+        numbers = np.zeros(cells.shape[:-1], np.int64)
         for body in aligned:
             for part in body.parts():
                 near = part.near(cells, grid)
-                found[near][part.distance(cells[near], grid) < 0] = body.material
-        return found
+                numbers[near][part.distance(cells[near], grid) < 0] = body.material
+        return numbers
 
-    places = [np.concatenate(own) for own in zip(*faces, strict=True)]
+    places = [np.concatenate(along) for along in zip(*faces, strict=True)]
     return Blocks.between(places, [cells - 1 for cells in grid.shape], material)
 
 
-def _located(
+def _measured(
     bodies: Sequence[Union], grid: Grid
 ) -> tuple[NDArray[np.int16], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return the material at the centre of each element, whether a surface intersects it, and which count.
+    """Return the material at the centre of each element, whether a surface intersects it, and a mask.
 
-    These are beside a tilted or curved body. All others are left to `_blocks`.
+    The mask has the elements beside a tilted or curved body. `_blocks` serves all others.
     """
     material = np.zeros([cells - 1 for cells in grid.shape], np.int16)
     cut, beside = np.zeros(material.shape, bool), np.zeros(material.shape, bool)
     if all(body.aligned for body in bodies):
         return material, cut, beside
     for body in bodies:
-        near, distance, inside = located(partial(body.distance, grid=grid), *body.range(grid))
-        own = tuple(near.T)
+        near, distance, inside = _near_surface(partial(body.distance, grid=grid), *body.range(grid))
+        cells = tuple(near.T)
         material[tuple(near[distance < 0].T)] = material[tuple(inside.T)] = body.material
-        cut[own] = (cut[own] | (distance < HALF_DIAGONAL)) & (distance > -HALF_DIAGONAL)
+        cut[cells] = (cut[cells] | (distance < _HALF_DIAGONAL)) & (distance > -_HALF_DIAGONAL)
         cut[tuple(inside.T)] = False
         if not body.aligned:
-            beside[tuple(near[distance < HALF_DIAGONAL].T)] = beside[tuple(inside.T)] = True
+            beside[tuple(near[distance < _HALF_DIAGONAL].T)] = beside[tuple(inside.T)] = True
     return material, cut, beside
 
 
@@ -135,22 +133,22 @@ def _finite(
     whole: NDArray[np.int16],
     grid: Grid,
 ) -> NDArray[np.bool_]:
-    """Return whether finite elements represent bodies in elements (K, n); `whole` as in `_thick`.
+    """Return a mask (K, n) of the bodies that finite elements represent; `whole` as in `_thick`.
 
-    They do where a sound-hard body is thick enough, and at edges of a fluid without a thin sound-hard body.
-    None does where a thin sound-hard body crosses the element, which sound would then pass.
+    These are rigid bodies that are thick enough, and edges of fluids without a thin rigid body beside them.
+    Where a thin rigid body crosses an element, no body is: sound would pass.
     """
     near = np.asarray((np.abs(distance) < FAR).any(axis=2))
     finite, thin, crossed = near.copy(), np.zeros(len(first), bool), np.zeros(len(first), bool)
-    for body, own, level, here in zip(bodies, finite, distance, near, strict=True):
+    for body, mask, level, here in zip(bodies, finite, distance, near, strict=True):
         if body.sound_hard:
-            own[own] = _thick(body, level[own], first[own], whole, grid)
-            crossed |= (level < 0).any(axis=1) & (level > 0).any(axis=1) & ~own
-            thin |= here & ~(own & body.finite)
+            mask[mask] = _thick(body, level[mask], first[mask], whole, grid)
+            crossed |= (level < 0).any(axis=1) & (level > 0).any(axis=1) & ~mask
+            thin |= here & ~(mask & body.finite)
         else:
-            own &= near_edge & body.finite
-            own[own] = roughness(level[own]) > _ROUGH
-        own &= body.finite
+            mask &= near_edge & body.finite
+            mask[mask] = roughness(level[mask]) > _ROUGH
+        mask &= body.finite
     hard = np.array([body.sound_hard for body in bodies])
     return np.asarray(finite & (hard[:, None] | ~thin) & ~crossed)
 
@@ -158,7 +156,7 @@ def _finite(
 def _thick(
     body: Union, distance: Array, first: Index, whole: NDArray[np.int16], grid: Grid
 ) -> NDArray[np.bool_]:
-    """Return whether a sound-hard body has one face in elements (n,), with enough of the body behind it.
+    """Return whether a rigid body has one face in elements (n,), with enough of the body behind it.
 
     `whole` (nx - 1, ny - 1, nz - 1) is the material of elements that no surface intersects, else -1.
     """
@@ -174,7 +172,7 @@ def _thick(
 
 
 def _distinct(distance: Array, finite: NDArray[np.bool_], less: Array) -> tuple[Index, Index]:
-    """Return the first of the elements (n,) that are alike, and the place of each (n,) among these."""
+    """Return the first of each kind of equal elements, and the kind of each element (n,)."""
     count = len(less)
     parts = (np.moveaxis(distance, 1, 0) / _SAME, finite.T, less / _SAME)
     keys = np.concatenate([part.reshape(count, -1).round().astype(np.int64) for part in parts], axis=1)
@@ -214,22 +212,23 @@ def _interface(
         distance = _distances(bodies, first, grid)
         edged = np.asarray(less.any(axis=(1, 2)))
         finite = _finite(bodies, distance, first, edged, whole, grid)
-        own, place = _distinct(distance, finite, less)
-        near = Bodies(distance, numbers, finite, less).chosen(own)
-        found = interface_elements(near, materials, stencil)
+        kinds, kind = _distinct(distance, finite, less)
+        elements = interface_elements(
+            Bodies(distance, numbers, finite, less).chosen(kinds), materials, stencil
+        )
         progress.advance(len(first))
-        return found.chosen(place)
+        return elements.chosen(kind)
 
     with show_progress(len(index), "measuring surfaces") as progress:
         parts = [InterfaceElements(*none), *spread(chunk, range(0, len(index), _CHUNK))]
     return InterfaceElements.joined(parts)
 
 
+# Returns the signed distances (...) [cells] of places (..., 3) [cells]
 Measure: TypeAlias = Callable[[Array], Array]
-"""Returns the signed distances (...) [cells] of places (..., 3) [cells]."""
 
-HALF_DIAGONAL = 0.87
-"""Half the diagonal of an element: a surface farther from its centre does not intersect it."""
+# Half the diagonal of an element: a surface farther from its centre does not intersect it
+_HALF_DIAGONAL = 0.87
 
 _LARGEST = 8  # Elements along an edge of the largest blocks that are inside or outside as a whole
 # Largest change of a distance over a cell: trilinear interpolation between voxels reaches the root of three
@@ -237,12 +236,12 @@ _STEEPEST = math.sqrt(3)
 # Largest difference [cells] of the distances in an element from a quadratic function at which the surface is
 # smooth: two faces at 6 degrees reach it. Distances at all points are then interpolated.
 _SMOOTH = 0.01
-# Least mean gradient of such distances: between the faces of a sheet along the grid they turn at its middle,
-# which three points along an axis do not show
+# Least mean gradient of such distances. Between the faces of a sheet along the grid they turn at its middle,
+# which three points along an axis do not show.
 _STEEP = 0.9
 
 
-def located(measure: Measure, lower: Index, upper: Index) -> tuple[Index, Array, Index]:
+def _near_surface(measure: Measure, lower: Index, upper: Index) -> tuple[Index, Array, Index]:
     """Return elements near a surface (n, 3), the distances (n,) of their centres, and others inside (k, 3).
 
     Elements are those from `lower` (3,) up to `upper` (3,). Blocks of them are halved until their surface is
@@ -254,7 +253,7 @@ def located(measure: Measure, lower: Index, upper: Index) -> tuple[Index, Array,
         far = measure(np.asarray(places + size / 2, np.float64))
         if size == 1:
             return places, far, np.concatenate(inside)
-        near = np.abs(far) <= HALF_DIAGONAL + _STEEPEST * math.sqrt(3) * (size - 1) / 2
+        near = np.abs(far) <= _HALF_DIAGONAL + _STEEPEST * math.sqrt(3) * (size - 1) / 2
         inside.append(_parts(places[~near & (far < 0)], size, 1, upper))
         places = _parts(places[near], size, size // 2, upper)
         size //= 2

@@ -33,9 +33,9 @@ from autdtorch.utils.array_types import Array, Index
 logger = logging.getLogger(__name__)
 
 GridShape = tuple[int, int, int]
-# Sum of coupling coefficients, relative to air, up to which a cell in a sound-hard body is sound-hard. Cells
-# at a surface have 0.3 or more, all others 0.03 or less. Vertices of finite elements stay cells in all but
-# slivers: the least sum is relative to the densest fluid, and above the 1e-5 that the body's density leaves.
+# Sum of coupling coefficients, relative to air, up to which a cell in a rigid body is sound-hard. Cells at a
+# surface have 0.3 or more, all others 0.03 or less. Vertices of finite elements inside a body remain
+# unknowns, except in slivers: the least sum is relative to the densest fluid, and above the body's 1e-5.
 _SOUND_HARD_COUPLING = 0.1
 _SLIVER_COUPLING, _LEAST_COUPLING = 1e-3, 3e-5
 # Eigenvalues below this share of the largest are rounding in a condensed stiffness matrix. A higher value
@@ -46,7 +46,7 @@ _ROW_ROUNDING = 1e-9  # Stencil rows within this of air's are those of air
 # the paper's cubes 1.1 costs 3 % of the time step and 1.2 would cost 8 %; a slab of density ratio 3 keeps its
 # mass.
 _ROW_SUM_MARGIN = 1.1
-_NEED_ITERATIONS = 3  # of the mass that a cell needs, as its neighbours' masses decide it
+_NEED_ITERATIONS = 3  # of the mass that a cell needs, which depends on its neighbours' masses
 _MASS_TRANSFERS = 6  # Largest number of mass transfers to light cells; one is nearly always enough
 
 
@@ -59,7 +59,7 @@ class HeterogeneousCells:
     weight: Array
     mass: Array  # m_i (n,), 1 in air
     sound_hard: Index  # flat indices of the sound-hard cells, ascending
-    shell: Index  # sound-hard cells next to other cells; those behind them are never read
+    shell: Index  # sound-hard cells next to other cells; no cell reads those behind them
     enclosed: Index  # sound-hard cells of air that no sound reaches, ascending
 
     def mass_of(self, cells: Index) -> Array:
@@ -103,7 +103,7 @@ def _neighbours(index: Index, shape: GridShape) -> Index:
 
 
 def _inner(index: Index, shape: GridShape) -> NDArray[np.bool_]:
-    """Return which cells (n,) are not in the outermost ring, which stays zero."""
+    """Return the mask (n,) of cells inside the outermost ring, which is always zero."""
     places = np.stack(np.unravel_index(index, shape), axis=-1)
     return np.asarray(((places > 0) & (places < np.array(shape) - 1)).all(axis=1))
 
@@ -116,18 +116,18 @@ def _vertices(elements: Elements, shape: GridShape) -> Index:
 
 
 def _cell_material(elements: Elements) -> NDArray[np.int16]:
-    """Return the material of each cell (k,): its first element's, right where no interface is near."""
+    """Return the material of each cell (k,), from its first element; exact where no interface is near."""
     return np.pad(elements.material, ((1, 0),) * 3, mode="edge").ravel()
 
 
 def _without_sound_hard(
     elements: Elements, touched: Index, shape: GridShape, stencil: Stencil
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return coupling and mass of the touched cells, and which cells (k,) are sound-hard."""
+    """Return coupling and mass of the touched cells, and the mask (k,) of sound-hard cells."""
     vertices, interface = _vertices(elements, shape), elements.interface
     hard = elements.materials.sound_hard[_cell_material(elements)]
     hard[vertices] = elements.materials.sound_hard[interface.material]
-    inside, known = hard[touched], -1
+    inside, count = hard[touched], -1
     densest = elements.materials.density[~elements.materials.sound_hard].max()
     least = np.full(len(hard), _SOUND_HARD_COUPLING * stencil.total)
     least[vertices[interface.finite]] = max(_SLIVER_COUPLING / densest, _LEAST_COUPLING) * stencil.total
@@ -136,23 +136,23 @@ def _without_sound_hard(
     while True:
         coupling *= _both_open(hard, touched, shape)
         hard[touched] |= inside & (np.abs(coupling).sum(axis=1) <= least[touched])
-        if hard.sum() == known or not inside.any():
+        if hard.sum() == count or not inside.any():
             return coupling, mass, hard
-        known, out = hard.sum(), hard[vertices]
+        count, out = hard.sum(), hard[vertices]
         interface = condensed(elements.interface, out)
         changed = np.isin(touched, vertices[out.any(axis=1)])
         coupling[changed], mass[changed] = _assembled(elements, interface, touched[changed], shape, stencil)
 
 
 def _both_open(hard: NDArray[np.bool_], touched: Index, shape: GridShape) -> NDArray[np.bool_]:
-    """Return whether a touched cell and its neighbours (n, 27) are both open, from the `hard` of all (k,)."""
+    """Return the mask (n, 27) of neighbours of touched cells where neither is in `hard` (k,)."""
     return np.asarray(~(hard[touched, None] | hard[_neighbours(touched, shape)]))
 
 
 def condensed(interface: InterfaceElements, out: NDArray[np.bool_]) -> InterfaceElements:
-    """Eliminate vertices `out` (n, 8) from the stiffness of elements (static condensation).
+    """Eliminate vertices `out` (n, 8) from the stiffness of elements by static condensation.
 
-    Their pressure takes the value of least energy. Dropping their coupling could make the energy negative.
+    Their pressure takes the value of least energy. To remove their coupling could make the energy negative.
     """
     some = np.flatnonzero(out.any(axis=1))
     gone = out[some]
@@ -184,11 +184,11 @@ def _assembled(
         (uniform_coupling(stencil) / kinds.density[:, None], interface.coupling)
     )
     masses[:count], masses[count:] = kinds.mass[:, None] / 8, interface.mass
-    for own, vertex in enumerate(VERTICES):
+    for number, vertex in enumerate(VERTICES):
         element = kind[np.ravel_multi_index(tuple((places - vertex).T), cells)]
         x, y, z = (slice(1 - end, 3 - end) for end in vertex)
-        cube[:, x, y, z] += pairs[element, own].reshape(-1, 2, 2, 2)
-        mass += masses[element, own]
+        cube[:, x, y, z] += pairs[element, number].reshape(-1, 2, 2, 2)
+        mass += masses[element, number]
     return coupling, mass
 
 
@@ -197,12 +197,12 @@ def _transferred_mass(
 ) -> Array:
     """Return masses (n,) with which few stencil rows shorten the time step.
 
-    A light cell with strong coupling, in a heavy obstacle just below its surface, moves with the air. It
-    takes mass from the cells it is coupled to; their sum is unchanged. The largest eigenvalue, which decides
-    the time step, then depends little on the contrast.
+    A light cell with strong coupling, in a heavy obstacle just below its surface, moves with the air. Mass is
+    transferred to it from the cells it is coupled to. The largest eigenvalue, which decides the time step,
+    then depends little on the contrast.
     """
     need = _needed_mass(coupling, mass, elements, touched, shape, largest)
-    mass, asked = mass.copy(), mass.sum()
+    mass, before = mass.copy(), mass.sum()
     for _ in range(_MASS_TRANSFERS):
         light = np.flatnonzero(need > mass)
         if len(light) == 0:
@@ -218,8 +218,8 @@ def _transferred_mass(
         mass -= np.bincount(place.ravel(), wish.ravel(), len(mass))
         mass[light] += wish.sum(axis=1)
     mass = np.maximum(mass, need)
-    if mass.sum() > asked * (1 + 1e-6):
-        logger.debug("light cells found too little mass around them: added %.2g", mass.sum() - asked)
+    if mass.sum() > before * (1 + 1e-6):
+        logger.debug("too little mass around light cells: added %.2g", mass.sum() - before)
     return np.where(mass > 0, mass, 1.0)
 
 
@@ -228,20 +228,20 @@ def _needed_mass(
 ) -> Array:
     """Return the masses (n,) at which Gershgorin's circles of the symmetric operator end at twice `largest`.
 
-    With the sum D_i of a row, that is D_i + sum_j |K_ij| sqrt(m_i / m_j) = 2 largest m_i. The root counts up
-    to 1: a uniform material, next to a lighter one, needs no more than its own mass.
+    With the sum D_i of a row, the condition is D_i + sum_j |K_ij| sqrt(m_i / m_j) = 2 largest m_i. The root
+    is limited to 1: a uniform material needs no more than its mass next to a lighter one.
     """
     neighbour, size = _neighbours(touched, shape), np.abs(coupling)
     place = np.searchsorted(touched, neighbour).clip(max=len(touched) - 1)
     beside, row = touched[place] != neighbour, coupling.sum(axis=1)
     uniform = elements.materials.mass[_cell_material(elements)[neighbour]]
     need = size.sum(axis=1) / largest
-    most = np.flatnonzero(need > mass)  # all others count with their own mass, which is more
+    most = np.flatnonzero(need > mass)  # all others have more mass than they need
     everyone = np.arange(len(need))
     for some in (*[most] * (_NEED_ITERATIONS - 1), everyone):
-        own = np.maximum(mass, need)
-        around = np.where(beside[some], uniform[some], own[place[some]])
-        ratio = np.divide(own[some, None], around, out=np.ones_like(around), where=around > 0)
+        final = np.maximum(mass, need)
+        around = np.where(beside[some], uniform[some], final[place[some]])
+        ratio = np.divide(final[some, None], around, out=np.ones_like(around), where=around > 0)
         lighter = np.sqrt(ratio).clip(max=1)
         need[some] = (np.maximum(row[some], 0) + (size[some] * lighter).sum(axis=1)) / (2 * largest)
     return np.asarray(need)
@@ -259,10 +259,10 @@ def _uniform_cells(
     return index, factor[material[index], None] * stencil.weights, elements.materials.mass[material[index]]
 
 
-# Coupling relative to all of a cell's, up to which nothing passes: a thin sound-hard body leaves less than
-# 1e-5, and a heavy fluid more, relative to all of its own
-_CLOSED = 1e-4
-# Steps from a place to a cell beside it, and the distance [cells] at which a wall is met
+# Coupling of two cells, relative to the sum of either, up to which nothing passes: 1e-5 or less through a
+# thin rigid body, and more through a heavy fluid
+_BLOCKED = 1e-4
+# Steps from a place to a cell beside it, and the distance [cells] at which a wall is reached
 _STEPS, _TOUCHING = 60, 1e-3
 
 
@@ -271,7 +271,7 @@ def enclosed_cells(
 ) -> Index:
     """Return the flat indices of cells that are not connected with the outermost ones.
 
-    `coupling` (n, 27) is that of the `touched` cells (n,); all others are connected with the six beside them,
+    The `touched` cells (n,) have `coupling` (n, 27). All others are connected with the six beside them,
     unless they are sound-hard.
     """
     free = ~hard
@@ -296,7 +296,7 @@ def enclosed_cells(
 def sees(begin: Array, end: Array, walls: Sequence[Shape], spacing: float) -> NDArray[np.bool_]:
     """Return whether no wall is between places (..., 3) and cells beside them (..., 3) [m] of `spacing` [m].
 
-    Nothing is nearer to a place than its distance: each step goes so far.
+    Each step goes as far as the distance from the nearest wall.
     """
     begin, end = np.broadcast_arrays(begin, end)
     length = np.linalg.norm(end - begin, axis=-1)
@@ -318,6 +318,6 @@ def _connections(
     row, neighbour = size.sum(axis=1), touched[places, None] + flat_offsets(shape)
     place = np.searchsorted(touched, neighbour).clip(max=len(touched) - 1)
     theirs = np.where(touched[place] == neighbour, row[place], np.inf)
-    passes = (size[places] > _CLOSED * np.minimum(row[places, None], theirs)) & free[neighbour]
+    passes = (size[places] > _BLOCKED * np.minimum(row[places, None], theirs)) & free[neighbour]
     first, offset = np.nonzero(passes)
     return touched[places[first]], neighbour[first, offset]

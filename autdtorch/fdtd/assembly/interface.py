@@ -46,8 +46,8 @@ from autdtorch.fdtd.assembly.smooth_faces import Surface, fields, smooth_stiffne
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 
-# Share of a rigid face's thickness by which the heavier fluid of a smooth surface is shrunk, and the ratio of
-# densities that halves it: the mean phase of tilted half-spaces is then right
+# Distance by which the heavier fluid of a smooth surface is shrunk, relative to the thickness added to a
+# rigid face, and the ratio of densities that halves it: the mean phase of tilted half-spaces is then exact
 _SHRUNK, _SHRUNK_RATIO = 0.5, 12.0
 _ABSENT_SHARE = 1e-4  # Share of an element's volume below which a material counts as absent
 
@@ -55,10 +55,10 @@ _ABSENT_SHARE = 1e-4  # Share of an element's volume below which a material coun
 class Bodies(NamedTuple):
     """Bodies near n elements; later ones take precedence."""
 
-    distance: Array  # signed distances of K bodies (K, n, 125) [cells]; `FAR` for those that are not near
+    distance: Array  # signed distances of K bodies (K, n, 125) [cells]; `FAR` if not near
     material: Index  # number of the material of each body (K,)
-    finite: NDArray[np.bool_]  # whether finite elements represent it in an element (K, n)
-    reductions: Array  # share of the stiffness that is taken away near edges of such bodies (n, 3, 3)
+    finite: NDArray[np.bool_]  # mask of the bodies that finite elements represent in an element (K, n)
+    reductions: Array  # relative reduction of the stiffness near edges of such bodies (n, 3, 3)
 
     def chosen(self, some: Index | NDArray[np.bool_]) -> Bodies:
         """Return the bodies near some of the elements."""
@@ -91,7 +91,7 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
 
 
 class _Cut(NamedTuple):
-    """Elements that surfaces intersect, whose coupling and mass are set in place."""
+    """Elements that surfaces intersect; their coupling and mass are set in place."""
 
     vertex: Index  # material at the vertices (n, 8)
     volumes: Array  # shares of the materials in the sub-cells (n, 64, m)
@@ -100,10 +100,7 @@ class _Cut(NamedTuple):
 
 
 def _set_others(cut: _Cut, bodies: Bodies, layered: Index, materials: Materials, stencil: Stencil) -> None:
-    """Set elements that are no finite elements.
-
-    `layered` (n,) is the axis along which alone an element varies, or -1.
-    """
+    """Set elements other than finite ones; `layered` (n,) is the only axis along which one varies, or -1."""
     count, distance, material = len(materials.density), bodies.distance, bodies.material
     vertex, volumes, coupling, mass = cut
     moved = np.flatnonzero(layered < 0)
@@ -111,59 +108,59 @@ def _set_others(cut: _Cut, bodies: Bodies, layered: Index, materials: Materials,
     volumes[moved] = shares(volume_coverage, distance[:, moved] - grow, material, count)
     lines = shares(line_coverage, distance, material, count)
     coupling[:] = _series_coupling(lines, materials, stencil)
-    mass[:] = lumped_mass(vertex, volumes, materials)
+    mass[:] = _lumped_mass(vertex, volumes, materials)
     for axis in range(3):
-        own = np.flatnonzero(layered == axis)
-        coupling[own], mass[own] = flat_elements(axis, distance[:, own], material, materials, stencil)
-    held = (vertex[:, :, None] == np.arange(count)).any(axis=1)
+        flat = np.flatnonzero(layered == axis)
+        coupling[flat], mass[flat] = flat_elements(axis, distance[:, flat], material, materials, stencil)
+    at_vertices = (vertex[:, :, None] == np.arange(count)).any(axis=1)
     present = volumes.mean(axis=1) > _ABSENT_SHARE
-    two = (held.sum(axis=1) == 2) & (present <= held).all(axis=1) & (layered < 0)
-    _set_smooth(cut, bodies, held, np.flatnonzero(two), materials, stencil)
+    two = (at_vertices.sum(axis=1) == 2) & (present <= at_vertices).all(axis=1) & (layered < 0)
+    _set_smooth(cut, bodies, at_vertices, np.flatnonzero(two), materials, stencil)
 
 
 def _set_smooth(
     cut: _Cut,
     bodies: Bodies,
-    held: NDArray[np.bool_],
+    at_vertices: NDArray[np.bool_],
     chosen: Index,
     materials: Materials,
     stencil: Stencil,
 ) -> None:
     """Set the `chosen` elements of two materials in which the surface between them has one normal.
 
-    `held` (n, m) are the materials at the vertices.
+    `at_vertices` (n, m) is a mask of the materials at the vertices.
     """
-    count = len(materials.density)
-    inner = count - 1 - held[chosen, ::-1].argmax(axis=1)
+    count, used = len(materials.density), at_vertices[chosen]
+    inner = count - 1 - used[:, ::-1].argmax(axis=1)
     level = distance_to_material(bodies.distance[:, chosen], bodies.material, inner)
-    sides = np.stack((held[chosen].argmax(axis=1), inner), axis=1)
+    sides = np.stack((used.argmax(axis=1), inner), axis=1)
     flat, surface = surfaces(level, materials.density[sides])
-    own, pair = chosen[flat], sides[flat]
-    mobility = cut.volumes[own] @ (1 / materials.density) / SUBCELLS**3
-    cut.coupling[own], weight = smooth_stiffness(
-        surface, mobility, cut.coupling[own], uniform_coupling(stencil)
+    cells, pair = chosen[flat], sides[flat]
+    mobility = cut.volumes[cells] @ (1 / materials.density) / SUBCELLS**3
+    cut.coupling[cells], weight = smooth_stiffness(
+        surface, mobility, cut.coupling[cells], uniform_coupling(stencil)
     )
     some = weight > 0
-    own, pair, surface, weight = own[some], pair[some], surface.chosen(some), weight[some, None]
-    part = _moved_shares(surface, pair, added_thickness(stencil.kappa), count)
-    lumped = lumped_mass(cut.vertex[own], part, materials)
-    cut.mass[own] += weight * (balanced_mass(surface, materials.mass[pair], lumped) - cut.mass[own])
+    cells, pair, surface, weight = cells[some], pair[some], surface.chosen(some), weight[some, None]
+    part = _moved_shares(surface, pair, _added_thickness(stencil.kappa), count)
+    lumped = _lumped_mass(cut.vertex[cells], part, materials)
+    cut.mass[cells] += weight * (_balanced_mass(surface, materials.mass[pair], lumped) - cut.mass[cells])
 
 
 def _finite_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -> tuple[Array, Array]:
     """Return coupling (n, 28) and mass (n, 8) of finite elements, the bodies grown by the added thickness."""
     contrast = np.where(materials.sound_hard, 1, (materials.density - 1) / (materials.density + 1))
     contrast = contrast[bodies.material, None, None] * bodies.finite[:, :, None]
-    grown = bodies.distance - added_thickness(stencil.kappa) * contrast
+    grown = bodies.distance - _added_thickness(stencil.kappa) * contrast
     part = shares(volume_coverage, grown, bodies.material, len(materials.density))
-    return cut_coupling(part, materials, bodies.reductions, stencil), cut_mass(part, materials)
+    return _cut_coupling(part, materials, bodies.reductions, stencil), _cut_mass(part, materials)
 
 
 def _vertex_materials(distance: Array, material: Index) -> Index:
     """Return the material at each vertex (n, 8), from distances at the lattice (K, n, 125)."""
     vertex = np.zeros((distance.shape[1], 8), np.int64)
-    for far, own in zip(distance, material, strict=True):
-        vertex[far[:, CORNERS] < 0] = own
+    for far, number in zip(distance, material, strict=True):
+        vertex[far[:, CORNERS] < 0] = number
     return vertex
 
 
@@ -176,7 +173,7 @@ def _series_coupling(lines: Array, materials: Materials, stencil: Stencil) -> Ar
 def _moved_shares(surface: Surface, pair: Index, thickness: float, count: int) -> Array:
     """Return the shares (n, 64, count) of two materials (n, 2), with the heavier one shrunk.
 
-    A wave on the grid is otherwise reflected in front of the surface, by a part of a rigid face's thickness.
+    Otherwise a wave on the grid is reflected in front of the surface, at a part of `_added_thickness`.
     """
     outer, inner = surface.density.T
     ratio = np.maximum(outer, inner) / np.minimum(outer, inner)
@@ -191,7 +188,7 @@ def _moved_shares(surface: Surface, pair: Index, thickness: float, count: int) -
 _MOST_TAKEN = 0.8  # Largest share of a vertex's mass that is taken away
 
 
-def lumped_mass(vertex: Index, volumes: Array, materials: Materials) -> Array:
+def _lumped_mass(vertex: Index, volumes: Array, materials: Materials) -> Array:
     """Return masses at the vertices (n, 8).
 
     Vertices in a material take its mass, except for the share of a flow through the surface which reaches
@@ -199,30 +196,30 @@ def lumped_mass(vertex: Index, volumes: Array, materials: Materials) -> Array:
     """
     total = np.zeros(vertex.shape)
     mean = volumes.mean(axis=1) @ materials.density
-    for own, mass in enumerate(materials.mass):
-        inside = vertex == own
+    for number, mass in enumerate(materials.mass):
+        inside = vertex == number
         beside = ~inside & ~materials.sound_hard[vertex]
         beside[~inside.any(axis=1)] = True
-        near, far = inside @ HATS.T, beside @ HATS.T
-        passed = np.minimum(1, (materials.density[own] / mean)[:, None] * far)
+        near, far = inside @ _HATS.T, beside @ _HATS.T
+        passed = np.minimum(1, (materials.density[number] / mean)[:, None] * far)
         passed[~inside.any(axis=1)] = 1
-        volume = volumes[:, :, own] / SUBCELLS**3
-        here = (volume * np.divide(1 - passed, near, out=np.zeros_like(near), where=near > 0)) @ HATS
-        there = (volume * np.divide(passed, far, out=np.zeros_like(far), where=far > 0)) @ HATS
+        volume = volumes[:, :, number] / SUBCELLS**3
+        here = (volume * np.divide(1 - passed, near, out=np.zeros_like(near), where=near > 0)) @ _HATS
+        there = (volume * np.divide(passed, far, out=np.zeros_like(far), where=far > 0)) @ _HATS
         total += mass * (np.where(inside, here, 0) + np.where(beside, there, 0))
     return total
 
 
-def balanced_mass(surface: Surface, own: Array, mass: Array) -> Array:
-    """Return masses (n, 8) with the same sums, and the exact first moment with the kinked local field.
+def _balanced_mass(surface: Surface, whole_cell: Array, mass: Array) -> Array:
+    """Return masses (n, 8) with equal sums, and the exact first moment with the kinked local field.
 
-    `own` (n, 2) are the masses of cells of the outer and the inner material. A wave across the surface then
-    feels no moment of the masses, as it feels no force.
+    `whole_cell` (n, 2) are the masses of cells of the outer and the inner material. A wave across the surface
+    then causes no moment of the masses, as it causes no force.
     """
     middle, inside = subcell_means(surface.level), volume_coverage(surface.level)
     cut = (inside > 0) & (inside < 1)
     half = np.abs(surface.normal).sum(axis=1)[:, None] / SUBCELLS / 2
-    moment, density = np.zeros(len(mass)), surface.density * own / SUBCELLS**3
+    moment, density = np.zeros(len(mass)), surface.density * whole_cell / SUBCELLS**3
     for side, part in enumerate((1 - inside, inside)):
         end = middle + half if side == 0 else middle - half
         depth = np.where(cut, end / 2, middle)
@@ -240,7 +237,7 @@ def balanced_mass(surface: Surface, own: Array, mass: Array) -> Array:
 _SUBCENTRES = (np.array(list(np.ndindex((SUBCELLS,) * 3))) + 0.5) / SUBCELLS
 # Linear factors of the trilinear functions of the vertices at the centres of the sub-cells (64, 8, 3)
 _FACTORS = np.where(VERTICES == 1, _SUBCENTRES[:, None], 1 - _SUBCENTRES[:, None])
-HATS = _FACTORS.prod(axis=2)  # Trilinear functions of the vertices at the centres of the sub-cells (64, 8)
+_HATS = _FACTORS.prod(axis=2)  # Trilinear functions of the vertices at the centres of the sub-cells (64, 8)
 # Their gradients (64, 8, 3)
 _SLOPES = np.stack(
     [(2 * VERTICES[:, axis] - 1) * np.delete(_FACTORS, axis, axis=2).prod(axis=2) for axis in range(3)],
@@ -249,10 +246,10 @@ _SLOPES = np.stack(
 _PRODUCTS = np.einsum("qix,qjx->qij", _SLOPES, _SLOPES)
 
 
-def cut_coupling(volumes: Array, materials: Materials, reductions: Array, stencil: Stencil) -> Array:
+def _cut_coupling(volumes: Array, materials: Materials, reductions: Array, stencil: Stencil) -> Array:
     """Return the coupling (n, 28) of elements, from the share of each material in sub-cells (n, 64, m).
 
-    `reductions` (n, 3, 3) is the share of the stiffness that is taken away near edges.
+    `reductions` (n, 3, 3) is the relative reduction of the stiffness near edges.
     """
     mobility = volumes @ np.where(materials.sound_hard, 0, 1 / materials.density) / SUBCELLS**3
     tuning = stiffness_matrix(uniform_coupling(stencil)[None])[0] - _PRODUCTS.mean(axis=0)
@@ -265,16 +262,16 @@ def cut_coupling(volumes: Array, materials: Materials, reductions: Array, stenci
     return np.asarray(-matrix[:, PAIRS[:, 0], PAIRS[:, 1]])
 
 
-def cut_mass(volumes: Array, materials: Materials) -> Array:
+def _cut_mass(volumes: Array, materials: Materials) -> Array:
     """Return the masses at the vertices (n, 8), from the share of each material in sub-cells (n, 64, m)."""
-    return np.asarray(volumes @ np.where(materials.sound_hard, 0, materials.mass) @ HATS / SUBCELLS**3)
+    return np.asarray(volumes @ np.where(materials.sound_hard, 0, materials.mass) @ _HATS / SUBCELLS**3)
 
 
-def added_thickness(kappa: float) -> float:
-    """Return the thickness [cells] by which sound-hard bodies are grown, about kappa^2 / 24.
+def _added_thickness(kappa: float) -> float:
+    """Return the thickness [cells] by which rigid bodies are grown, about kappa^2 / 24.
 
-    A wave on the grid is otherwise reflected so far behind the surface, at any tilt and incidence. It is the
-    mean of kappa^2 (d^3 / 3 - d / 12) over all places d of a face between the cells, and higher terms;
-    `layers.mean_thickness` serves fluids.
+    Otherwise a wave on the grid is reflected this far behind the surface, at any tilt and incidence: the mean
+    of kappa^2 (d^3 / 3 - d / 12) over all places d of a face between the cells, and higher terms. Fluids have
+    `layers.mean_thickness`.
     """
     return (math.tan(kappa / 2) / (kappa / 2) - 1) / 2

@@ -25,8 +25,8 @@ from autdtorch.fdtd.assembly.element import (
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 
-# Square of the sine of the second angle of incidence. With s for this square, the second-order term of the
-# exact mass is (1 - s)^2. The scheme has 1 - 1.25 s, nearest to it over s of 0 to 1: equal at 0 and 0.75.
+# Square s of the sine of the second angle of incidence. The second-order term of the exact mass is (1 - s)^2.
+# The scheme has 1 - 1.25 s, which is nearest to it for s of 0 to 1: equal at 0 and 0.75.
 _OBLIQUE = 0.75
 # Largest relative change by terms of second order: coarse grids of slow materials stay stable
 _LARGEST_CHANGE = 0.5
@@ -39,7 +39,7 @@ class TwoPort(NamedTuple):
     """n stacks of layers as two planes of vertices see them; in air 1, 1/2 and 1."""
 
     link: Array  # coupling across (n,)
-    thickness: Array  # masses of the planes (n, 2), in those of a cell of the plane's material
+    thickness: Array  # masses of the planes (n, 2), relative to a cell of the plane's material
     mobility: Array  # mobilities along the planes (n, 2)
 
 
@@ -55,7 +55,7 @@ def two_port(width: Array, density: Array, wavenumber: Array, air: float) -> Two
 
 
 def _corrected(still: Array, near: Array) -> Array:
-    """Return a value at the drive, given those for long waves and at `_SMALL` times its wavenumber."""
+    """Return a value at the drive's wavenumber, from values for long waves and at `_SMALL` times it."""
     most = _LARGEST_CHANGE * still
     return np.asarray(still + np.clip((near - still) / _SMALL**2, -most, most))
 
@@ -70,24 +70,24 @@ def long_wave_port(width: Array, density: Array, wavenumber: Array) -> TwoPort:
 
 
 def long_wave_shares(width: Array, density: Array) -> Array:
-    """Return the widths (n, 2, L) of layers that count for each plane: a steady flow divides them."""
+    """Return the widths (n, 2, L) of layers as a steady flow divides them between the planes."""
     resistance = width * density
     middle = (np.cumsum(resistance, axis=1) - resistance / 2) / resistance.sum(axis=1)[:, None]
     return np.stack((1 - middle, middle), axis=1) * width[:, None]
 
 
 def _exact_port(width: Array, density: Array, wavenumber: Array, air: float) -> TwoPort:
-    """Return the two-ports that are exact at normal incidence, and whose mobility is that of `_OBLIQUE`."""
+    """Return the two-ports, exact at normal incidence; their mobility is exact at `_OBLIQUE` incidence."""
     resistance, flow = _flows(width, density, wavenumber, 0.0)
     _, oblique = _flows(width, density, wavenumber, _OBLIQUE * air**2)
-    own_density, own_wavenumber = (part[:, [0, -1]].reshape(-1, 1) for part in (density, wavenumber))
-    whole = np.ones_like(own_density)
-    own, own_oblique = (
-        _flows(whole, own_density, own_wavenumber, across)[1][:, 0].reshape(-1, 2)
+    # a cell of each plane's material
+    end_density, end_wavenumber = (part[:, [0, -1]].reshape(-1, 1) for part in (density, wavenumber))
+    cell, cell_oblique = (
+        _flows(np.ones_like(end_density), end_density, end_wavenumber, across)[1][:, 0].reshape(-1, 2)
         for across in (0.0, _OBLIQUE * air**2)
     )
-    mobility = (flow - oblique) / (own - own_oblique) / density[:, [0, -1]]
-    return TwoPort(1 / resistance, flow / (2 * own), mobility)
+    mobility = (flow - oblique) / (cell - cell_oblique) / density[:, [0, -1]]
+    return TwoPort(1 / resistance, flow / (2 * cell), mobility)
 
 
 def _flows(width: Array, density: Array, wavenumber: Array, across: float) -> tuple[Array, Array]:
@@ -117,9 +117,9 @@ def layered_elements(
 ) -> tuple[Array, Array]:
     """Return coupling (n, 28) and mass (n, 8) of elements with layers across an axis.
 
-    `ends` (n, 2) are the materials of the two planes. With p0 and p1 the pressures in the planes, the energy
-    is g (p1 - p0)^T W (p1 - p0), W being the averages along a plane in air, and for each plane that of air
-    times a mobility. Each part is positive: waves would grow in a boundary layer otherwise.
+    `ends` (n, 2) are the materials of the two planes. The energy has a part g (p1 - p0)^T W (p1 - p0) of the
+    pressures p0 and p1 in the planes, where W averages along a plane in air. Each plane adds its energy in
+    air times a mobility. All parts are positive: waves would grow in a boundary layer otherwise.
     """
     across, side = EDGES_BETWEEN[:, axis] == 1, VERTICES[:, axis]
     uniform = uniform_coupling(stencil)
@@ -133,11 +133,11 @@ def layered_elements(
 def mean_thickness(materials: Materials, stencil: Stencil) -> Array:
     """Return the second-order thickness [cells] of air before each material (m,), averaged over places.
 
-    A wave on the grid is reflected so far behind surfaces of fluids that are not parallel to it. Sound-hard
-    ones need none.
+    A wave on the grid is reflected this far behind surfaces of fluids that are not parallel to the grid.
+    Rigid materials have none.
     """
     depth = (np.arange(_PLACES) + 0.5) / _PLACES
-    width, found = np.stack((depth, 1 - depth), axis=1), np.zeros(len(materials.density))
+    width, mean = np.stack((depth, 1 - depth), axis=1), np.zeros(len(materials.density))
     for number in np.flatnonzero(~materials.sound_hard)[1:]:
         density, slowness = (
             np.broadcast_to(part[[0, number]], width.shape)
@@ -146,8 +146,8 @@ def mean_thickness(materials: Materials, stencil: Stencil) -> Array:
         wavenumber = stencil.kappa * slowness
         waves = two_port(width, density, wavenumber, stencil.kappa).thickness
         still = long_wave_port(width, density, wavenumber).thickness
-        found[number] = (waves - still)[:, 0].mean()
-    return found
+        mean[number] = (waves - still)[:, 0].mean()
+    return mean
 
 
 _VARIATION = 1e-6  # Largest variation of a distance along a face [cells]: rounding
@@ -155,13 +155,13 @@ _STEP = 1 / SUBCELLS  # Distance of the points of a profile [cells]
 
 
 def layered_axis(distance: Array) -> Index:
-    """Return the axis (n,) along which alone signed distances (K, n, 125) of bodies vary, or -1."""
-    found = np.full(distance.shape[1], -1)
+    """Return the only axis (n,) along which signed distances (K, n, 125) of bodies vary, or -1."""
+    only = np.full(distance.shape[1], -1)
     cube = distance.reshape(*distance.shape[:2], *(SUBCELLS + 1,) * 3)
     for axis in range(3):
         across = tuple(2 + other for other in range(3) if other != axis)
-        found[np.ptp(cube, axis=across).max(axis=(0, 2), initial=0) < _VARIATION] = axis
-    return found
+        only[np.ptp(cube, axis=across).max(axis=(0, 2), initial=0) < _VARIATION] = axis
+    return only
 
 
 def crossed_by_layers(distance: Array) -> NDArray[np.bool_]:
@@ -169,17 +169,18 @@ def crossed_by_layers(distance: Array) -> NDArray[np.bool_]:
 
     A thin body, or a narrow gap, may lie between points that all have distances of one sign.
     """
-    found = np.zeros(distance.shape[:2], bool)
-    for number, own in enumerate(distance):
-        axes = layered_axis(own[None])
+    crossed = np.zeros(distance.shape[:2], bool)
+    for number, of_body in enumerate(distance):
+        axes = layered_axis(of_body[None])
         for axis in range(3):
             rows = np.flatnonzero(axes == axis)
-            found[number, rows] = [len(_faces(line)) > 0 for line in _lines(axis, own[None, rows])[:, 0]]
-    return found
+            lines = _lines(axis, of_body[None, rows])[:, 0]
+            crossed[number, rows] = [len(_faces(line)) > 0 for line in lines]
+    return crossed
 
 
 def _lines(axis: int, distance: Array) -> Array:
-    """Return the distances (n, K, 5) along an axis of those (K, n, 125) that do not vary across it."""
+    """Return the distances (n, K, 5) along an axis, from distances (K, n, 125) that do not vary across it."""
     cube = distance.reshape(*distance.shape[:2], *(SUBCELLS + 1,) * 3)
     return np.moveaxis(cube, 2 + axis, 2)[:, :, :, 0, 0].transpose(1, 0, 2)
 
@@ -194,9 +195,9 @@ def flat_elements(
     stacks = [_layers(line, material) for line in _lines(axis, distance)]
     most = max((len(width) for width, _ in stacks), default=1)
     width, layer = np.zeros((len(stacks), most)), np.zeros((len(stacks), most), np.int64)
-    for row, (own, inside) in enumerate(stacks):
-        width[row, : len(own)], layer[row] = own, inside[-1]
-        layer[row, : len(own)] = inside
+    for row, (widths, inside) in enumerate(stacks):
+        width[row, : len(widths)], layer[row] = widths, inside[-1]
+        layer[row, : len(widths)] = inside
     wavenumber = stencil.kappa * materials.slowness[layer]
     ports = two_port(width, materials.density[layer], wavenumber, stencil.kappa)
     return layered_elements(axis, ports, layer[:, [0, -1]], materials, stencil)
@@ -204,29 +205,29 @@ def flat_elements(
 
 def _layers(line: Array, material: Index) -> tuple[Array, Index]:
     """Return widths and materials of the layers along a line, from signed distances (K, 5) of bodies."""
-    faces = [_faces(own) for own in line]
+    faces = [_faces(distance) for distance in line]
     ends = np.unique(np.concatenate(([0.0, 1.0], *faces)))
     middle = (ends[1:] + ends[:-1]) / 2
     layer = np.zeros(len(middle), np.int64)
-    for own, found, number in zip(line, faces, material, strict=True):
-        crossed = (np.array(found)[:, None] < middle).sum(axis=0)
-        layer[(crossed % 2 == 1) != (own[0] < 0)] = number
+    for distance, places, number in zip(line, faces, material, strict=True):
+        crossed = (np.array(places)[:, None] < middle).sum(axis=0)
+        layer[(crossed % 2 == 1) != (distance[0] < 0)] = number
     return np.diff(ends), layer
 
 
 def _faces(distance: Array) -> list[float]:
     """Return the places of a body's faces on a line, from its signed distances (5,).
 
-    They change by one from point to point where the nearest face stays on one side, so that two distances
-    whose sum is below the step have a thin body or a narrow gap between them.
+    Distances change by the step from point to point while the nearest face is on one side. Two distances
+    whose sum is below the step therefore have a thin body or a narrow gap between them.
     """
-    found = []
+    places = []
     rising = np.diff(np.abs(distance)) > _STEP / 2  # from each point to the next
     for number, (low, high) in enumerate(itertools.pairwise(distance.tolist())):
         begin, end = _STEP * number, _STEP * (number + 1)
         ahead, back = begin + abs(low), end - abs(high)
         if (low < 0) == (high < 0):
-            found += [ahead, back] if ahead < back else []
+            places += [ahead, back] if ahead < back else []
             continue
         # the nearest face of each point is the one between them if its distance rises on the other side
         from_low = number > 0 and np.sign(distance[number - 1]) == np.sign(low) and not rising[number - 1]
@@ -234,5 +235,5 @@ def _faces(distance: Array) -> list[float]:
             number < SUBCELLS - 1 and np.sign(distance[number + 2]) == np.sign(high) and rising[number + 1]
         )
         between = begin + _STEP * low / (low - high)
-        found.append(between if from_low == from_high else ahead if from_low else back)
-    return found
+        places.append(between if from_low == from_high else ahead if from_low else back)
+    return places

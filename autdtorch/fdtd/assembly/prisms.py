@@ -23,7 +23,7 @@ from autdtorch.fdtd.assembly.sections import (
     COLUMN_PAIRS,
     COLUMNS,
     RING,
-    Kinds,
+    MaterialKey,
     PlaneFields,
     Section,
     layered_element,
@@ -36,12 +36,12 @@ from autdtorch.utils.array_types import Array, Index
 
 # Fields of the fit of one element; each further one needs two more, up to a limit
 _FIELDS, _MOST_FIELDS = 8, 12
-# Most mass of a column in a heavy body, relative to its material's or to how strongly it is coupled (air: 1).
-# One that air reaches weakly would else be a pipe that resonates
+# Largest mass of a column in a heavy body, relative to its material's or to its coupling (air: 1). A column
+# that air reaches weakly would otherwise be a pipe that resonates.
 _REACHED = 2.0
 _LEAST_WEIGHT, _EXACT, _MOST_STEPS = 1e-12, 1e-14, 100
 _SUM = 100.0  # Weight of the sum of masses, relative to their moments
-_LEAST_MOBILITY = 1e-9  # Mobility of a column that a sound-hard material closes
+_LEAST_MOBILITY = 1e-9  # Mobility of a column that a rigid material closes
 _DECIMALS = 9  # Sections that agree to so many decimals [cells] share their fit
 
 
@@ -60,7 +60,7 @@ _IMAGES = [(a, b, c) for a, b, c in itertools.product((False, True), repeat=3)]
 
 
 @lru_cache(maxsize=4096)
-def prisms(section: Section, kinds: Kinds, stencil: Stencil) -> Prisms:
+def prisms(section: Section, materials: MaterialKey, stencil: Stencil) -> Prisms:
     """Return the fitted elements of a section.
 
     Images of a section share a fit, and the fit of a symmetric one is the mean over its images: symmetric
@@ -68,7 +68,7 @@ def prisms(section: Section, kinds: Kinds, stencil: Stencil) -> Prisms:
     """
     images = [(_image_of_section(section, image), image) for image in _IMAGES]
     key = min(each for each, _ in images)
-    fit = _fitted(key, kinds, stencil)
+    fit = _fitted(key, materials, stencil)
     alike = [_original(fit, image) for each, image in images if each == key]
     return Prisms(*(np.asarray(sum(parts) / len(parts)) for parts in zip(*alike, strict=True)))
 
@@ -79,8 +79,7 @@ def _image_of_section(section: Section, image: Image) -> Section:
     (a, b), (one, other), blocks = section.size, section.cuts, np.array(section.material)
     if exchanged:
         a, b, one, other, blocks = b, a, other, one, blocks.T
-    for axis, mirror in enumerate(mirrored):
-        blocks = np.flip(blocks, axis) if mirror else blocks
+    blocks = np.flip(blocks, tuple(axis for axis, mirror in enumerate(mirrored) if mirror))
     cuts = _mirrored(one, a, mirrored[0]), _mirrored(other, b, mirrored[1])
     return Section((a, b), cuts, tuple(map(tuple, blocks.tolist())))
 
@@ -109,8 +108,8 @@ def stacked(width: Array, slices: Sequence[Prisms], axis: int, stencil: Stencil)
     """Return the coupling (28,) and mass (8,) of an element, a stack of slices of prisms along an axis.
 
     Each slice has a width (L,). A flow along a column passes all slices, which decides the pressure in each.
-    The energy across the columns is that of a slice, at the pressures there. What pressures that differ at
-    the ends of the columns have beyond is not negative: the stencil would take some from strong couplings.
+    The energy across the columns is the sum over the slices, at their pressures. The energy along the columns
+    is made positive: the stencil would subtract some where couplings are strong.
     """
     flat, mass, mobility = (np.stack(parts) for parts in zip(*slices, strict=True))
     resistance = width[:, None, None] / np.maximum(mobility, _LEAST_MOBILITY)
@@ -123,14 +122,14 @@ def stacked(width: Array, slices: Sequence[Prisms], axis: int, stencil: Stencil)
     matrix, masses = np.zeros((8, 8)), np.zeros(8)
     low, high = np.eye(8)[number]
     slices_of = zip(flat, width, mass, resistance, middle, drop, strict=True)
-    for own, thick, part, passed, place, change in slices_of:
+    for coupling, thick, part, passed, place, change in slices_of:
         at_middle = (1 - place).reshape(4, 1) * low + place.reshape(4, 1) * high
         along = change.reshape(4, 1) * (high - low)
-        across = _stiffness(2 * (straight + oblique) * own)
-        # what the stencil has beyond pressures that vary linearly along the columns
-        beyond = _stiffness(((straight + oblique) / 3 - oblique) * own)
-        own_along = np.diag(1 / passed.ravel()) + thick / 12 * across + beyond / thick
-        matrix += thick * at_middle.T @ across @ at_middle + along.T @ _without_negative(own_along) @ along
+        across = _stiffness(2 * (straight + oblique) * coupling)
+        # difference of the stencil from pressures that vary linearly along the columns
+        beyond = _stiffness(((straight + oblique) / 3 - oblique) * coupling)
+        lengthwise = np.diag(1 / passed.ravel()) + thick / 12 * across + beyond / thick
+        matrix += thick * at_middle.T @ across @ at_middle + along.T @ _without_negative(lengthwise) @ along
         masses[number] += thick * np.stack(((1 - place) * part, place * part)).reshape(2, 4)
     return -matrix[PAIRS[:, 0], PAIRS[:, 1]], masses
 
@@ -153,48 +152,50 @@ def _sides_between() -> Index:
 
 
 @lru_cache(maxsize=4096)
-def _fitted(section: Section, kinds: Kinds, stencil: Stencil) -> Prisms:
+def _fitted(section: Section, materials: MaterialKey, stencil: Stencil) -> Prisms:
     """Return the elements of a section, those that vary along both axes fitted in the window around it."""
     uniform, varied = uniform_columns(stencil), []
-    found = Prisms(np.zeros((*section.size, 2, 2, 2, 2)), *np.zeros((2, *section.size, 2, 2)))
+    fit = Prisms(np.zeros((*section.size, 2, 2, 2, 2)), *np.zeros((2, *section.size, 2, 2)))
     for x, y in np.ndindex(section.size):
-        if (element := layered_element(section, x, y, kinds, stencil)) is None:
+        if (element := layered_element(section, x, y, materials, stencil)) is None:
             varied.append((x, y))
         else:
-            found.coupling[x, y] = _by_columns(element.coupling / uniform)
-            found.mass[x, y], found.mobility[x, y] = element.mass, element.mobility
+            fit.coupling[x, y] = _by_columns(element.coupling / uniform)
+            fit.mass[x, y], fit.mobility[x, y] = element.mass, element.mobility
     if not varied:
-        return found
-    fields = plane_fields(section, kinds.mobility, min(_FIELDS + 2 * (len(varied) - 1), _MOST_FIELDS))
-    couplings = fitted_couplings(section, varied, fields, kinds, stencil)
+        return fit
+    fields = plane_fields(section, materials.mobility, min(_FIELDS + 2 * (len(varied) - 1), _MOST_FIELDS))
+    couplings = _fitted_couplings(section, varied, fields, materials, stencil)
     for (x, y), coupling in zip(varied, couplings, strict=True):
-        found.coupling[x, y] = _by_columns(coupling / uniform)
+        fit.coupling[x, y] = _by_columns(coupling / uniform)
         reached = np.bincount(COLUMN_PAIRS.ravel(), np.repeat(coupling, 2), 4) / (2 * uniform.sum() / 4)
         values = fields.values[RING + x : RING + x + 2, RING + y : RING + y + 2].reshape(4, -1)
-        for part, weight in ((found.mass, kinds.masses), (found.mobility, kinds.mobility)):
-            own = weight[section.at_columns(x, y)]
-            most = np.where(own < weight.max(), np.maximum(own, _REACHED * reached) / 4, np.inf)
+        for part, weight in ((fit.mass, materials.masses), (fit.mobility, materials.mobility)):
+            at_columns = weight[section.at_columns(x, y)]
+            most = np.maximum(at_columns, _REACHED * reached) / 4
+            most = np.where(at_columns < weight.max(), most, np.inf)
             part[x, y] = _lumped(values, fields.over_element(weight, x, y), fields.order, most)
-    return found
+    return fit
 
 
 def _by_columns(coupling: Array) -> Array:
     """Return coupling (6,) of pairs by the places of their columns (2, 2, 2, 2)."""
-    found = np.zeros((2,) * 4)
+    square = np.zeros((2,) * 4)
     for (one, other), value in zip(COLUMNS[COLUMN_PAIRS], coupling, strict=True):
-        found[(*one, *other)] = found[(*other, *one)] = value
-    return found
+        square[(*one, *other)] = square[(*other, *one)] = value
+    return square
 
 
 def _lumped(values: Array, integrals: Array, order: Array, most: Array) -> Array:
     """Return weights (2, 2) of the columns with which fields (4, m) have their integrals (m,).
 
-    Their sum is nearly exact, the others as exact as weights from 0 up to `most` (4,) allow.
+    The integral of the constant field is nearly exact, the others as exact as weights from 0 up to `most`
+    (4,) allow.
     """
-    weight = importance(order)
+    weight = _importance(order)
     weight[0] = _SUM
     bounds = np.zeros(4), np.maximum(most, _LEAST_WEIGHT)
-    found = lsq_linear(
+    fit = lsq_linear(
         weight[:, None] * values.T,
         weight * integrals,
         bounds,
@@ -202,39 +203,44 @@ def _lumped(values: Array, integrals: Array, order: Array, most: Array) -> Array
         tol=_EXACT,
         max_iter=_MOST_STEPS,
     )
-    return np.asarray(found.x.reshape(2, 2))
+    return np.asarray(fit.x.reshape(2, 2))
 
 
-# Order up to which fields count in the fit, and the steepness of their decay beyond: higher fields vary so
-# much between cells that no coupling reproduces them
+# Order up to which fields count in the fit, and steepness of the decay of their weights beyond: no coupling
+# reproduces the rapid variation of higher fields between cells
 _ORDER, _STEEPNESS = 2.6, 8
-_PRIOR = 1e-4  # Weight of the first guess, for what the fields do not determine
+_PRIOR = 1e-4  # Weight of the first guess, for couplings that the fields do not determine
 _LEAST_START = 0.03  # Least coupling to start from, relative to air: no slope leads away from zero
-# Relative change at which a fit ends: symmetric scenes stay so, and derivatives by density are smooth
+# Relative change at which a fit ends: symmetric scenes remain symmetric, and derivatives by density are
+# smooth
 _FIT_EXACT = 1e-13
-_GROUND = 1e-9  # Stiffness to zero pressure, for a cavity that sound-hard material closes within the window
+_GROUND = 1e-9  # Stiffness to zero pressure, for a cavity that rigid material closes within the window
 _MOST_FIT_STEPS = 80  # of a fit; within a heavy cylinder it is too flat to end by itself
 
 
-def importance(order: Array) -> Array:
+def _importance(order: Array) -> Array:
     """Return the weights (m,) of fields by their order."""
     return np.asarray(1 / (1 + (order / _ORDER) ** _STEEPNESS))
 
 
-def fitted_couplings(
-    section: Section, varied: list[tuple[int, int]], fields: PlaneFields, kinds: Kinds, stencil: Stencil
+def _fitted_couplings(
+    section: Section,
+    varied: list[tuple[int, int]],
+    fields: PlaneFields,
+    materials: MaterialKey,
+    stencil: Stencil,
 ) -> Array:
     """Return the couplings (k, 6) between the columns of the elements `varied` of a section.
 
-    That of an element belongs to a stiffness matrix B R R^T B^T with R triangular, so that no energy is
-    negative; B spans the differences of its columns that are not in a sound-hard material.
+    The stiffness matrix of an element is B R R^T B^T with R triangular, so that no energy is negative. B
+    spans the differences of its columns outside rigid materials.
     """
-    window = _Window(section, varied, fields, kinds, stencil)
-    means = np.stack([mean_densities(section, *place, kinds) for place in varied])
+    window = _Window(section, varied, fields, materials, stencil)
+    means = np.stack([mean_densities(section, *place, materials) for place in varied])
     guess = uniform_columns(stencil) * np.maximum(1 / means, _LEAST_START)
     roots = _Roots([window.present[columns] for columns in window.columns])
     start = roots.of(guess)
-    if not len(start):  # at most one column of each element is not in a sound-hard material
+    if not len(start):  # at most one column of each element is outside rigid materials
         return np.zeros_like(guess)
 
     def missed(root: Array) -> Array:
@@ -246,22 +252,22 @@ def fitted_couplings(
         by_coupling = np.concatenate((by_coupling, _PRIOR * np.diag(1 / guess.ravel())))
         return np.asarray(by_coupling @ roots.slopes(root))
 
-    found = least_squares(
+    fit = least_squares(
         missed, start, slopes, ftol=_FIT_EXACT, xtol=_FIT_EXACT, gtol=_FIT_EXACT, max_nfev=_MOST_FIT_STEPS
     )
-    parts = [section.parts(*place, kinds.sound_hard) for place in varied]
-    return np.stack([_apart(own, part) for own, part in zip(roots.couplings(found.x), parts, strict=True)])
+    parts = [section.parts(*place, materials.sound_hard) for place in varied]
+    couplings = roots.couplings(fit.x)
+    return np.stack([_apart(coupling, part) for coupling, part in zip(couplings, parts, strict=True)])
 
 
 def _apart(coupling: Array, part: Index) -> Array:
     """Return the coupling (6,) of an element without any between columns (4,) in different parts.
 
-    The energy of pressures that vary in one part only stays, so that it is not negative.
+    The energy of pressures that vary in one part only is unchanged, so that no energy is negative.
     """
     matrix, separate = stiffness_matrix(coupling, COLUMN_PAIRS), np.zeros((4, 4))
     for number in range(1, int(part.max()) + 1):
-        own: NDArray[np.bool_] = part == number
-        basis = _differences(own)
+        basis = _differences(np.asarray(part == number))
         separate += basis @ (basis.T @ matrix @ basis) @ basis.T
     return np.asarray(-separate[tuple(COLUMN_PAIRS.T)])
 
@@ -274,16 +280,18 @@ class _Window:
         section: Section,
         varied: list[tuple[int, int]],
         fields: PlaneFields,
-        kinds: Kinds,
+        materials: MaterialKey,
         stencil: Stencil,
     ) -> None:
         """Assemble all elements but those `varied`."""
         self.present = fields.present.ravel()
         inside = np.zeros(fields.present.shape, bool)
         inside[1:-1, 1:-1] = True
-        self._given, self._free = self.present & ~inside.ravel(), self.present & inside.ravel()
-        self._fields = (fields.values[:, :, 1:] * importance(fields.order[1:])).reshape(len(self.present), -1)
-        self._matrix = _known_stiffness(section, kinds, stencil)[self._free]
+        self._fixed, self._free = self.present & ~inside.ravel(), self.present & inside.ravel()
+        self._fields = (fields.values[:, :, 1:] * _importance(fields.order[1:])).reshape(
+            len(self.present), -1
+        )
+        self._matrix = _known_stiffness(section, materials, stencil)[self._free]
         self.columns = [_columns(section, place) for place in varied]
         judged = self._free.copy()
         judged[np.concatenate(self.columns)] = False
@@ -292,7 +300,7 @@ class _Window:
         self._one, self._other = pairs.T  # the vertices that each coupling connects
 
     def missed(self, coupling: Array) -> Array:
-        """Return how far the pressure at the vertices of other elements is from the fields."""
+        """Return the difference of the pressure at the vertices of other elements from the fields."""
         solution, _ = self._solved(coupling)
         return np.asarray((solution - self._fields)[self._free][self._judged].ravel())
 
@@ -306,15 +314,15 @@ class _Window:
         return np.asarray((response[:, None] * change.T).reshape(-1, len(change)))
 
     def _solved(self, coupling: Array) -> tuple[Array, Array]:
-        """Return the fields with the pressures of the scheme between the given ones, and the inverse."""
-        own, whole = coupling.ravel(), np.zeros((len(self.present),) * 2)
+        """Return the fields with the scheme's pressures inside the rim, and the inverse of the stiffness."""
+        flat, whole = coupling.ravel(), np.zeros((len(self.present),) * 2)
         one, other = self._one, self._other
         for rows, columns, sign in ((one, other, -1), (other, one, -1), (one, one, 1), (other, other, 1)):
-            np.add.at(whole, (rows, columns), sign * own)
+            np.add.at(whole, (rows, columns), sign * flat)
         matrix = self._matrix + whole[self._free]
         inverse = np.linalg.inv(matrix[:, self._free] + _GROUND * np.eye(len(matrix)))
         solution = self._fields.copy()
-        solution[self._free] = -inverse @ (matrix[:, self._given] @ self._fields[self._given])
+        solution[self._free] = -inverse @ (matrix[:, self._fixed] @ self._fields[self._fixed])
         return solution, np.asarray(inverse)
 
 
@@ -323,14 +331,14 @@ def _columns(section: Section, place: Sequence[int]) -> Index:
     return np.asarray((COLUMNS + place + RING) @ (section.size[1] + 2 * RING + 1, 1))
 
 
-def _known_stiffness(section: Section, kinds: Kinds, stencil: Stencil) -> Array:
+def _known_stiffness(section: Section, materials: MaterialKey, stencil: Stencil) -> Array:
     """Return the stiffness matrix of the elements of a window that do not vary along both axes.
 
     Elements beyond the section continue those beside it.
     """
     wide, tall = section.size
     alike = {
-        (x, y): layered_element(section, x, y, kinds, stencil)
+        (x, y): layered_element(section, x, y, materials, stencil)
         for x, y in itertools.product(range(-1, wide + 1), range(-1, tall + 1))
     }
     pairs, values = [], []
@@ -348,22 +356,22 @@ def _known_stiffness(section: Section, kinds: Kinds, stencil: Stencil) -> Array:
 
 
 class _Roots:
-    """Couplings of k elements and the triangular matrices, flat and joined, that they belong to."""
+    """The triangular matrices, flat and joined, of the couplings of k elements."""
 
     def __init__(self, present: list[NDArray[np.bool_]]) -> None:
-        """Take which columns (4,) of each element are not in a sound-hard material."""
-        self._bases = [_differences(own) for own in present]
+        """Start from masks (4,) of the columns of each element outside rigid materials."""
+        self._bases = [_differences(columns) for columns in present]
         counts = [basis.shape[1] * (basis.shape[1] + 1) // 2 for basis in self._bases]
         self._ends = list(itertools.pairwise(np.cumsum([0, *counts])))
 
     def of(self, coupling: Array) -> Array:
         """Return the roots of couplings (k, 6) of positive energy between the columns that are present."""
-        found = []
-        for basis, own in zip(self._bases, coupling, strict=True):
+        roots = []
+        for basis, of_element in zip(self._bases, coupling, strict=True):
             present = np.asarray(basis.any(axis=1))[COLUMN_PAIRS].all(axis=1)
-            matrix = stiffness_matrix(np.where(present, own, 0), COLUMN_PAIRS)
-            found.append(np.linalg.cholesky(basis.T @ matrix @ basis)[np.tril_indices(basis.shape[1])])
-        return np.concatenate(found)
+            matrix = stiffness_matrix(np.where(present, of_element, 0), COLUMN_PAIRS)
+            roots.append(np.linalg.cholesky(basis.T @ matrix @ basis)[np.tril_indices(basis.shape[1])])
+        return np.concatenate(roots)
 
     def couplings(self, root: Array) -> Array:
         """Return the couplings (k, 6) of roots."""
@@ -375,30 +383,29 @@ class _Roots:
 
     def slopes(self, root: Array) -> Array:
         """Return the derivatives (6 k, n) of the couplings by the roots."""
-        found = np.zeros((6 * len(self._bases), len(root)))
+        slopes = np.zeros((6 * len(self._bases), len(root)))
         for number, (basis, (first, last)) in enumerate(zip(self._bases, self._ends, strict=True)):
             half = basis @ _triangle(root[first:last], basis)
             for place, unit in enumerate(np.eye(last - first)):
                 change = basis @ _triangle(unit, basis) @ half.T
-                found[6 * number : 6 * number + 6, first + place] = -(change + change.T)[
-                    tuple(COLUMN_PAIRS.T)
-                ]
-        return found
+                by_pairs = -(change + change.T)[tuple(COLUMN_PAIRS.T)]
+                slopes[6 * number : 6 * number + 6, first + place] = by_pairs
+        return slopes
 
 
 def _triangle(root: Array, basis: Array) -> Array:
     """Return the lower triangular matrix of flat entries."""
     size = basis.shape[1]
-    found = np.zeros((size, size))
-    found[np.tril_indices(size)] = root
-    return found
+    triangle = np.zeros((size, size))
+    triangle[np.tril_indices(size)] = root
+    return triangle
 
 
 def _differences(present: NDArray[np.bool_]) -> Array:
     """Return orthonormal differences (4, n - 1) of the n columns that are present."""
     some = np.flatnonzero(present)
-    found = np.zeros((4, max(len(some) - 1, 0)))
+    basis = np.zeros((4, max(len(some) - 1, 0)))
     for number in range(1, len(some)):
-        found[some[:number], number - 1] = 1 / np.sqrt(number * (number + 1))
-        found[some[number], number - 1] = -number / np.sqrt(number * (number + 1))
-    return found
+        basis[some[:number], number - 1] = 1 / np.sqrt(number * (number + 1))
+        basis[some[number], number - 1] = -number / np.sqrt(number * (number + 1))
+    return basis

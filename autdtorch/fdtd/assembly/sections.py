@@ -30,26 +30,26 @@ _SIDES = np.abs(COLUMNS[COLUMN_PAIRS[:, 0]] - COLUMNS[COLUMN_PAIRS[:, 1]]).sum(a
 _ALONG_LINE = 32  # Points along a line between two columns for its mean density
 
 
-class Kinds(NamedTuple):
-    """Materials as tuples, which can be keys: density as assembled, mass of a cell, whether sound-hard."""
+class MaterialKey(NamedTuple):
+    """Materials as tuples, which can be a key of caches."""
 
-    density: tuple[float, ...]
-    mass: tuple[float, ...]
+    density: tuple[float, ...]  # as assembled
+    mass: tuple[float, ...]  # mass of a cell
     sound_hard: tuple[bool, ...]
 
     @property
     def mobility(self) -> Array:
-        """Mobility of each material (m,), zero if sound-hard."""
+        """Mobility of each material (m,), zero if rigid."""
         return np.where(self.sound_hard, 0, 1 / np.array(self.density))
 
     @property
     def masses(self) -> Array:
-        """Mass of each material (m,), zero if sound-hard."""
+        """Mass of each material (m,), zero if rigid."""
         return np.where(self.sound_hard, 0, self.mass)
 
 
 class Section(NamedTuple):
-    """Elements across bodies, from (0, 0) to `size`. Blocks at its ends continue without end."""
+    """Elements across bodies, from (0, 0) to `size`; the blocks at its ends are infinite."""
 
     size: tuple[int, int]  # elements along both axes
     cuts: tuple[tuple[float, ...], tuple[float, ...]]  # places of the faces along both axes [cells]
@@ -65,10 +65,7 @@ class Section(NamedTuple):
         return np.array(self.material)[self.blocks_at(*places.T)]
 
     def parts(self, x: int, y: int, sound_hard: Sequence[bool]) -> Index:
-        """Return which part of an element each column (4,) is in, 0 for sound-hard material.
-
-        Sound-hard material divides an element into parts.
-        """
+        """Return the part of an element, between rigid materials, that holds each column (4,), else 0."""
         *_, material = self.element(x, y)
         part, _ = label(~np.array(sound_hard)[material])
         return np.asarray(part[np.ix_((0, -1), (0, -1))].ravel(), np.int64)
@@ -99,7 +96,9 @@ def uniform_columns(stencil: Stencil) -> Array:
     return np.asarray(2 * by_edges[_SIDES] + 2 * by_edges[_SIDES + 1])
 
 
-def layered_element(section: Section, x: int, y: int, kinds: Kinds, stencil: Stencil) -> Layered | None:
+def layered_element(
+    section: Section, x: int, y: int, materials: MaterialKey, stencil: Stencil
+) -> Layered | None:
     """Return an element for long waves, or None if it varies along both axes."""
     *ends, part = section.element(x, y)
     varied = [bool((np.diff(part, axis=axis) != 0).any()) for axis in (0, 1)]
@@ -107,29 +106,29 @@ def layered_element(section: Section, x: int, y: int, kinds: Kinds, stencil: Ste
         return None
     axis = int(varied[1])
     layers = part[:, 0] if axis == 0 else part[0]
-    width, density = np.diff(ends[axis])[None], np.array(kinds.density)[None, layers]
+    width, density = np.diff(ends[axis])[None], np.array(materials.density)[None, layers]
     port, uniform = long_wave_port(width, density, np.ones_like(width)), uniform_columns(stencil)
     one, other = COLUMNS[COLUMN_PAIRS.T, axis]
     along = port.mobility[0, one] * (uniform[0] + uniform[2]) - port.link[0] * uniform[2]
     shares = np.expand_dims(long_wave_shares(width, density)[0], 1 - axis) / 2
     shares = np.repeat(shares, 2, axis=1 - axis)
     coupling = np.where(one != other, uniform * port.link[0], along)
-    return Layered(coupling, shares @ kinds.masses[layers], shares @ kinds.mobility[layers])
+    return Layered(coupling, shares @ materials.masses[layers], shares @ materials.mobility[layers])
 
 
-def mean_densities(section: Section, x: int, y: int, kinds: Kinds) -> Array:
+def mean_densities(section: Section, x: int, y: int, materials: MaterialKey) -> Array:
     """Return the mean densities (6,) along the lines between the columns of an element."""
     share = (np.arange(_ALONG_LINE) + 0.5) / _ALONG_LINE
     begin, end = (COLUMNS[COLUMN_PAIRS[:, side]][:, None] for side in (0, 1))
     places = np.array((x, y)) + begin + share[:, None] * (end - begin)
     block = section.blocks_at(places[..., 0], places[..., 1])
-    return np.asarray(np.array(kinds.density)[np.array(section.material)[block]].mean(axis=1))
+    return np.asarray(np.array(materials.density)[np.array(section.material)[block]].mean(axis=1))
 
 
 # Elements of the mesh on each side of a section: more than those of the window, in which fields are smoother
 _REACH = 5
-# Lines of the mesh on each side of a face: the distance of the farthest [cells], the ratio of the next, their
-# number, and the least distance from other lines, relative to that from the face
+# Lines of the mesh on each side of a face: distance of the farthest [cells], ratio of successive distances,
+# number of lines, and least distance from other lines over the distance from the face
 _FARTHEST, _NEARER, _LINES, _APART = 0.5, 0.4, 6, 0.6
 _RIM_STEP = 0.25  # Distance of the points that determine the fields at the rim [cells]
 _ROUNDING = 1e-9  # Distance of lines that are one [cells]
@@ -144,9 +143,9 @@ _ALONG_Y = np.einsum("ab,cd->acbd", _MASS, _STIFFNESS).reshape(9, 9)
 class PlaneFields(NamedTuple):
     """m fields of long waves in the window around a section; the first one is constant."""
 
-    values: Array  # at the vertices of the window's elements (p, q, m); zero in sound-hard materials
-    present: NDArray[np.bool_]  # which vertices are not in sound-hard materials (p, q)
-    order: Array  # power with which each field grows with the distance (m,)
+    values: Array  # at the vertices of the window's elements (p, q, m); zero in rigid materials
+    present: NDArray[np.bool_]  # mask of the vertices outside rigid materials (p, q)
+    order: Array  # power of the distance with which each field grows (m,)
     lines: tuple[Array, Array]  # lines of the mesh, in the coordinates of the section
     material: Index  # material of each cell of the mesh (c, d)
     integrals: Array  # integral of each field over each cell of the mesh (c, d, m)
@@ -162,7 +161,7 @@ class PlaneFields(NamedTuple):
 
 
 def plane_fields(section: Section, mobility: Array, count: int) -> PlaneFields:
-    """Return the constant field and `count` others, by the mobility of each material, zero if sound-hard."""
+    """Return the constant field and `count` others, by the mobility of each material, zero if rigid."""
     x, y = (_mesh_lines(np.array(cuts), size) for cuts, size in zip(section.cuts, section.size, strict=True))
     middles = [(line[1:] + line[:-1]) / 2 for line in (x, y)]
     material = np.array(section.material)[np.ix_(*section.blocks_at(*middles))]
@@ -175,12 +174,12 @@ def plane_fields(section: Section, mobility: Array, count: int) -> PlaneFields:
     used, rim = np.zeros(shape, bool), np.ones(shape, bool)
     used.ravel()[number[mobility[material] > 0]] = True
     rim[1:-1, 1:-1] = False
-    given, free = (used & rim).ravel(), (used & ~rim).ravel()
+    fixed, free = (used & rim).ravel(), (used & ~rim).ravel()
     outside, order = _rim_fields(section, mobility, nodes, count)
     field = np.zeros((used.size, len(order)))
     field[:, 0] = used.ravel()
-    field[given, 1:] = outside.reshape(used.size, -1)[given]
-    field[free, 1:] = _solved(matrix[free][:, free], matrix[free][:, given] @ -field[given, 1:])
+    field[fixed, 1:] = outside.reshape(used.size, -1)[fixed]
+    field[free, 1:] = _solved(matrix[free][:, free], matrix[free][:, fixed] @ -field[fixed, 1:])
     share = width[:, :, None] * height[:, :, None] * np.outer(_INTEGRAL, _INTEGRAL).ravel()
     at = np.ix_(*map(_places_of_vertices, nodes, section.size))
     return PlaneFields(
@@ -208,19 +207,24 @@ def _mesh_lines(cuts: Array, size: int) -> Array:
         others = fixed[fixed != cut]
         gap = np.abs(graded[:, None] - others).min(axis=1)
         lines.append(graded[gap > _APART * np.abs(graded - cut)])
-    found = np.unique(np.concatenate(lines))
-    return found[np.diff(found, prepend=-np.inf) > _ROUNDING]
+    return _distinct(np.concatenate(lines))
+
+
+def _distinct(places: Array) -> Array:
+    """Return places in ascending order, those within rounding once."""
+    places = np.unique(places)
+    return places[np.diff(places, prepend=-np.inf) > _ROUNDING]
 
 
 def _stiffness(
     number: Index, mobility: Array, width: Array, height: Array, shape: tuple[int, int]
 ) -> csr_array:
     """Return the stiffness matrix of biquadratic elements with nodes `number` (c, d, 9)."""
-    own = mobility > 0
-    along_x, along_y = (mobility * height / width)[own], (mobility * width / height)[own]
+    used = mobility > 0
+    along_x, along_y = (mobility * height / width)[used], (mobility * width / height)[used]
     local = along_x[:, None, None] * _ALONG_X + along_y[:, None, None] * _ALONG_Y
-    rows = np.broadcast_to(number[own][:, :, None], local.shape)
-    columns = np.broadcast_to(number[own][:, None, :], local.shape)
+    rows = np.broadcast_to(number[used][:, :, None], local.shape)
+    columns = np.broadcast_to(number[used][:, None, :], local.shape)
     size = shape[0] * shape[1]
     return csr_array(coo_array((local.ravel(), (rows.ravel(), columns.ravel())), (size, size)))
 
@@ -235,14 +239,13 @@ def _solved(matrix: csr_array, right: Array) -> Array:
 def _rim_fields(section: Section, mobility: Array, nodes: list[Array], count: int) -> tuple[Array, Array]:
     """Return values (nx, ny, count) at the nodes on the rim, and the orders (count + 1,) of all fields.
 
-    They are the smoothest eigenfunctions of the second derivative along the rim, weighted by mobility.
+    The values are the smoothest eigenfunctions of the second derivative along the rim, weighted by mobility.
     """
     (low_x, high_x), (low_y, high_y) = ((each[0], each[-1]) for each in nodes)
     along = [
-        np.unique(np.concatenate((np.arange(low, high + _ROUNDING, _RIM_STEP), cuts)))
+        _distinct(np.concatenate((np.arange(low, high + _ROUNDING, _RIM_STEP), cuts)))
         for low, high, cuts in ((low_x, high_x, section.cuts[0]), (low_y, high_y, section.cuts[1]))
     ]
-    along = [each[np.diff(each, prepend=-np.inf) > _ROUNDING] for each in along]
     wide, tall = high_x - low_x, high_y - low_y
     whole = 2 * (wide + tall)
     up, right = along[0][:-1] - low_x, along[1][:-1] - low_y
@@ -257,8 +260,7 @@ def _rim_fields(section: Section, mobility: Array, nodes: list[Array], count: in
         [np.full_like(middle, low_y), low_y + middle - wide, np.full_like(middle, high_y)],
         high_y - middle + 2 * wide + tall,
     )
-    own = mobility[np.array(section.material)[section.blocks_at(x, y)]]
-    value, order = _smoothest(step, own, count)
+    value, order = _smoothest(step, mobility[np.array(section.material)[section.blocks_at(x, y)]], count)
     at = np.full((len(nodes[0]), len(nodes[1])), np.nan)
     at[0], at[:, -1] = 2 * wide + tall + high_y - nodes[1], wide + tall + high_x - nodes[0]
     at[-1], at[:, 0] = wide + nodes[1] - low_y, nodes[0] - low_x

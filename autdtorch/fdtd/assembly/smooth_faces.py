@@ -1,14 +1,20 @@
 """Elements that one smooth surface between two fluids cuts: local fields and the forces they cause.
 
-The local fields are two coordinates along the surface, and a kinked one, continuous in pressure and flow.
-What flows through a face of the element is distributed to its vertices by what the face alone shows, so that
-two elements sharing it get opposite forces: fields like these cause no net force at any vertex.
+The local fields are two coordinates along the surface, and a kinked one, continuous in pressure and flow. The
+flow through a face of the element is divided among its vertices from that face's data only, so that two
+elements sharing it get opposite forces: such fields cause no net force at any vertex.
 
-With the fields N and their forces G at the vertices, the energies are A = N^T G, and the stiffness is
-G A^-1 G^T + (I - N P)^T S (I - N P), with P = A^-1 G^T and the stiffness in series S. Where the surface bends
-too much, local fields get their energies A alone, with S + C^T (A - N^T S N) C and the projection
-C = (N^T S N)^-1 N^T S. Both are virtual elements (Beirao da Veiga et al. 2013) with the local solutions
-of immersed finite elements (Li 1998).
+N holds the fields at the vertices, G their forces, and S is the stiffness in series. The energies are
+A = N^T G, and the stiffness is
+
+    G A^-1 G^T + (I - N P)^T S (I - N P),    P = A^-1 G^T.
+
+Where the surface bends too much, only the energies A of the local fields are prescribed:
+
+    S + C^T (A - N^T S N) C,    C = (N^T S N)^-1 N^T S.
+
+Both are virtual elements (Beirao da Veiga et al. 2013) with the local solutions of immersed finite elements
+(Li 1998).
 """
 
 from __future__ import annotations
@@ -35,15 +41,15 @@ _LEAST_GRADIENT = 0.5
 _SECOND = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 # Curvature [1/cells] that local solutions follow if only their energies are prescribed
 _LARGEST_CURVATURE = 0.5
-# Forces are those of flat surfaces. Up to this curvature [1/cells], times the square root of the ratio of
+# Forces are exact for flat surfaces. Up to this curvature [1/cells], times the square root of the ratio of
 # densities, they are better than energies; 5 % on either side both are blended.
 _WEAK_CURVATURE, _BLEND = 0.0156, 0.05
-# Between these ratios of densities forces give way to energies: four vertices of a face cannot have all
-# moments, and the energy of the forces would not be positive.
+# Ratios of densities between which energies replace forces: four vertices of a face cannot have all moments,
+# and the energy of the forces would not be positive
 _LARGE_RATIO, _TOO_LARGE = 80.0, 160.0
 _LEAST_ENERGY = 0.01  # Smallest energy of a sum of fields, relative to theirs, that is safely positive
 _MIDDLE = len(LATTICE) // 2  # The centre of an element in the lattice
-# Weight of a vertex for the flow on the other side of a surface: this power of the ratio of densities
+# Weight of a vertex for the flow on the other side of a surface: power of the ratio of densities
 _BESIDE = 0.33
 _SQUARES = 2  # Squares along each side of a face, each of four triangles on which distances are linear
 _SINGULAR = 1e-10  # Relative size of eigenvalues that are rounding
@@ -70,9 +76,8 @@ def _face_geometry() -> tuple[Index, Index]:
     for axis in range(3):
         for end in (0, 1):
             vertices.append(np.flatnonzero(VERTICES[:, axis] == end))
-            own = np.array([each + c for each in np.ndindex((_SQUARES,) * 2) for c in corners])
-            own *= SUBCELLS // _SQUARES
-            points = np.insert(own, axis, end * SUBCELLS, axis=2)
+            plane = np.array([each + c for each in np.ndindex((_SQUARES,) * 2) for c in corners])
+            points = np.insert(plane * (SUBCELLS // _SQUARES), axis, end * SUBCELLS, axis=2)
             triangles.append(points @ ((SUBCELLS + 1) ** 2, SUBCELLS + 1, 1))
     return np.array(vertices), np.array(triangles)
 
@@ -106,7 +111,7 @@ def roughness(level: Array) -> Array:
 
 
 def surfaces(level: Array, density: Array) -> tuple[NDArray[np.bool_], Surface]:
-    """Return which elements (n,) have a surface with one normal, and the surface in these."""
+    """Return the mask (n,) of elements in which the surface has one normal, and the surface in these."""
     fit = level @ _FIT.T
     steep = np.linalg.norm(fit[:, 1:4], axis=1)
     flat = steep > _LEAST_GRADIENT
@@ -165,8 +170,8 @@ def smooth_stiffness(
 ) -> tuple[Array, Array]:
     """Return the coupling (n, 28) of elements with a smooth surface, and the share (n,) of forces in it.
 
-    `mobility` (n, 64) belongs to the sub-cells; `coupling` (n, 28) is
-    in series, and `uniform` (28,) in air.
+    `mobility` (n, 64) is that of the sub-cells, `coupling` (n, 28) the coupling in series, and `uniform`
+    (28,) the coupling in air.
     """
     weight = weight_of_forces(surface)
     total = np.zeros((len(weight), 8, 8))
@@ -183,9 +188,9 @@ def smooth_stiffness(
 
 
 def _with_energies(surface: Surface, mobility: Array, series: Array) -> Array:
-    """Return the stiffness (n, 8, 8) with which the two fields along the surface have their exact energy.
+    """Return the stiffness (n, 8, 8) with the exact energy of the two fields along the surface.
 
-    The third keeps its energy in series.
+    The energy of the third is that in series.
     """
     sharp = np.abs(np.linalg.eigvalsh(surface.bend)).max(axis=1) > _LARGEST_CURVATURE  # edges
     surface = surface._replace(bend=np.where(sharp[:, None, None], 0, surface.bend))
@@ -194,16 +199,16 @@ def _with_energies(surface: Surface, mobility: Array, series: Array) -> Array:
     energy = np.zeros((len(depth), 3, 3))
     energy[:, :2, :2] = np.einsum("nq,nqab,nqcb->nac", mobility, stretch, stretch)
     flow = series @ local
-    own = local.transpose(0, 2, 1) @ flow
-    energy[:, 2, 2] = own[:, 2, 2]
-    projection = np.linalg.solve(own, flow.transpose(0, 2, 1))
-    return np.asarray(series + projection.transpose(0, 2, 1) @ (energy - own) @ projection)
+    in_series = local.transpose(0, 2, 1) @ flow
+    energy[:, 2, 2] = in_series[:, 2, 2]
+    projection = np.linalg.solve(in_series, flow.transpose(0, 2, 1))
+    return np.asarray(series + projection.transpose(0, 2, 1) @ (energy - in_series) @ projection)
 
 
 def _with_forces(surface: Surface, series: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the stiffness (n, 8, 8) with the forces of the local fields, and whether these have an energy.
+    """Return the stiffness (n, 8, 8) with the local fields' forces, and whether their energy is positive.
 
-    All other fields keep their energy in series.
+    The energy of all other fields is that in series.
     """
     local, force = fields(surface), forces(surface)
     force = force - force.mean(axis=1, keepdims=True)  # the curvature alone leaves a sum
@@ -291,25 +296,25 @@ def _flow(surface: Surface, axis: int, place: Array, depth: Array, side: Index) 
 
 
 def _distributed(near: Array, moments: Array, total: Array, local: Array, weight: Array) -> Array:
-    """Return forces (n, 4, 3) near given ones, with exact totals (n, 3) and as exact moments as possible.
+    """Return forces (n, 4, 3) close to `near`, with exact totals (n, 3) and as exact moments as possible.
 
-    `moments` (n, 3, 3) are those of the flow of each second field with each first, and `local` (n, 4, 3) the
-    fields at the vertices. Four forces cannot have all moments where the values of two fields are the same
-    at the vertices. The rest of the moments is symmetric, so that forces remain those of an energy.
+    Entry (a, b) of `moments` (n, 3, 3) is the moment of the flow of field b with field a, and `local` (n, 4,
+    3) are the fields at the vertices. Four forces cannot have all moments where two fields are equal at the
+    vertices. Their antisymmetric part is exact, so that the forces belong to an energy.
     """
     square = local @ local.transpose(0, 2, 1)
     square[:, range(4), range(4)] += weight
     inverse = np.linalg.inv(square)
-    found = inverse @ (weight[:, :, None] * near + local @ moments)
-    rules, goal = np.zeros((len(near), 6, 4, 3)), np.zeros((len(near), 6))
+    fitted = inverse @ (weight[:, :, None] * near + local @ moments)
+    rules, exact = np.zeros((len(near), 6, 4, 3)), np.zeros((len(near), 6))
     rules[:, range(3), :, range(3)] = 1
-    goal[:, :3] = total
+    exact[:, :3] = total
     for number, (one, other) in enumerate(((0, 1), (0, 2), (1, 2)), start=3):
         rules[:, number, :, other] = local[:, :, one]
         rules[:, number, :, one] = -local[:, :, other]
-        goal[:, number] = moments[:, one, other] - moments[:, other, one]
-    gap = goal - np.einsum("nril,nil->nr", rules, found)
+        exact[:, number] = moments[:, one, other] - moments[:, other, one]
+    gap = exact - np.einsum("nril,nil->nr", rules, fitted)
     moved = np.einsum("nij,nrjl->nril", inverse, rules)
     gram = np.einsum("nril,nsil->nrs", rules, moved, optimize=True)
     factors = np.linalg.pinv(gram, rcond=_SINGULAR, hermitian=True) @ gap[:, :, None]
-    return np.asarray(found + np.einsum("nril,nr->nil", moved, factors[:, :, 0]))
+    return np.asarray(fitted + np.einsum("nril,nr->nil", moved, factors[:, :, 0]))
