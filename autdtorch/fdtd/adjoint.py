@@ -1,12 +1,13 @@
 """Gradients of receiver records, by an adjoint run of any kernel (`docs/decisions/gradients.md`).
 
-The derivatives lambda of a loss by all forces come from a run of the same kernel, driven in the receivers'
-cells by the loss's derivatives over the masses, last step first, and read times the masses:
+The derivatives lambda of a loss by all forces come from an adjoint run of the same kernel, last step first.
+It is driven in the receivers' cells by the derivatives of the loss by their record, divided by the masses,
+and its pressures are multiplied by the masses:
 
     dL / d force_is  = sum_t lambda_i(t) signal_s(t)
     dL / d weight_ij = sum_t lambda_i(t) (p_j(t) - p_i(t)).
 
-The second sum needs the run itself in reverse. Its state is kept at the beginning of segments, which are
+The second sum needs the run itself in reverse. Its state is stored at the beginning of segments, which are
 stepped again with the heterogeneous cells and their neighbours as receivers.
 """
 
@@ -28,7 +29,7 @@ from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.utils.threads import spread
 
-# Memory [bytes] of the record of a segment; larger only where the states kept would take more
+# Memory [bytes] of the record of a segment; larger only where the stored states would take more
 _SEGMENT_BYTES = 128 * 2**20
 _CHUNK = 1000  # Cells whose derivatives are summed at a time
 _ROUNDING = 4  # Singular values below this many roundings of the largest are zero
@@ -91,8 +92,8 @@ class _Run:
         amplitude = (size[:rank, None] * right[:rank]).T
         cells, place = torch.unique(self.receivers.index, return_inverse=True)
         force = torch.zeros((len(cells), rank), dtype=slope.dtype, device="cpu")
-        for point, weight, own in zip(place, self.receivers.weight, amplitude, strict=True):
-            force.index_add_(0, point, weight[:, None] * own)
+        for point, weight, size_of in zip(place, self.receivers.weight, amplitude, strict=True):
+            force.index_add_(0, point, weight[:, None] * size_of)
         return Sources(cells, force / self.mass(cells)[:, None]), signal.flip(0)
 
 
@@ -100,7 +101,7 @@ class _Run:
 class _Neighbourhood:
     """The heterogeneous cells outside the layers, and the cells whose field their derivatives need."""
 
-    own: Tensor  # mask of these among the heterogeneous cells
+    mask: Tensor  # of these among the heterogeneous cells
     index: Tensor  # their flat indices (n,)
     cells: Tensor  # flat indices of these, of their neighbours and of the receivers (k,), ascending
     offsets: Tensor  # flat offsets to the neighbours (27,)
@@ -109,14 +110,14 @@ class _Neighbourhood:
     @classmethod
     def of(cls, run: _Run) -> _Neighbourhood:
         grid, heterogeneous = run.assembly.grid, run.assembly.coefficients.heterogeneous_index
-        own = torch.from_numpy(grid.inside(heterogeneous.numpy()))
-        index, offsets = heterogeneous[own], torch.from_numpy(flat_offsets(grid.shape))
+        mask = torch.from_numpy(grid.inside(heterogeneous.numpy()))
+        index, offsets = heterogeneous[mask], torch.from_numpy(flat_offsets(grid.shape))
         used = torch.zeros(math.prod(grid.shape), dtype=torch.bool, device="cpu")
         used[run.receivers.index] = True
         for offset in offsets:
             used[index + offset] = True
         points = Interpolation(run.receivers.index.numpy(), run.receivers.weight.numpy())
-        return cls(own, index, used.nonzero().reshape(-1), offsets, points)
+        return cls(mask, index, used.nonzero().reshape(-1), offsets, points)
 
     def received(self, field: Tensor) -> Tensor:
         """Return the record of the receivers (steps, R) from the field in the cells (steps, k)."""
@@ -141,7 +142,7 @@ class _Recorded(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, force: Tensor, weight: Tensor, run: _Run) -> Tensor:
-        """Record, and keep the states at the cuts where derivatives by the weights are needed."""
+        """Record, and store the states at the cuts where derivatives by the weights are needed."""
         sources, steps = Sources(run.driven, force.detach()), len(run.signal)
         state = run.assembly.silence(sources)
         ctx.run, ctx.sources, ctx.around, ctx.cuts = run, sources, None, [0, steps]
@@ -188,12 +189,12 @@ class _Recorded(torch.autograd.Function):
         if around is None:
             return by_force, None, None
         by_weight = torch.zeros_like(run.assembly.coefficients.heterogeneous_weight)
-        by_weight[around.own] = by_row
+        by_weight[around.mask] = by_row
         return by_force, by_weight, None
 
 
 def _cuts(steps: int, state: State, cells: int) -> list[int]:
-    """Return the ends of segments. Their record and the states kept take least memory at a root's length."""
+    """Return the ends of segments, with least memory for the record of one and the stored states."""
     numbers = 2 * state.now.numel() + sum(part.numel() for layer in state.memory for part in layer)
     fitting = _SEGMENT_BYTES / (cells * state.now.element_size())
     least = math.sqrt(steps * numbers / (2 * cells))

@@ -6,17 +6,17 @@ g = 1 / (1 + sigma / (alpha - i w)). In time this takes two memory variables (CP
 
     psi  <- b psi  + a (u[l+1] - u[l])                      between the cells
     zeta <- b zeta + a (u[l+1] - 2 u[l] + u[l-1] + psi[l+1/2] - psi[l-1/2])        at the cells
-    d2 u becomes d2 u + psi[l+1/2] - psi[l-1/2] + zeta.
+    d2 u <- d2 u + psi[l+1/2] - psi[l-1/2] + zeta.
 
-With E_a u the term that the layer adds to d2 u, T_a + E_a replaces every sum T_a of the two neighbours along
-axis a in the 27-point sum, in products too: the exact complex stretching of the *discrete* equation, edges
-and corners of the grid included (`docs/decisions/boundary-layer.md`).
+E_a u is the term that the layer adds to d2 u. In the 27-point sum, T_a + E_a replaces every sum T_a of the
+two neighbours along axis a, in products too. This is the exact complex stretching of the *discrete* equation,
+edges and corners of the grid included (`docs/decisions/boundary-layer.md`).
 
 A layer repeats the cells that it touches, so the stencil row of a cell is constant along the layer's normal.
-The kernels stretch rows as in air, scaled to the sum of the cell's own weights: exact inside an obstacle. The
-difference of a row at an interface from that is stretched here, by column, with a memory of its own. Where
-two layers meet, the difference has a part in the product of both stretchings: columns of one layer cross
-those of the other and add to their sums. Without it, waves along interfaces grow.
+The kernels stretch rows as in air, scaled to the sum of the cell's weights: exact inside an obstacle. At an
+interface the difference of a row from that is stretched here, by column, with a separate memory. Where two
+layers meet, the difference has a part in the product of both stretchings: columns of one layer cross columns
+of the other and add to their sums. Without it, waves along interfaces grow.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from autdtorch.utils.array_types import Array, Index
 
 # Angles of incidence at which the profile is fitted [rad]
 TUNED_ANGLES = np.radians((0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 55.0, 60.0, 65.0, 70.0, 75.0, 80.0))
-# Strength and order of the power-law profiles that the fit starts from; the better result is kept
+# Strength and order of the power-law profiles that the fit starts from; the better result is used
 _STARTS = ((10.0, 1.5), (20.0, 2.5))
-# Frequency shift alpha over w. At frequencies above alpha a layer gives energy to evanescent waves, so that a
-# small shift lets the near field of a light obstacle grow. The fit alone would choose 0.01, which returns ten
-# times as much; 0.3 would cost 16 dB of reflection.
+# Frequency shift alpha over w. At frequencies above alpha a layer gives energy to evanescent waves: with a
+# small shift the near field of a light obstacle grows. The fit alone would choose 0.01, which gives ten times
+# as much energy; 0.3 would cost 16 dB of reflection.
 _SHIFT = 0.1
 _DIFFERENCE = 1e-7  # Step of the logarithms of the damping, for numerical derivatives
 _BOUNDS = (-14.0, 6.0)  # Range of the logarithms of the damping over w: from none to opaque
@@ -82,10 +82,10 @@ def reflection(profile: LayerProfile, along: Array, turn: Array) -> NDArray[np.c
     matrix[..., cells + 1, cells - 1] = 1
     matrix[..., cells + 1, cells] = -2 * np.cos(along)
     matrix[..., cells + 1, cells + 1] = np.exp(1j * along)
-    known = np.zeros((len(along), cells + 2, 1), complex)
-    known[:, cells, 0] = 1
-    known[:, cells + 1, 0] = -np.exp(-1j * along)
-    return np.asarray(np.linalg.solve(matrix, known)[..., -1, 0], np.complex128)
+    right = np.zeros((len(along), cells + 2, 1), complex)
+    right[:, cells, 0] = 1
+    right[:, cells + 1, 0] = -np.exp(-1j * along)
+    return np.asarray(np.linalg.solve(matrix, right)[..., -1, 0], np.complex128)
 
 
 @lru_cache(maxsize=64)

@@ -21,8 +21,8 @@ from autdtorch.utils.validation import invalid, positive
 logger = logging.getLogger(__name__)
 
 MIN_CELLS_PER_WAVELENGTH = 3.0  # Fewest cells per wavelength; coarser grids are refused
-# Fewest cells per wavelength without a warning. Below, points would need interpolation over more than 10
-# cells a side, and the layer reflects more than -61 dB.
+# Fewest cells per wavelength without a warning. On coarser grids points would need interpolation over more
+# than 10 cells a side, and the layer reflects more than -61 dB.
 FAIR_CELLS_PER_WAVELENGTH = 4.0
 # Most cells per wavelength. The fit of the boundary layer starts within its bounds up to about 700.
 MAX_CELLS_PER_WAVELENGTH = 500
@@ -35,11 +35,11 @@ AROUND = 5
 # 60 degrees is below -68 dB (-82 dB from 8.5 cells per wavelength on); of coarser grids -66 dB at 4.25 cells
 # and -32 dB at 3.
 FINE_LAYER_CELLS, COARSE_LAYER_CELLS = 6, 8
-# Cells by which the layer of a box is thinner, and the longest side of its bodies [wavelengths]. What it
-# reflects of the scattered field is then a small part of the error: at 1 mm 0.11 to 0.12 % for the paper's
-# three cubes, 0.45 % as before for a rigid sphere. In the shadow of a larger body incident and scattered
-# field cancel: behind a plate of 0.1 m, 12 wavelengths, the error at 1 mm falls from 1.1 to 0.3 % with the
-# whole layer.
+# Cells by which the layer of a box is thinner, up to a longest side of its bodies [wavelengths]. Its
+# reflection of the scattered field is then a small part of the error: at 1 mm it raises 0.11 to 0.12 % for
+# the paper's three cubes, and leaves 0.45 % for a rigid sphere. In the shadow of a larger body incident and
+# scattered field cancel: behind a plate of 0.1 m, 12 wavelengths, the error at 1 mm is 1.1 %, and 0.3 % with
+# the whole layer.
 _THINNER, _SMALL_BODIES = 2, 4
 RATIO = 1.5  # Ratio of the spacings of the two grids: the coarser costs a fifth of the finer
 
@@ -188,7 +188,7 @@ def _covering(region: Region, spacing: float, extent: Extent) -> Grid:
 
 
 def require_fine(speeds: Mapping[str, float], frequency: float, spacing: float) -> None:
-    """Check that a spacing [m] resolves sound speeds [m/s], given by where they are."""
+    """Check that a spacing [m] resolves sound speeds [m/s] by place."""
     for where, speed in speeds.items():
         coarsest = speed / frequency / MIN_CELLS_PER_WAVELENGTH
         if spacing > coarsest:
@@ -197,7 +197,7 @@ def require_fine(speeds: Mapping[str, float], frequency: float, spacing: float) 
 
 
 def warn_if_coarse(speeds: Mapping[str, float], frequency: float, spacing: float) -> None:
-    """Log where a spacing [m] is coarse for sound speeds [m/s], given by where they are."""
+    """Log the places where a spacing [m] is coarse for sound speeds [m/s] by place."""
     places: dict[float, list[str]] = {}
     for where, speed in speeds.items():
         if spacing > speed / frequency / FAIR_CELLS_PER_WAVELENGTH:

@@ -1,7 +1,7 @@
-"""The error of a grid, as other grids and the uncertain surfaces of bodies tell it.
+"""The error of a grid, estimated from other grids and from the uncertain surfaces of bodies.
 
-Which of two grids is nearer the truth is a matter of chance; the estimate is the geometric mean over two of
-them, where there are two, and of what such a grid usually errs by.
+Chance decides which of two grids is nearer the truth. The estimate is the geometric mean of the errors that
+up to two other grids show and of the usual error of such a grid.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import SILENCE
 
 _WEIGHT = 0.2  # of the logarithm of the usual error: grids may agree by chance
-_MOST_APART = 10.0  # Largest ratio to it for which it has this weight; beyond, it counts as if so far apart
-_LEAST = 0.37  # Share of the usual error that is claimed at least
-_COMPARED = 2  # Other grids that count: those before, which may be too coarse for the scene, do not
+_MOST_APART = 10.0  # Largest ratio of the two errors: a usual error farther away is moved to this ratio
+_LEAST = 0.37  # Least error that is claimed, relative to the usual one
+_COMPARED = 2  # Last other grids that count: earlier ones may be too coarse for the scene
 _TINY = torch.finfo(torch.float64).tiny
 
 
@@ -27,8 +27,8 @@ _TINY = torch.finfo(torch.float64).tiny
 class Law:
     """The growth of errors with the spacing, for a shortest wavelength [m].
 
-    Along faces parallel to the grid they are mostly those of the stencil, of fourth order; where cells cut
-    faces, the part of second order is larger.
+    At faces parallel to the grid the stencil's error, of fourth order, dominates. Where faces cut cells, the
+    part of second order is larger.
     """
 
     wavelength: float
@@ -53,7 +53,7 @@ class Law:
         return share**2 * (1 + (share / self._equal) ** 2)
 
     def spacing_of(self, wanted: float) -> float:
-        """Return the spacing [m] whose `growth` is as `wanted`."""
+        """Return the spacing [m] whose `growth` is `wanted`."""
         square = (math.sqrt(1 + 4 * wanted / self._equal**2) - 1) / 2
         return self._equal * math.sqrt(square) * self.wavelength
 
@@ -80,7 +80,7 @@ def grid_errors(
 def errors_by_grids(
     matrix: Tensor, free: Tensor, spacing: float, others: Sequence[tuple[Tensor, float]], law: Law
 ) -> Tensor:
-    """Return the errors (P,) that other grids tell; see `grid_errors`."""
+    """Return the errors (P,) from other grids alone; see `grid_errors`."""
     size, logarithms = sizes(matrix, free), []
     for other, coarser in others[-_COMPARED:]:
         difference = (matrix - other).norm(dim=1) / size
@@ -90,7 +90,7 @@ def errors_by_grids(
 
 
 def shape_errors(matrix: Tensor, free: Tensor, region: Region) -> Tensor:
-    """Return the relative errors (P,) of the rows of a matrix (P, M) as its bodies' surfaces are uncertain.
+    """Return the relative errors (P,) of the rows of a matrix (P, M) due to uncertain surfaces of bodies.
 
     A surface off by a distance d turns the phase of what it scatters by up to 2 k d.
     """
@@ -99,12 +99,13 @@ def shape_errors(matrix: Tensor, free: Tensor, region: Region) -> Tensor:
     return errors
 
 
-def hardening_errors(matrix: Tensor, free: Tensor, region: Region) -> Tensor:
-    """Return the relative errors (P,) of the rows of a matrix (P, M) as heavy bodies are taken as sound-hard.
+def rigid_errors(matrix: Tensor, free: Tensor, region: Region) -> Tensor:
+    """Return the relative errors (P,) of the rows of a matrix (P, M) due to heavy bodies taken as rigid.
 
-    What passes them is known relative to the field in free space (P, M); in their shadow it is much of it.
+    The sound through them is known relative to the field in free space (P, M). In their shadow it is a large
+    part of the field.
     """
-    passing = math.hypot(*(body.hardening for body in region.bodies))
+    passing = math.hypot(*(body.rigid_error for body in region.bodies))
     errors: Tensor = passing * free.norm(dim=1) / sizes(matrix, free)
     return errors
 
@@ -112,7 +113,7 @@ def hardening_errors(matrix: Tensor, free: Tensor, region: Region) -> Tensor:
 def _scattered(matrix: Tensor, free: Tensor) -> Tensor:
     """Return the share (P,) of the scattered field in rows of a matrix (P, M), at most 1.
 
-    In a shadow more of it only cancels the field in free space (P, M), wherever the surface is.
+    In a shadow the rest of it cancels the field in free space (P, M), wherever the surface is.
     """
     scattered = torch.minimum((matrix - free).norm(dim=1), matrix.norm(dim=1))
     share: Tensor = scattered / sizes(matrix, free)

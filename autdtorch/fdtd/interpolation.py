@@ -59,8 +59,8 @@ def exclude_cells(
 ) -> Interpolation:
     """Return kernels of points at `cells` (P, 3) without the `excluded` cells (P, n), fitted to the others.
 
-    The fit covers all waves up to the drive's wavenumber. Points with no cell left next to them get no
-    weight.
+    The fit covers all waves up to the drive's wavenumber. Points get no weight if all cells next to them are
+    excluded.
     """
     rows = np.flatnonzero(excluded.any(axis=1))
     if len(rows) == 0:
@@ -104,14 +104,13 @@ def average_nodes(nodes: Interpolation, share: Array) -> Interpolation:
     index = nodes.index.reshape(-1, len(share) * nodes.index.shape[1])
     weight = (share[:, None] * nodes.weight.reshape(len(index), len(share), -1)).reshape(index.shape)
     groups = []
-    for own, parts in zip(index, weight, strict=True):
-        unique, place = np.unique(own, return_inverse=True)
+    for cells, parts in zip(index, weight, strict=True):
+        unique, place = np.unique(cells, return_inverse=True)
         groups.append((unique, np.bincount(place, parts)))
     most = max(len(unique) for unique, _ in groups)
-    cells = [np.pad(own, (0, most - len(own)), constant_values=own[0]) for own, _ in groups]
-    return Interpolation(
-        np.stack(cells), np.stack([np.pad(sums, (0, most - len(sums))) for _, sums in groups])
-    )
+    padded = [np.pad(unique, (0, most - len(unique)), constant_values=unique[0]) for unique, _ in groups]
+    sums = [np.pad(sums, (0, most - len(sums))) for _, sums in groups]
+    return Interpolation(np.stack(padded), np.stack(sums))
 
 
 def interpolate_points(

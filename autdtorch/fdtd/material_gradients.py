@@ -1,10 +1,10 @@
 """Heterogeneous cells that are differentiable by materials: of obstacles, or of maps of the domain.
 
 For obstacles the derivatives are central differences of the whole assembly. Maps are differentiated by
-autograd. On a map the coupling of two cells has both densities in series, 2 / (rho_i + rho_j), and a cell the
-mass 1 / (rho_i f_i), with density and speed factor f as in `assembly/elements.py`. Uniform maps give the
-stencil rows of an obstacle of that material; surfaces are staircases half-way between two cells, and
-densities are scaled for these.
+autograd. On a map the coupling of two cells is that of both densities in series, 2 / (rho_i + rho_j). The
+mass of a cell is 1 / (rho_i f_i), with density and speed factor f as in `assembly/unions.py`. Uniform maps
+give the stencil rows of an obstacle of that material. Surfaces are staircases half-way between two cells, for
+which densities are scaled.
 """
 
 from __future__ import annotations
@@ -48,9 +48,10 @@ class DifferentiableCells:
 
     def driven(self, sources: Sources) -> Sources:
         """Return the assembly's sources, differentiable also by the mass of the cells they are in."""
-        _, place, own = np.intersect1d(self.heterogeneous.index, sources.index.numpy(), return_indices=True)
+        index = self.heterogeneous.index
+        _, place, driven = np.intersect1d(index, sources.index.numpy(), return_indices=True)
         share = torch.ones(len(sources.index), dtype=self.mass.dtype, device="cpu")
-        share[own] = torch.from_numpy(self.heterogeneous.mass[place]) / self.mass[place]
+        share[driven] = torch.from_numpy(self.heterogeneous.mass[place]) / self.mass[place]
         return Sources(sources.index, share.to(sources.force)[:, None] * sources.force)
 
 
@@ -59,9 +60,9 @@ def cells_of_obstacles(
 ) -> DifferentiableCells:
     """Return the cells of K bodies, differentiable by density and sound speed (K,); rigid ones are not."""
     stencil = air_stencil(grid, region)
-    given = {"density": density, "sound_speed": sound_speed}
-    base = _assembled(region, grid, stencil, given)
-    differences = list(_differences(region, grid, stencil, given))
+    materials = {"density": density, "sound_speed": sound_speed}
+    base = _assembled(region, grid, stencil, materials)
+    differences = list(_differences(region, grid, stencil, materials))
     every = [base.index, *(cells.index for _, _, sides in differences for cells in sides)]
     index = np.unique(np.concatenate(every))
     weight, mass = (torch.from_numpy(part) for part in _on(index, base, stencil))
@@ -80,10 +81,10 @@ def cells_of_obstacles(
 
 
 def _differences(
-    region: Region, grid: Grid, stencil: Stencil, given: dict[str, Tensor | None]
+    region: Region, grid: Grid, stencil: Stencil, materials: dict[str, Tensor | None]
 ) -> Iterator[tuple[Tensor, float, list[HeterogeneousCells]]]:
     """Yield each number that requires gradients, a step, and the cells for the number plus and minus it."""
-    for name, values in given.items():
+    for name, values in materials.items():
         if values is None or not values.requires_grad:
             continue
         for number in (number for number, body in enumerate(region.bodies) if body.fluid is not None):
@@ -91,20 +92,20 @@ def _differences(
             for way in (1, -1):
                 moved = values.detach().clone()
                 moved[number] += way * step
-                sides.append(_assembled(region, grid, stencil, given | {name: moved}))
+                sides.append(_assembled(region, grid, stencil, materials | {name: moved}))
             yield values[number], step, sides
 
 
 def _assembled(
-    region: Region, grid: Grid, stencil: Stencil, given: dict[str, Tensor | None]
+    region: Region, grid: Grid, stencil: Stencil, materials: dict[str, Tensor | None]
 ) -> HeterogeneousCells:
-    """Assemble a region whose K bodies have the densities (K,) and sound speeds (K,) given."""
+    """Assemble a region whose K bodies have other densities (K,) and sound speeds (K,)."""
     bodies = list(region.bodies)
     for number, body in enumerate(bodies):
         if body.fluid is not None:
             density, sound_speed = (
-                own if values is None else values[number].item()
-                for own, values in zip(body.fluid, given.values(), strict=True)
+                usual if values is None else values[number].item()
+                for usual, values in zip(body.fluid, materials.values(), strict=True)
             )
             bodies[number] = replace(body, fluid=Fluid(*fluid(f"obstacles[{number}]", density, sound_speed)))
     changed = replace(region, bodies=tuple(bodies))
@@ -112,7 +113,7 @@ def _assembled(
 
 
 def _on(index: Index, cells: HeterogeneousCells, stencil: Stencil) -> tuple[Array, Array]:
-    """Return stencil rows (n, 27) and mass (n,) of `index` (n,), which holds `cells` and cells of air."""
+    """Return stencil rows (n, 27) and mass (n,) at `index` (n,), which has `cells` and cells of air."""
     weight, mass = np.tile(stencil.weights, (len(index), 1)), np.ones(len(index))
     place = np.searchsorted(index, cells.index)
     weight[place], mass[place] = cells.weight, cells.mass
@@ -120,7 +121,7 @@ def _on(index: Index, cells: HeterogeneousCells, stencil: Stencil) -> tuple[Arra
 
 
 def domain_cells(region: Region, grid: Grid) -> tuple[slice, ...]:
-    """Return the cells of the domain along each axis, which maps are given for."""
+    """Return the cells of the domain along each axis, the shape of maps."""
     margin = domain_extent(region, grid.spacing).margin
     return tuple(slice(a + margin, b - margin) for a, b in zip(grid.first, grid.last, strict=True))
 
@@ -131,27 +132,27 @@ def cells_of_maps(
     """Return the heterogeneous cells of maps (nx, ny, nz) of density [kg/m^3] and sound speed [m/s]."""
     cells = domain_cells(region, grid)
     shape = tuple(part.stop - part.start for part in cells)
-    for name, given in (("density", density), ("sound_speed", sound_speed)):
-        if given is not None and given.shape != shape:
-            raise ValueError(f"{name}: shape {tuple(given.shape)}; must be {shape}, the cells of the domain")
+    for name, values in (("density", density), ("sound_speed", sound_speed)):
+        if values is not None and values.shape != shape:
+            raise ValueError(f"{name}: shape {tuple(values.shape)}; must be {shape}, the cells of the domain")
     stencil = air_stencil(grid, region)
     air = torch.ones(shape, **REAL)
     relative = air if density is None else density / region.fluid.density
     speed = air if sound_speed is None else sound_speed / region.fluid.sound_speed
     # the impedance of a face half-way between two cells is off by tan(k / 2) / (k / 2)
-    half, own = stencil.kappa / 2, stencil.kappa / 2 / speed
-    relative = relative / (math.tan(half) / half * own / torch.tan(own))
+    outer, inner = stencil.kappa / 2, stencil.kappa / 2 / speed
+    relative = relative / (math.tan(outer) / outer * inner / torch.tan(inner))
     fluidity = relative * _speed_factor(stencil, speed)
     weight, mass = _rows(stencil, relative, fluidity)
     axes = [np.arange(part.start - 1, part.stop + 1) for part in cells]
     index = np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), grid.shape).ravel()
     nothing = np.zeros(0, np.int64)
-    values = weight.detach().numpy(), mass.detach().numpy()
-    return DifferentiableCells(HeterogeneousCells(index, *values, nothing, nothing, nothing), weight, mass)
+    numbers = weight.detach().numpy(), mass.detach().numpy()
+    return DifferentiableCells(HeterogeneousCells(index, *numbers, nothing, nothing, nothing), weight, mass)
 
 
 def _speed_factor(stencil: Stencil, speed_ratio: Tensor) -> Tensor:
-    """Return `elements.speed_factor` for each cell: cos(k . n) averages to sin(|k n|) / |k n|."""
+    """Return `unions.speed_factor` for each cell: cos(k . n) averages to sin(|k n|) / |k n|."""
     wave = complex(stencil.kappa, stencil.eta) / speed_ratio
     symbol = torch.zeros_like(speed_ratio)
     for count, weight, length in (
@@ -166,8 +167,8 @@ def _rows(stencil: Stencil, density: Tensor, fluidity: Tensor) -> tuple[Tensor, 
     density, fluidity = (
         torch.nn.functional.pad(part, (_RIM,) * 6, value=1.0) for part in (density, fluidity)
     )
-    own, weight = (slice(1, -1),) * 3, []
+    middle, weight = (slice(1, -1),) * 3, []
     for coupling, offset in zip(stencil.weights, OFFSETS, strict=True):
         beside = tuple(slice(1 + step, step - 1 or None) for step in offset)
-        weight.append(2 * coupling * fluidity[own] / (density[own] + density[beside]))
-    return torch.stack(weight, dim=-1).reshape(-1, 27), (1 / fluidity[own]).reshape(-1)
+        weight.append(2 * coupling * fluidity[middle] / (density[middle] + density[beside]))
+    return torch.stack(weight, dim=-1).reshape(-1, 27), (1 / fluidity[middle]).reshape(-1)

@@ -1,10 +1,10 @@
 """Placement of the grid: axis-aligned faces lie about half-way between cell centres where possible.
 
-Elements at faces and edges are accurate to second order wherever these fall (`assembly/prisms.py`). What is
-left is least for a face 0.45 cells behind the last centre: 0.1 % of the field for a rigid cube at 1 mm, 0.5 %
-at 0.1 cells and 1 % at 0.9. A slit narrower than a cell needs a layer of centres in it: without a pressure of
-its own it is closed. Among similar placements the grid takes a symmetric one: a symmetric scene needs fewer
-runs (`fdtd/symmetry.py`).
+Elements at faces and edges are accurate to second order wherever these fall (`assembly/prisms.py`). The
+remaining error is least for a face 0.45 cells behind the last centre: 0.1 % of the field for a rigid cube at
+1 mm, 0.5 % at 0.1 cells and 1 % at 0.9. A slit narrower than a cell is open only if it contains a layer of
+centres. Among similar placements the grid takes a symmetric one: a symmetric scene needs fewer runs
+(`symmetry.py`).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _WORTHWHILE = 0.9  # Error of an asymmetric placement, relative to the symmetric
 # Additional distance from the best place [cells, rms] allowed to a symmetric grid if the faces are symmetric:
 # a fifth of the largest. `docs/decisions/runs.md` has the errors.
 _ALLOWANCE = 0.1
-_NARROWER = 0.2  # Distance by which faces that stand for a slender cylinder are within it [cells]
+_NARROWER = 0.2  # Distance of the faces that represent a slender cylinder from its surface [cells]
 _BEST = 0.45  # Best distance of a face behind the last centre [cells]
 _CLOSED = 1.0  # Square error of the faces of a slit without a centre in it
 
@@ -51,8 +51,8 @@ def grid_offset(
 def _flat_surface(shape: Shape, spacing: float) -> tuple[Array, Array]:
     """Return the first corners (n, 3) [m] of triangles, and their outward normals of twice their area.
 
-    Of a slender cylinder these are the faces of a narrower cuboid in it: half a cell thick, it has no centre
-    in it yet.
+    A slender cylinder has the faces of a narrower cuboid in it: half a cell thick, it has no centre in it
+    yet.
     """
     vertices, triangles = (part.numpy() for part in shape.surface())
     if slender_faces(vertices / spacing) is None:
@@ -84,8 +84,8 @@ def _faces(region: Region, surfaces: list[tuple[Array, Array]], axis: int, origi
         first = -outward if heavier else outward
         parts.append(np.stack((place - origin, first, double[aligned] / 2))[:, inside])
     place, first, area = np.concatenate(parts, axis=1)
-    faces, own = np.unique(np.stack((place.round(9), first)), axis=1, return_inverse=True)
-    return np.vstack((faces, np.bincount(own.ravel(), area, faces.shape[1])))
+    faces, number = np.unique(np.stack((place.round(9), first)), axis=1, return_inverse=True)
+    return np.vstack((faces, np.bincount(number.ravel(), area, faces.shape[1])))
 
 
 def _axis_offset(faces: Array, transducers: Array, length: float, spacing: float) -> float:
@@ -114,7 +114,7 @@ def _axis_offset(faces: Array, transducers: Array, length: float, spacing: float
 
 
 def _slits(cells: Array, first: Array) -> Index:
-    """Return the pairs (s, 2) of faces around slits narrower than a cell, given places [cells] and sides."""
+    """Return the pairs (s, 2) of faces, by places [cells] and sides, around slits narrower than a cell."""
     order = np.argsort(cells, kind="stable")
     before, behind = order[:-1], order[1:]
     width = cells[behind] - cells[before]

@@ -50,11 +50,10 @@ class Body:
     """A shape of one material."""
 
     shape: Shape
-    fluid: Fluid | None  # its material, None where it is sound-hard
+    fluid: Fluid | None  # its material, None if it is rigid
     continued: bool = False  # whether it continues through the boundary layers instead of ending before them
     uncertainty: float = 0.0  # distance [m] by which its surface may be off (rms)
-    # relative difference of the field that comes from taking its material as sound-hard, in front of it
-    hardening: float = 0.0
+    rigid_error: float = 0.0  # relative difference of the field in front of it, of a body taken as rigid
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,12 +91,12 @@ class Region:
 
     @property
     def walls(self) -> list[Shape]:
-        """Shapes of the sound-hard bodies."""
+        """Shapes of the rigid bodies."""
         return [body.shape for body in self.bodies if body.fluid is None]
 
     @property
     def sound_speeds(self) -> dict[str, float]:
-        """Sound speeds [m/s] by where they are, for messages."""
+        """Sound speeds [m/s] by place, for messages."""
         fluids = {f"obstacle {index}": body.fluid for index, body in enumerate(self.bodies)}
         everywhere = {"the medium": self.fluid} | fluids
         return {where: fluid.sound_speed for where, fluid in everywhere.items() if fluid}

@@ -1,7 +1,7 @@
 """The scattered field in a box: driven in heterogeneous cells, radiated from a Huygens surface.
 
-With p = p_inc + p_scat and p_inc the exact field in free space, the scheme leaves the force
-sum_j (w_ij - w_air) (p_inc,j - p_inc,i) on p_scat in heterogeneous cells. Around them chi steps from 1 to 0
+The pressure is p_inc + p_scat, with the exact field p_inc in free space. In heterogeneous cells the scheme
+then drives p_scat by the force sum_j (w_ij - w_air) (p_inc,j - p_inc,i). Around them chi steps from 1 to 0
 between two cells of air. The cells there radiate sum_j w_ij (chi_j - chi_i) p_scat,j by the exact Green's
 function: the sources of a field that is p_scat outside and zero inside (a discrete Huygens surface).
 """
@@ -48,7 +48,7 @@ class ScatteredField:
         return self.positions(self._driven[0])
 
     def sources(self, field: Tensor) -> Sources:
-        """Return the forces of an incident field, given (n,) at the `driven` positions."""
+        """Return the forces of an incident field (n,) at the `driven` positions."""
         assembly = self.assembly
         incident = field.numpy()[self._driven[1]]
         step = incident - incident[:, 13, None]
@@ -68,8 +68,8 @@ class ScatteredField:
     def incident(self, points: Tensor, sources: Apertures, strength: Tensor, nearest: float = 0.0) -> Tensor:
         """Return the incident field (P,) at points (P, 3) [m] of sources with strengths (N,) [Pa m]."""
         far = sources.far_from(points, self.wavenumber)
-        near, own = sources.chosen(~far), strength[~far]
-        amplitude = own.repeat_interleave(len(near.weights)) * near.weights.repeat(len(own))
+        near, of_near = sources.chosen(~far), strength[~far]
+        amplitude = of_near.repeat_interleave(len(near.weights)) * near.weights.repeat(len(of_near))
         field = self.waves(points, near.positions.reshape(-1, 3), amplitude[:, None], nearest)[:, 0]
         if far.any():
             field = field + self.waves(points, sources.chosen(far).discs, strength[far, None])[:, 0]
@@ -95,7 +95,7 @@ class ScatteredField:
         return self.waves(points, self.surface[0], amplitude)
 
     def inside(self, points: Tensor) -> Tensor:
-        """Return which points (..., 3) are read from the grid; others are clear of the Huygens surface."""
+        """Return the mask of points (..., 3) read from the grid; others are clear of the Huygens surface."""
         grid = self.assembly.grid
         cells = torch.from_numpy(grid.to_cells(self._on_axes(points)))
         first, last = torch.tensor([grid.first, grid.last], dtype=torch.int64, device="cpu").unbind()
@@ -106,15 +106,13 @@ class ScatteredField:
         return self.assembly.touches_heterogeneous(self._on_axes(points[self.inside(points)]))
 
     def enclosed(self, points: Tensor, walls: Sequence[Shape]) -> Tensor:
-        """Return which points (..., 3) [m] are in air that sound-hard bodies, the `walls`, enclose."""
-        found, inside = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu"), self.inside(points)
+        """Return the mask of points (..., 3) [m] in air that rigid bodies, the `walls`, enclose."""
+        enclosed, inside = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu"), self.inside(points)
         if inside.any():
-            found[inside] = torch.from_numpy(
-                self.assembly.is_enclosed(
-                    self._on_axes(points[inside]), [turned_shape(wall, self.axes) for wall in walls]
-                )
-            )
-        return found
+            turned = [turned_shape(wall, self.axes) for wall in walls]
+            mask = self.assembly.is_enclosed(self._on_axes(points[inside]), turned)
+            enclosed[inside] = torch.from_numpy(mask)
+        return enclosed
 
     def positions(self, cells: Index) -> Tensor:
         """Return the centres (n, 3) [m] of cells."""
@@ -158,12 +156,12 @@ class ScatteredField:
 
 @dataclass(frozen=True)
 class NearToFar:
-    """Near-to-far-field transform from phasors of a box's cells to the scattered field at P targets."""
+    """The near-to-far-field transform from phasors of a box's cells to the scattered field at P targets."""
 
     box: ScatteredField
     targets: Apertures
-    far: Tensor  # which targets are discs far from the box (P,)
-    within: Tensor  # mask of the nodes of the others in the box, where its cells are read (Q, n)
+    far: Tensor  # mask of the targets that are discs far from the box (P,)
+    within: Tensor  # mask of the other targets' nodes in the box, where its cells are read (Q, n)
     cells: Index  # flat indices (k,) of the cells whose phasors are needed
     outward: csr_array  # amplitudes of the Huygens surface from those phasors
     inward: csr_array  # field at the nodes in the box from those phasors
@@ -178,7 +176,7 @@ class NearToFar:
         return self._mean(amplitude, amplitude[:0])
 
     def _mean(self, amplitude: Tensor, inner: Tensor) -> Tensor:
-        """Return the means (P, R) over the targets' nodes, given the field `inner` at those in the box."""
+        """Return the means (P, R) over the targets' nodes; `inner` is the field at nodes in the box."""
         near, runs = self.targets.chosen(~self.far), amplitude.shape[1]
         field = torch.zeros((*self.within.shape, runs), **COMPLEX)
         field[self.within] = inner
@@ -193,11 +191,11 @@ class NearToFar:
         """Return amplitudes (n, R) [Pa m] of the Huygens surface, from the cells' phasors (k, R)."""
         return torch.from_numpy(self.outward @ phasors.numpy())
 
-    def readings(self, every: int) -> Readings:
-        """Return the readings of each `every`-th target."""
+    def matrices(self, every: int) -> FieldMatrices:
+        """Return the matrices of each `every`-th target."""
         chosen, weights = torch.arange(0, len(self.far), every, device="cpu"), self.targets.weights
         far = self.far[chosen]
-        near = (torch.cumsum(~self.far, 0) - 1)[chosen[~far]]  # their numbers among all that are not far
+        near = (torch.cumsum(~self.far, 0) - 1)[chosen[~far]]  # their numbers among all near targets
         within, some = self.within[near], self.targets.chosen(chosen[~far])
         received = torch.zeros((len(self.box.surface[0]), len(far)), **COMPLEX)
         # reciprocity of Green's function
@@ -210,26 +208,27 @@ class NearToFar:
         row, node = torch.nonzero(within, as_tuple=True)
         place = torch.nonzero(~far)[row, 0].numpy(), np.arange(len(row))
         mean = csr_array((weights[node].numpy(), place), (len(far), len(row)))
-        return Readings(self.outward, received, csr_array(mean @ self.inward[read[self.within].numpy()]))
+        return FieldMatrices(self.outward, received, csr_array(mean @ self.inward[read[self.within].numpy()]))
 
     def _received(self, targets: Apertures, weights: Tensor, far: bool) -> Tensor:
         """Return waves (m, P) from the Huygens surface to P targets, with weights (P, n) of their nodes.
 
         Targets that are `far` discs have one weight each.
         """
-        found = [torch.zeros((len(self.box.surface[0]), 0), **COMPLEX)]
+        waves = [torch.zeros((len(self.box.surface[0]), 0), **COMPLEX)]
         for first in range(0, len(weights), _TOGETHER):
-            some, own = targets.chosen(slice(first, first + _TOGETHER)), weights[first : first + _TOGETHER]
-            columns = torch.arange(len(own), device="cpu").repeat_interleave(own.shape[1])
-            amplitude = torch.zeros((own.numel(), len(own)), **COMPLEX)
-            amplitude[torch.arange(own.numel(), device="cpu"), columns] = own.flatten().to(amplitude)
+            rows = slice(first, first + _TOGETHER)
+            some, of_nodes = targets.chosen(rows), weights[rows]
+            columns = torch.arange(len(of_nodes), device="cpu").repeat_interleave(of_nodes.shape[1])
+            amplitude = torch.zeros((of_nodes.numel(), len(of_nodes)), **COMPLEX)
+            amplitude[torch.arange(len(columns), device="cpu"), columns] = of_nodes.flatten().to(amplitude)
             sources = some.discs if far else some.positions.flatten(0, 1)
-            found.append(self.box.waves(self.box.surface[0], sources, amplitude))
-        return torch.cat(found, dim=1)
+            waves.append(self.box.waves(self.box.surface[0], sources, amplitude))
+        return torch.cat(waves, dim=1)
 
 
 @dataclass(frozen=True)
-class Readings:
+class FieldMatrices:
     """The scattered field at P targets, as matrices that are built once for many phasors."""
 
     outward: csr_array  # amplitudes of the Huygens surface from phasors (n, k)

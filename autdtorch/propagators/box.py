@@ -138,7 +138,7 @@ class BoxSimulation(Simulation):
         incident = self.incident(sources, strength, receivers)
         transforms = [box.near_to_far(receivers) for box in boxes]
         every = math.ceil(len(receivers.positions) / MOST_JUDGED)
-        readings = [transform.readings(every) for transform in transforms]
+        readings = [transform.matrices(every) for transform in transforms]
         sizes = [len(transform.cells) for transform in transforms]
         silent = self.silent(receivers.positions)
         heard = (~silent[::every]).to(incident.dtype)[:, None]

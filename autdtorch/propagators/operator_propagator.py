@@ -12,7 +12,7 @@ from typing import Literal, overload
 import torch
 
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.fdtd.grid_errors import grid_errors, hardening_errors, shape_errors, sizes
+from autdtorch.fdtd.grid_errors import grid_errors, rigid_errors, shape_errors, sizes
 from autdtorch.fdtd.thin_walls import warn_of_thin_walls
 from autdtorch.fdtd.turning import axes_along, flat_faces
 from autdtorch.propagators.bodies import ScatteringBodies, bodies_at, scattered_waves
@@ -178,7 +178,7 @@ class OperatorPropagator:
         other = second.transfer_matrix(points)
         others = [(other, second.spacing)]
         errors = grid_errors(matrix, free, self.spacing, others, self._plan.law)
-        known = shape_errors(matrix, free, region) + hardening_errors(matrix, free, region)
+        known = shape_errors(matrix, free, region) + rigid_errors(matrix, free, region)
         return self.tolerance + errors + known
 
     @one_library_thread()

@@ -39,7 +39,7 @@ def region_of(scene: Scene) -> Region:
 def hardened(region: Region, tolerance: float) -> Region:
     """Return the region with its hard bodies rigid, where that changes the field by less than a tolerance.
 
-    That is relative to the field in free space: errors count it (`hardening_errors`). A body that a later one
+    That is relative to the field in free space: errors count it (`rigid_errors`). A body that a later one
     may cut into keeps its material: what is left of it may be thin. No sound enters the cavities of rigid
     bodies, so they are filled.
     """
@@ -50,7 +50,7 @@ def hardened(region: Region, tolerance: float) -> Region:
             difference = difference_from_rigid(body, region)
             if difference <= tolerance:
                 hard.append(str(index))
-                body = replace(body, fluid=None, hardening=difference)
+                body = replace(body, fluid=None, rigid_error=difference)
         if body.fluid is None and whole:
             body = replace(body, shape=cast(Obstacle, body.shape).filled())
         bodies.append(body)

@@ -13,7 +13,7 @@ from typing import Literal, Protocol, overload, runtime_checkable
 import torch
 
 from autdtorch.analytic.green import PAIR_BYTES, free_space_matrix
-from autdtorch.fdtd.grid_errors import errors_by_grids, grid_errors, hardening_errors, shape_errors, sizes
+from autdtorch.fdtd.grid_errors import errors_by_grids, grid_errors, rigid_errors, shape_errors, sizes
 from autdtorch.fdtd.thin_walls import warn_of_thin_walls
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.cache import DiskCache, cache_key
@@ -219,7 +219,7 @@ class SimulatedPropagator:
         errors = of_grids(matrix, free, self.spacing, grids, self._plan.law)
         errors = torch.where(matrix.any(dim=1), errors, 0.0)  # silence is exact
         region = self._plan.region
-        return errors + shape_errors(matrix, free, region) + hardening_errors(matrix, free, region)
+        return errors + shape_errors(matrix, free, region) + rigid_errors(matrix, free, region)
 
     def _free(self, points: torch.Tensor | None) -> torch.Tensor:
         """Return the matrix of points in free space, by default of the control points."""
@@ -321,13 +321,11 @@ class SimulatedPropagator:
     def known_errors(self) -> tuple[float, float, float]:
         """Simulate the control points; return their error, and its parts by uncertain surfaces and hardening.
 
-        The error is that by the grids given, infinite without any. For the last part see `hardening_errors`.
+        The error is that by the grids given, infinite without any. For the last part see `rigid_errors`.
         """
         result = self._with_error(None) if self._given else self._result(None)
         matrix, free = (part.reshape(1, -1) for part in (result.matrix, self._free(None)))
-        shape, hardening = (
-            float(of(matrix, free, self._plan.region)) for of in (shape_errors, hardening_errors)
-        )
+        shape, hardening = (float(of(matrix, free, self._plan.region)) for of in (shape_errors, rigid_errors))
         return result.error if self._given else math.inf, shape, hardening
 
     def _report_near(self, points: torch.Tensor) -> None:

@@ -25,7 +25,7 @@ from triton.runtime import driver
 from triton.runtime.jit import JITFunction
 
 from autdtorch.fdtd.kernels.cuda import DeviceMedium, DeviceRun, blocks_of
-from autdtorch.fdtd.kernels.cuda_tables import Shape
+from autdtorch.fdtd.kernels.cuda_tables import Cells
 from autdtorch.fdtd.stepping import assemble, drive_signal
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
@@ -59,7 +59,7 @@ def compiled(capability: int, dtype: torch.dtype) -> dict[str, Any]:
     )
     driver.set_active(absent_gpu)
     with patch.object(JITFunction, "run", compile_only):
-        shape = Shape(*assembly.grid.shape)
+        shape = Cells(*assembly.grid.shape)
         medium = DeviceMedium(assembly.coefficients, shape, blocks_of(shape), torch.device("cpu"))
         DeviceRun(medium, assembly.silence(sources), sources, receivers, len(signal)).advance(signal)
     return found

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from autdtorch.fdtd.assembly.element import LATTICE
-from autdtorch.fdtd.assembly.elements import HALF_DIAGONAL, lattice_distances, located
+from autdtorch.fdtd.assembly.elements import HALF_DIAGONAL, lattice_distances, near_surface
 from autdtorch.scene.obstacles import Box, Mesh, Sphere
 from autdtorch.scene.obstacles.mesh import MeshDistance
 
@@ -86,7 +86,7 @@ def test_no_element_is_missed_and_distances_at_its_lattice_are_right(body):
     def measure(cells):
         return body.signed_distance(cells).numpy()
 
-    near, far, inside = located(measure, np.array([1, 0, 2]), np.array([33, 31, 30]))
+    near, far, inside = near_surface(measure, np.array([1, 0, 2]), np.array([33, 31, 30]))
     every = np.stack(np.meshgrid(np.arange(1, 33), np.arange(31), np.arange(2, 30), indexing="ij"), -1)
     every = every.reshape(-1, 3)
     exact = measure(every + 0.5)

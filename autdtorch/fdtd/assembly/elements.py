@@ -103,13 +103,13 @@ def _measured(
     if all(body.aligned for body in bodies):
         return material, cut, beside
     for body in bodies:
-        near, distance, inside = _near_surface(partial(body.distance, grid=grid), *body.range(grid))
+        near, distance, inside = near_surface(partial(body.distance, grid=grid), *body.range(grid))
         cells = tuple(near.T)
         material[tuple(near[distance < 0].T)] = material[tuple(inside.T)] = body.material
-        cut[cells] = (cut[cells] | (distance < _HALF_DIAGONAL)) & (distance > -_HALF_DIAGONAL)
+        cut[cells] = (cut[cells] | (distance < HALF_DIAGONAL)) & (distance > -HALF_DIAGONAL)
         cut[tuple(inside.T)] = False
         if not body.aligned:
-            beside[tuple(near[distance < _HALF_DIAGONAL].T)] = beside[tuple(inside.T)] = True
+            beside[tuple(near[distance < HALF_DIAGONAL].T)] = beside[tuple(inside.T)] = True
     return material, cut, beside
 
 
@@ -228,7 +228,7 @@ def _interface(
 Measure: TypeAlias = Callable[[Array], Array]
 
 # Half the diagonal of an element: a surface farther from its centre does not intersect it
-_HALF_DIAGONAL = 0.87
+HALF_DIAGONAL = 0.87
 
 _LARGEST = 8  # Elements along an edge of the largest blocks that are inside or outside as a whole
 # Largest change of a distance over a cell: trilinear interpolation between voxels reaches the root of three
@@ -241,7 +241,7 @@ _SMOOTH = 0.01
 _STEEP = 0.9
 
 
-def _near_surface(measure: Measure, lower: Index, upper: Index) -> tuple[Index, Array, Index]:
+def near_surface(measure: Measure, lower: Index, upper: Index) -> tuple[Index, Array, Index]:
     """Return elements near a surface (n, 3), the distances (n,) of their centres, and others inside (k, 3).
 
     Elements are those from `lower` (3,) up to `upper` (3,). Blocks of them are halved until their surface is
@@ -253,7 +253,7 @@ def _near_surface(measure: Measure, lower: Index, upper: Index) -> tuple[Index, 
         far = measure(np.asarray(places + size / 2, np.float64))
         if size == 1:
             return places, far, np.concatenate(inside)
-        near = np.abs(far) <= _HALF_DIAGONAL + _STEEPEST * math.sqrt(3) * (size - 1) / 2
+        near = np.abs(far) <= HALF_DIAGONAL + _STEEPEST * math.sqrt(3) * (size - 1) / 2
         inside.append(_parts(places[~near & (far < 0)], size, 1, upper))
         places = _parts(places[near], size, size // 2, upper)
         size //= 2

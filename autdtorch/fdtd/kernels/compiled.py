@@ -48,7 +48,7 @@ hold_at_fork(global_compiler_lock)
 class _CheckedFiles(IndexDataCacheFile):
     """Numba's files of a kernel with a checksum at their ends, which pickle ignores.
 
-    Numba would run what a crash or a full disk has left of them. Files that are not whole are compiled again.
+    Numba would run files that a crash or a full disk has cut off. Such files are compiled again.
     """
 
     @contextlib.contextmanager
@@ -59,8 +59,9 @@ class _CheckedFiles(IndexDataCacheFile):
             file.write(content.getvalue() + hashlib.sha256(content.getvalue()).digest())
 
     def _load_index(self) -> Any:
-        known = not Path(self._index_path).exists() or _is_whole(Path(self._index_path))
-        return super()._load_index() if known else {}  # type: ignore[no-untyped-call]
+        path = Path(self._index_path)
+        readable = not path.exists() or _is_whole(path)
+        return super()._load_index() if readable else {}  # type: ignore[no-untyped-call]
 
     def _load_data(self, name: str) -> Any:
         path = Path(self._data_path(name))  # type: ignore[no-untyped-call]

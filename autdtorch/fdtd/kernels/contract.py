@@ -135,6 +135,6 @@ class Kernel(Protocol):
     ) -> tuple[State, Tensor]:
         """Step once per row of `signal` (steps, S); return the new state and the record (steps, R).
 
-        The new state may share memory with the one given, which must not be used again. The record holds the
+        The new state may share memory with `state`, which must not be used again. The record holds the
         pressure at the receivers after each step.
         """

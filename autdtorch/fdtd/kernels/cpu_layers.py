@@ -181,14 +181,14 @@ def add_terms(q, at, across, here, place, shape, cells, terms, ends, weights):  
         e = (place * lanes + side * reach) * nz
         o = (ny - reach) * side * nz
         for k in range(nz, (cells + one) * nz):
-            own, beside = e_y[e + k], e_y[e + k - one] + e_y[e + k + one]
-            across[here + o + k] += edge * own + corner * beside
-            q[at + o + k] += face * own + edge * beside
+            middle, beside = e_y[e + k], e_y[e + k - one] + e_y[e + k + one]
+            across[here + o + k] += edge * middle + corner * beside
+            q[at + o + k] += face * middle + edge * beside
     e = place * ny * lanes
     for k in range(lanes, (ny - one) * lanes):
-        own, beside = e_z[e + k], e_z[e + k - lanes] + e_z[e + k + lanes]
-        a[k] = edge * own + corner * beside
-        b[k] = face * own + edge * beside
+        middle, beside = e_z[e + k], e_z[e + k - lanes] + e_z[e + k + lanes]
+        a[k] = edge * middle + corner * beside
+        b[k] = face * middle + edge * beside
     for side in range(two):
         e = (place * lanes + side * reach) * lanes
         o = (ny - reach) * side * lanes

@@ -1,13 +1,13 @@
 """One step of a chunk of planes on one core.
 
-A step goes through the planes once. With T_a the sum of the two neighbours along axis a, plane i of the
-pressure gives two planes,
+A step goes through the planes once. T_a is the sum of the two neighbours along axis a. Plane i of the
+pressure gives two planes, A and B, and the new pressure is
 
     A = face p + edge (T_y + T_z) p + corner T_y T_z p,    B = center p + face (T_y + T_z) p + edge T_y T_z p,
+    new_i = B_i + A_(i-1) + A_(i+1) - keep before_i.
 
-and new_i = B_i + A_(i-1) + A_(i+1) - keep before_i; the last A is added when plane i + 2 reads it. The
-boundary layers across y and z stretch T_y and T_z. `cpu_layers.py` adds what follows from this to A and B, in
-the cells of the layers, and the terms of the layers across x to new_i.
+The last A is added when plane i + 2 reads it. The boundary layers across y and z stretch T_y and T_z:
+`cpu_layers.py` adds the resulting terms to A and B, and the terms of the layers across x to new_i.
 
 All arrays are flat with unsigned indices: array views cost numba more than a short row, and possibly negative
 indices a test. Loops run over whole planes, or all rows of a layer, as if they were one row. The values that
@@ -35,10 +35,10 @@ def _sweep(p, at, n, row, q, old, back, across, here, behind, weights):  # type:
     for k in range(n):
         beside = (p[up + k] + p[down + k]) + (p[at + k - one] + p[at + k + one])
         diagonal = (p[up + k - one] + p[up + k + one]) + (p[down + k - one] + p[down + k + one])
-        own, a = p[at + k], across[behind + k]
+        middle, a = p[at + k], across[behind + k]
         old[back + k] += a
-        q[at + k] = (center * own + face * beside + edge * diagonal) + a - keep * q[at + k]
-        across[here + k] = face * own + edge * beside + corner * diagonal
+        q[at + k] = (center * middle + face * beside + edge * diagonal) + a - keep * q[at + k]
+        across[here + k] = face * middle + edge * beside + corner * diagonal
 
 
 @njit(**INNER)
@@ -47,10 +47,10 @@ def _heterogeneous(p, q, cells, first, last, keep):  # type: ignore[no-untyped-d
     index, weight, offset, scale, air, new, swept = cells
     for n in range(first, last):
         cell = index[n]
-        own, old = p[cell], q[cell]
-        new[n] = own + keep * (own - old) + sum_of_rows(p, cell, offset, weight, n * len(air))
+        here, before = p[cell], q[cell]
+        new[n] = here + keep * (here - before) + sum_of_rows(p, cell, offset, weight, n * len(air))
         if scale[n] != 0:
-            swept[n] = own + keep * (own - old) + sum_of_rows(p, cell, offset, air, 0)
+            swept[n] = here + keep * (here - before) + sum_of_rows(p, cell, offset, air, 0)
 
 
 @njit(**INNER)
@@ -65,7 +65,7 @@ def _silence_row_ends(u, base, shape):  # type: ignore[no-untyped-def]
 def sweep_planes(  # type: ignore[no-untyped-def]
     p, q, first, last, shape, weights, x_layer, x_profile, layers, profiles, cells, starts, room
 ):
-    """Step planes first .. last - 1 as if others were zero; `room` then has A for the neighbours."""
+    """Step planes first .. last - 1 as if others were zero; `room` then holds A for the neighbours."""
     nx, ny, nz = shape
     across, outermost, terms, ends = room
     one, two, three = _U(1), _U(2), _U(3)

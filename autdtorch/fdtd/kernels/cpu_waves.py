@@ -44,7 +44,7 @@ def _room(dtype: type) -> tuple[AnyArray, ...]:
 
 @njit(**INNER)
 def _terms(c):  # type: ignore[no-untyped-def]
-    """Return coefficients as values: the compiler knows that a loop does not change them."""
+    """Return coefficients as values, which the compiler knows to be constant in a loop."""
     return c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8], c[9], c[10], c[11], c[12]
 
 
@@ -72,8 +72,8 @@ def _directed(place, others, first, pattern, real, imaginary, distance, room):  
         for k in range(_BLOCK):
             b[k] = b[k] * nearness[k] + _series(imaginary_terms, sine_squared[k])
     for k in range(_BLOCK):
-        own, other = real[k], imaginary[k]
-        real[k], imaginary[k] = a[k] * own - b[k] * other, a[k] * other + b[k] * own
+        re, im = real[k], imaginary[k]
+        real[k], imaginary[k] = a[k] * re - b[k] * im, a[k] * im + b[k] * re
 
 
 @njit(**INNER)
@@ -208,7 +208,7 @@ def _superposed(
     nearest: float,
     dtype: torch.dtype,
 ) -> Tensor:
-    """Do the work of `superposition` for discs of equal radius."""
+    """Return the sum of `superposition` for discs of equal radius."""
     number = np.float32 if dtype == torch.float32 else np.float64
     wavenumber = complex(wavenumber)
     # turns and halvings of a wave per metre
@@ -223,11 +223,8 @@ def _superposed(
         fields = np.zeros((2, runs, columns.shape[1] // _LANES, _LANES))
         both = columns, origins
     else:
-        columns, add, fields = (
-            _filled(origins[:, :3].T, "edge"),
-            _sum_over_sources,
-            np.zeros((2, runs, count)),
-        )
+        columns, add = _filled(origins[:, :3].T, "edge"), _sum_over_sources
+        fields = np.zeros((2, runs, count))
         strength = _filled(strength, "constant").reshape(2, runs, -1, _LANES)
         both = places, columns
     units = fields.shape[2]
@@ -240,11 +237,11 @@ def _superposed(
     return torch.from_numpy((real + 1j * imaginary).T)
 
 
-def _rows(given: Tensor | Discs, wavenumber: complex) -> tuple[AnyArray, AnyArray]:
+def _rows(places: Tensor | Discs, wavenumber: complex) -> tuple[AnyArray, AnyArray]:
     """Return positions and normals (N, 6), and the pattern of discs; points have none."""
-    if isinstance(given, Discs):
-        return torch.cat((given.centers, given.normals), dim=1).numpy(), given.pattern(wavenumber)
-    return np.pad(given.numpy(), ((0, 0), (0, 3))), np.zeros((0, 2, PATTERN_TERMS))
+    if isinstance(places, Discs):
+        return torch.cat((places.centers, places.normals), dim=1).numpy(), places.pattern(wavenumber)
+    return np.pad(places.numpy(), ((0, 0), (0, 3))), np.zeros((0, 2, PATTERN_TERMS))
 
 
 def _filled(rows: AnyArray, mode: Literal["edge", "constant"]) -> AnyArray:

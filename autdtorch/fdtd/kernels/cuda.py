@@ -22,7 +22,7 @@ _GRAPH_STEPS = 16  # Steps of a captured graph; even, so that both fields return
 # Most cells of a grid whose steps are captured. Beyond, a step takes longer than its three launches from
 # Python, some 100 us: 17 million cells take 112 us on an H100.
 _MOST_CAPTURED = 2**25
-_MOST_KEPT = 2**22  # Most cells whose two fields, in single precision, stay in 50 MB of cache
+_MOST_CACHED = 2**22  # Most cells whose two fields, in single precision, stay in 50 MB of cache
 _FEWEST_PROGRAMS = 1000  # That occupy a GPU of 132 multiprocessors
 
 
@@ -35,10 +35,10 @@ class Blocks(NamedTuple):
     lanes: int = 16  # columns through a boundary layer
 
 
-def blocks_of(shape: tables.Shape) -> Blocks:
+def blocks_of(shape: tables.Cells) -> Blocks:
     """Return the blocks for a grid, by timings on an H100; `docs/decisions/cuda.md` has them."""
     nx, ny, nz = shape
-    if nx * ny * nz > _MOST_KEPT:
+    if nx * ny * nz > _MOST_CACHED:
         return Blocks(32, 1, 256)
     blocks = Blocks()
     tiles = triton.cdiv(ny, blocks.y) * triton.cdiv(nz, blocks.z)
@@ -61,7 +61,7 @@ class Ends(NamedTuple):
 class DeviceMedium:
     """A medium on the device, and workspace."""
 
-    def __init__(self, c: Coefficients, shape: tables.Shape, blocks: Blocks, device: torch.device) -> None:
+    def __init__(self, c: Coefficients, shape: tables.Cells, blocks: Blocks, device: torch.device) -> None:
         """Copy the medium `c` of a grid to a device."""
         self.coefficients, self.shape, self.blocks, self.device = c, shape, blocks, device
         self.cells, self.depths = c.layer_cells, triton.next_power_of_2(max(1, c.layer_cells))
@@ -183,7 +183,7 @@ class CudaKernel:
         self, state: State, c: Coefficients, sources: Sources, receivers: Receivers, signal: Tensor
     ) -> tuple[State, Tensor]:
         """See `Kernel.advance`; the record stays on the device."""
-        shape = tables.Shape(*state.now.shape)
+        shape = tables.Cells(*state.now.shape)
         medium, run = self._medium, self._run
         if medium is None or medium.coefficients is not c or medium.shape != shape:
             self._run = run = None

@@ -154,7 +154,7 @@ def _gather_heterogeneous(p, before, shape, weights, heterogeneous, program, LAN
     n = program * LANES + tl.arange(0, LANES)
     mask = n < heterogeneous.size
     cell = tl.load(heterogeneous.cell + n, mask=mask, other=0)
-    own, old = tl.load(p + cell, mask=mask, other=0), tl.load(before + cell, mask=mask, other=0)
+    middle, old = tl.load(p + cell, mask=mask, other=0), tl.load(before + cell, mask=mask, other=0)
     keep = tl.load(weights + KEEP)
     air, change = -keep * old, tl.zeros([LANES], p.dtype.element_ty)
     plane = tl.cast(shape.ny, tl.int64) * shape.nz
@@ -164,12 +164,12 @@ def _gather_heterogeneous(p, before, shape, weights, heterogeneous, program, LAN
                 beside = p + cell + ((x - 1) * plane + (y - 1) * shape.nz + (z - 1))
                 value = tl.load(beside, mask=mask, other=0)
                 place = n + (9 * x + 3 * y + z) * heterogeneous.size
-                change += tl.load(heterogeneous.weight + place, mask=mask, other=0) * (value - own)
+                change += tl.load(heterogeneous.weight + place, mask=mask, other=0) * (value - middle)
                 kind = (x - 1) * (x - 1) + (y - 1) * (y - 1) + (z - 1) * (z - 1)
                 air += tl.load(weights + kind) * value
     scale = tl.load(heterogeneous.scale + n, mask=mask, other=0)
     # The sweep gives `air` and the layers' term; `settle` adds `scale` times that.
-    tl.store(heterogeneous.settled + n, own + keep * (own - old) + change - scale * air, mask=mask)
+    tl.store(heterogeneous.settled + n, middle + keep * (middle - old) + change - scale * air, mask=mask)
 
 
 @triton.jit
@@ -209,13 +209,13 @@ def prepare(p, before, shape, weights, profile, old, new, terms, heterogeneous, 
 
 @triton.jit
 def _plane(p, i, shape, tile, weights, terms, CELLS: tl.constexpr):
-    """Return the sums over a plane across x for its own cells and for the planes beside it."""
+    """Return the sums over a plane across x for its cells and for the planes beside it."""
     ny, nz = shape.ny, shape.nz
     column, inside, near_y, near_z, in_y, in_z, place_y, place_z, place_yz = tile
     center, face, edge, corner = weights
     here = p + i * (tl.cast(ny, tl.int64) * nz) + column
     below, above = here - nz, here + nz
-    own = tl.load(here, mask=inside)
+    middle = tl.load(here, mask=inside)
     faces = tl.load(below, mask=inside) + tl.load(above, mask=inside)
     faces += tl.load(here - 1, mask=inside) + tl.load(here + 1, mask=inside)
     edges = tl.load(below - 1, mask=inside) + tl.load(below + 1, mask=inside)
@@ -231,7 +231,7 @@ def _plane(p, i, shape, tile, weights, terms, CELLS: tl.constexpr):
     if near_y & near_z:
         at = terms.yz + i * (2 * CELLS) * (2 * CELLS) + place_yz
         edges += tl.load(at, mask=in_y & in_z, other=0)
-    return center * own + face * faces + edge * edges, face * own + edge * faces + corner * edges
+    return center * middle + face * faces + edge * edges, face * middle + edge * faces + corner * edges
 
 
 @triton.jit

@@ -10,7 +10,7 @@ from torch import Tensor
 from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources
 
 
-class Shape(NamedTuple):
+class Cells(NamedTuple):
     """Number of cells along x, y and z."""
 
     nx: int
@@ -122,13 +122,13 @@ def settled_table(c: Coefficients, device: torch.device) -> Settled:
 def driven_table(sources: Sources, settled: Settled, dtype: torch.dtype, device: torch.device) -> Driven:
     """Return the settled cells and the driven ones, each once."""
     index = sources.index.to(device)
-    known = torch.isin(index, settled.cell)
-    cell = torch.cat((settled.cell, index[~known]))
+    listed = torch.isin(index, settled.cell)
+    cell = torch.cat((settled.cell, index[~listed]))
     place = torch.searchsorted(settled.cell, index)
-    place[~known] = torch.arange(len(settled.cell), len(cell), device=device)
-    given = sources.force.detach().to(device, dtype)
-    force = torch.zeros((given.shape[1], len(cell)), dtype=dtype, device=device)
-    force[:, place] = given.T
+    place[~listed] = torch.arange(len(settled.cell), len(cell), device=device)
+    of_sources = sources.force.detach().to(device, dtype)
+    force = torch.zeros((of_sources.shape[1], len(cell)), dtype=dtype, device=device)
+    force[:, place] = of_sources.T
     return Driven(len(settled.cell), len(cell), cell, force)
 
 
@@ -141,7 +141,7 @@ def receiver_table(
     return ReceiverTable(index.shape[1], len(index), index, weight.to(dtype), recorded)
 
 
-def no_terms(shape: Shape, c: Coefficients, device: torch.device) -> Terms:
+def no_terms(shape: Cells, c: Coefficients, device: torch.device) -> Terms:
     """Return workspace for the layers' terms."""
     cells, (nx, ny, nz) = c.layer_cells, shape
     columns, crossed = ((cells * len(each.index) + 1,) for each in (c.columns, c.crossed))

@@ -39,11 +39,11 @@ class ReferenceKernel:
     def _step(self, state: State, c: Coefficients, driven: Tensor, force: Tensor) -> State:
         new = torch.nn.functional.pad(_sweep(state.now, c) - c.keep * _core(state.before), (1,) * 6)
         flat_now, flat_before = state.now.reshape(-1), state.before.reshape(-1)
-        own, before = flat_now[c.heterogeneous_index], flat_before[c.heterogeneous_index]
+        now, before = flat_now[c.heterogeneous_index], flat_before[c.heterogeneous_index]
         around = c.heterogeneous_index[:, None] + torch.from_numpy(flat_offsets(state.now.shape))
-        change = (c.heterogeneous_weight * (flat_now[around] - own[:, None])).sum(-1)
-        kept = own + c.keep * (own - before)
-        new = new.reshape(-1).index_copy(0, c.heterogeneous_index, kept + change).reshape(state.now.shape)
+        change = (c.heterogeneous_weight * (flat_now[around] - now[:, None])).sum(-1)
+        value = now + c.keep * (now - before) + change
+        new = new.reshape(-1).index_copy(0, c.heterogeneous_index, value).reshape(state.now.shape)
         memory, term = _absorb(state.now, state.memory, c)
         term = term.reshape(-1)
         term = term.index_copy(0, c.layer_index, c.layer_scale * term[c.layer_index]).reshape(new.shape)
@@ -122,7 +122,9 @@ def _absorb_columns(
 def _stretch(field: Tensor, layer: Layer, c: Coefficients, axis: int) -> tuple[Layer, tuple[Tensor, Tensor]]:
     """Advance the memory of an axis; return it and E_a of the field in the low and the high layer."""
     slabs = (each.narrow(axis, 0, c.layer_cells + 2) for each in (field, torch.flip(field, (axis,))))
-    sides = [_advanced(slab, Layer(*own), c, axis) for slab, *own in zip(slabs, *layer, strict=True)]
+    sides = [
+        _advanced(slab, Layer(psi, zeta), c, axis) for slab, psi, zeta in zip(slabs, *layer, strict=True)
+    ]
     (low, low_term), (high, high_term) = sides
     return Layer(*map(torch.stack, zip(low, high, strict=True))), (low_term, high_term)
 
