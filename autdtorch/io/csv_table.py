@@ -6,19 +6,49 @@ import csv
 import math
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from autdtorch.io.stated_units import FACTORS, mentioned_units, stated_unit, unit_called
 from autdtorch.utils.array_types import AnyArray, Array
 from autdtorch.utils.files import replacing
 from autdtorch.utils.units import warn_user, warned_within
 from autdtorch.utils.validation import invalid, require_known, within
 
 _LONGEST = 1000  # characters of a name or a comment that are read
+
+_FACTORS: dict[str, dict[str, float]] = {  # to SI, of the accepted units, by SI unit
+    "": {"": 1.0},
+    "m": {"m": 1.0, "mm": 1e-3, "cm": 1e-2},
+    "rad": {"rad": 1.0, "deg": math.pi / 180},
+    "Pa m": {"Pa m": 1.0},
+}
+# Patterns of what people write. The case of a lone m counts: M is a number of transducers.
+_SPELLED = {
+    "": "",
+    "Pa m": r"Pa\s?m",
+    "mm": "mm|millimet(?:er|re)s?",
+    "cm": "cm|centimet(?:er|re)s?",
+    "m": "(?-i:m)|met(?:er|re)s?",
+    "rad": "rad|radians?",
+    "deg": "deg|degrees?|°",
+}
+_OTHERS = {  # units that are refused where they are stated
+    "m": "inch(?:es)?|[µμu]m|micromet(?:er|re)s?|microns?|nm|dm|km|ft|feet|mils?|wavelengths?|lambda|λ",
+    "rad": "pi|π|turns|cycles|revolutions|gon|grad|gradians?|levels?",
+}
+_WORD = "|".join([*filter(None, _SPELLED.values()), *_OTHERS.values()])
+# Neither a part of a word nor of another unit, such as m/s or mm^2, nor the size of steps
+_UNIT = rf"(?<![\w'])(?P<unit>{_WORD})(?![\w/^*·])(?!\s+(?:steps?|grid)\b)"
+_ANYWHERE = re.compile(_UNIT, re.IGNORECASE)
+_STATED = re.compile(
+    rf"\b(?:in(?:\s+(?:units|multiples)\s+of)?|units?(?:\s+of)?)\s*[:=]?\s*{_UNIT}"
+    rf"|[\[(]\s*{_UNIT.replace('?P<unit>', '?P<bracketed>')}\s*[\])]",
+    re.IGNORECASE,
+)
+_LABEL = re.compile(r"\bunits?\s*[:=]\s*(.*)", re.IGNORECASE | re.DOTALL)
 
 
 class Guessed(NamedTuple):
@@ -142,19 +172,19 @@ def table_of(
     for kind in {columns[name]: None for name, unit in header if unit is None and columns[name]}:
         without = {name: table[name] for name, unit in header if unit is None and columns[name] == kind}
         if (unit := _unit(rows, kind, without, guess)) is not None:
-            table |= {name: values * FACTORS[kind][unit] for name, values in without.items()}
-    return table | {name: table[name] * FACTORS[columns[name]][unit] for name, unit in header if unit}
+            table |= {name: values * _FACTORS[kind][unit] for name, values in without.items()}
+    return table | {name: table[name] * _FACTORS[columns[name]][unit] for name, unit in header if unit}
 
 
 def _unit(rows: Rows, kind: str, table: Mapping[str, Array], guess: Guess) -> str | None:
     """Return the unit of columns whose names have none, from the comments or a guess that agrees."""
     with within(rows.path), warned_within(rows.path):
-        if (stated := stated_unit(rows.comments, kind)) is not None:
+        if (stated := _unit_stated(rows.comments, kind)) is not None:
             return stated
         if (guessed := guess(kind, table)) is None:
             return None
         unit, why = guessed
-        if others := mentioned_units(rows.comments, kind) - {unit}:
+        if others := _mentioned_units(rows.comments, kind) - {unit}:
             guess_text = f"columns {', '.join(table)} seem to be in {unit}"
             accepted = f"the header must be as {next(iter(table))} [{unit}]"
             raise ValueError(f"{guess_text}, but a comment has {', '.join(sorted(others))}; {accepted}")
@@ -213,7 +243,7 @@ def _header(rows: Rows, columns: Mapping[str, str]) -> list[Column]:
     for name, unit in header:
         kind = columns[name]
         if unit is None and any(columns[other] == kind and stated for other, stated in header):
-            accepted = " or ".join(f"{name} [{unit}]" for unit in FACTORS[kind])
+            accepted = " or ".join(f"{name} [{unit}]" for unit in _FACTORS[kind])
             raise ValueError(f"{where}: column {name!r}; must be {accepted}")
     return header
 
@@ -248,7 +278,59 @@ def _column(where: str, cell: str, columns: Mapping[str, str]) -> Column:
     kind = columns[name]
     if text is None:
         return Column(name, None if kind else "")
-    if (unit := unit_called(text, kind)) is not None:
+    if (unit := _unit_called(text, kind)) is not None:
         return Column(name, unit)
-    accepted = " or ".join(f"{name} [{known}]" if known else name for known in FACTORS[kind])
+    accepted = " or ".join(f"{name} [{known}]" if known else name for known in _FACTORS[kind])
     raise ValueError(f"{where}: column {cell!r}; must be {accepted}")
+
+
+def _unit_called(text: str, kind: str) -> str | None:
+    """Return the unit of an SI unit's kind that a text names, None if it names none."""
+    return next((unit for unit in _FACTORS[kind] if re.fullmatch(_SPELLED[unit], text, re.IGNORECASE)), None)
+
+
+def _unit_stated(comments: Sequence[str], kind: str) -> str | None:
+    """Return the unit that comments state, as in "units: mm", "in millimetres", "[mm]" or "mm" alone.
+
+    Raises:
+        ValueError: they state several units of this kind, or another one than the accepted.
+    """
+    stated = {unit: None for comment in comments for unit in _of_kind(_stated(comment), kind)}
+    if not stated:
+        return None
+    if len(stated) > 1 or not stated.keys() <= _FACTORS[kind].keys():
+        accepted = f"must be one of {', '.join(_FACTORS[kind])}"
+        raise ValueError(f"the comments state the unit {' and '.join(map(repr, stated))}; {accepted}")
+    return next(iter(stated))
+
+
+def _mentioned_units(comments: Sequence[str], kind: str) -> set[str]:
+    """Return the accepted units that comments name at all; a lone m may be anything else."""
+    words = [match["unit"] for comment in comments for match in _ANYWHERE.finditer(comment)]
+    return _FACTORS[kind].keys() & set(_of_kind([word for word in words if word != "m"], kind))
+
+
+def _stated(comment: str) -> Iterator[str]:
+    """Yield the words that a comment states as units, known or not."""
+    if re.fullmatch(_UNIT, comment, re.IGNORECASE):
+        yield comment
+    for match in _STATED.finditer(comment):
+        yield match["unit"] or match["bracketed"]
+    if label := _LABEL.search(comment):
+        yield from [match["unit"] for match in _ANYWHERE.finditer(label[1])] or label[1].split()[:1]
+
+
+def _of_kind(words: Iterable[str], kind: str) -> Iterator[str]:
+    """Yield units of a kind for words, and words of no other kind as they are."""
+    for word in words:
+        if (unit := _unit_called(word, kind)) is not None:
+            yield unit
+        elif not any(_is_of(word, other) for other in _FACTORS if other != kind):
+            yield word
+
+
+def _is_of(word: str, kind: str) -> bool:
+    others = _OTHERS.get(kind)
+    return _unit_called(word, kind) is not None or (
+        others is not None and re.fullmatch(others, word, re.IGNORECASE) is not None
+    )

@@ -15,8 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from autdtorch.scene.obstacles.base import Obstacle
-from autdtorch.scene.obstacles.voxel_cubes import VoxelCubes
-from autdtorch.scene.obstacles.voxel_surface import ThinError, VoxelSurface
+from autdtorch.scene.obstacles.voxel_surface import ThinError, VoxelCubes, VoxelSurface
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.cached import cached_property
 from autdtorch.utils.digest import digest_of
