@@ -55,7 +55,7 @@ class Guessed(NamedTuple):
     """A unit that a file does not state."""
 
     unit: str
-    why: str  # of what, and why, for a warning; empty where no other is in use
+    why: str  # text of the warning; empty where no other unit is in use
 
 
 Guess: TypeAlias = Callable[[str, Mapping[str, Array]], Guessed | None]
@@ -321,7 +321,7 @@ def _stated(comment: str) -> Iterator[str]:
 
 
 def _of_kind(words: Iterable[str], kind: str) -> Iterator[str]:
-    """Yield units of a kind for words, and words of no other kind as they are."""
+    """Yield the units of a kind that words name, and words of unknown kind as they are."""
     for word in words:
         if (unit := _unit_called(word, kind)) is not None:
             yield unit

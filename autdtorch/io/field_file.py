@@ -43,9 +43,9 @@ def save_field(
     - `.vti`: VTK image data, for ParaView and PyVista. Point data pressure_real, pressure_imag and
       pressure_magnitude [Pa], field data frequency [Hz]; lengths in m. A tilted grid
       has a direction matrix (VTK 9 and later).
-    - `.h5`, `.hdf5`: the dataset `pressure`, complex128, with the attributes units "Pa", origin (3,), the
-      first point, spacing (n,) and axes (n, 3), unit vectors, of its n axes, length_units "m", frequency,
-      frequency_units "Hz" and time_convention "exp(-i omega t)".
+    - `.h5`, `.hdf5`: the dataset `pressure`, complex128. Attributes: units "Pa"; origin (3,), a point;
+      spacing (n,) and axes (n, 3), unit vectors, of its n axes; length_units "m"; frequency;
+      frequency_units "Hz"; time_convention "exp(-i omega t)".
 
     Args:
         path: of the file, which is replaced; the suffix decides the format.

@@ -80,7 +80,7 @@ class Obstacle(ABC):
 
     @property
     def fills_bounds(self) -> bool:
-        """Whether the obstacle is all of its bounding box, as a wall along the axes is."""
+        """True if the obstacle is all of its bounding box, such as a wall along the axes."""
         return False
 
     @property

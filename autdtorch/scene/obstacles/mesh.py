@@ -63,9 +63,9 @@ class Mesh(Obstacle):
         offset: position of the file's origin (3,) [m].
         rotation: angles (3,) [rad] about the file's origin; see `autdtorch.scene.geometry.rotation_matrix`.
         rotation_degrees: these angles (3,) in degrees, in place of `rotation`; it is no attribute afterwards.
-        repair: whether to mend what is not watertight: join vertices up to 1e-3 of the extent apart, turn
-            triangles over, leave out doubled ones and stray pieces, close holes up to 30 % of the area, and
-            make the surface anew where it crosses itself. The log says what was done, as a warning.
+        repair: whether to mend a mesh that is not watertight. Vertices up to 1e-3 of the extent apart are
+            joined, triangles turned over, doubled ones and stray pieces left out, and holes up to 30 % of the
+            area closed. A surface that crosses itself is replaced by a new one. A warning in the log says so.
         vertices: (V, 3) [m], float64, in the scene.
         faces: vertices of each triangle (F, 3), int64, counter-clockwise as seen from outside.
         digest: of vertices and faces. Meshes of equal digest and material are equal, whatever their files.
@@ -235,10 +235,10 @@ def _drop_all() -> None:
 class MeshDistance:
     """The distance to a closed surface, negative inside.
 
-    The nearest point of the surface is on a triangle, an edge or at a vertex. A point is outside if it is on
-    the side of its normal: that of the triangle, the mean of two at an edge, the mean by angles at a vertex
-    (Baerentzen and Aanaes 2005, doi:10.1109/TVCG.2005.49). Where more than two triangles meet at an edge, or
-    parts at a vertex, the winding number decides.
+    A point is outside if the normal at the nearest point of the surface points towards it. At an edge, this
+    normal is the mean of two triangles, at a vertex the mean weighted by angles (Baerentzen and Aanaes 2005,
+    doi:10.1109/TVCG.2005.49). Where more than two triangles meet at an edge, or parts at a vertex, the
+    winding number decides.
     """
 
     def __init__(self, vertices: Array, faces: Index) -> None:

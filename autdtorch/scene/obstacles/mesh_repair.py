@@ -1,8 +1,8 @@
 """Repair of surfaces that enclose nothing as they are: scans with holes, turned triangles, crossing parts.
 
-What is mended in its place comes first: vertices that nearly agree, doubled triangles, orientation, stray
-pieces, holes. A new surface replaces what crosses itself after that, by winding numbers (Jacobson et al.
-2013, doi:10.1145/2461912.2461916), which tell inside from outside of any soup of triangles.
+Local faults are mended first: vertices that nearly agree, doubled triangles, orientation, stray pieces and
+holes. A surface that still crosses itself is replaced by a new one. Winding numbers tell its inside from its
+outside (Jacobson et al. 2013, doi:10.1145/2461912.2461916), for any set of triangles.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from autdtorch.utils.spatial import areas_of, paired_sides, sides_of
 
 _FARTHEST = 1.0001e-3  # distance between vertices that are taken as one, relative to the extent
 _STRAY = 1e-3  # share of all area below which an open piece is no part of the body
-_LARGEST_HOLE = 0.3  # area of a hole, relative to that of the surface, up to which it is closed
-_CELLS = 160  # cells along the longest side on which a surface is made anew
+_LARGEST_HOLE = 0.3  # largest area of a hole that is closed, relative to the surface
+_CELLS = 160  # cells along the longest side of a new surface
 
 
 class Repaired(NamedTuple):
@@ -159,7 +159,7 @@ def _outlines(faces: Index) -> list[Index]:
 
 
 def _anew(vertices: Array, faces: Index, done: list[str], reason: str) -> Triangles:
-    """Make the surface anew: at distance 0 from a soup of triangles, inside where it winds around half."""
+    """Return a new surface around the points that the triangles wind around at least half."""
     import igl
 
     lower, upper = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))

@@ -32,8 +32,8 @@ _BESIDE = 1e-6  # distance from a triangle of points on both sides of it, relati
 _END = 1e-6  # share of an edge, at each end, that may touch the triangles there
 _MOST_CROSSINGS = 10**6  # of edges and triangles of all parts; a union with so many takes seconds
 _TRIED = 1000  # edges on which they are counted
-# Distances, relative to the extent, between vertices that differ by rounding: the least that is tried, in
-# steps of ten, and the most. The last is 1 um for a body of 0.1 m, as of text with six decimals in metres
+# Distances, relative to the extent, up to which vertices are joined, tried in steps of ten from the first to
+# the last: 1 um for a body of 0.1 m, as in text with six decimals in metres
 _ROUNDING, _ROUNDED = 1e-9, 1.0001e-5
 _FOLDED = 1e-10  # 1 - cosine of the angle between faces that lie on each other
 _AROUND = 1e-4  # distance from a crossing at which windings are counted, relative to the extent

@@ -87,7 +87,7 @@ class Box(_Centred):
 
     @property
     def fills_bounds(self) -> bool:
-        """Whether the edges are along the axes; see `Obstacle.fills_bounds`."""
+        """True if the edges are along the axes; see `Obstacle.fills_bounds`."""
         return self.rotation == (0.0, 0.0, 0.0)
 
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:

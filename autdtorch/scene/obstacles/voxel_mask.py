@@ -44,9 +44,9 @@ _UNCERTAIN_CUBES = 0.3
 class VoxelMask(Obstacle):
     """A body of voxels, such as a segmented scan.
 
-    Voxels are samples: the body is the smooth one that has them, with flat faces and edges where the voxels
-    show some, and with their volume (`voxel_surface.py`). Errors of fields count the `uncertainty` of its
-    surface. With `smooth=False` it is made of the voxels themselves.
+    Voxels are samples of a smooth body, which has flat faces and edges where the voxels show some, and their
+    volume (`voxel_surface.py`). Errors of fields include the `uncertainty` of its surface. With
+    `smooth=False` the body is the union of the voxels.
 
     Attributes:
         mask: (nx, ny, nz): booleans, True in the body; or whole numbers, 0 outside and one other inside; or
@@ -131,7 +131,7 @@ class VoxelMask(Obstacle):
         """Make a body of a PyVista `ImageData`, from the values of its cells or, without any, of its points.
 
         A value at a point stands for the voxel around it. Spacing and origin of the image count, times
-        `scale`, metres per unit of the image: 1e-3 for one in millimetres. `name` is that of the array, by
+        `scale`, metres per unit of the image: 1e-3 for one in millimetres. `name` selects the array, by
         default the active one. For the other arguments see `VoxelMask`, and for the material see `Obstacle`.
 
         Raises:
@@ -146,7 +146,7 @@ class VoxelMask(Obstacle):
 
     @property
     def uncertainty(self) -> float:
-        """Distance [m] by which the surface may be off (rms): voxels do not say where it is between them."""
+        """Distance [m] by which the surface may be off (rms), as it lies somewhere between voxels."""
         return self._body.uncertainty
 
     @property

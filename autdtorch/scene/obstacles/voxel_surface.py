@@ -1,11 +1,11 @@
-"""The body of voxels: the smooth one that they sample, or the cuboids that they are.
+"""The body of voxels: a smooth surface through their samples, or the union of the cuboids.
 
-A mask says of each voxel whether its centre is in a body. The body is not made of cubes: those of a sphere
-have more than its surface, and a tilted face has stairs. The surface of a mask is found in three steps: the
-mask is smoothed and becomes a level set; its normals are averaged among those of nearby triangles that are
-nearly parallel (bilateral filter: Zheng et al. 2011, doi:10.1109/TVCG.2010.264), so that flat faces become
-flat and edges stay sharp; vertices follow the normals (Sun et al. 2007, doi:10.1109/TVCG.2007.1065). The
-volume is preserved. Grey values, as those of a scan, have their surface at a level between voxels.
+A mask says for each voxel whether its centre is in the body. A body of cubes would have too large a surface,
+and stairs on tilted faces. So the mask is smoothed and becomes a level set. The normals of its triangles are
+averaged with nearby ones that are nearly parallel (bilateral filter: Zheng et al. 2011,
+doi:10.1109/TVCG.2010.264), so that faces become flat and edges stay sharp. Vertices follow the normals (Sun
+et al. 2007, doi:10.1109/TVCG.2007.1065), and the volume is restored. The surface of grey values, such as
+those of a scan, is at a level between voxels.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ _ROUNDS, _AVERAGED, _MOVED = 3, 12, 12
 # Standard deviations of the distance between triangles whose normals are averaged [voxels], and of the
 # difference of these normals: with 0.3 spheres get facets, with 0.5 edges are rounded
 _NEAR, _PARALLEL = 1.8, 0.38
-_REACH = 1.7  # Distance of the farthest of them, in the former
+_REACH = 1.7  # Largest distance of triangles that are averaged, relative to `_NEAR`
 _VOLUME_STEPS, _VOLUME_ERROR = 20, 1e-9  # Most steps that restore the volume, and the relative error left
 # Standard deviations of the levels of smoothing that are compared [voxels], and the difference from the mask
 # at which a level is too smooth
 _LEVELS, _MISSED = (0.5, 0.8, 1.2, 1.8, 2.6), 0.15
-# Share of the distance between the surface and a smoother one that is the uncertainty: fitted to the fields
+# Uncertainty, relative to the rms distance of the sharpened surface from the smooth one; fitted to the fields
 # of spheres and boxes
 _UNCERTAIN = 0.5
-_UNCERTAIN_SMOOTH, _UNCERTAIN_GREY = 0.1, 0.02  # Those of the smoother surface and of grey values [voxels]
+_UNCERTAIN_SMOOTH, _UNCERTAIN_GREY = 0.1, 0.02  # Of the smooth surface and of grey values [voxels]
 # Depth [voxels] by which a surface may have the centre of a voxel on the wrong side. Sharpened surfaces of
 # balls and boxes reach 0.2; more is a body of few voxels, a thin part or a hole that is lost
 _WRONG_SIDE = 0.25
-_MOST_WRONG = 0.05  # Share of the voxels beside a surface from which the surface does not belong to the mask
+_MOST_WRONG = 0.05  # Share of nearby voxels on the wrong side, above which a mask is too thin
 _LEAST = 1e-7  # Share of a smoothed mask that is rounding
 _AIR = 2  # Voxels of air around cuboids in the distance transform; points farther away use a search tree
 
@@ -97,8 +97,8 @@ class VoxelSurface:
     def _build(self) -> tuple[Array, Index, float, int]:
         """Return vertices, triangles, the uncertainty and the number of voxels lost.
 
-        Sharpening makes cubes of balls of few voxels, and a volume that is kept swells what thin parts have
-        lost: of three surfaces the first counts that has the centres of all voxels on their side.
+        The first of three surfaces is used that has the centres of all voxels on their side: sharpening makes
+        cubes of balls of few voxels, and restoring the volume swells bodies that have lost thin parts.
         """
         edge = float(np.cbrt(np.prod(self._edges)))
         if self._level is not None:
@@ -108,9 +108,9 @@ class VoxelSurface:
         if not len(rough[1]) or not len(smooth[1]):
             raise ThinError
         places, sides = _beside_surface(self._values, self._edges)
-        for vertices, faces, known in self._tried(*rough, *smooth):
+        for vertices, faces, uncertain in self._tried(*rough, *smooth):
             wrong = np.maximum(0, -sides * MeshDistance(vertices, faces)(places))
-            uncertainty = math.hypot(known, math.sqrt(float((wrong**2).mean())))
+            uncertainty = math.hypot(uncertain, math.sqrt(float((wrong**2).mean())))
             lost = int((wrong > _WRONG_SIDE * edge).sum())
             if not lost:
                 break
@@ -121,7 +121,7 @@ class VoxelSurface:
     def _tried(
         self, rough: Array, rough_faces: Index, smooth: Array, smooth_faces: Index
     ) -> Iterator[tuple[Array, Index, float]]:
-        """Yield the surfaces that may count, each with its uncertainty [m], made when it is asked for."""
+        """Yield surfaces, each with its uncertainty [m]: sharpened, smooth with the volume, and smooth."""
         uncertain = _UNCERTAIN_SMOOTH * float(np.cbrt(np.prod(self._edges)))
         sharpened = _sharpened(rough, rough_faces, float(self._edges.max()))
         sharp = _with_volume(sharpened, rough_faces, self._volume)
@@ -240,7 +240,7 @@ class VoxelCubes:
 
 
 def _padded(grey: Array) -> Array:
-    """Return a field, negative in the body, with a voxel around it; bodies at its end reach to its faces."""
+    """Return a field, negative in the body, padded by a voxel; bodies at its end reach to its faces."""
     padded = np.pad(grey, 1, mode="edge")
     around = np.pad(np.zeros(grey.shape, bool), 1, constant_values=True)
     return np.where(around, np.abs(padded), padded)
