@@ -73,8 +73,8 @@ class TransducerArray:
     `array + other` joins two arrays: the transducers of `array`, then those of `other`.
 
     A transducer is a point, or a disc of monopoles: Rayleigh's integral for a flat circular piston of uniform
-    velocity. The far field of a disc has the directivity 2 J1(k a sin t) / (k a sin t) at the angle t from its
-    normal. Without a baffle, the field behind the disc mirrors the field in front.
+    velocity. The far field of a disc has the directivity 2 J1(k a sin t) / (k a sin t) at the angle t from
+    its normal. Without a baffle, the field behind the disc mirrors the field in front.
 
     Attributes:
         positions: (M, 3) [m], float64, all different.
