@@ -1,26 +1,33 @@
-"""Exact fields of point sources and discs in free space."""
+"""Exact fields of point sources, discs and pistons in free space."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 
 from autdtorch.scene.arrays import TransducerArray, strengths_of
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.spatial import distances
+from autdtorch.utils.units import real_wavenumber
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
+    Vector,
     differentiable_points,
     invalid,
     not_negative,
     points_tensor,
     positive,
+    unit_vector,
 )
 
 PAIR_BYTES = 80.0  # Memory for each entry of a transfer matrix while it is computed [bytes]
+_HALVINGS = 30  # Halvings of the angle along the rim of a piston towards the point nearest to the receiver
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+_PANEL_PHASE = 6.0  # Phase of a panel that 16 Gauss nodes integrate with errors below 1e-13 [rad]
 
 
 def green(points: ArrayLike, sources: ArrayLike, wavenumber: complex) -> torch.Tensor:
@@ -63,9 +70,65 @@ def free_space_matrix(points: ArrayLike, array: TransducerArray, wavenumber: com
     return 4 * math.pi * strengths_of(array).to(points.device) * sum(terms, start=none)
 
 
+def piston_field(
+    points: ArrayLike, sources: ArrayLike, wavenumber: float, radius: float, normal: Vector
+) -> torch.Tensor:
+    """Return the pressure of circular pistons in an infinite rigid baffle, by the Rayleigh integral.
+
+    The integral over the disc is exact along rays from the foot of the receiver's perpendicular. The integral
+    along the rim remains, (1 / ik) oint (e^{ikR} - e^{ikz}) d phi (Schoch 1941, Akust. Z. 6, 318).
+
+    Args:
+        points: (P, 3) [m]; the field is equal on both sides of the disc.
+        sources: centres of the pistons (M, 3) [m].
+        wavenumber: k [rad/m], > 0.
+        radius: a [m], > 0.
+        normal: axis of all pistons (3,); any length.
+
+    Returns:
+        complex128 (P, M) [1/m]; e^{ikr} / (4 pi r) on the axis far away, as `green`.
+
+    Raises:
+        ValueError: not finite, wrong shape, or an argument <= 0.
+
+    Source: Morse & Ingard, Theoretical Acoustics (1968), section 7.4; Pierce, Acoustics, section 5-2.
+    """
+    targets = points_tensor("points", points)
+    centers = points_tensor("sources", sources).to(targets.device)
+    wavenumber, radius = real_wavenumber(wavenumber), positive("radius", radius, "m")
+    axis = targets.new_tensor(unit_vector("normal", normal))
+    between = targets[:, None] - centers
+    along = between @ axis
+    offset = (between - along[..., None] * axis).norm(dim=-1)
+    z = along.abs()
+    total = torch.zeros_like(offset, dtype=torch.complex128)
+    for angle, weight in _rim(wavenumber * radius):
+        # 1 - cos as a square: next to the rim it alone keeps R from zero.
+        from_nearest = 2 * math.sin(angle / 2) ** 2
+        aside = (radius - offset) ** 2 + 2 * radius * offset * from_nearest
+        rim = torch.sqrt(z**2 + aside)
+        edge = radius * (radius - offset + offset * from_nearest)
+        # aside = R^2 - z^2 in e^{ikR} - e^{ikz} cancels with the denominator of d phi / d angle.
+        path = aside / (rim + z)
+        factor = weight * edge / (rim + z) * torch.sinc(wavenumber * path / (2 * math.pi))
+        total += factor * torch.exp(0.5j * wavenumber * (rim + z))
+    return total / (4 * math.pi**2 * radius**2)
+
+
 def _wavenumber(value: complex) -> tuple[float, float]:
     """Return wavenumber k and attenuation alpha of a complex wavenumber."""
     if not isinstance(value, complex):
         return positive("wavenumber", value, "rad/m"), 0.0
     k = positive("wavenumber.real", value.real, "rad/m")
     return k, not_negative("wavenumber.imag", value.imag, "Np/m")
+
+
+def _rim(size: float) -> list[tuple[float, float]]:
+    """Return angles over half the rim and weights over all of it, for a size of ka."""
+    pieces = 1 + int(size * math.pi / 2 / _PANEL_PHASE)
+    edges = [0.0]
+    for halving in range(_HALVINGS, -1, -1):
+        edges.extend(np.linspace(edges[-1], math.pi / 2**halving, 1 + pieces)[1:].tolist())
+    lower, upper = np.array(edges[:-1])[:, None], np.array(edges[1:])[:, None]
+    angles = (lower + upper) / 2 + (upper - lower) / 2 * _NODES
+    return list(zip(angles.ravel().tolist(), ((upper - lower) * _WEIGHTS).ravel().tolist(), strict=True))

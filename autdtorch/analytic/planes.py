@@ -1,13 +1,23 @@
-"""Point sources in front of an infinite rigid or pressure-release plane, fluid half-space or fluid slab."""
+"""Point sources in front of an infinite rigid plane, fluid half-space or fluid slab.
+
+Fields of layers are superpositions of plane waves.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
 
+import numpy as np
 import torch
+from scipy.integrate import cumulative_trapezoid
+from scipy.special import hankel1, jv
 
 from autdtorch.analytic.green import green
-from autdtorch.analytic.layers import Layering, source_response
+from autdtorch.utils.array_types import Array, ComplexArray
+from autdtorch.utils.units import real_wavenumber
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
@@ -47,25 +57,13 @@ def rigid_plane(
 
     Source: Pierce, Acoustics, section 5-1.
     """
-    image = _image_wave(points, sources, wavenumber, origin, normal)
-    return image if boolean("scattered", scattered) else green(points, sources, wavenumber) + image
-
-
-def soft_plane(
-    points: ArrayLike,
-    sources: ArrayLike,
-    wavenumber: float,
-    origin: Vector,
-    normal: Vector,
-    *,
-    scattered: bool = False,
-) -> torch.Tensor:
-    """Return the field of point sources in front of a pressure-release plane: source minus image source.
-
-    Arguments, returns and errors as for `rigid_plane`.
-    """
-    image = _image_wave(points, sources, wavenumber, origin, normal)
-    return -image if boolean("scattered", scattered) else green(points, sources, wavenumber) - image
+    targets = points_tensor("points", points)
+    origins = points_tensor("sources", sources).to(targets.device)
+    axis = targets.new_tensor(unit_vector("normal", normal))
+    _heights("points", targets, origin, axis, -LENGTH_TOLERANCE)
+    heights = _heights("sources", origins, origin, axis, -LENGTH_TOLERANCE)
+    image = green(targets, origins - 2 * heights[:, None] * axis, wavenumber)
+    return image if boolean("scattered", scattered) else green(targets, origins, wavenumber) + image
 
 
 def fluid_half_space(
@@ -81,9 +79,9 @@ def fluid_half_space(
 ) -> torch.Tensor:
     """Return the field of point sources in front of a fluid half-space, on both sides of its face.
 
-    Arguments, returns and errors as for `rigid_plane`, with the ratios of `step_coefficients`; the points may
-    be anywhere. With `scattered`, the field of the sources in the infinite medium is subtracted. The error is
-    about 1e-10 of the direct wave.
+    Arguments, returns and errors as for `rigid_plane`, with the ratios rho_1 / rho > 0 and c_1 / c > 0; the
+    points may be anywhere. With `scattered`, the field of the sources in the infinite medium is subtracted.
+    The error is about 1e-10 of the direct wave.
 
     Source: Brekhovskikh & Godin, Acoustics of Layered Media II (1992), chapter 1.
     """
@@ -110,17 +108,6 @@ def fluid_slab(
     """
     layering = Layering(wavenumber, density_ratio, speed_ratio, positive("thickness", thickness, "m"))
     return _layered_field(points, sources, layering, origin, normal, scattered)
-
-
-def _image_wave(
-    points: ArrayLike, sources: ArrayLike, wavenumber: float, origin: Vector, normal: Vector
-) -> torch.Tensor:
-    targets = points_tensor("points", points)
-    origins = points_tensor("sources", sources).to(targets.device)
-    axis = targets.new_tensor(unit_vector("normal", normal))
-    _heights("points", targets, origin, axis, -LENGTH_TOLERANCE)
-    heights = _heights("sources", origins, origin, axis, -LENGTH_TOLERANCE)
-    return green(targets, origins - 2 * heights[:, None] * axis, wavenumber)
 
 
 def _layered_field(
@@ -159,3 +146,184 @@ def _heights(
             f"of the plane; must be at least {least:g} m"
         )
     return heights
+
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
+# A panel of 32 Gauss nodes has errors below 1e-13 up to these limits.
+_PANEL_PHASE = 20.0  # [rad] along it
+_PANEL_LENGTH = 3.0  # times the distance to the nearest singularity
+# Depth of the contour below the axis times the offset; J_0 grows to e^4 there, at a loss of two digits
+_DIP = 4.0
+# Legs of the diagonal; the first leaves out 8^-6 = 4e-6 of the dip, with an error of its square
+_DIAGONAL_LEGS = 6
+_TAIL = 40.0  # exponent of decay at the end of a tail: e^-40 = 4e-18
+
+
+@dataclass(frozen=True)
+class Layering:
+    """A fluid behind a plane front face, a half-space or a slab in a medium, and its response to plane waves.
+
+    Responses are pressures over the incident pressure at the front face, for horizontal wavenumbers kappa
+    [rad/m]. They also hold for complex kappa, on the sheet that `vertical_wavenumber` defines. The transfer
+    matrix of a slab is multiplied by e^{i gamma_1 d}, so that decaying waves do not overflow, and contains
+    sin(gamma_1 x) / gamma_1, so that gamma_1 = 0 needs no special case.
+
+    Source: Brekhovskikh & Godin, Acoustics of Layered Media I (1990), section 2.2 and chapter 2.
+    """
+
+    wavenumber: float  # k of the medium in front [rad/m]
+    density_ratio: float  # rho_1 / rho of the fluid and the medium
+    speed_ratio: float  # c_1 / c of the fluid and the medium
+    thickness: float | None = None  # d of a slab [m], None for a half-space
+
+    def __post_init__(self) -> None:
+        """Check the attributes and make them floats."""
+        object.__setattr__(self, "wavenumber", real_wavenumber(self.wavenumber))
+        object.__setattr__(self, "density_ratio", positive("density_ratio", self.density_ratio))
+        object.__setattr__(self, "speed_ratio", positive("speed_ratio", self.speed_ratio))
+
+    @property
+    def inner_wavenumber(self) -> float:
+        """Wavenumber in the fluid [rad/m]."""
+        return self.wavenumber / self.speed_ratio
+
+    @property
+    def depth(self) -> float:
+        """Distance over which waves are reflected back and forth behind the front face [m]."""
+        return self.thickness or 0.0
+
+    def reflected(self, kappa: ComplexArray) -> ComplexArray:
+        """Return the reflected pressure at the front face."""
+        outer, inner, denominator = self._terms(kappa)
+        if self.thickness is None:
+            return (outer - inner) / denominator
+        _, sine = _scaled_cosine_and_sine(inner, self.thickness)
+        return -1j * (outer**2 - inner**2) * sine / denominator
+
+    def transmitted(self, kappa: ComplexArray, depth: float) -> ComplexArray:
+        """Return the total pressure at `depth` [m] >= 0 behind the front face, in the fluid or beyond it."""
+        outer, inner, denominator = self._terms(kappa)
+        if self.thickness is None:
+            return 2 * outer / denominator * np.exp(1j * inner * depth)
+        inside = min(depth, self.thickness)
+        # At the back face, p and its slope over the density are those of the transmitted wave.
+        cosine, sine = _scaled_cosine_and_sine(inner, self.thickness - inside)
+        pressure = 2 * outer * (cosine - 1j * outer * sine) / denominator * np.exp(1j * inner * inside)
+        return pressure * np.exp(1j * outer / self.density_ratio * (depth - inside))
+
+    def _terms(self, kappa: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Return the vertical wavenumbers outside, times the density ratio, and inside, and a denominator."""
+        outer = self.density_ratio * vertical_wavenumber(self.wavenumber, kappa)
+        inner = vertical_wavenumber(self.inner_wavenumber, kappa)
+        if self.thickness is None:
+            return outer, inner, outer + inner
+        cosine, sine = _scaled_cosine_and_sine(inner, self.thickness)
+        return outer, inner, 2 * outer * cosine - 1j * (outer**2 + inner**2) * sine
+
+
+def vertical_wavenumber(wavenumber: float, kappa: ComplexArray) -> ComplexArray:
+    """Return the root gamma of k^2 - kappa^2 with the branch cut from kappa = k upwards.
+
+    For real kappa >= 0 the wave travels or decays away from its source. The root is analytic in the fourth
+    quadrant, and in the first to the right of k, where contours of integration run.
+    """
+    below: ComplexArray = np.sqrt(-1j * (wavenumber - kappa)) * np.exp(0.25j * np.pi)
+    return below * np.sqrt(wavenumber + kappa)
+
+
+def _scaled_cosine_and_sine(inner: ComplexArray, length: float) -> tuple[ComplexArray, ComplexArray]:
+    """Return cos(inner length) and sin(inner length) / inner, both times e^{i inner length}."""
+    phase = 2j * length * inner
+    # expm1(z) / z is 1 at z = 0.
+    safe = np.where(phase == 0, 1, phase)
+    sine = length * np.where(phase == 0, 1, np.expm1(safe) / safe)
+    return np.asarray((1 + np.exp(phase)) / 2, np.complex128), np.asarray(sine, np.complex128)
+
+
+def source_response(layering: Layering, offset: float, height: float, source_height: float) -> complex:
+    """Return the field at a horizontal `offset` and a `height` [m] of a point source at `source_height` [m].
+
+    It is the reflected wave for `height` >= 0, else the total field: i / 4 pi times the integral of
+    F(kappa) J_0(kappa offset) kappa / gamma from kappa = 0 to infinity (Brekhovskikh & Godin, Acoustics of
+    Layered Media II, 1992, chapter 1). F = e^{i gamma height} gives `green`. Singularities of F lie between
+    0 and the larger wavenumber: branch points and poles of guided waves on the real axis, poles of leaky
+    waves above it. The contour passes below all of them. Beyond, where F is real for real kappa and decays
+    like e^{-kappa height}, both halves of J_0 follow their paths of steepest descent.
+    """
+    wavenumbers = (layering.wavenumber, layering.inner_wavenumber)
+    vertical, end = source_height + abs(height), 1.5 * max(wavenumbers)
+
+    def integrand(kappa: ComplexArray) -> ComplexArray:
+        gamma = vertical_wavenumber(layering.wavenumber, kappa)
+        if height >= 0:
+            spectrum = layering.reflected(kappa) * np.exp(1j * gamma * vertical)
+        else:
+            spectrum = layering.transmitted(kappa, -height) * np.exp(1j * gamma * source_height)
+        return spectrum * kappa / gamma
+
+    kappa, weights = _contour(wavenumbers, end, offset, vertical + 2 * layering.depth)
+    total = np.sum(weights * integrand(kappa) * jv(0, kappa * offset))
+    return complex(0.25j / np.pi * (total + _tail(integrand, end, offset, vertical)))
+
+
+def _contour(
+    wavenumbers: tuple[float, float], end: float, offset: float, vertical: float
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return nodes and weights along 0, dip - i dip, end - i dip, end.
+
+    The first part is diagonal, because evanescent leaky waves have poles to the left of the negative
+    imaginary axis. Its legs grow eightfold, because waves near their cut-off have poles near 0.
+    """
+    dip = 0.5 * wavenumbers[0]
+    if offset > 0:
+        dip = min(dip, _DIP / offset)
+    down = [dip * (1 - 1j) / 8**leg for leg in range(_DIAGONAL_LEGS, -1, -1)]
+    nodes, weights = [], []
+    for start, stop in pairwise([0j, *down, end - 1j * dip, complex(end)]):
+        edges = _panel_edges(start, stop, wavenumbers, offset, vertical) if start else np.array([0.0, 1.0])
+        fractions, fraction_weights = _gauss(edges)
+        nodes.append(start + (stop - start) * fractions)
+        weights.append((stop - start) * fraction_weights)
+    return np.concatenate(nodes, dtype=np.complex128), np.concatenate(weights, dtype=np.complex128)
+
+
+def _panel_edges(
+    start: complex, stop: complex, wavenumbers: tuple[float, float], offset: float, vertical: float
+) -> Array:
+    """Return the edges of panels, as fractions of a leg, for the limits of phase and length."""
+    length, singular = abs(stop - start), max(wavenumbers)
+    nearest = max(min(-start.imag, -stop.imag), min(start.real, stop.real) - singular)
+    along = np.linspace(0, 1, 2 + int(8 * length / nearest))
+    kappa = (start + (stop - start) * along).astype(np.complex128)
+    clearance = np.maximum(-kappa.imag, kappa.real - singular)
+    outer, inner = (np.abs(kappa / vertical_wavenumber(wavenumber, kappa)) for wavenumber in wavenumbers)
+    density = 1 / (_PANEL_LENGTH * clearance) + (offset + vertical * (outer + inner)) / _PANEL_PHASE
+    panels = length * cumulative_trapezoid(density, along, initial=0)
+    return np.interp(np.linspace(0, panels[-1], 1 + int(np.ceil(panels[-1]))), panels, along)
+
+
+def _tail(
+    integrand: Callable[[ComplexArray], ComplexArray], start: float, offset: float, height: float
+) -> complex:
+    distance = float(np.hypot(offset, height))
+    length = _TAIL / distance
+    edges = [0.0, min(start, length)]
+    while edges[-1] < length:  # widths grow with the distance to the singularities
+        edges.append(min(2 * edges[-1], length))
+    along, weights = _gauss(np.array(edges))
+    if offset <= height:
+        kappa = (start + along).astype(np.complex128)
+        return complex(np.sum(weights * integrand(kappa) * jv(0, kappa * offset)))
+    direction = (height + 1j * offset) / distance
+    kappa = (start + direction * along).astype(np.complex128)
+    upper = np.sum(weights * direction * integrand(kappa) * hankel1(0, kappa * offset))
+    # 2 J_0 = H^(1) + H^(2), and here integrand(conj kappa) = -conj integrand(kappa): the integral of H^(2) on
+    # the mirrored path is minus the conjugate of the integral of H^(1).
+    return complex(1j * upper.imag)
+
+
+def _gauss(edges: Array) -> tuple[Array, Array]:
+    """Return nodes and weights of Gauss quadrature on each interval between `edges`."""
+    half = np.diff(edges)[:, None] / 2
+    middle = (edges[1:] + edges[:-1])[:, None] / 2
+    return (middle + half * _NODES).ravel(), (half * _WEIGHTS).ravel()

@@ -1,4 +1,4 @@
-"""Point sources outside a rigid, pressure-release or fluid sphere.
+"""Point sources outside a rigid or fluid sphere.
 
 The partial-wave series of Anderson (1950, JASA 22, 426; also Morse & Ingard, Theoretical Acoustics (1968),
 chapter 8) is written with ratios of Hankel functions and logarithmic derivatives, which overflow at no order.
@@ -30,8 +30,8 @@ from autdtorch.utils.validation import (
     positive,
 )
 
-# Condition slope * dp/d(kr) + pressure * p = 0: from N to (slope, pressure) of the orders 0 to N
-Boundary: TypeAlias = Callable[[int], tuple[torch.Tensor | float, torch.Tensor | float]]
+# Condition dp/d(kr) + admittance * p = 0: from N to the admittances of the orders 0 to N
+Boundary: TypeAlias = Callable[[int], torch.Tensor | float]
 # Radial functions: from k r (P,) and N to the orders 0 to N, complex (N + 1, P)
 Radial: TypeAlias = Callable[[torch.Tensor, int], torch.Tensor]
 
@@ -71,26 +71,7 @@ def rigid_sphere(
         rho_1 -> infinity.
     """
     setup = _setup(points, sources, wavenumber, center, radius)
-    return _field_outside(setup, lambda _: (1.0, 0.0), boolean("scattered", scattered))
-
-
-def soft_sphere(
-    points: ArrayLike,
-    sources: ArrayLike,
-    wavenumber: float,
-    center: Vector,
-    radius: float,
-    *,
-    scattered: bool = False,
-) -> torch.Tensor:
-    """Return the field of point sources outside a pressure-release sphere.
-
-    Arguments, returns and errors as for `rigid_sphere`.
-
-    Source: Anderson (1950), JASA 22, 426, for rho_1 -> 0.
-    """
-    setup = _setup(points, sources, wavenumber, center, radius)
-    return _field_outside(setup, lambda _: (0.0, 1.0), boolean("scattered", scattered))
+    return _field_outside(setup, lambda _: 0.0, boolean("scattered", scattered))
 
 
 def fluid_sphere(
@@ -106,7 +87,7 @@ def fluid_sphere(
 ) -> torch.Tensor:
     """Return the field of point sources outside a fluid sphere, outside and inside it.
 
-    Arguments, returns and errors as for `rigid_sphere`, with the ratios of `step_coefficients`;
+    Arguments, returns and errors as for `rigid_sphere`, with the ratios rho_1 / rho > 0 and c_1 / c > 0;
     points may be anywhere. With `scattered`, the field of the sources in the infinite medium is subtracted.
 
     Source: Anderson (1950), JASA 22, 426, with the partial waves of a point source for those of a plane wave.
@@ -173,10 +154,9 @@ def _field_outside(
     x = setup.size
 
     def radial(kr: torch.Tensor, orders: int) -> torch.Tensor:
-        slope, pressure = boundary(orders)
-        bessel, hankel = _bessel_slopes(x, orders), _hankel_slopes(x, orders)
+        admittance, bessel, hankel = boundary(orders), _bessel_slopes(x, orders), _hankel_slopes(x, orders)
         # A_n h_n(x)^2, with the Wronskian j_n h_n (h_n'/h_n - j_n'/j_n) = i / x^2.
-        modes = (pressure + slope * bessel) / ((bessel - hankel) * (pressure + slope * hankel))
+        modes = (admittance + bessel) / ((bessel - hankel) * (admittance + hankel))
         return (1j / x**2 * modes)[:, None] * _hankel_fall(x, kr, orders)
 
     field = _series(setup, setup.wavenumber * setup.point_distances, radial, inner_size)
@@ -188,9 +168,8 @@ def _field_inside(setup: _Setup, density_ratio: float, speed_ratio: float, scatt
     boundary = _fluid_boundary(x, density_ratio, speed_ratio)
 
     def radial(kr: torch.Tensor, orders: int) -> torch.Tensor:
-        slope, pressure = boundary(orders)
         # B_n h_n(x) j_n(x_1), times j_n(k_1 r) / j_n(x_1) with j_n = (j_n h_n) / h_n: j_n may be zero.
-        modes = 1j / x**2 / (pressure + slope * _hankel_slopes(x, orders)) / _product(inner_size, orders)
+        modes = 1j / x**2 / (boundary(orders) + _hankel_slopes(x, orders)) / _product(inner_size, orders)
         return modes[:, None] * _product(kr, orders) * _hankel_fall(kr, inner_size, orders)
 
     inner_wavenumber = setup.wavenumber / speed_ratio
@@ -201,7 +180,7 @@ def _field_inside(setup: _Setup, density_ratio: float, speed_ratio: float, scatt
 
 def _fluid_boundary(x: torch.Tensor, density_ratio: float, speed_ratio: float) -> Boundary:
     """Return the condition that p and (1/rho) dp/dr are continuous."""
-    return lambda orders: (1.0, -_bessel_slopes(x / speed_ratio, orders) / (density_ratio * speed_ratio))
+    return lambda orders: -_bessel_slopes(x / speed_ratio, orders) / (density_ratio * speed_ratio)
 
 
 def _series(setup: _Setup, kr: torch.Tensor, radial: Radial, inner_size: float) -> torch.Tensor:

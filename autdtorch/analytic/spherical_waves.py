@@ -31,36 +31,36 @@ def degrees(degree: int) -> torch.Tensor:
 
 def orders(degree: int) -> torch.Tensor:
     """Return the order m of each wave (N,), int64."""
-    own = degrees(degree)
-    return torch.arange(len(own), dtype=torch.int64, device="cpu") - own.square() - own
+    every = degrees(degree)
+    return torch.arange(len(every), dtype=torch.int64, device="cpu") - every.square() - every
 
 
 def mirrored(degree: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the place of each wave (l, m) at (l, -m), and the sign (-1)^m, (N,) each."""
-    own, order = degrees(degree), orders(degree)
-    return own.square() + own - order, 1.0 - 2.0 * (order % 2)
+    every, order = degrees(degree), orders(degree)
+    return every.square() + every - order, 1.0 - 2.0 * (order % 2)
 
 
 def real_waves(degree: int) -> torch.Tensor:
-    """Return the unitary mixing (N, N) of waves to those with real harmonics.
+    """Return the unitary matrix (N, N) from waves with real harmonics, one a column, to waves.
 
-    Of (l, m) and (l, -m), column (l, m), m > 0, has cos(m phi), and column (l, -m) has sin(m phi).
+    For m > 0, column (l, m) has cos(m phi), and column (l, -m) has sin(m phi).
     """
     order, (place, sign) = orders(degree), mirrored(degree)
     mixing = torch.zeros(len(order), len(order), **COMPLEX)
-    for own, m in enumerate(order.tolist()):
+    for wave, m in enumerate(order.tolist()):
         half = torch.tensor(math.sqrt(0.5) * (1 if m > 0 else 1j), dtype=mixing.dtype, device="cpu")
-        mixing[own, own] = half if m else 1.0
+        mixing[wave, wave] = half if m else 1.0
         if m:
-            mixing[place[own], own] = sign[own] * half.conj()
+            mixing[place[wave], wave] = sign[wave] * half.conj()
     return mixing
 
 
 def parities(degree: int) -> torch.Tensor:
     """Return whether each of the `real_waves` is odd in x, y and z: 0 or 1 (N, 3), int64."""
-    own, order = degrees(degree), orders(degree)
+    order = orders(degree)
     sine = (order < 0).to(torch.int64)
-    return torch.stack([(order.abs() + sine) % 2, sine, (own + order) % 2], dim=1)
+    return torch.stack([(order.abs() + sine) % 2, sine, (degrees(degree) + order) % 2], dim=1)
 
 
 def harmonics(degree: int, directions: torch.Tensor) -> torch.Tensor:
@@ -85,7 +85,7 @@ def harmonics(degree: int, directions: torch.Tensor) -> torch.Tensor:
 
 
 class _Recurrence(NamedTuple):
-    """Factors of P_lm / sin^m, and where the harmonics of all m are among those of m >= 0."""
+    """Factors of P_lm / sin^m, and the places of the harmonics of all m among those of m >= 0."""
 
     factor: list[torch.Tensor]  # of z P_(l-1)m, for m = 0 to l - 1
     back: list[torch.Tensor]  # of P_(l-2)m before that factor, for m = 0 to l - 2
@@ -106,8 +106,8 @@ def _recurrence(degree: int) -> _Recurrence:
         back.append((((n - 1) ** 2 - m * m) / (4 * (n - 1) ** 2 - 1)).sqrt())
         tops.append(-tops[-1] * math.sqrt((2 * n + 1) / (2 * n)))
     pairs = (degree + 1) * (degree + 2) // 2
-    own, m = degrees(degree), orders(degree)
-    place = own * (own + 1) // 2 + m.abs()
+    every, m = degrees(degree), orders(degree)
+    place = every * (every + 1) // 2 + m.abs()
     order = torch.cat([torch.arange(n + 1, dtype=torch.int64, device="cpu") for n in range(degree + 1)])
     sign = torch.where(m < 0, mirrored(degree)[1], 1.0).to(torch.float64)
     return _Recurrence(factor, back, tops, order, torch.where(m < 0, place + pairs, place), sign)
@@ -157,8 +157,8 @@ def sphere_coefficients(
         speed_ratio: ratio of sound speeds, sphere over medium.
     """
     order = np.arange(degree + 1)
-    own, slope = spherical_jn(order, size), spherical_jn(order, size, derivative=True)
-    out = own + 1j * spherical_yn(order, size)
+    regular, slope = spherical_jn(order, size), spherical_jn(order, size, derivative=True)
+    out = regular + 1j * spherical_yn(order, size)
     out_slope = slope + 1j * spherical_yn(order, size, derivative=True)
     inner, inner_slope = np.ones(degree + 1), np.zeros(degree + 1)
     if not math.isinf(density_ratio):
@@ -167,8 +167,8 @@ def sphere_coefficients(
         lost = np.abs(inner) < _LOST  # j_l is proportional to x^l there
         inner, slope_inside = np.where(lost, 1.0, inner), np.where(lost, order / inside, slope_inside)
         inner_slope = slope_inside / (density_ratio * speed_ratio)
-    found: ComplexArray = -(slope * inner - own * inner_slope) / (out_slope * inner - out * inner_slope)
-    return found
+    outgoing = out_slope * inner - out * inner_slope
+    return np.asarray(-(slope * inner - regular * inner_slope) / outgoing, np.complex128)
 
 
 def enough_degrees(size: float, error: float) -> int:

@@ -30,18 +30,13 @@ from autdtorch.utils.array_types import Array
 
 logger = logging.getLogger(__name__)
 
-MOST_PASSES = 12
-"""Most passes of the multiple-scattering iteration between boxes; one box is cheaper than more."""
-
-_MOST_OBSTACLES = 64
-"""Most obstacles that are grouped; more share one box."""
-
+MOST_PASSES = 12  # Most passes of the iteration between boxes; beyond, one box is cheaper
+_MOST_OBSTACLES = 64  # Most obstacles that are grouped; more share one box
+# Periods of a usual run among obstacles, relative to the fewest; 1.0 to 3.5 depending on the resonances
 USUAL_PERIODS = 1.7
-"""Periods of a usual run among obstacles, relative to the fewest; 1.0 to 3.5 depending on the resonances."""
-
+# Time of a step of a cell in a boundary layer, of a run in a box beside its steps, and of a term of a sum
+# over Green's function
 _LAYER, _BOX_RUN, _PAIR = 4.0, 2_000_000, 1.0
-"""Time of a step of a cell in a boundary layer, of a run in a box beside its steps, and of a term of a sum
-over Green's function."""
 
 
 @dataclass(frozen=True)
@@ -125,9 +120,9 @@ def choose_grids(
     """Return the method and its grids; for "auto" the cheapest of "box" and "full" that is accurate."""
     if method in ("box", "operator"):
         return method, cheapest_boxes(region, spacing, tolerance, runs)
-    own, extent = np.eye(3), domain_extent(region, spacing)
-    aligned = bool(region.bodies) and all(flat_faces(shape).all_aligned(own) for shape in region.shapes)
-    domain = _boxes(region, [_Box(tuple(range(len(region.bodies))), own, extent, aligned)], spacing, 1)
+    axes, extent = np.eye(3), domain_extent(region, spacing)
+    aligned = bool(region.bodies) and all(flat_faces(shape).all_aligned(axes) for shape in region.shapes)
+    domain = _boxes(region, [_Outline(tuple(range(len(region.bodies))), axes, extent, aligned)], spacing, 1)
     if method == "full":
         return method, domain
     boxes = cheapest_boxes(region, spacing, tolerance, runs)
@@ -158,19 +153,21 @@ def cheapest_boxes(region: Region, spacing: float, tolerance: float, runs: int) 
     best = _one_box(region, spacing, surfaces)
     if len(region.bodies) > _MOST_OBSTACLES:
         return best
-    boxes = [_Box.around(region, [index], surfaces) for index in range(len(region.bodies))]
+    boxes = [_Outline.around(region, [index], surfaces) for index in range(len(region.bodies))]
     while len(boxes) > 1:
         gaps = _gaps(boxes, spacing)
         if gaps.min() > 0 and (passes := _expected_passes(boxes, tolerance)) <= MOST_PASSES:
-            best = min(best, _boxes(region, boxes, spacing, passes), key=lambda found: found.box_cost(runs))
+            best = min(
+                best, _boxes(region, boxes, spacing, passes), key=lambda grouping: grouping.box_cost(runs)
+            )
         first, second = sorted(map(int, np.unravel_index(gaps.argmin(), gaps.shape)))
         both = sorted((*boxes[first].group, *boxes.pop(second).group))
-        boxes[first] = _Box.around(region, both, surfaces)
+        boxes[first] = _Outline.around(region, both, surfaces)
     return best
 
 
 @dataclass(frozen=True)
-class _Box:
+class _Outline:
     """The obstacles of a box, its axes, one a row (3, 3), and its extent along them.
 
     It is aligned if every face of its obstacles is parallel to them.
@@ -182,7 +179,7 @@ class _Box:
     aligned: bool
 
     @classmethod
-    def around(cls, region: Region, group: Sequence[int], surfaces: Sequence[FlatFaces]) -> _Box:
+    def around(cls, region: Region, group: Sequence[int], surfaces: Sequence[FlatFaces]) -> _Outline:
         faces = [surfaces[index] for index in group]
         axes = axes_along(faces)
         shapes = [turned_shape(region.bodies[index].shape, axes) for index in group]
@@ -201,16 +198,16 @@ class _Box:
 
 
 def _one_box(region: Region, spacing: float, surfaces: Sequence[FlatFaces]) -> Grouping:
-    return _boxes(region, [_Box.around(region, range(len(surfaces)), surfaces)], spacing, 1)
+    return _boxes(region, [_Outline.around(region, range(len(surfaces)), surfaces)], spacing, 1)
 
 
-def _boxes(region: Region, boxes: Sequence[_Box], spacing: float, passes: int) -> Grouping:
+def _boxes(region: Region, boxes: Sequence[_Outline], spacing: float, passes: int) -> Grouping:
     grids = tuple(grid_cost(region, box.extent, spacing) for box in boxes)
     groups, axes = tuple(box.group for box in boxes), tuple(box.axes for box in boxes)
     return Grouping(groups, axes, grids, passes, all(box.aligned for box in boxes))
 
 
-def _gaps(boxes: Sequence[_Box], spacing: float) -> Array:
+def _gaps(boxes: Sequence[_Outline], spacing: float) -> Array:
     """Distances (B, B) [m] of boxes' interiors, along the axis where it is largest; infinite to itself."""
     gaps = np.full((len(boxes), len(boxes)), math.inf)
     for (i, one), (j, other) in combinations(enumerate(boxes), 2):
@@ -223,7 +220,7 @@ def _gaps(boxes: Sequence[_Box], spacing: float) -> Array:
     return gaps
 
 
-def _expected_passes(boxes: Sequence[_Box], tolerance: float) -> int:
+def _expected_passes(boxes: Sequence[_Outline], tolerance: float) -> int:
     """Expected passes: a large body of radius a scatters a / 2d of an incident field to a distance d."""
     middle = np.array([box.middle for box in boxes])
     radius = np.array([np.linalg.norm(box.half) for box in boxes])

@@ -24,8 +24,9 @@ from autdtorch.utils.array_types import Array, Index
 logger = logging.getLogger(__name__)
 
 CLOSE = 1.03  # A bound within this factor of an attained value is used as it is: 1.5 % of the time step
-# Factor on the iterated eigenvalue, at 0.5 % of the time step. Iteration approaches from below: 60 steps
-# leave up to 2e-4, the rim of one cell 3e-4 (cubes of density ratio 1e-3 to 1e4, speed ratio 0.3 to 4).
+# Factor on the iterated eigenvalue, which costs 0.5 % of the time step. Iteration approaches from below:
+# after 60 steps it is off by up to 2e-4, and with a rim of one cell by 3e-4 (cubes of density ratio 1e-3 to
+# 1e4, speed ratio 0.3 to 4).
 MARGIN = 1.01
 # Most heterogeneous cells for the iteration, which takes about five seconds; beyond, the bound decides
 MOST_CELLS = 1_000_000
@@ -39,8 +40,8 @@ _ROUNDING = 1e-9  # Stencil rows within this of air's are those of air; most row
 def largest_eigenvalue(index: Index, weight: Array, stencil: Stencil, shape: tuple[int, int, int]) -> float:
     """Return an upper bound of the largest eigenvalue of the operator.
 
-    The larger one of uniform air, and of the heterogeneous cells `index` (n,), ascending, with a rim of one
-    cell: a mode above those of air is bound to these cells and fades within a cell.
+    It is the larger one of uniform air, and of the heterogeneous cells `index` (n,), ascending, with a rim of
+    one cell. A mode above those of air is bound to these cells and fades within a cell.
     """
     air = stencil.largest_symbol
     unlike = (np.abs(weight - stencil.weights) > _ROUNDING).any(axis=1)
@@ -78,12 +79,12 @@ _REVERSED = 26 - np.arange(27)  # Index in `OFFSETS` of the opposite offset
 
 def _with_rim(index: Index, shape: tuple[int, int, int]) -> tuple[Index, NDArray[np.int32]]:
     """Return cells `index` and their neighbours, ascending, and the place of each grid cell among them."""
-    found = np.zeros(math.prod(shape), bool)
+    near = np.zeros(math.prod(shape), bool)
     for offset in flat_offsets(shape):
-        found[index + offset] = True
-    found &= np.pad(np.ones([cells - 2 for cells in shape], bool), 1).ravel()  # not in the outermost ring
-    rows = np.flatnonzero(found)
-    place = np.full(len(found), -1, np.int32)
+        near[index + offset] = True
+    near &= np.pad(np.ones([cells - 2 for cells in shape], bool), 1).ravel()  # not in the outermost ring
+    rows = np.flatnonzero(near)
+    place = np.full(len(near), -1, np.int32)
     place[rows] = np.arange(len(rows))
     return rows, place
 

@@ -3,7 +3,7 @@
 A block is the fewest periods, at least three, with a whole number of steps. Phasors of windows of that
 length, a quarter of a block apart, follow x_(n+1) = A x_n + b, as the scheme is linear. Reduced rank
 extrapolation (Eddy 1979; Sidi 2017) estimates the fixed point: the mean sum g_j x_j, with sum g_j = 1, of
-least residual sum g_j (x_(j+1) - x_j). It removes the slowest modes first, those of cavities.
+least residual sum g_j (x_(j+1) - x_j). It removes the slowest modes first, such as resonances of cavities.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_basis, drive_s
 from autdtorch.utils.array_types import COMPLEX, Index
 
 Phasors = NDArray[np.complex128]
-# Fewest periods of a block. Shorter blocks cost more overhead, and the phasors kept cover less time.
+# Fewest periods of a block. Shorter blocks cost more overhead, and their phasors cover less time.
 _FEWEST_PERIODS = 3
 _PARTS = 4  # Windows per block
-# Range of the number of phasors kept, limited by `_MOST_NUMBERS`; more extrapolate better
+# Range of the number of stored phasors, limited by `_MOST_NUMBERS`; more extrapolate better
 _FEWEST_PHASORS, _MOST_PHASORS = 12, 64
-_MOST_NUMBERS = 20_000_000  # Most complex numbers that the phasors kept may hold: 320 MB
+_MOST_NUMBERS = 20_000_000  # Most complex numbers of the stored phasors: 320 MB
 _MOST_FITTED = 2048  # Most cells whose phasors decide the means
 _ROUNDING = 1e-13  # Regularisation of the normal equations, relative to the mean square of the differences
 # Pressure relative to that in free space, -80 dB, below which errors are relative to this floor: behind a
@@ -103,7 +103,7 @@ def fewest_periods(arrival: float) -> int:
 
 
 def phasors_kept(cells: int) -> int:
-    """Return the number of phasors that a run keeps of so many cells."""
+    """Return the number of phasors of `cells` cells that a run stores."""
     return min(max(_FEWEST_PHASORS, _MOST_NUMBERS // max(1, cells)), _MOST_PHASORS)
 
 
@@ -117,7 +117,7 @@ class Extrapolation:
         self._product = np.zeros((0, 0), np.complex128)
 
     def __len__(self) -> int:
-        """Return the number of values kept."""
+        """Return the number of stored values."""
         return len(self._values)
 
     def append(self, value: Phasors) -> None:

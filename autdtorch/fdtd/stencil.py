@@ -1,7 +1,7 @@
 """The 27-point stencil tuned to one frequency (nonstandard FDTD, Mickens 1994, Cole 2002).
 
-A step in uniform air is p_new = 2 p - p_old + C sum_j g_j (p_j - p), with one value of g for the 6 faces, one
-for the 12 edges and one for the 8 corners of the surrounding cube. The three values make the symbol
+A step in uniform air is p_new = 2 p - p_old + C sum_j g_j (p_j - p). The weights g have three values, for the
+6 faces, the 12 edges and the 8 corners of the surrounding cube. These make the symbol
 
     L(kappa) = sum_j g_j (1 - cos(kappa . n_j)),        kappa = k h,
 
@@ -73,7 +73,7 @@ class Stencil:
         return float((_basis(corners) @ (self.face, self.edge, self.corner)).max())
 
     def isotropic_symbol(self, kappa: float) -> float:
-        """Return the mean real part of the symbol of another sound speed; the loss per wavelength is kept."""
+        """Return the mean real part of the symbol of another sound speed, at equal loss per wavelength."""
         loss = self.eta / self.kappa
         return _mean_symbol(kappa * complex(1, loss), (self.face, self.edge, self.corner)).real
 

@@ -27,9 +27,9 @@ from autdtorch.utils.validation import invalid
 
 logger = logging.getLogger(__name__)
 
-# Periods over which the drive is switched on. A short ramp excites the shortest waves of the grid, which
-# almost stand still and stay: at 2 mm, 3 periods left changes of 1e-3 per period after 60 periods. Free space
-# at 1 mm has errors of 0.056, 0.120, 0.074 and 0.050 % with 5 to 8 periods.
+# Periods over which the drive is switched on. A short ramp excites the shortest waves of the grid, whose
+# group velocity is almost zero: at 2 mm, 3 periods left changes of 1e-3 per period after 60 periods. Free
+# space at 1 mm has errors of 0.056, 0.120, 0.074 and 0.050 % with 5 to 8 periods.
 RAMP_PERIODS = 8
 # Initial uniform pressure, relative to the largest force. From exact zeros the wave's precursors would decay
 # into subnormal numbers, on which processors are slow (2.4 times, measured at 120^3 in float32).
@@ -61,10 +61,10 @@ class Assembly:
     def interpolation(self, points: Tensor, weights: Tensor = _ONE_NODE) -> Interpolation:
         """Return cells and weights of points (P, 3) [m], or of nodes (P, n, 3) with `weights` (n,)."""
         nodes, grid = points.reshape(-1, 3), self.grid
-        found = self._in_air(nodes)
-        sound_hard = np.isin(found.index, self.heterogeneous.sound_hard)  # their pressure is not defined
-        found = exclude_cells(found, grid.to_cells(nodes), sound_hard, grid.shape, grid.kappa)
-        return average_nodes(found, weights.numpy())
+        kernels = self._in_air(nodes)
+        sound_hard = np.isin(kernels.index, self.heterogeneous.sound_hard)  # their pressure is not defined
+        kernels = exclude_cells(kernels, grid.to_cells(nodes), sound_hard, grid.shape, grid.kappa)
+        return average_nodes(kernels, weights.numpy())
 
     def _in_air(self, points: Tensor) -> Interpolation:
         """Return the interpolation as if all cells were of air."""
@@ -78,7 +78,7 @@ class Assembly:
     def is_enclosed(self, points: Tensor, walls: Sequence[Shape]) -> NDArray[np.bool_]:
         """Return whether points (N, 3) [m] are nearer to enclosed cells than to others of air.
 
-        Cells behind sound-hard `walls`, in the coordinates of the grid, do not count.
+        Cells behind rigid `walls`, in the coordinates of the grid, do not count.
         """
         if not len(self.heterogeneous.enclosed):
             return np.zeros(len(points), bool)
@@ -98,18 +98,18 @@ class Assembly:
 
     def receivers(self, points: Tensor, weights: Tensor = _ONE_NODE) -> Receivers:
         """Return receivers at points (P, 3) [m], or of means over nodes (P, n, 3) with `weights` (n,)."""
-        found = self.interpolation(points, weights)
-        return Receivers(torch.from_numpy(found.index), torch.from_numpy(found.weight).to(self.dtype))
+        kernels = self.interpolation(points, weights)
+        return Receivers(torch.from_numpy(kernels.index), torch.from_numpy(kernels.weight).to(self.dtype))
 
     def sources(self, points: Tensor, strength: Tensor, weights: Tensor = _ONE_NODE) -> Sources:
         """Return point sources at (P, 3) [m] with far field strength e^{ikr}/r, strength (P,) complex [Pa m].
 
         Nodes (P, n, 3) with `weights` (n,) share the strength of a source. Differentiable by strength.
         """
-        found = self.interpolation(points, weights)
+        kernels = self.interpolation(points, weights)
         factor = self.stencil.source_factor(float(self.steps_per_period)) / self.grid.spacing
-        index, inverse = np.unique(found.index, return_inverse=True)
-        force = (strength[:, None] * torch.from_numpy(factor * found.weight)).reshape(-1)
+        index, inverse = np.unique(kernels.index, return_inverse=True)
+        force = (strength[:, None] * torch.from_numpy(factor * kernels.weight)).reshape(-1)
         total = force.new_zeros(len(index)).index_add(0, torch.from_numpy(inverse.reshape(-1)), force)
         total = total / torch.from_numpy(self.heterogeneous.mass_of(index))
         return Sources(torch.from_numpy(index), torch.view_as_real(total).to(self.dtype))

@@ -24,12 +24,10 @@ from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
+# Largest difference of equal stencil rows, relative to the weight of a face: on a grid of 1 mm, shifts by
+# `LENGTH_TOLERANCE` cause it
 _ROUNDING = 1e-6
-"""Largest difference of equal stencil rows, relative to the weight of a face; `LENGTH_TOLERANCE` shifts cause
-as much on a grid of 1 mm."""
-
-_NONE = -1
-"""Index of the image of a point that is none of the points."""
+_NONE = -1  # Index of an image that is none of the points
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +82,8 @@ def orbits_of_points(points: torch.Tensor, symmetries: Sequence[Symmetry]) -> Or
 
 def orbits_of_transducers(points: torch.Tensor, symmetries: Sequence[Symmetry]) -> Orbits:
     """Return the orbits of transducers as sources, by the symmetries that map the points onto themselves."""
-    both = [(symmetry.images(points), symmetry.transducers) for symmetry in symmetries]
-    images, transducers = zip(*[(own, to) for own, to in both if (own != _NONE).all()], strict=True)
+    pairs = [(symmetry.images(points), symmetry.transducers) for symmetry in symmetries]
+    images, transducers = zip(*[pair for pair in pairs if (pair[0] != _NONE).all()], strict=True)
     return Orbits(False, *_representatives(np.stack(transducers)), np.stack(images))
 
 
@@ -109,7 +107,7 @@ def symmetries(assemblies: Sequence[Assembly], along: Array, transducers: Apertu
     grid, cells = assembly.grid, assembly.heterogeneous
     center = (np.array(grid.origin) + grid.spacing * (np.array(grid.shape) - 1) / 2) @ along
     positions, weights = transducers.positions.numpy(), transducers.weights.numpy()
-    found = [Symmetry(np.eye(3), center, np.arange(len(positions)))]
+    result = [Symmetry(np.eye(3), center, np.arange(len(positions)))]
     turns = itertools.product(itertools.permutations(range(3)), itertools.product((1, -1), repeat=3))
     for axes, signs in itertools.islice(turns, 1, None if len(assemblies) == 1 else 1):
         turn = np.diag(signs) @ np.eye(3, dtype=np.int64)[list(axes)]
@@ -118,8 +116,8 @@ def symmetries(assemblies: Sequence[Assembly], along: Array, transducers: Apertu
         matrix = along.T @ turn @ along
         images = _matched(positions, weights, matrix, center)
         if (images != _NONE).all() and _maps_cells(cells, grid, turn, _ROUNDING * assembly.stencil.face):
-            found.append(Symmetry(matrix, center, images))
-    return found
+            result.append(Symmetry(matrix, center, images))
+    return result
 
 
 def _matched(groups: Array, weights: Array, matrix: Array, center: Array) -> Index:

@@ -23,11 +23,11 @@ from autdtorch.utils.validation import Vector
 
 ALIGNED = 1 - 1e-9  # Smallest cosine between the normal of a face and an axis that is parallel to it
 _PERPENDICULAR = 4e-5  # Largest cosine between perpendicular normals; the same angle
-# Share of all surfaces that must become aligned before a grid is turned, which may cost symmetries
+# Least additional share of all surfaces aligned by turning a grid, which may cost symmetries
 _WORTHWHILE = 0.4
-_AXES_DECIMALS = 12  # Decimals of the normals that axes follow: rounding of a place must not turn the grid
+_AXES_DECIMALS = 12  # Decimals of normals: rounding of positions must not turn the grid
 _DECIMALS = 6  # Normals that agree to so many decimals are equal: files hold single precision
-_ALL = 1 - 1e-6  # Share of a surface that is aligned if it all is: slivers do not count
+_ALL = 1 - 1e-6  # Aligned share of a surface from which all of it is aligned, apart from slivers
 _SAGITTA = 1.5  # Growth of a bounding box, relative to the distance of triangles from a curved surface
 
 
@@ -78,7 +78,7 @@ def turned_shape(shape: Shape, axes: Array) -> Shape:
 
 
 def turned(region: Region, axes: Array) -> Region:
-    """Return a region in the coordinates of other axes, one a row (3, 3), without a domain of its own."""
+    """Return a region in the coordinates of other axes, one a row (3, 3); its domain is infinite."""
     if not is_turned(axes):
         return region
     bodies = tuple(replace(body, shape=turned_shape(body.shape, axes)) for body in region.bodies)
@@ -113,15 +113,15 @@ def axes_along(surfaces: Sequence[FlatFaces]) -> Array:
     Where flat faces are too small, a direction along which no body varies, as along a cylinder, is an axis.
     """
     together = FlatFaces(*(np.concatenate(parts) for parts in zip(*surfaces, strict=True)))
-    own = np.eye(3)
-    best = max((_own_axes(*faces) for faces in surfaces), key=together.aligned_share)
-    if together.aligned_share(best) > together.aligned_share(own) + _WORTHWHILE:
+    scene_axes = np.eye(3)
+    best = max((_axes_of_faces(*faces) for faces in surfaces), key=together.aligned_share)
+    if together.aligned_share(best) > together.aligned_share(scene_axes) + _WORTHWHILE:
         return best
-    if any(together.is_prism(axis) for axis in own):
-        return own
+    if any(together.is_prism(axis) for axis in scene_axes):
+        return scene_axes
     _, directions = np.linalg.eigh(together.normals.T @ (together.areas[:, None] * together.normals))
     along = next((axis for axis in directions.T if together.is_prism(axis)), None)
-    return own if along is None else _axes_with(along.round(_AXES_DECIMALS))
+    return scene_axes if along is None else _axes_with(along.round(_AXES_DECIMALS))
 
 
 def flat_faces(shape: Shape) -> FlatFaces:
@@ -137,7 +137,7 @@ def flat_faces(shape: Shape) -> FlatFaces:
     return FlatFaces(total / areas[:, None], areas / 2)
 
 
-def _own_axes(normals: Array, areas: Array) -> Array:
+def _axes_of_faces(normals: Array, areas: Array) -> Array:
     """Return the axes (3, 3) of the largest face and of the largest perpendicular one, in the usual order."""
     normals = normals.round(_AXES_DECIMALS)
     first = normals[areas.argmax()]
@@ -158,10 +158,10 @@ def _axes_with(first: Array, second: Array | None = None) -> Array:
 
 # Largest radius [cells] of such a cylinder: elements across it are fitted together, at most four by four
 _LARGEST_RADIUS = 1.25
-_FEWEST_CORNERS = 16  # Fewest corners of a polygon that stands for a circle
+_FEWEST_CORNERS = 16  # Fewest corners of a polygon that represents a circle
 _ROUND = 1e-6  # Largest deviation of corners from the circle, relative to the radius
 _STEPS = np.cos((np.arange(4) + 0.5) * np.pi / 8)  # Faces of the staircase, relative to its radius
-_SCALE = 0.957173  # Radius of the staircase over that of the circle of equal area
+_SCALE = 0.957173  # Radius of the staircase over the radius of the circle of equal area
 
 
 def slender_faces(corners: Array) -> list[Array] | None:

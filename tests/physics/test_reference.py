@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from exact_fields import WAVELENGTH, K
+from exact_fields import WAVELENGTH, K, piston_directivity
 from scipy.special import j0, struve
 
 from autdtorch import analytic
@@ -18,16 +18,13 @@ def test_piston_on_its_axis_is_the_closed_form_near_and_far():
     z = torch.tensor([0.0, 1e-4, 5e-3, 0.1, 3.0, 1e3], dtype=torch.float64)
     points = torch.stack([z, 0 * z, 0 * z], dim=1)
     field = analytic.piston_field(points, [[0.0, 0.0, 0.0]], K, PISTON, (2.0, 0.0, 0.0))[:, 0]
-    exact = analytic.piston_on_axis(z, K, PISTON)
+    # (e^{ik sqrt(z^2 + a^2)} - e^{ikz}) / (2 pi i k a^2) as a product, which does not cancel far away
+    path = torch.hypot(z, 0 * z + PISTON) + z
+    amplitude = torch.sinc(K * PISTON**2 / path / (2 * math.pi)) / (2 * math.pi * path)
     # Rounding of k z = 7e5 at the farthest.
-    assert torch.allclose(field, exact, rtol=1e-9, atol=0)
+    assert torch.allclose(field, amplitude * torch.exp(0.5j * K * path), rtol=1e-9, atol=0)
     # Fresnel's phase k a^2 / 4z = 5e-6 is left at 1 km.
-    assert abs(exact[-1] / green(points[-1:], [[0.0, 0.0, 0.0]], K) - 1) < 1e-5
-    difference = (torch.exp(1j * K * torch.hypot(z, 0 * z + PISTON)) - torch.exp(1j * K * z)) / (
-        2j * math.pi * K * PISTON**2
-    )
-    # The difference of two waves loses digits far away, as 1 / z.
-    assert torch.allclose(exact[:4], difference[:4], rtol=1e-10, atol=0)
+    assert abs(field[-1] / green(points[-1:], [[0.0, 0.0, 0.0]], K) - 1) < 1e-5
 
 
 @pytest.mark.parametrize("reach", [0.1, 3.7, 30.0])
@@ -35,11 +32,11 @@ def test_piston_far_away_is_its_directivity(reach):
     """At 1e5 a^2 / wavelength and 1e4 wavelengths, Fresnel's phase and the 1 / (k r) terms are below 1e-4."""
     radius = reach / K
     distance = 1e4 * WAVELENGTH * max(1, reach**2)
-    angle = torch.linspace(0, math.pi / 2, 9, dtype=torch.float64)
+    angle = torch.linspace(1e-3, math.pi / 2, 9, dtype=torch.float64)
     points = distance * torch.stack([torch.sin(angle), 0 * angle, torch.cos(angle)], dim=1)
     field = analytic.piston_field(points, [[0.0, 0.0, 0.0]], K, radius, (0.0, 0.0, 1.0))
     ratio = (field / green(points, [[0.0, 0.0, 0.0]], K))[:, 0]
-    assert (ratio - analytic.piston_directivity(angle, K, radius)).abs().max() < 1e-4
+    assert (ratio - piston_directivity(angle, reach)).abs().max() < 1e-4
 
 
 def test_piston_near_is_the_sum_over_its_disc():

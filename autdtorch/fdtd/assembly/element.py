@@ -1,6 +1,6 @@
 """The reference element, the cube between eight cell centres, and the shares of materials in its parts.
 
-The scheme is a sum over elements of a stiffness matrix, given by 28 coupling coefficients between vertices,
+The scheme is a sum over elements of a stiffness matrix, with 28 coupling coefficients between vertices,
 and of a lumped mass at each vertex. Lengths are in cells, densities and masses relative to air.
 """
 

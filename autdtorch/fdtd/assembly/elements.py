@@ -260,7 +260,7 @@ def near_surface(measure: Measure, lower: Index, upper: Index) -> tuple[Index, A
 
 
 def lattice_distances(measure: Measure, first: Index) -> Array:
-    """Return the distances (n, 125) at the lattice of elements, given their first cells (n, 3)."""
+    """Return the distances (n, 125) at the lattice of elements, by their first cells (n, 3)."""
     halves = _at_lattice(measure, first, _HALVES)
     bent = (np.abs(halves @ _BEYOND_QUADRATIC) > _SMOOTH).any(axis=1)
     rough = np.flatnonzero(bent | (np.linalg.norm(halves @ _GRADIENT, axis=1) < _STEEP))
