@@ -40,27 +40,23 @@ def written(folder):
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.fixture
-def composed():
-    def config(*overrides):
-        # `output` refers to Hydra's own settings, which compose() leaves out.
+def composed(*overrides):
+    # `output` refers to Hydra's settings, which compose() leaves out.
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
         return OmegaConf.to_container(compose("config", [*overrides, "output=x"]), resolve=True)
 
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        yield config
+
+def test_every_scene_builds_and_has_the_name_of_its_file():
+    for name in CONFIG_NAMES["scene"]:
+        assert load_scene(composed(f"scene={name}")["scene"]).name == name
 
 
-@pytest.mark.parametrize("name", CONFIG_NAMES["scene"])
-def test_every_scene_builds_and_has_the_name_of_its_file(name, composed):
-    assert load_scene(composed(f"scene={name}")["scene"]).name == name
+def test_every_method_builds_with_known_settings():
+    for name in CONFIG_NAMES["method"]:
+        assert isinstance(load_method("method", composed(f"method={name}")["method"], ()), Method)
 
 
-@pytest.mark.parametrize("name", CONFIG_NAMES["method"])
-def test_every_method_builds_with_known_settings(name, composed):
-    assert isinstance(load_method("method", composed(f"method={name}")["method"], ()), Method)
-
-
-def test_every_goal_has_a_config_of_its_name_with_all_its_settings(composed):
+def test_every_goal_has_a_config_of_its_name_with_all_its_settings():
     assert sorted(GOALS) == CONFIG_NAMES["goal"]
     for name, goal in GOALS.items():
         section = composed(f"goal={name}")["goal"]
@@ -68,7 +64,7 @@ def test_every_goal_has_a_config_of_its_name_with_all_its_settings(composed):
         assert list(section)[1:] == [field.name for field in dataclasses.fields(goal)]
 
 
-def test_the_papers_experiment(composed):
+def test_the_papers_experiment():
     config = composed("experiment=paper")
     assert load_goal("goal", config["goal"]) == WeakestFocus()
     assert not {"scene", "method"} & set(config)
@@ -84,141 +80,111 @@ def test_the_papers_experiment(composed):
     assert composed("experiment=paper", "trials=7")["trials"] == 7
 
 
-@pytest.mark.parametrize(
-    ("words", "goal"),
-    [
-        ((), WeakestFocus()),
-        (("goal.weights=[1,2,1,2]",), WeakestFocus([1, 2, 1, 2])),
-        (("goal=mean_pressure",), MeanPressure()),
-        (("goal=target_pressures", "goal.targets=[4,2,4,2]"), TargetPressures([4, 2, 4, 2])),
-        (("goal=quiet_points", "goal.points=[2,3]"), QuietPoints(WeakestFocus(), [2, 3], 0.03)),
-        (
-            ("goal=quiet_points", "goal.points=[3]", "goal.ratio=0.1", "goal.goal=mean_pressure"),
-            QuietPoints(MeanPressure(), [3], 0.1),
-        ),
-        (
-            ("goal=quiet_points", "goal.points=[0]", "goal.goal={name:target_pressures,targets:[4,2,4]}"),
-            QuietPoints(TargetPressures([4, 2, 4]), [0], 0.03),
-        ),
-        (("goal=contrast", "goal.points=1-3"), Contrast([1, 2, 3])),
-    ],
-)
-def test_a_run_maximises_the_goal_of_its_settings(words, goal, run, tmp_path, capsys):
+GOAL_WORDS = {
+    "": WeakestFocus(),
+    "goal.weights=[1,2,1,2]": WeakestFocus([1, 2, 1, 2]),
+    "goal=mean_pressure": MeanPressure(),
+    "goal=target_pressures goal.targets=[4,2,4,2]": TargetPressures([4, 2, 4, 2]),
+    "goal=quiet_points goal.points=[2,3]": QuietPoints(WeakestFocus(), [2, 3], 0.03),
+    "goal=quiet_points goal.points=[3] goal.ratio=0.1 goal.goal=mean_pressure": QuietPoints(
+        MeanPressure(), [3], 0.1
+    ),
+    "goal=quiet_points goal.points=[0] goal.goal={name:target_pressures,targets:[4,2,4]}": QuietPoints(
+        TargetPressures([4, 2, 4]), [0], 0.03
+    ),
+    "goal=contrast goal.points=1-3": Contrast([1, 2, 3]),
+}
+
+
+def test_a_run_maximises_the_goal_of_its_settings_and_uses_no_results_of_another(run, tmp_path, capsys):
     command = ("scene=homogeneous", "method=gabs", "method.levels=4", "plane_spacing=20e-3", "output=out")
-    for reused in (False, True):
-        assert run(*command, *words) == 0
-        assert ("re-using" in capsys.readouterr().err) is reused
-    scene = load_results(tmp_path / "out").scenes["homogeneous"]
-    assert load_goal("goal", scene.goal) == goal
-    solution = scene.methods["gabs"].solution
-    assert solution.score.tolist() == goal(solution.pressure).tolist()
-    assert solution.score.max() <= scene.bound == goal.bound(scene.transfer_matrix)
+    for words, goal in GOAL_WORDS.items():
+        for reused in (False, True):
+            assert run(*command, *words.split()) == 0
+            assert ("re-using" in capsys.readouterr().err) is reused
+        scene = load_results(tmp_path / "out").scenes["homogeneous"]
+        assert load_goal("goal", scene.goal) == goal
+        solution = scene.methods["gabs"].solution
+        assert solution.score.tolist() == goal(solution.pressure).tolist()
+        assert solution.score.max() <= scene.bound == goal.bound(scene.transfer_matrix)
+    assert len(list((tmp_path / "out").glob("previous-*"))) == len(GOAL_WORDS) - 1
 
 
-def test_results_of_another_goal_are_not_used(run, tmp_path, capsys):
-    command = ("scene=homogeneous", "method=lssg", "plane_spacing=20e-3", "output=out")
-    for words in ((), ("goal=mean_pressure",), ("goal.weights=[1,2,1,2]",), ("goal.weights=[1,2,1,3]",)):
-        assert run(*command, *words) == 0
-        assert "re-using" not in capsys.readouterr().err
-    assert len(list((tmp_path / "out").glob("previous-*"))) == 3
+#: Overrides in one string, divided by two spaces, and the beginning of the message.
+WRONG = {
+    "goal=loudest": "goal: 'loudest'; must be one of contrast, mean_pressure, quiet_points, ",
+    "goal.name=loudest": r"goal\.name: 'loudest'; must be one of weakest_focus, mean_pressure, ",
+    "goal=target_pressures": "goal: targets: None; must be",
+    "goal=target_pressures  goal.targets=[4,2]": r"goal: targets: \(4\.0, 2\.0\); must be 4 numbers",
+    "goal=quiet_points  goal.points=[4]": r"goal: points: \(4,\); must be indices from 0 to 3",
+    "goal=quiet_points  goal.points=[3]  goal.goal=gabs": r"goal\.goal\.name: 'gabs'; must be one of",
+    "goal=quiet_points  goal.points=[3]  goal.goal=3": r"goal\.goal: 3; must be the name of a goal",
+    "+goal.targets=[1]": "goal: unknown key 'targets'.*; allowed keys: name, weights",
+    "+goal._target_=os.system": r"goal\._target_: 'os\.system'; must not be given",
+    "goal=quiet_points  goal.goal={_target_:os.system}": r"goal\.goal\._target_: 'os\.system'; must not be",
+    "scene=two_cube": r"scene: 'two_cube'; must be one of homogeneous, .* \(did you mean 'two_cubes'\?\)",
+    "method=GABS": r"method: 'GABS'; must be one of .* \(did you mean 'gabs'\?\)",
+    "experiment=nature": "experiment: 'nature'; must be one of paper",
+    "trails=3": r"trails: unknown key \(did you mean 'trials'\?\)",
+    "scene.freqency=4": r"scene\.freqency: unknown key \(did you mean 'frequency'\?\)",
+    "method.level=8": r"method\.level: unknown key \(did you mean 'levels'\?\); keys that are set: levels, ",
+    "scene.medium.absorption=1": r"scene\.medium\.absorption: .*; .* as \+scene\.medium\.absorption=1;",
+    "+solver.spcing=1e-3": "solver: unknown key 'spcing' .*; allowed keys: method, spacing, ",
+    "+speed=1": "settings: unknown key 'speed' .*; allowed keys: scene, method, ",
+    "+method.trials=3": "method: unknown key 'trials'; allowed keys: levels",
+    "+scene.colour=red": "scene: unknown key 'colour'",
+    "solver.spacing=abc": "solver: spacing: 'abc'; must be a real number",
+    "method.levels=1": "method: levels: 1; must be an integer >= 2",
+    "plane_spacing=1": r"plane_spacing: 1\.0 m; must be at most 0\.1 m, the plane's edge",
+    "scene.frequency=-40e3": r"scene: Scene\.frequency: -40000\.0 Hz; must be finite and > 0",
+    "method._target_=autdtorch.tabu": r"method\._target_: 'autdtorch\.tabu'; must be one of autdtorch",
+    "method._target_=tabu.search  modules=tabu": r"method\._target_: .*No module named 'tabu'",
+    "method._target_=.foo.gabs  modules=.foo": r"method\._target_: '\.foo\.gabs'; must be a module",
+    "method._target_='a b.gabs'  modules='a b'": r"method\._target_: 'a b\.gabs'; must be a module",
+    "method._target_=autdtorch": r"method\._target_: 'autdtorch'; must be one of",
+    "~method._target_": "method: no _target_",
+    "scene.obstacles.0.density=5": "Error merging override scene.obstacles.0.density=5: list index",
+    "scene.array={type: file, path: a.csv}": r"scene\.array\.path: unknown key",
+    "solver.spacing=[1": r"argument 'solver\.spacing=\[1': no viable alternative at input",
+    "-m  hydra.sweep.dir=a=b": r"argument 'hydra\.sweep\.dir=a=b': mismatched input",
+    "seed=1,2": "Ambiguous value for argument 'seed=1,2'",
+    "--config-dir  nowhere": "Additional config directory '.*nowhere' not found",
+    "output=file/below": "file/below: Not a directory",
+    "experiment=paper  scene=two_cubes": "scene: given beside an experiment, .* own scenes: homog",
+    "experiment=paper  scenes.two_cubes.frequency=0": r"scenes\.two_cubes: Scene\.frequency: 0 Hz",
+    "experiment=paper  methods.gabs.levels=0": r"methods\.gabs: levels: 0",
+    "experiment=paper  trials.gabs=0": r"trials\.gabs: 0; must be an integer >= 1",
+    "experiment=paper  scenes=3": "scenes: 3; must be a mapping",
+    "experiment=paper  poses={count: 2}": "poses: .*beside an experiment",
+    "poses={rotaton: [0, 0, 1], count: 3}": "poses: unknown key 'rotaton' .*'rotation'",
+    "three_cubes": "three_cubes: must be key=value",
+    "explor": "explor: must be key=value, .*did you mean 'explore'",
+    "hydra/launcher=nope": r"hydra/launcher: 'nope'; must be one of basic, joblib.*extra cluster",
+    "hydra/job_logging=lab/mine.yaml": r".*: hydra\.searchpath=\[FOLDER\] hydra/job_logging=mine",
+    "scene=configs/scene/two_cubes.yaml": "scene: .* a name, not a path: scene=two_cubes; .*--config-dir",
+    "scene=lab/scene/duct.yaml": "scene: .* a name, not a path: --config-dir lab scene=duct",
+    "hardware=emulated  hardware/sensor=scpe": r"hardware/sensor: 'scpe'; .*did you mean 'scope'",
+    "collect": "collect: ''; must be one folder",
+    "collect  .": r"\.: no finished study \(results\.h5\) there or below",
+    "scene=homogeneous  collect": "collect: 'scene=homogeneous'; must be one folder",
+    "--scene  two_cubes": "--scene: unknown option; settings have no dashes, as in scene=VALUE",
+    "--multrun  seed=1,2": "--multrun: unknown option .*did you mean '--multirun'",
+    "-m  output=x": r"output=x: a sweep has a folder .* hydra\.sweep\.dir=x",
+    "hydra.mode=MULTIRUN  output=x": r"output=x: a sweep has a folder .* hydra\.sweep\.dir=x",
+    "explore  scene=homogeneous  explore.port=-1": "port: -1; must be an integer >= 0",
+    "explore  scene=homogeneous  +explore.other=1": "explore: unknown key 'other'",
+    "explore  scene=homogeneous  explore.drive=missing.npz": ".*missing.npz: there is no such file",
+    "explore  scene=homogeneous  method=lssg": "method=lssg: has no effect on explore",
+    "explore  scene=homogeneous  solver.tolerance=0.1": "solver.tolerance=0.1: has no effect on explore",
+}
 
 
-WRONG = [
-    (["goal=loudest"], "goal: 'loudest'; must be one of contrast, mean_pressure, quiet_points, "),
-    (["goal.name=loudest"], r"goal\.name: 'loudest'; must be one of weakest_focus, mean_pressure, "),
-    (["goal=target_pressures"], "goal: targets: None; must be"),
-    (["goal=target_pressures", "goal.targets=[4,-2,4,2]"], "goal: targets: .*; must be numbers > 0"),
-    (["goal=target_pressures", "goal.targets=[4,2]"], r"goal: targets: \(4\.0, 2\.0\); must be 4 numbers"),
-    (["goal=quiet_points", "goal.points=[4]"], r"goal: points: \(4,\); must be indices from 0 to 3"),
-    (["goal=quiet_points", "goal.points=[3]", "goal.ratio=0"], "goal: ratio: 0.*; must be finite and > 0"),
-    (["goal=quiet_points", "goal.points=[3]", "goal.goal=gabs"], r"goal\.goal\.name: 'gabs'; must be one of"),
-    (["goal=quiet_points", "goal.points=[3]", "goal.goal=3"], r"goal\.goal: 3; must be the name of a goal"),
-    (["goal.weights=[1,0,1,1]"], "goal: weights: .*; must be numbers > 0"),
-    (["+goal.targets=[1]"], "goal: unknown key 'targets'.*; allowed keys: name, weights"),
-    (["+goal._target_=os.system"], r"goal\._target_: 'os\.system'; must not be given"),
-    (
-        ["goal=quiet_points", "goal.goal={_target_:os.system}"],
-        r"goal\.goal\._target_: 'os\.system'; must not be given",
-    ),
-    (["scene=thre_cubes"], "scene: 'thre_cubes'; must be one of homogeneous, sphere"),
-    (["experiment=nature"], "experiment: 'nature'; must be one of paper"),
-    (["spacing=1e-3"], "spacing: unknown key"),
-    (["solver.spcing=1e-3"], r"solver\.spcing: unknown key"),
-    (["+solver.spcing=1e-3"], "solver: unknown key 'spcing' .*; allowed keys: method, spacing, "),
-    (["+speed=1"], "settings: unknown key 'speed' .*; allowed keys: scene, method, "),
-    (["+method.trials=3"], "method: unknown key 'trials'; allowed keys: levels"),
-    (["+scene.colour=red"], "scene: unknown key 'colour'"),
-    (["solver.spacing=abc"], "solver: spacing: 'abc'; must be a real number"),
-    (["solver.device=gpu"], "solver: device: 'gpu'; must be 'cpu', 'cuda' or"),
-    (["solver.method=fast"], "solver: method: 'fast'; must be one of auto, free_space, box, full"),
-    (["method.levels=1"], "method: levels: 1; must be an integer >= 2"),
-    (["plane_spacing=1"], r"plane_spacing: 1\.0 m; must be at most 0\.1 m, the plane's edge"),
-    (["scene.frequency=-40e3"], r"scene: Scene\.frequency: -40000\.0 Hz; must be finite and > 0"),
-    (["method._target_=autdtorch.tabu"], r"method\._target_: 'autdtorch\.tabu'; must be one of autdtorch"),
-    (
-        ["method._target_=tabu.search", "modules=tabu"],
-        r"method\._target_: 'tabu\.search'; .*No module named 'tabu'",
-    ),
-    (["method._target_=.foo.gabs", "modules=.foo"], r"method\._target_: '\.foo\.gabs'; must be a module"),
-    (["method._target_=gabs", "modules=''"], r"method\._target_: 'gabs'; must be a module"),
-    (["method._target_='a b.gabs'", "modules='a b'"], r"method\._target_: 'a b\.gabs'; must be a module"),
-    (["method._target_=autdtorch"], r"method\._target_: 'autdtorch'; must be one of"),
-    (["~method._target_"], "method: no _target_"),
-    (["scene.obstacles.0.density=5"], "Error merging override scene.obstacles.0.density=5: list index"),
-    (["scene.array={type: file, path: a.csv}"], r"scene\.array\.path: unknown key"),
-    (["solver.spacing=[1"], r"argument 'solver\.spacing=\[1': no viable alternative at input"),
-    (["-m", "hydra.sweep.dir=a=b"], r"argument 'hydra\.sweep\.dir=a=b': mismatched input"),
-    (["seed=1,2"], "Ambiguous value for argument 'seed=1,2'"),
-    (["--config-dir", "nowhere"], "Additional config directory '.*nowhere' not found"),
-    (["output=file/below"], "file/below: Not a directory"),
-    (["experiment=paper", "scene=two_cubes"], "scene: given beside an experiment, .* own scenes: homog"),
-    (["experiment=paper", "scenes.two_cubes.frequency=0"], r"scenes\.two_cubes: Scene\.frequency: 0 Hz"),
-    (["experiment=paper", "methods.gabs.levels=0"], r"methods\.gabs: levels: 0"),
-    (["experiment=paper", "trials.gabs=0"], r"trials\.gabs: 0; must be an integer >= 1"),
-    (["three_cubes"], "three_cubes: must be key=value"),
-    (["hydra/launcher=nope"], r"hydra/launcher: 'nope'; must be one of basic, joblib.*extra cluster"),
-    (["collect"], "collect: ''; must be one folder"),
-    (["collect", "."], r"\.: no finished study \(results\.h5\) there or below"),
-    (["experiment=paper", "scenes=3"], "scenes: 3; must be a mapping"),
-    (
-        ["method.level=8"],
-        r"method\.level: unknown key \(did you mean 'levels'\?\); keys that are set: levels, ",
-    ),
-    (
-        ["scene.medium.absorption=1"],
-        r"scene\.medium\.absorption: .*set: density, sound_speed; .* as \+scene\.medium\.absorption=1;",
-    ),
-    (["trails=3"], r"trails: unknown key \(did you mean 'trials'\?\)"),
-    (["scene.freqency=4"], r"scene\.freqency: unknown key \(did you mean 'frequency'\?\)"),
-    (["method=GABS"], r"method: 'GABS'; must be one of .* \(did you mean 'gabs'\?\)"),
-    (["scene=two_cube"], r"scene: 'two_cube'; .* \(did you mean 'two_cubes'\?\)"),
-    (["scene=configs/scene/two_cubes.yaml"], "scene: .* a name, not a path: scene=two_cubes; .*--config-dir"),
-    (["scene=lab/scene/duct.yaml"], "scene: .* a name, not a path: --config-dir lab scene=duct"),
-    (["hydra/job_logging=stdou"], "hydra/job_logging: 'stdou'; .*did you mean 'stdout'"),
-    (
-        ["hydra/job_logging=lab/mine.yaml"],
-        r"hydra/job_logging: .*: hydra\.searchpath=\[FOLDER\] hydra/job_logging=mine",
-    ),
-    (["hardware=emulated", "hardware/sensor=scpe"], r"hardware/sensor: 'scpe'; .*did you mean 'scope'"),
-    (["explor"], "explor: must be key=value, .*did you mean 'explore'"),
-    (["scene=homogeneous", "explore", "explore.port=-1"], "port: -1; must be an integer >= 0"),
-    (["scene=homogeneous", "collect"], "collect: 'scene=homogeneous'; must be one folder"),
-    (["--scene", "two_cubes"], "--scene: unknown option; settings have no dashes, as in scene=VALUE"),
-    (["--multrun", "seed=1,2"], "--multrun: unknown option .*did you mean '--multirun'"),
-    *(
-        ([sweep, "output=x"], r"output=x: a sweep has a folder .* hydra\.sweep\.dir=x")
-        for sweep in ("-m", "--multirun", "--multi", "hydra.mode=MULTIRUN")
-    ),
-    (["poses={rotaton: [0, 0, 1], count: 3}"], "poses: unknown key 'rotaton' .*'rotation'"),
-]
-
-
-@pytest.mark.parametrize(("arguments", "message"), WRONG, ids=[" ".join(arguments) for arguments, _ in WRONG])
-def test_a_wrong_command_gets_one_line(arguments, message, refused, write, monkeypatch):
+@pytest.mark.parametrize("words", WRONG)
+def test_a_wrong_command_gets_one_line(words, refused, write, monkeypatch):
     monkeypatch.setattr(autdtorch.study.run, "_run_scene", lambda *_: pytest.fail("simulated too early"))
     write("file", "")
-    line = refused(*arguments)
-    assert re.match(rf"autdtorch: {message}", line), line
+    line = refused(*words.split("  "))
+    assert re.match(rf"autdtorch: {WRONG[words]}", line), line
 
 
 @pytest.mark.parametrize("launcher", ["slurm", "joblib", "submitit_local"])
@@ -229,7 +195,7 @@ def test_a_launcher_that_is_not_installed_names_its_extra(launcher, refused, mon
 
 
 def test_runs_of_other_methods_in_a_scene_simulate_its_matrix_once(run, tmp_path, capsys):
-    words = ("scene=two_cubes", "solver.spacing=2e-3", "plane_spacing=0.05")
+    words = ("scene=two_cubes", "solver.spacing=2.5e-3", "solver.tolerance=0.1", "plane_spacing=0.05")
     shares = []
     for method, runs in (("lss", 2), ("gradient", 1)):  # the observation plane is simulated each time
         assert run(*words, f"method={method}", "drive=full") == 0
@@ -261,19 +227,13 @@ def test_the_best_drive_is_written_as_the_levels_of_a_device(run, refused, tmp_p
 
 
 @pytest.mark.filterwarnings("always")
-def test_degrees_on_the_command_line_are_told(run, capsys):
-    words = ("scene=three_cubes", "solver.spacing=2e-3", "method=lss", "plane_spacing=0.02")
-    assert run(*words, "+scene.obstacles.0.rotation=[0,0,45]") == 0
-    told = capsys.readouterr().err
-    assert re.search(
-        r"^obstacles\[0\]: Box\.rotation: \(0\.0, 0\.0, 45\.0\) rad is more than a turn", told, re.MULTILINE
-    )
-
-
-@pytest.mark.filterwarnings("always")
-def test_a_scene_in_millimetres_is_told_under_one_name(run, capsys):
-    words = ("scene=homogeneous", "method=lss", "~scene.observation_plane", "~scene.domain")
-    assert run(*words, "scene.control_points.radius=20") == 0
+def test_degrees_and_millimetres_on_the_command_line_are_told(run, capsys):
+    words = ("scene=homogeneous", "solver.method=free_space", "method=lss", "plane_spacing=0.02")
+    turned = "{type: box, center: [41e-3, 50e-3, 50e-3], size: [9e-3, 9e-3, 9e-3], rotation: [0, 0, 45]}"
+    assert run(*words, f"scene.obstacles=[{turned[:-1]}, rigid: true}}]") == 0
+    told = r"^obstacles\[0\]: Box\.rotation: \(0\.0, 0\.0, 45\.0\) rad is more than a turn"
+    assert re.search(told, capsys.readouterr().err, re.MULTILINE)
+    assert run(*words, "~scene.observation_plane", "~scene.domain", "scene.control_points.radius=20") == 0
     assert re.search(r"^Scene: ", capsys.readouterr().err, re.MULTILINE)
 
 
@@ -298,20 +258,19 @@ def broken(objective): return objective.missing
 def empty(objective): ...
 """
 BAD_METHODS = {
-    "greedy": (2, "autdtorch: method: 'own.greedy'; missing a required argument: 'steps'; must take an obj"),
-    "broken": (1, r"autdtorch: AttributeError: .* 'missing' \(own.py, line 3, in broken\); HYDRA_FULL_ERROR"),
+    "greedy": (2, "autdtorch: method: 'mine.greedy'; missing a required argument: 'steps'; must take an obj"),
+    "broken": (1, r"autdtorch: AttributeError: .* 'missing' \(mine.py, line 3, in broken\); HYDRA_FULL_ERR"),
     "empty": (2, "autdtorch: method empty: None; must return a Solution"),
 }
 
 
-@pytest.mark.parametrize("name", BAD_METHODS)
-def test_an_error_of_ones_own_method_is_one_line(name, run, write, tmp_path, capsys, monkeypatch):
-    monkeypatch.delitem(sys.modules, "own", raising=False)
-    write("own.py", OWN_METHODS)
-    write("method/own.yaml", f"_target_: own.{name}\n")
-    status, message = BAD_METHODS[name]
-    assert run("--config-dir", str(tmp_path), "method=own", "modules=own") == status
-    assert re.match(message, capsys.readouterr().err.splitlines()[-1])
+def test_an_error_of_ones_own_method_is_one_line(run, write, capsys, monkeypatch):
+    monkeypatch.delitem(sys.modules, "mine", raising=False)
+    write("mine.py", OWN_METHODS)
+    for name, (status, message) in BAD_METHODS.items():
+        write("here/method/bad.yaml", f"_target_: mine.{name}\n")
+        assert run("--config-dir", "here", "method=bad", "modules=mine") == status
+        assert re.match(message, capsys.readouterr().err.splitlines()[-1])
 
 
 BAD_MODULES = {
@@ -323,47 +282,36 @@ BAD_MODULES = {
 }
 
 
-@pytest.mark.parametrize("name", BAD_MODULES)
-def test_a_module_that_cannot_be_imported_is_named_with_the_reason(name, refused, write):
-    content, reason = BAD_MODULES[name]
-    write(f"{name}.py", content)
-    line = refused(f"method._target_={name}.search", f"modules={name}")
-    message = rf"autdtorch: method\._target_: '{name}\.search'; {name} cannot be imported \({reason}"
-    assert re.match(message, line)
+def test_a_module_that_cannot_be_imported_is_named_with_the_reason(refused, write):
+    for name, (content, reason) in BAD_MODULES.items():
+        write(f"{name}.py", content)
+        line = refused(f"method._target_={name}.search", f"modules={name}")
+        message = rf"autdtorch: method\._target_: '{name}\.search'; {name} cannot be imported \({reason}"
+        assert re.match(message, line)
 
 
-def test_the_version_is_ours(run, capsys):
-    assert run("--version") == 0
-    assert capsys.readouterr().out == f"autdtorch {autdtorch.__version__}\n"
-
-
-def test_one_scene_and_one_method(run, tmp_path, capsys):
-    assert run("scene=homogeneous", "method=gabs", "solver.method=free_space", "trials=2") == 0
+def test_one_scene_and_one_method_are_computed_once(run, tmp_path, capsys, monkeypatch):
+    command = ("scene=homogeneous", "method=gabs", "solver.method=free_space", "trials=2")
+    assert run(*command) == 0
     folder = tmp_path / "outputs" / "homogeneous_gabs"
+    # Free space has no matrix to keep.
     assert written(tmp_path) == {f"outputs/homogeneous_gabs/{name}" for name in SINGLE_FILES}
-    assert [path.name for path in (tmp_path / "outputs").iterdir()] == ["homogeneous_gabs"]
     assert Path.cwd() == tmp_path
     method = load_results(folder).scenes["homogeneous"].methods["gabs"]
     assert method.trials == 2
     rows = [json.loads(line) for line in (folder / "trials.jsonl").read_text(encoding="utf-8").splitlines()]
     assert [row["mean"] for row in rows] == method.metrics.mean.tolist()
     captured = capsys.readouterr()
-    head, row, end = captured.out.splitlines()
+    table = head, row, end = captured.out.splitlines()
     assert head.split()[:3] == ["scene", "method", "trials"]
     assert row.split()[:4] == ["homogeneous", "GABS", "2", f"{method.metrics.mean.mean():.2f}"]
     assert end == f"The results are in {Path('outputs', 'homogeneous_gabs')}"
     assert captured.err.startswith("homogeneous: free space, ")
 
-
-def test_what_is_finished_is_not_computed_again(run, tmp_path, capsys, monkeypatch):
-    command = ("scene=homogeneous", "method=lssg", "solver.method=free_space", "plane_spacing=10e-3")
-    assert run(*command, f"solver.cache={tmp_path / 'one'}", "output=here") == 0
-    assert not (tmp_path / "one").exists()  # free space has no matrix to keep
-    table = capsys.readouterr().out
     monkeypatch.setattr(autdtorch.study.run, "_run_scene", lambda *_: pytest.fail("computed again"))
-    assert run(*command, f"solver.cache={tmp_path / 'two'}", "output=here") == 0  # changes no result
+    assert run(*command, f"solver.cache={tmp_path / 'two'}") == 0  # changes no result
     captured = capsys.readouterr()
-    assert captured.out == table
+    assert captured.out.splitlines() == table
     assert "re-using homogeneous" in captured.err
     # Where results go does not change them, but there is nothing to use elsewhere.
     with pytest.raises(pytest.fail.Exception):
@@ -410,6 +358,7 @@ def test_an_experiment_ends_with_its_report(run, tmp_path, capsys, monkeypatch):
         "experiment=paper",
         "~methods.bayes_opt",
         "~methods.bo_foci",
+        "~methods.identify",
         "~scenes.two_cubes",
         "plane_spacing=5e-3",
         "trials=2",
@@ -419,7 +368,7 @@ def test_an_experiment_ends_with_its_report(run, tmp_path, capsys, monkeypatch):
     assert captured.out.splitlines()[-1] == f"The report is {Path('outputs', 'paper', 'report.html')}"
     results = load_results(tmp_path / "outputs" / "paper")
     assert list(results.scenes) == ["homogeneous", "three_cubes"]
-    assert [method.trials for method in results.scenes["three_cubes"].methods.values()] == [1, 2, 2, 2]
+    assert [method.trials for method in results.scenes["three_cubes"].methods.values()] == [1, 2, 2]
     report = (tmp_path / "outputs" / "paper" / "report.md").read_text(encoding="utf-8")
     assert f"`autdtorch {' '.join(command)} solver.method=free_space`" in report.replace("'", "")
 
@@ -435,32 +384,24 @@ def test_ctrl_c_ends_with_one_line_and_its_status(run, capsys, monkeypatch):
     assert line.startswith("autdtorch: interrupted; ")
 
 
-def test_help_tells_what_there_is(run, tmp_path, capsys):
+def test_help_tells_what_there_is_with_the_defaults(run, tmp_path, capsys):
     assert run("--help") == 0
     text = capsys.readouterr().out
     assert "autdtorch experiment=paper" in text
     assert f"scene: {', '.join(CONFIG_NAMES['scene'])}" in text
     assert len(text.splitlines()) <= 45
-    assert written(tmp_path) == set()
-
-
-def test_the_settings_of_the_help_are_those_there_are_with_their_defaults(run, capsys):
-    assert run("--help") == 0
-    rows = re.findall(r"^  ([a-z_.]+) +\S.* \[(.*)\]$", capsys.readouterr().out, re.MULTILINE)
+    rows = re.findall(r"^  ([a-z_.]+) +\S.* \[(.*)\]$", text, re.MULTILINE)
     assert len(rows) >= 8
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        config = compose("config")
+    config = OmegaConf.create(composed())
     for key, default in rows:
         if key != "output":  # named after scene and method
-            assert (
-                OmegaConf.select(config, key, throw_on_missing=True) == OmegaConf.create(f"x: {default}").x
-            ), key
-
-
-@pytest.mark.parametrize("flag", ["--cfg", "--hydra-help"])
-def test_the_other_flags_that_the_help_names_print_and_run_nothing(run, tmp_path, capsys, flag):
-    assert run(flag, *(["job"] if flag == "--cfg" else [])) == 0
-    assert ("tolerance: 0.002" if flag == "--cfg" else "--multirun") in capsys.readouterr().out
+            shown = OmegaConf.create(f"x: {default}").x
+            assert OmegaConf.select(config, key, throw_on_missing=True) == shown, key
+    for words, part in ((["--cfg", "job"], "tolerance: 0.002"), (["--hydra-help"], "--multirun")):
+        assert run(*words) == 0
+        assert part in capsys.readouterr().out
+    assert run("--version") == 0
+    assert capsys.readouterr().out == f"autdtorch {autdtorch.__version__}\n"
     assert written(tmp_path) == set()
 
 
@@ -502,20 +443,20 @@ def test_solver_settings_are_the_defaults_of_make_propagator():
     assert OmegaConf.to_container(OmegaConf.load(CONFIGS / "solver" / "default.yaml")) == defaults
 
 
-@pytest.mark.parametrize("sensor", sorted(path.stem for path in (CONFIGS / "hardware" / "sensor").glob("*")))
 @pytest.mark.parametrize("bench", ["autd3", "emulated", "openmpd", "sonicsurface", "ultraino"])
-def test_every_bench_has_the_same_keys(bench, sensor, composed):
-    words = (f"hardware={bench}", f"hardware/sensor={sensor}", "hardware.limits.amplitude=1")
+def test_every_bench_has_the_same_keys(bench):
     device = "sonicsurface" if bench == "emulated" else bench
-    where = ("hardware.sensor.path=x",) if sensor == "file" else ()
-    section = composed(*words, f"hardware.device={device}", *where)["hardware"]
-    assert section["device"] == device
-    assert section["sensor"]["kind"] == sensor
-    assert section["emulated"] is (bench == "emulated")
-    assert section["limits"] == dataclasses.asdict(Limits(amplitude=1))
+    for sensor in sorted(path.stem for path in (CONFIGS / "hardware" / "sensor").glob("*")):
+        words = (f"hardware={bench}", f"hardware/sensor={sensor}", "hardware.limits.amplitude=1")
+        where = ("hardware.sensor.path=x",) if sensor == "file" else ()
+        section = composed(*words, f"hardware.device={device}", *where)["hardware"]
+        assert section["device"] == device
+        assert section["sensor"]["kind"] == sensor
+        assert section["emulated"] is (bench == "emulated")
+        assert section["limits"] == dataclasses.asdict(Limits(amplitude=1))
 
 
-def test_a_path_of_the_obstacles_is_a_study_of_its_poses(run, tmp_path, refused):
+def test_a_path_of_the_obstacles_is_a_study_of_its_poses(run, tmp_path, refused, monkeypatch):
     coarse = ("scene=two_cubes", "solver.spacing=2.5e-3", "solver.tolerance=0.1", "plane_spacing=0.02")
     poses = "poses={offset: [0, 4e-3, 0], rotation: [0, 0, 0.1], count: 3}"
     assert run(*coarse, "method=lssg", poses, "+scene.pose={offset: [0, 1e-3, 0]}", "output=path") == 0
@@ -526,25 +467,9 @@ def test_a_path_of_the_obstacles_is_a_study_of_its_poses(run, tmp_path, refused)
     last = make_propagator(scene, spacing=2.5e-3, tolerance=0.1, cache=False).transfer_matrix()
     # the same simulation, up to rounding in single precision
     assert float((results.scenes["two_cubes_2"].transfer_matrix - last).norm() / last.norm()) < 1e-3
+    monkeypatch.setattr("autdtorch.study.report.study_report.rendering_problem", lambda: "not tried")
     assert run("collect", "path") == 0
     assert "count: 1; must be an integer >= 2" in refused(*coarse, "poses={count: 1}")
-    assert "unknown key 'ofset'" in refused(*coarse, "poses={ofset: [0, 0, 0]}")
-    assert "beside an experiment" in refused("experiment=paper", "poses={count: 2}")
-
-
-@pytest.mark.parametrize(
-    ("setting", "named"),
-    [
-        ("method=lssg", "method=lssg"),
-        ("solver.tolerance=0.1", "solver.tolerance"),
-        ("explore.port=70000", "port"),
-        ("+explore.other=1", "other"),
-        ("explore.drive=missing.npz", "missing.npz"),
-        ("solver.spacing=-1", "spacing"),
-    ],
-)
-def test_explore_refuses_settings_that_it_cannot_use(refused, setting, named):
-    assert named in refused("explore", "scene=sphere", setting)
 
 
 def test_explore_shows_the_scene_and_drive_of_the_settings(run, write, monkeypatch, capsys):

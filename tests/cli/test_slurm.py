@@ -22,7 +22,14 @@ SWEEP += ("method=identify", f"trials={TRIALS}")
 LAUNCHER = ("hydra/launcher=slurm", "hydra.launcher.timeout_min=5", "hydra.launcher.mem_gb=1")
 
 
-@pytest.fixture
+ASKING_EVERY_SECOND = """
+from autdtorch.cli import main, slurm
+slurm._PAUSE = (1.0, 1.0)
+main.main()
+"""
+
+
+@pytest.fixture(scope="module")
 def slurm():
     """The environment in which Slurm's commands find the cluster."""
     if missing := missing_programs():
@@ -60,10 +67,10 @@ def run_out_of_time(job, slurm):
 def test_disturbed_jobs_end_with_the_numbers_of_undisturbed_ones(slurm, tmp_path, run):
     assert run("-m", *SWEEP) == 0
     undisturbed, disturbed = tmp_path / "multirun", tmp_path / "auf Slurm, gestört"
-    command = [sys.executable, "-m", "autdtorch", "-m", *LAUNCHER, "hydra.launcher.cpus_per_task=1"]
-    command += [*SWEEP, f"hydra.sweep.dir='{disturbed}'"]
+    same = (*SWEEP, f"hydra.sweep.dir='{disturbed}'")
+    command = [sys.executable, "-c", ASKING_EVERY_SECOND, "-m", *LAUNCHER, "hydra.launcher.cpus_per_task=1"]
 
-    popen = subprocess.Popen(command, env=slurm, stderr=subprocess.PIPE, text=True)
+    popen = subprocess.Popen([*command, *same], env=slurm, stderr=subprocess.PIPE, text=True)
     with popen as sweep, contextlib.ExitStack() as ending:
         ending.callback(sweep.kill)  # a failure would otherwise wait for it
         for seed, disturb in ((0, kill), (1, run_out_of_time)):
@@ -81,7 +88,7 @@ def test_disturbed_jobs_end_with_the_numbers_of_undisturbed_ones(slurm, tmp_path
     assert (job_folder(disturbed, 1) / "results.h5").exists()
     assert "Restarts=1" in answer(slurm, "scontrol", "show", "job", f"{number}_1")
 
-    subprocess.run(command, env=slurm, check=True)
+    assert run("-m", *same) == 0
     for seed in (0, 1):
         sweeps = (undisturbed, disturbed)
         one, other = (load_results(job_folder(sweep, seed)).scenes["sphere"] for sweep in sweeps)

@@ -15,6 +15,7 @@ from checks.kills import Subject, of_studies, wait
 from hydra import compose, initialize_config_dir
 
 from autdtorch.cli.config_files import CONFIGS
+from autdtorch.study.report.tables import save_summary
 from autdtorch.study.results_file import load_results
 from autdtorch.study.sweeps import collect_results
 
@@ -25,34 +26,47 @@ def jobs(folder):
     return sorted(file.parent.name for file in folder.rglob("results.h5"))
 
 
-def test_a_sweep_has_a_folder_for_each_job(run, tmp_path):
-    assert run("-m", "hydra/launcher=submitit_local", *QUICK, "method=gabs,lssg") == 0
-    assert jobs(tmp_path) == [
-        f"method={name},plane_spacing=0.02,scene=homogeneous" for name in ("gabs", "lssg")
-    ]
+def test_a_sweep_by_submitit_has_a_folder_for_each_job(run, tmp_path):
+    assert run("-m", "hydra/launcher=submitit_local", *QUICK, "method=lssg") == 0
+    assert jobs(tmp_path) == ["method=lssg,plane_spacing=0.02,scene=homogeneous"]
+
+
+CLIMBING = """
+import autdtorch as at
+
+def climb(objective, steps, trials, seed):
+    return at.random_search(objective, evaluations=steps, trials=trials, seed=seed)
+"""
 
 
 @pytest.mark.parametrize("launcher", ["basic", "joblib"])
-def test_a_sweep_logs_a_line_for_each_job_between_its_start_and_its_end(tmp_path, launcher):
-    """In a process of its own, as workers write to stderr and not to what stands for it in a test."""
-    command = [
-        sys.executable,
-        "-m",
-        "autdtorch",
-        "-m",
-        *QUICK,
-        "method=gabs,lssg",
-        f"hydra/launcher={launcher}",
-    ]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    start, *each = done.stderr.splitlines()
+def test_jobs_log_a_line_each_and_find_methods_in_the_working_directory(
+    run, write, tmp_path, capsys, launcher
+):
+    write("climbing.py", CLIMBING)
+    write("mine/method/climb.yaml", "_target_: climbing.climb\nsteps: 5\n")
+    command = ["--config-dir", "mine", "-m", f"hydra/launcher={launcher}", "modules=climbing"]
+    command += [*QUICK, "method=climb,lssg", "trials=3"]
+    if launcher == "basic":
+        assert run(*command) == 0
+        output = capsys.readouterr()
+        out, err = output.out, output.err
+    else:  # in a process of its own, as workers write to stderr and not to what stands for it in a test
+        command = [sys.executable, "-m", "autdtorch", *command]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+        out, err = done.stdout, done.stderr
+    start, *each = err.splitlines()
     assert start.startswith("sweep into multirun: ")
-    assert start.endswith("method=gabs,lssg")
     assert sorted(line.partition(" free space")[0] for line in each) == [
-        "job 0: homogeneous:",
-        "job 1: homogeneous:",
+        f"job {number}: homogeneous:" for number in (0, 1)
     ]
-    assert done.stdout.splitlines()[-1].startswith("autdtorch collect merges")
+    assert out.splitlines()[-1].startswith("autdtorch collect merges")
+    assert jobs(tmp_path) == [
+        f"method={name},plane_spacing=0.02,scene=homogeneous,trials=3" for name in ("climb", "lssg")
+    ]
+    methods = collect_results(tmp_path).results.scenes["homogeneous"].methods
+    assert sorted(methods) == ["climb", "lssg"]
+    assert methods["climb"].solution.evaluations.tolist() == [5, 5, 5]
 
 
 def test_jobs_in_one_scene_share_its_matrices(run, tmp_path):
@@ -111,11 +125,13 @@ def test_the_folder_of_a_job_has_a_name_that_every_file_system_takes(run, tmp_pa
     assert [shlex.quote(name) for name in folders] == folders
 
 
-def test_settings_and_folders_of_jobs_can_be_pasted_into_a_shell(run, tmp_path, capsys):
+def test_settings_and_folders_can_be_pasted_into_a_shell(run, tmp_path, capsys):
+    assert run(*QUICK, "method=lssg", "output=my results") == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "The results are in 'my results'"
     settings = (*QUICK, "method=lssg", "poses={offset: [0, 2e-3, 0], count: 2}")
     assert run("-m", *settings) == 0
     printed = capsys.readouterr()
-    (folder,) = jobs(tmp_path)
+    (folder,) = jobs(tmp_path / "multirun")
     assert shlex.quote(folder) == folder
     assert Path(shlex.split(printed.out.splitlines()[-2])[-1]) == Path("multirun", folder)
     (begun,) = (line for line in printed.err.splitlines() if line.startswith("sweep into multirun: "))
@@ -124,35 +140,6 @@ def test_settings_and_folders_of_jobs_can_be_pasted_into_a_shell(run, tmp_path, 
     ]
     assert pasted[:3] == list(settings[:3])
     assert pasted[3].startswith("poses={offset:[0,")
-
-
-def test_a_folder_with_a_space_is_printed_in_quotes(run, capsys):
-    assert run(*QUICK, "method=lssg", "output=my results") == 0
-    assert capsys.readouterr().out.splitlines()[-1] == "The results are in 'my results'"
-
-
-def test_a_sweep_says_where_its_folders_are_set(run, capsys):
-    assert run("-m", *QUICK, "output=here") == 2
-    assert "a sweep has a folder for each job in hydra.sweep.dir" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("launcher", ["basic", "joblib"])
-def test_a_method_of_ones_own_is_found_in_the_working_directory(run, write, tmp_path, launcher):
-    write(
-        "climbing.py",
-        "import autdtorch as at\n\n"
-        "def climb(objective, steps, trials, seed):\n"
-        "    return at.random_search(objective, evaluations=steps, trials=trials, seed=seed)\n",
-    )
-    write("mine/method/climb.yaml", "_target_: climbing.climb\nsteps: 5\n")
-    command = ("--config-dir", "mine", "-m", f"hydra/launcher={launcher}", "modules=climbing")
-    assert run(*command, *QUICK, "method=climb,lssg", "trials=3") == 0
-    assert jobs(tmp_path) == [
-        f"method={name},plane_spacing=0.02,scene=homogeneous,trials=3" for name in ("climb", "lssg")
-    ]
-    methods = collect_results(tmp_path).results.scenes["homogeneous"].methods
-    assert sorted(methods) == ["climb", "lssg"]
-    assert methods["climb"].solution.evaluations.tolist() == [5, 5, 5]
 
 
 def test_collected_seeds_are_trials_and_other_settings_make_names(run, tmp_path, capsys, monkeypatch):
@@ -194,18 +181,18 @@ def test_collected_seeds_are_trials_and_other_settings_make_names(run, tmp_path,
     assert "in the folders that the settings name: `results.h5`" in report
 
 
-def test_swept_goals_are_scenes_of_their_own(run, tmp_path, monkeypatch):
-    monkeypatch.setattr("autdtorch.study.report.study_report.rendering_problem", lambda: "not tried")
+def test_swept_goals_are_scenes_of_their_own(run, tmp_path):
     assert run("-m", *QUICK, "method=lssg", "goal=weakest_focus,mean_pressure") == 0
     targets = ("goal=target_pressures", "goal.targets=[4,2,4,2],[2,4,2,4]")
     assert run("-m", *QUICK, "method=lssg", *targets) == 0
-    assert run("collect", "multirun") == 0
-    scenes = collect_results(tmp_path).results.scenes
+    sweep = collect_results(tmp_path)
+    save_summary(sweep, tmp_path / "summary.csv")
+    scenes = sweep.results.scenes
     assert [scene.goal["name"] for scene in scenes.values()] == [
         "mean_pressure", "target_pressures", "target_pressures", "weakest_focus"
     ]  # fmt: skip
     assert "homogeneous,goal=target_pressures,targets=4x2x4x2" in scenes
-    with (tmp_path / "multirun" / "summary.csv").open(encoding="utf-8", newline="") as file:
+    with (tmp_path / "summary.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["goal"] for row in rows] == [scene.goal["name"] for scene in scenes.values()]
     assert [row["unit"] for row in rows] == ["Pa", "", "", "Pa"]
@@ -221,18 +208,40 @@ def test_an_unfinished_study_is_left_out(run, tmp_path, capsys):
     )
 
 
+#: As a sweep does it, without the packages of a sweep.
+WORKERS = """
+import subprocess, sys, time
+from autdtorch.cli.workers import end_workers_with_us
+worker = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(300)"])
+end_workers_with_us()
+print(worker.pid, flush=True)
+time.sleep(300)
+"""
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_workers_end_with_a_sweep_that_a_signal_ends(tmp_path, number):
+def test_workers_end_with_a_process_that_a_signal_ends(number):
+    command = [sys.executable, "-c", WORKERS]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        worker = psutil.Process(int(process.stdout.readline()))
+        process.send_signal(number)
+        assert process.wait(30) == -number
+    psutil.wait_procs([worker], timeout=30)
+    assert not worker.is_running()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_workers_end_with_a_sweep_that_a_signal_ends(tmp_path):
     endless = ("method=random", "method.evaluations=100000", "trials=10000", "hydra.launcher.n_jobs=2")
     scenes = ("scene=homogeneous,two_cubes", "solver.spacing=2.4e-3", "plane_spacing=0.02")
     command = [sys.executable, "-m", "autdtorch", "-m", "hydra/launcher=joblib", *scenes, *endless]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "stdin": subprocess.DEVNULL}
     sweep = subprocess.Popen(command, cwd=tmp_path, **quiet)
-    own = psutil.Process(sweep.pid)
-    wait(lambda: len(own.children(recursive=True)) >= 2, sweep)
-    workers = own.children(recursive=True)
-    sweep.send_signal(number)
-    assert sweep.wait(30) == -number
-    _, alive = psutil.wait_procs(workers, timeout=10)
+    parent = psutil.Process(sweep.pid)
+    wait(lambda: len(parent.children(recursive=True)) >= 2, sweep)
+    workers = parent.children(recursive=True)
+    sweep.send_signal(signal.SIGTERM)
+    assert sweep.wait(60) == -signal.SIGTERM
+    _, alive = psutil.wait_procs(workers, timeout=60)
     assert not alive
