@@ -7,18 +7,19 @@ from .io.field_file import save_field
 from .io.scene_file import load_scene
 from .io.scene_writer import save_scene
 from .methods.base import Method, Problem, State
-from .methods.bayes.bayes import BayesOpt, bayes_opt
 from .methods.bayes.focus_problem import FocusProblem
 from .methods.bayes.kernels import PhasorKernel
-from .methods.driver import run
-from .methods.gabs import GABS, gabs
-from .methods.gradient import GradientAscent, gradient_ascent
+from .methods.bayes_opt import BayesOpt
+from .methods.functions import bayes_opt, gabs, gradient_ascent, identify, lss, lssg, random_search
+from .methods.gabs import GABS
+from .methods.gradient import GradientAscent
 from .methods.holography.holography import Holography, holography
 from .methods.holography.sequence import drive_sequence
-from .methods.identify import Identify, identify
-from .methods.lssg import LSS, LSSG, lss, lssg
+from .methods.identify import Identify
+from .methods.lssg import LSS, LSSG
 from .methods.prior import Prior
-from .methods.random_search import RandomSearch, random_search
+from .methods.random_search import RandomSearch
+from .methods.run import run
 from .methods.solution import Solution
 from .methods.state_file import load_state, save_state
 from .objectives.bound import focus_bound

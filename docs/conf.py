@@ -40,7 +40,7 @@ autodoc_default_options = {"members": True, "special-members": "__call__"}
 autodoc_preserve_defaults = True
 autodoc_type_aliases = {
     "ArrayLike": "autdtorch.utils.validation.ArrayLike",
-    "Score": "autdtorch.objectives.objective.Score",
+    "GoalFunction": "autdtorch.objectives.objective.GoalFunction",
     "Trials": "autdtorch.methods.seeds.Trials",
     "Vector": "autdtorch.utils.validation.Vector",
 }

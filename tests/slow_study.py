@@ -10,7 +10,7 @@ from pathlib import Path
 from small_scenes import CUBE, small_scene
 
 import autdtorch.study.run
-from autdtorch.methods.gabs import gabs
+from autdtorch.methods.functions import gabs
 from autdtorch.scene.geometry import Plane
 
 PLANE = Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 16e-3))

@@ -37,7 +37,7 @@ _SETTINGS = (
     "explore",
 )
 _PLACES = ("modules", "output")  # settings that change no result
-_NOT_OF_METHODS = ("objective", "trials", "seed", "score")  # the study's to give
+_NOT_OF_METHODS = ("objective", "trials", "seed", "goal", "score")  # parameters that a study fills
 _CALLS = (TARGET, "_args_", "_convert_", "_partial_", "_recursive_")  # keys by which Hydra calls functions
 _TARGETS = re.compile(rf"(method|methods\.[^.]+|(scene|scenes\.[^.]+)\.obstacles\.\d+)\.{TARGET}")
 
@@ -83,7 +83,7 @@ def load_method(where: str, section: Mapping[str, Any], modules: Collection[Any]
     if not isinstance(target, type):
         method = functools.partial(target, **settings)
         signature = inspect.signature(method)
-        given = [key for key in ("trials", "seed", "score") if key in signature.parameters]
+        given = [key for key in ("trials", "seed", "goal", "score") if key in signature.parameters]
         try:
             signature.bind("objective", **dict.fromkeys(given))
         except TypeError as error:

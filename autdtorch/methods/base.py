@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import ClassVar, NamedTuple
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 
-from autdtorch.methods.doubts import log_doubts, lone_score
+from autdtorch.methods.doubtful_readings import log_doubts, lone_score
 from autdtorch.methods.seeds import Trials, trial_seeds
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal, goal_of, scores_of
 from autdtorch.objectives.objective import (
+    GoalFunction,
     Objective,
-    Score,
     require_objective,
     validate_drives,
     validate_matrix,
@@ -31,6 +32,7 @@ from autdtorch.utils.validation import (
     real_tensor,
     require_callable,
     require_kind,
+    require_one_of,
     within,
 )
 
@@ -61,7 +63,7 @@ class Problem:
 
     transducers: int
     foci: int
-    goal: Score = WEAKEST_FOCUS
+    goal: GoalFunction = WEAKEST_FOCUS
     scene: Scene | None = None
     transfer_matrix: torch.Tensor | None = None
     quantise: Callable[[torch.Tensor], torch.Tensor] = field(default=lambda drive: drive)
@@ -92,11 +94,14 @@ class Problem:
 
     @classmethod
     def of(
-        cls, objective: Objective, goal: Score = WEAKEST_FOCUS, start: torch.Tensor | None = None
+        cls, objective: Objective, goal: GoalFunction = WEAKEST_FOCUS, start: torch.Tensor | None = None
     ) -> Problem:
         """Return the problem that an objective poses, with the transfer matrix that it has inside, if any.
 
-        A drive (M,) or (T, M) to start from may be given.
+        Args:
+            objective: simulated or measured.
+            goal: function of pressures (..., P) [Pa] that gives the scores (...) to maximise.
+            start: drive (M,) or (T, M) to start from, if any.
         """
         require_objective(objective)
         scene, matrix = objective.scene, simulated_matrix(objective)
@@ -169,11 +174,31 @@ class State:
         return int(self.best.evaluations.sum())
 
 
+def whole(default: int | None, least: int) -> Any:
+    """Return the field of a setting that is an integer >= `least`, or None where that is the default."""
+    return setting(default, partial(integer_at_least, minimum=least))
+
+
+def choice(default: str, *others: str) -> Any:
+    """Return the field of a setting that is one of these texts, the default first."""
+    return setting(default, partial(_one_of, accepted=(default, *others)))
+
+
+def setting(default: object, check: Callable[[str, Any], object]) -> Any:
+    """Return the field of a setting that a function of its name and value checks, and may convert."""
+    return field(default=default, metadata={"check": check})
+
+
+def _one_of(name: str, value: object, accepted: Sequence[str]) -> object:
+    require_one_of(name, value, accepted)
+    return value
+
+
 @dataclass(frozen=True)
 class Method(ABC):
     """Base of all methods: a frozen dataclass of settings that are checked when it is made.
 
-    A method of one's own adds its settings as fields and implements `begin`, `advance` and
+    A method of a user's adds its settings as fields and implements `begin`, `advance` and
     `most_evaluations`; ``docs/extending.md`` has an example.
 
     Attributes:
@@ -192,6 +217,13 @@ class Method(ABC):
         """Name a method without a name after its class."""
         cls.name = cls.__dict__.get("name", cls.__name__)
         cls.label = cls.__dict__.get("label", cls.name)
+
+    def __post_init__(self) -> None:
+        """Check the fields made by `setting`, `whole` and `choice`."""
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if (check := entry.metadata.get("check")) and not (value is None is entry.default):
+                object.__setattr__(self, entry.name, check(entry.name, value))
 
     def most_evaluations(self, problem: Problem) -> int:
         """Return the most evaluations that a trial can take: the setting `evaluations`, or 1."""
@@ -263,7 +295,7 @@ class Method(ABC):
 
     def ask(self, state: State) -> torch.Tensor:
         """Return the drives (B, M), complex128, to observe next; none when the method is done."""
-        self._require_own(state)
+        self._require_state(state)
         return state.drives.flatten(0, 1).clone()
 
     def tell(self, state: State, pressure: torch.Tensor) -> State:
@@ -277,12 +309,14 @@ class Method(ABC):
             ValueError: a state that is done or of another method, pressures of another shape or that cannot
                 be magnitudes, or scores that are not finite.
         """
-        self._require_own(state)
+        self._require_state(state)
         if state.done:
             raise ValueError("state: it is done, and no drive was asked for; take best(state)")
         batch = state.drives.shape[:2]
         name = "pressure of the objective"
-        pressure = _real(name, pressure, (batch.numel(), state.problem.foci), "Pa")
+        pressure = real_tensor(name, pressure, "Pa").detach().cpu()
+        if pressure.shape != (shape := (batch.numel(), state.problem.foci)):
+            raise ValueError(f"{name}: shape {tuple(pressure.shape)}; must be {shape}")
         if len(wrong := ((pressure < 0) | (pressure > _LOUDEST)).nonzero()):
             place, value = wrong[0].tolist(), float(pressure[tuple(wrong[0])])
             accepted = f"must be a magnitude from 0 to {_LOUDEST:g}, not a level in dB or a signed sample"
@@ -298,7 +332,7 @@ class Method(ABC):
 
     def best(self, state: State) -> Solution:
         """Return the best drive of each trial so far; `ValueError` before the first evaluation."""
-        self._require_own(state)
+        self._require_state(state)
         if not state.best.history.shape[1]:
             raise ValueError("state: nothing was observed yet; tell what the drives of ask give first")
         history = state.best.history.cummax(dim=1).values.minimum(state.best.score[:, None])
@@ -310,7 +344,7 @@ class Method(ABC):
         """Describe what is doubtful about the readings of each trial after `tell`: a lone highest score."""
         return [lone_score(score) for score in state.best.history] if state.done else []
 
-    def _require_own(self, state: State) -> None:
+    def _require_state(self, state: State) -> None:
         require_kind("state", state, State)
         if state.method != self:
             raise invalid("state", f"of {state.method}", f"must be of {self}")
@@ -337,10 +371,3 @@ def first_of_best(score: torch.Tensor) -> torch.Tensor:
     """Return the index (T,) of the first of scores (T, B) within `NEAR_TIE` of the best."""
     best = score.amax(dim=1, keepdim=True)
     return (score >= best - NEAR_TIE * best.abs()).byte().argmax(dim=1)
-
-
-def _real(name: str, value: object, shape: Sequence[int], unit: str = "") -> torch.Tensor:
-    tensor = real_tensor(name, value, unit).detach().cpu()
-    if tensor.shape != tuple(shape):
-        raise ValueError(f"{name}: shape {tuple(tensor.shape)}; must be {tuple(shape)}")
-    return tensor

@@ -5,10 +5,11 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 
-from autdtorch.methods.base import first_of_best
+from autdtorch.methods.base import first_of_best, setting
 from autdtorch.scene.drive import drive_from_phases, phases_of
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import integers, invalid
@@ -21,26 +22,30 @@ Search = Mapping[str, torch.Tensor]
 """
 
 
-def order_setting(order: str | Sequence[int], names: Sequence[str]) -> str | tuple[int, ...]:
-    """Return the setting `order`, one of `names` or indices, after checking it."""
+def order(*names: str) -> Any:
+    """Return the field of a setting that is one of these names, the first by default, or indices."""
+    return setting(names[0], functools.partial(_checked_order, names=names))
+
+
+def _checked_order(name: str, order: str | Sequence[int], names: Sequence[str]) -> str | tuple[int, ...]:
     if isinstance(order, str) and order in names:
         return order
     quoted = ", ".join(f'"{name}"' for name in names)
     accepted = f"must be {quoted} or the indices of all, each once"
-    chosen = tuple(integers("order", order, 0, accepted))
+    chosen = tuple(integers(name, order, 0, accepted))
     if sorted(chosen) != list(range(len(chosen))):
-        raise invalid("order", order, accepted)
+        raise invalid(name, order, accepted)
     return chosen
 
 
 def require_all(order: str | Sequence[int], count: int) -> None:
-    """Check that an order given by indices has `count` of them."""
+    """Check that an order by indices has `count` of them."""
     if not isinstance(order, str) and len(order) != count:
         raise invalid("order", order, f"must be the indices 0 to {count - 1}, each once")
 
 
 def indices_of(order: str | Sequence[int], count: int) -> torch.Tensor:
-    """Return the indices (count,) of an order; in ascending order unless it is given by indices."""
+    """Return the indices (count,) of an order; ascending where the order is a name."""
     return torch.tensor(range(count) if isinstance(order, str) else order, dtype=torch.int64, device="cpu")
 
 

@@ -9,14 +9,10 @@ from typing import ClassVar, Literal
 import torch
 
 from autdtorch.methods import coordinates
-from autdtorch.methods.base import NEAR_TIE, Method, Problem, State, Step, starts_of
-from autdtorch.methods.driver import run
-from autdtorch.methods.seeds import Trials, generators_of
-from autdtorch.methods.solution import Solution
-from autdtorch.objectives.goals import WEAKEST_FOCUS
-from autdtorch.objectives.objective import Objective, Score
+from autdtorch.methods.base import NEAR_TIE, Method, Problem, State, Step, starts_of, whole
+from autdtorch.methods.seeds import generators_of
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.validation import integer_at_least, invalid
+from autdtorch.utils.validation import invalid
 
 
 @dataclass(frozen=True)
@@ -46,19 +42,12 @@ class GABS(Method):
     name: ClassVar[str] = "gabs"
     label: ClassVar[str] = "GABS"
 
-    levels: int = 16
-    order: Literal["random", "given", "strength"] | Sequence[int] = "random"
-    first: int | None = None
-    passes: int = 1
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        object.__setattr__(self, "levels", integer_at_least("levels", self.levels, 2))
-        order = coordinates.order_setting(self.order, ("random", "given", "strength"))
-        object.__setattr__(self, "order", order)
-        object.__setattr__(self, "passes", integer_at_least("passes", self.passes, 1))
-        if self.first is not None:
-            object.__setattr__(self, "first", integer_at_least("first", self.first, 0))
+    levels: int = whole(16, least=2)
+    order: Literal["random", "given", "strength"] | Sequence[int] = coordinates.order(
+        "random", "given", "strength"
+    )
+    first: int | None = whole(None, least=0)
+    passes: int = whole(1, least=1)
 
     def check(self, problem: Problem) -> None:
         """Check order and first transducer against the number of transducers."""
@@ -83,7 +72,9 @@ class GABS(Method):
             return Step(alone.expand(len(seeds), -1, -1), {})
         orders = coordinates.indices_of(self.order, count).expand(len(seeds), -1)
         if self.order == "random":
-            shuffled = [torch.randperm(count, generator=own, device="cpu") for own in generators_of(seeds)]
+            shuffled = [
+                torch.randperm(count, generator=draws, device="cpu") for draws in generators_of(seeds)
+            ]
             orders = torch.stack(shuffled)
         search = self._begun(problem, orders)
         return Step(search["weights"][:, None], search)
@@ -116,24 +107,10 @@ class GABS(Method):
         if self.first is not None:
             others = orders[orders != self.first].reshape(len(orders), -1)
             orders = torch.cat([orders.new_full((len(orders), 1), self.first), others], dim=1)
-        if (given := starts_of(problem, len(orders))) is not None:
-            return coordinates.begin_ascent(coordinates.at_levels(given, self.levels), orders)
+        if (starts := starts_of(problem, len(orders))) is not None:
+            return coordinates.begin_ascent(coordinates.at_levels(starts, self.levels), orders)
         alone = torch.eye(orders.shape[1], **COMPLEX)
         return coordinates.begin_ascent(alone[orders[:, 0]], orders)
-
-
-def gabs(
-    objective: Objective,
-    levels: int = 16,
-    order: Literal["random", "given", "strength"] | Sequence[int] = "random",
-    first: int | None = None,
-    passes: int = 1,
-    trials: Trials = 1,
-    seed: int = 0,
-    score: Score = WEAKEST_FOCUS,
-) -> Solution:
-    """Run `GABS` with these settings on an objective; see `GABS` and `run`."""
-    return run(GABS(levels, order, first, passes), objective, trials, seed, score=score)
 
 
 def _best_first(score: torch.Tensor) -> torch.Tensor:

@@ -12,19 +12,17 @@ from typing import ClassVar
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, State, Step
-from autdtorch.methods.doubts import reading_doubts, sensor_doubts
-from autdtorch.methods.driver import run
+from autdtorch.methods.base import Method, Problem, State, Step, setting, whole
+from autdtorch.methods.doubtful_readings import Magnitudes, reading_doubts, sensor_doubts
 from autdtorch.methods.gradient import climb, climbed, random_drives
-from autdtorch.methods.magnitudes import Magnitudes
-from autdtorch.methods.matrix_fits import Fit, kept, posteriors
+from autdtorch.methods.matrix_fit import Fit, posteriors, tensors_of
 from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, prior_mean, prior_of
-from autdtorch.methods.seeds import Trials, generators_of, restored, states_of
+from autdtorch.methods.seeds import generators_of, restored, states_of
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.goals import WEAKEST_FOCUS, scores_of
-from autdtorch.objectives.objective import Objective, Score
+from autdtorch.objectives.goals import scores_of
+from autdtorch.objectives.objective import GoalFunction
 from autdtorch.utils.threads import one_library_thread
-from autdtorch.utils.validation import integer_at_least, invalid
+from autdtorch.utils.validation import invalid
 
 _LEAST = 64  # evaluations without the setting; more where transducers need them
 _LEAST_READINGS = 2.3  # for each transducer, to find a row by its magnitudes
@@ -32,8 +30,8 @@ _STARTS = 16  # drives from which the fitted matrix is climbed
 _CLIMB_STEPS = 300
 _SAMPLE_STEPS = 60  # of the climb on a sample of the matrix, from the best drive
 _GROWTH = 24  # a round observes one drive for so many that were observed
-_WORSE = 9.0  # median deviations of scores from the fit, 6 standard deviations, and
-_LEAST_WORSE = 0.05  # of the score, by which the last drive must be below another one not to be the solution
+_WORSE = 9.0  # The last drive is not the solution if so many median deviations (6 sigma) below another one,
+_LEAST_WORSE = 0.05  # and by this share of the score
 
 
 @dataclass(frozen=True)
@@ -59,14 +57,8 @@ class Identify(Method):
     name: ClassVar[str] = "identify"
     label: ClassVar[str] = "identify"
 
-    evaluations: int | None = None
-    prior: Prior | None = None
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        if self.evaluations is not None:
-            object.__setattr__(self, "evaluations", integer_at_least("evaluations", self.evaluations, 2))
-        object.__setattr__(self, "prior", prior_of("prior", self.prior))
+    evaluations: int | None = whole(None, least=2)
+    prior: Prior | None = setting(None, prior_of)
 
     def check(self, problem: Problem) -> None:
         """Check that there are enough evaluations for the number of transducers, or that the prior fits."""
@@ -80,13 +72,13 @@ class Identify(Method):
             raise invalid("evaluations", self.evaluations, accepted)
 
     def most_evaluations(self, problem: Problem) -> int:
-        """Return `evaluations`, or what they are by default."""
+        """Return `evaluations`, or their default."""
         if self.evaluations is not None:
             return self.evaluations
         return _LEAST if self.prior is not None else max(_LEAST, 4 * problem.transducers)
 
     def numbers_kept(self, problem: Problem) -> float:
-        """Return the numbers of the fit, too: derivatives, and with a prior all pairs of readings."""
+        """Add the numbers of the fit: derivatives, and with a prior all pairs of readings."""
         readings = float(self.most_evaluations(problem) * problem.foci)
         pairs = 3 * readings**2 if self.prior is not None else 0.0
         return super().numbers_kept(problem) + 6 * readings * problem.transducers + pairs
@@ -96,14 +88,14 @@ class Identify(Method):
         generators = generators_of(seeds)
         if self.prior is None:
             count = self._random_drives(problem)
-            drives = torch.stack([random_drives(count, problem.transducers, own) for own in generators])
+            drives = torch.stack([random_drives(count, problem.transducers, draws) for draws in generators])
         else:
             drives = best_simulated_drives(self.prior, problem, generators)[:, None]
         return Step(problem.quantise(drives), {"generators": states_of(generators)})
 
     @one_library_thread()
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
-        """Fit the matrix, and observe the best drives of samples of it; that of the fit at the end."""
+        """Fit the matrix, and observe the best drives of samples of it, or of the fit at the end."""
         search, problem = dict(state.search), state.problem
         drives, observed = state.drives, pressure
         if "drives" in search:
@@ -116,31 +108,29 @@ class Identify(Method):
         generators = restored(search["generators"])
         prior = None if self.prior is None else matrix_prior(self.prior, problem)
         fits = posteriors(prior, search, drives, observed, generators)
-        apart = [own.clone() for own in drives]  # their products must not round by the place in memory
-        best = torch.stack([_highest(problem.goal, *of) for of in zip(fits, apart, generators, strict=True)])
-        search |= {"drives": drives, "observed": observed, **kept(fits)}
+        copies = [played.clone() for played in drives]  # products must not round by the place in memory
+        trials = list(zip(fits, copies, generators, strict=True))
+        best = torch.stack([_highest(problem.goal, *trial) for trial in trials])
+        search |= {"drives": drives, "observed": observed, **tensors_of(fits)}
         if left == 0:
             last = problem.quantise(best)[:, None]
-            played = torch.cat([drives, last], dim=1)
-            return Step(last, {**search, "fitted": _magnitudes(fits, played)})
+            return Step(last, {**search, "fitted": _magnitudes(fits, torch.cat([drives, last], dim=1))})
         count = min(left, max(1, drives.shape[1] // _GROWTH))
-        each = zip(fits, apart, best, generators, strict=True)
-        chosen = torch.stack([_sampled(problem.goal, *of, count) for of in each])
+        pairs = zip(trials, best, strict=True)
+        chosen = torch.stack([_sampled(problem.goal, *trial, start, count) for trial, start in pairs])
         search |= {"fitted": _magnitudes(fits, drives), "generators": states_of(generators)}
         return Step(problem.quantise(chosen), search)
 
     def best(self, state: State) -> Solution:
         """Return the solution of each trial; before the last evaluation, the best one that is no outlier."""
-        found, search = super().best(state), state.search
+        solution, search, goal = super().best(state), state.search, state.problem.goal
         if "outliers" not in search:
-            return found
-        answer = (
-            search["answer"] if state.done else _best_believed(_believed_scores(state.problem.goal, search))
-        )
+            return solution
+        answer = search["answer"] if state.done else _best_believed(_believed_scores(goal, search))
         chosen = torch.arange(len(answer), device="cpu"), answer
         pressure = search["observed"][chosen]
-        score = scores_of(state.problem.goal, pressure)
-        return replace(found, drive=search["drives"][chosen], pressure=pressure, score=score)
+        score = scores_of(goal, pressure)
+        return replace(solution, drive=search["drives"][chosen], pressure=pressure, score=score)
 
     def _doubts(self, state: State) -> Sequence[Iterable[str]]:
         """Describe doubtful sensors after the random drives, in time to mend them, and all at the end."""
@@ -169,20 +159,7 @@ class Identify(Method):
         return min(max(3 * problem.transducers - 2, most // 2), most - 1)
 
 
-def identify(
-    objective: Objective,
-    evaluations: int | None = None,
-    trials: Trials = 1,
-    seed: int = 0,
-    *,
-    prior: Prior | None = None,
-    score: Score = WEAKEST_FOCUS,
-) -> Solution:
-    """Run `Identify` with these settings on an objective; see `Identify` and `run`."""
-    return run(Identify(evaluations, prior), objective, trials, seed, score=score)
-
-
-def _highest(goal: Score, fit: Fit, drives: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+def _highest(goal: GoalFunction, fit: Fit, drives: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
     """Return the best drive (M,) of a fitted matrix, which was fitted to drives (N, M)."""
     seen = drives[scores_of(goal, (drives @ fit.posterior.matrix.T).abs()).argmax()]
     starts = random_drives(_STARTS, len(seen), generator)
@@ -190,11 +167,11 @@ def _highest(goal: Score, fit: Fit, drives: torch.Tensor, generator: torch.Gener
 
 
 def _sampled(
-    goal: Score,
+    goal: GoalFunction,
     fit: Fit,
     drives: torch.Tensor,
-    best: torch.Tensor,
     generator: torch.Generator,
+    best: torch.Tensor,
     count: int,
 ) -> torch.Tensor:
     """Return the best drives (count, M) of samples of the matrix, near the best of the fitted one."""
@@ -204,10 +181,11 @@ def _sampled(
 
 def _magnitudes(fits: Sequence[Fit], drives: torch.Tensor) -> torch.Tensor:
     """Return the magnitudes (T, N, P) [Pa] that fitted matrices give for drives (T, N, M)."""
-    return torch.stack([(own @ fit.posterior.matrix.T).abs() for fit, own in zip(fits, drives, strict=True)])
+    pairs = zip(fits, drives, strict=True)
+    return torch.stack([(played @ fit.posterior.matrix.T).abs() for fit, played in pairs])
 
 
-def _believed_scores(goal: Score, search: Mapping[str, torch.Tensor]) -> torch.Tensor:
+def _believed_scores(goal: GoalFunction, search: Mapping[str, torch.Tensor]) -> torch.Tensor:
     """Return the scores (T, N) of the evaluations that were fitted, NaN where a reading is an outlier."""
     outliers = search["outliers"]
     score = scores_of(goal, search["observed"][:, : outliers.shape[1]])
@@ -219,10 +197,10 @@ def _best_believed(score: torch.Tensor) -> torch.Tensor:
     return score.nan_to_num(-torch.inf).argmax(dim=1)
 
 
-def _answer(goal: Score, search: Mapping[str, torch.Tensor]) -> torch.Tensor:
+def _answer(goal: GoalFunction, search: Mapping[str, torch.Tensor]) -> torch.Tensor:
     """Return the index (T,) of the solution: the last evaluation, or the best before where it is far worse.
 
-    How far scores are from those of the fitted matrix says what is far.
+    Deviations of scores from the fitted matrix's set the scale.
     """
     score = _believed_scores(goal, search)
     last = scores_of(goal, search["observed"][:, -1])

@@ -9,14 +9,10 @@ from typing import ClassVar, Literal
 import torch
 
 from autdtorch.methods import coordinates
-from autdtorch.methods.base import Method, Problem, State, Step
-from autdtorch.methods.driver import run
-from autdtorch.methods.solution import Solution
-from autdtorch.objectives.goals import WEAKEST_FOCUS
-from autdtorch.objectives.objective import Objective, Score
+from autdtorch.methods.base import Method, Problem, State, Step, whole
 from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.validation import integer_at_least, invalid
+from autdtorch.utils.validation import invalid
 
 
 @dataclass(frozen=True)
@@ -55,15 +51,9 @@ class LSSG(Method):
     label: ClassVar[str] = "LSSG"
     random: ClassVar[bool] = False
 
-    levels: int = 16
-    order: Literal["given"] | Sequence[int] = "given"
-    passes: int = 1
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        object.__setattr__(self, "levels", integer_at_least("levels", self.levels, 2))
-        object.__setattr__(self, "order", coordinates.order_setting(self.order, ("given",)))
-        object.__setattr__(self, "passes", integer_at_least("passes", self.passes, 1))
+    levels: int = whole(16, least=2)
+    order: Literal["given"] | Sequence[int] = coordinates.order("given")
+    passes: int = whole(1, least=1)
 
     def check(self, problem: Problem) -> None:
         """Check the order against the number of foci."""
@@ -93,22 +83,6 @@ class LSSG(Method):
             return Step(state.drives[:, :0], search)
         weights = coordinates.candidates(search, self.levels, step)
         return Step(normalise(weights @ search["foci"]), search, goes_on)
-
-
-def lss(objective: Objective, score: Score = WEAKEST_FOCUS) -> Solution:
-    """Run `LSS` on an objective, with a `score` to report; see `run`."""
-    return run(LSS(), objective, score=score)
-
-
-def lssg(
-    objective: Objective,
-    levels: int = 16,
-    order: Literal["given"] | Sequence[int] = "given",
-    passes: int = 1,
-    score: Score = WEAKEST_FOCUS,
-) -> Solution:
-    """Run `LSSG` with these settings on an objective: one trial; see `LSSG` and `run`."""
-    return run(LSSG(levels, order, passes), objective, score=score)
 
 
 def _focus_drives(problem: Problem) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""The posterior of a transfer matrix, given the magnitudes that drives made and a Gaussian prior."""
+"""The posterior of a transfer matrix by a Gaussian prior and by magnitudes read for known drives."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from autdtorch.methods.magnitudes import Magnitudes
+from autdtorch.methods.doubtful_readings import Magnitudes
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.threads import one_library_thread
 
-_STEPS = 10  # of Gauss and Newton
-_HALVINGS = 6  # of a step that misfits more
+_STEPS = 10  # of the Gauss-Newton search
+_HALVINGS = 6  # of a step that raises the misfit
 _ENOUGH = 1e-3  # relative gain of a step below which the fit ends
-_NOISE_ROUNDS = 4  # of estimates of the noise
+_NOISE_ROUNDS = 4  # estimates of the noise
 _NOISE_FACTOR = 1.5  # change of the variance above which the maximum is sought again
-_DARK = 1e-6  # smallest entries that a row is expected to have, in those of the strongest row, and
-_TINY = 1e-150  # in pascals: their squares must not be 0
-_USUAL_NOISE = 0.03  # in rms pressures at random phases, assumed before readings
-_WEIGHT = 4.0  # of this assumption beside readings: so many of them
-_FAR = 5.0  # ratio of a first reading's units to those of the others above which it is an outlier
-_OUTLIER = 6.0  # standard deviations, as the median of all shows them, beyond which a reading is an outlier
-_HARMLESS = 0.1  # in rms pressures at random phases: smaller deviations harm no more than usual noise
-_LEAST_SHARE = 0.02  # of a reading's variance that the fit leaves; less is rounding
-_MEDIAN = 0.6745  # of the magnitude of a normal deviate
+_DARK = 1e-6  # floor of a row's spread, relative to the strongest row's
+_TINY = 1e-150  # floor of a row's spread [Pa], whose square is not 0
+_USUAL_NOISE = 0.03  # noise assumed before readings, in rms pressures at random phases
+_WEIGHT = 4.0  # number of pseudo-readings that stand for the assumed noise
+_FAR = 5.0  # ratio of the first reading's scale to the others' beyond which it is an outlier
+_OUTLIER = 6.0  # robust standard deviations beyond which a reading is an outlier
+_HARMLESS = 0.1  # deviation, in rms pressures at random phases, that does no harm
+_LEAST_SHARE = 0.02  # least share of a reading's variance that the fit leaves; less is rounding
+_MEDIAN = 0.6745  # median magnitude of a standard normal deviate
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +52,9 @@ class MatrixPrior:
         return 0.5 * _USUAL_NOISE**2 * power
 
     def in_units_of(self, drives: torch.Tensor, observed: torch.Tensor) -> MatrixPrior:
-        """Return the prior in the units of the first of magnitudes (N, P) that drives (N, M) made.
+        """Return the prior in units of the first of magnitudes (N, P) by drives (N, M), or of their median.
 
-        Where it is far from the median of all, an outlier, the median decides.
+        The median decides where the first reading is far from it: an outlier.
         """
         expected = (drives @ self.rows.T).abs()
         ratio = (observed / expected)[(observed > 0) & (expected > 0)]
@@ -106,10 +106,10 @@ class MatrixPosterior:
 
     @one_library_thread()
     def fitted(self, drives: torch.Tensor, read: Magnitudes, infer_noise: bool = True) -> MatrixPosterior:
-        """Return the posterior given magnitudes (N, P) that drives (N, M) made.
+        """Return the posterior by magnitudes (N, P) that drives (N, M) made.
 
-        The maximum is sought from this one. The noise follows by MacKay's rule (1992): the misfit over the
-        number of readings that no unknown explains, beside a few readings of the usual noise.
+        The search for the maximum begins at this one. The noise follows MacKay's rule (1992): the misfit over
+        the number of readings that no unknown explains, with a few pseudo-readings of the usual noise.
         """
         now, line = self._maximum(_Linearised.at(self, drives, read), drives, read)
         for _ in range(_NOISE_ROUNDS if infer_noise else 0):
@@ -121,7 +121,7 @@ class MatrixPosterior:
     def _maximum(
         self, line: _Linearised, drives: torch.Tensor, read: Magnitudes
     ) -> tuple[MatrixPosterior, _Linearised]:
-        """Return the maximum that damped steps of Gauss and Newton find, linearised."""
+        """Return the maximum by damped Gauss-Newton steps, and its linearisation."""
         now = self
         for _ in range(_STEPS):
             target, misfit = now._solved(line), now._misfit(line)
@@ -145,7 +145,7 @@ class MatrixPosterior:
 
     @one_library_thread()
     def sample(self, drives: torch.Tensor, read: Magnitudes, generator: torch.Generator) -> torch.Tensor:
-        """Return a sample (P, M) [Pa] of the matrix, given readings (N, P) of drives (N, M) that were fitted.
+        """Return a sample (P, M) [Pa] of the matrix after readings (N, P) of drives (N, M) that were fitted.
 
         A sample of the prior is corrected by the readings that it would give (Matheron's rule).
         """
@@ -153,8 +153,7 @@ class MatrixPosterior:
         factors = self.prior.widths * _normal(generator, *self.factors.shape)
         entries = _circular(generator, *self.entries.shape)
         noise = self.variance.sqrt() * _normal(generator, *line.magnitudes.shape)
-        given = line.change(factors, entries) + noise
-        correction = line.explained(self, given)
+        correction = line.explained(self, line.change(factors, entries) + noise)
         drawn = replace(
             self,
             factors=self.factors + factors - correction[0],
@@ -176,14 +175,14 @@ class MatrixPosterior:
         share = line.unexplained_shares(self).masked_fill(~line.decided, 1)
         ratio = left / share.clamp_min(_LEAST_SHARE).sqrt()
         usual = ratio.masked_fill(~line.decided, torch.nan)
-        # Of all readings, or of the control point's: a row that was not found explains none of its readings.
+        # Of all readings, or of the point's: a row that the search missed explains none of its readings.
         deviation = torch.maximum(usual.nanmedian(), usual.nanmedian(dim=0).values.nan_to_num()) / _MEDIAN
         return doubtful.logical_and(ratio > _OUTLIER * deviation)
 
     def deviations(self, drives: torch.Tensor, read: Magnitudes) -> torch.Tensor:
         """Return how far the readings of each control point (P,) are from this fit, rms [Pa].
 
-        Over the readings that no unknown explains; without any, one more would be needed to say.
+        It is over the number of readings that no unknown explains, at least 1.
         """
         line = _Linearised.at(self, drives, read)
         shares = (line.unexplained_shares(self) * line.decided).sum(dim=0)
@@ -212,7 +211,7 @@ class MatrixPosterior:
         )
 
     def _misfit(self, line: _Linearised) -> torch.Tensor:
-        """Return twice the negative logarithm of the posterior, but for a constant."""
+        """Return twice the negative logarithm of the posterior, up to a constant."""
         readings = (line.left.square() / self.variance).sum()
         factors = (self.factors / self.prior.widths).square().sum()
         return readings + factors + 2 * self.entries.abs().square().sum()
@@ -224,7 +223,8 @@ class _Linearised:
 
     Attributes:
         left: differences (N, P) of readings to the magnitudes.
-        decided: which readings say something here (N, P); of the others, differences and derivatives are 0.
+        decided: readings that constrain the fit here (N, P), bool; differences and derivatives of the others
+            are 0.
     """
 
     magnitudes: torch.Tensor
@@ -260,9 +260,8 @@ class _Linearised:
             by_readings = slope.mT @ (left.T / posterior.variance[:, None])[..., None]
             parts = torch.cholesky_solve(by_readings, factor)[..., 0]
             return posterior.factors, torch.complex(*parts.chunk(2, dim=1))
-        weights = (
-            torch.cholesky_solve(left.T.reshape(-1, 1), self._of_readings(posterior)).reshape(left.T.shape).T
-        )
+        column = torch.cholesky_solve(left.T.reshape(-1, 1), self._of_readings(posterior))
+        weights = column.reshape(left.T.shape).T
         factors = posterior.prior.widths.square() * (weights[..., None] * self.by_factors).sum(dim=(0, 1))
         return factors, 0.5 * (weights[..., None] * self.by_entries.conj()).sum(dim=0)
 
@@ -287,7 +286,7 @@ class _Linearised:
     def _of_rows(self, posterior: MatrixPosterior) -> tuple[torch.Tensor, torch.Tensor]:
         """Return derivatives (P, N, 2 M), and the Cholesky factor of the inverse covariance of the entries.
 
-        For many readings of each row, which has its own unknowns.
+        For many readings of each row, whose unknowns are separate.
         """
         by_focus = self.by_entries.transpose(0, 1)
         slope = torch.cat([by_focus.real, -by_focus.imag], dim=-1)
@@ -298,11 +297,11 @@ class _Linearised:
     def _of_readings(self, posterior: MatrixPosterior) -> torch.Tensor:
         """Return the Cholesky factor (P N, P N) of the readings' covariance, of which there are few."""
         by_focus = self.by_entries.transpose(0, 1)
-        own = 0.5 * (by_focus @ by_focus.mH).real
-        own.diagonal(dim1=1, dim2=2).add_(posterior.variance[:, None])
+        blocks = 0.5 * (by_focus @ by_focus.mH).real
+        blocks.diagonal(dim1=1, dim2=2).add_(posterior.variance[:, None])
         shared = (self.by_factors * posterior.prior.widths).transpose(0, 1).flatten(0, 1)
-        covariance = (shared @ shared.T).reshape(len(own), own.shape[1], len(own), own.shape[1])
-        for focus, block in enumerate(own):
+        covariance = (shared @ shared.T).reshape(2 * blocks.shape[:2])
+        for focus, block in enumerate(blocks):
             covariance[focus, :, focus] += block
         factor: torch.Tensor = torch.linalg.cholesky(covariance.reshape(len(shared), -1))
         return factor

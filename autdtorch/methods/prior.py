@@ -18,23 +18,23 @@ from autdtorch.utils.validation import complex_tensor, invalid, number_between, 
 _STARTS, _CLIMB_STEPS = 16, 300  # of the climbs to the best drive of a simulation
 
 _LEAST_WIDTH = 1e-6  # of gain, phase and rest
-_DARK = 1e-2  # rms entry that a row has at least, in those of the strongest row: simulated shadows are deep
+_DARK = 1e-2  # least rms entry of a row, relative to the strongest row's: simulated shadows are deep
 
 _SCALE = 0.3
-"""Standard deviation of the logarithm of the scale between readings and simulation, once the first reading
-has given their units."""
+"""Standard deviation of the logarithm of the scale between readings and simulation, after a first scaling by
+the first reading."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What a simulation says of the device that is measured, and how far to trust it.
+    """A simulated transfer matrix, and how far to trust it as one of the measured device.
 
-    The measured matrix is that of the simulation, but for gain and phase of each transducer, for a scale that
-    all readings share, for steps towards variants of the scene, and for errors of single entries.
+    The measured matrix differs from the simulated one by gain and phase of each transducer, by a scale of all
+    readings, by steps towards variants of the scene, and by errors of single entries.
 
     Attributes:
         transfer_matrix: G (P, M) [Pa] of the simulation; None for the one that the objective has: a
-            `SimulatedObjective`, also within perturbations, or a `HardwareObjective` to which it was given.
+            `SimulatedObjective`, also within perturbations, or a `HardwareObjective` made with one.
         variants: transfer matrices (K, P, M) [Pa] of the scene as it may also be, each simulated with one
             change of the size that is to be expected: an obstacle 2 mm aside, the air 5 K warmer.
         gain: standard deviation of the logarithm of a transducer's gain, 1e-6 to 3.
@@ -69,7 +69,7 @@ class Prior:
 
 
 def prior_of(name: str, value: object) -> Prior | None:
-    """Return a prior, or None, of a setting; a mapping, as in a config, has the settings of a prior."""
+    """Return the prior, or None, that a setting means; a mapping of a config has the fields of a prior."""
     if value is None or isinstance(value, Prior):
         return value
     if isinstance(value, Mapping):
@@ -110,5 +110,5 @@ def best_simulated_drives(
 ) -> torch.Tensor:
     """Return drives (T, M) that focus best in the simulation, one for each generator of random starts."""
     matrix = prior_mean(prior, problem)
-    starts = [random_drives(_STARTS, problem.transducers, own) for own in generators]
+    starts = [random_drives(_STARTS, problem.transducers, draws) for draws in generators]
     return torch.stack([climb(problem.goal, matrix, start, _CLIMB_STEPS) for start in starts])

@@ -9,13 +9,8 @@ from typing import ClassVar
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, State, Step
-from autdtorch.methods.driver import run
-from autdtorch.methods.seeds import Trials, generators_of, restored, states_of
-from autdtorch.methods.solution import Solution
-from autdtorch.objectives.goals import WEAKEST_FOCUS
-from autdtorch.objectives.objective import Objective, Score
-from autdtorch.utils.validation import integer_at_least
+from autdtorch.methods.base import Method, Problem, State, Step, whole
+from autdtorch.methods.seeds import generators_of, restored, states_of, uniform
 
 _AT_ONCE = 64  # evaluations of a trial in one step, which bounds the memory of a step
 
@@ -32,14 +27,8 @@ class RandomSearch(Method):
     name: ClassVar[str] = "random_search"
     label: ClassVar[str] = "random search"
 
-    evaluations: int = 256
-    levels: int | None = None
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        object.__setattr__(self, "evaluations", integer_at_least("evaluations", self.evaluations, 1))
-        if self.levels is not None:
-            object.__setattr__(self, "levels", integer_at_least("levels", self.levels, 2))
+    evaluations: int = whole(256, least=1)
+    levels: int | None = whole(None, least=2)
 
     def most_at_once(self, problem: Problem) -> int:
         """Return the size of a step."""
@@ -58,21 +47,8 @@ class RandomSearch(Method):
 
     def _drawn(self, generators: Sequence[torch.Generator], transducers: int, done: int) -> Step:
         size = min(_AT_ONCE, self.evaluations - done), transducers
-        drawn = [torch.rand(size, dtype=torch.float64, generator=own, device="cpu") for own in generators]
-        turns = torch.stack(drawn)
+        turns = torch.stack([uniform(draws, *size) for draws in generators])
         if self.levels is not None:
             turns = (self.levels * turns).floor() / self.levels
         drives = torch.polar(torch.ones_like(turns), -2 * math.pi * turns)
         return Step(drives, {"generators": states_of(generators)})
-
-
-def random_search(
-    objective: Objective,
-    evaluations: int = 256,
-    levels: int | None = None,
-    trials: Trials = 1,
-    seed: int = 0,
-    score: Score = WEAKEST_FOCUS,
-) -> Solution:
-    """Run `RandomSearch` with these settings on an objective; see `RandomSearch` and `run`."""
-    return run(RandomSearch(evaluations, levels), objective, trials, seed, score=score)

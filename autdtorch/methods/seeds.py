@@ -24,6 +24,11 @@ def generators_of(seeds: Sequence[int]) -> list[torch.Generator]:
     return [torch.Generator("cpu").manual_seed(seed) for seed in seeds]
 
 
+def uniform(generator: torch.Generator, *shape: int) -> torch.Tensor:
+    """Return random numbers in [0, 1), float64."""
+    return torch.rand(shape, dtype=torch.float64, generator=generator, device="cpu")
+
+
 def states_of(generators: Sequence[torch.Generator]) -> torch.Tensor:
     """Return the states (T, N), uint8, of generators, as a `State` keeps them."""
     return torch.stack([generator.get_state() for generator in generators])

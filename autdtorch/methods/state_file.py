@@ -1,16 +1,18 @@
 """The state of a method in a file: plain NumPy arrays and a line of JSON, so that reading it runs no code.
 
-The line holds a version of the format, what the state is of, and a digest of every array, so that nothing but
-what `save_state` has written goes on.
+The line holds a version of the format, method and problem of the state, and a digest of every array: a run
+goes on from files that `save_state` has written alone.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import io
 import json
 import os
-from collections.abc import Mapping
+import types
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,14 +20,15 @@ import torch
 
 from autdtorch.methods.base import Method, Problem, State
 from autdtorch.methods.solution import Solution
-from autdtorch.methods.state_origin import differences, origin_of
+from autdtorch.objectives.goals import Goal
 from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import read_arrays, replace_file
 from autdtorch.utils.validation import invalid, path_of, require_kind, within
 
 _BEST, _SEARCH, _HEADER = "best.", "search.", "header"
-_VERSION = 3  # of the format; a new one where `State`, or what a method keeps in `search`, changes
+_VERSION = 3  # of the format; a new one where `State`, or the `search` of a method, changes
+_SHOWN = 16  # digits of a digest
 _COLUMNS = tuple(field.name for field in dataclasses.fields(Solution))
 
 
@@ -48,7 +51,7 @@ def save_state(path: str | os.PathLike[str], method: Method, state: State) -> No
     tensors |= {f"{_SEARCH}{name}": tensor for name, tensor in state.search.items()}
     arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in tensors.items()}
     digests = {name: digest_of(array.shape, array) for name, array in arrays.items()}
-    header = [_VERSION, origin_of(method, state.problem), digests]
+    header = [_VERSION, _origin_of(method, state.problem), digests]
     arrays[_HEADER] = np.array(json.dumps([*header, digest_of(*header)]))
     content = io.BytesIO()
     np.savez(content, **arrays)
@@ -63,7 +66,7 @@ def load_state(path: str | os.PathLike[str], method: Method, problem: Problem) -
         method: of the same settings as when the state was saved.
         problem: the same as when the state was saved: numbers of transducers and foci, goal, start, scene and
             transfer matrix. Of a goal that is a function, code and values are compared, but not what it finds
-            by global names; of an object of a class of one's own, unless it is a dataclass, the name alone.
+            by global names; of an object of a user's class, unless it is a dataclass, the name alone.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -74,7 +77,7 @@ def load_state(path: str | os.PathLike[str], method: Method, problem: Problem) -
     require_kind("problem", problem, Problem)
     arrays = read_arrays(path_of("path", path))
     with within(os.fspath(path)):
-        _require_as_saved(arrays, arrays.pop(_HEADER, None), origin_of(method, problem))
+        _require_as_saved(arrays, arrays.pop(_HEADER, None), _origin_of(method, problem))
     tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
     best = Solution(**{name: tensors[f"{_BEST}{name}"] for name in _COLUMNS})
     search = {
@@ -100,10 +103,92 @@ def _require_as_saved(
     if not whole:
         raise ValueError("header: changed; must be as save_state wrote it")
     if written != origin:
-        found, wanted = differences(written, origin)
-        raise ValueError(f"state of {found}; must be of {wanted}")
+        stored, wanted = _differences(written, origin)
+        raise ValueError(f"state of {stored}; must be of {wanted}")
     missing = [f"{name}: missing" for name in digests if name not in arrays]
     there = {name: digest_of(array.shape, array) for name, array in arrays.items()}
     changed = [f"{name}: changed" for name, digest in there.items() if digest != digests.get(name)]
     if missing or changed:
         raise ValueError(f"{', '.join(missing + changed)}; must be as save_state wrote it")
+
+
+def _origin_of(method: Method, problem: Problem) -> dict[str, Any]:
+    """Return the settings of a method and the fields of a problem by name, as JSON gives them.
+
+    Of a tensor, of the scene and of a goal that is no `Goal`, it is a digest.
+    """
+    origin = {
+        "method": method.name,
+        "settings": dataclasses.asdict(method),
+        "transducers": problem.transducers,
+        "foci": problem.foci,
+        "goal": _goal(problem.goal),
+        "start": problem.start,
+        "scene": None if problem.scene is None else _digest(problem.scene),
+        "transfer_matrix": problem.transfer_matrix,
+    }
+    plain: dict[str, Any] = json.loads(json.dumps(origin, default=_digest))
+    return plain
+
+
+def _differences(written: Mapping[str, Any], wanted: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the entries that differ in two origins, after the name of the method, as JSON."""
+    names = [name for name in wanted if name == "method" or written[name] != wanted[name]]
+    return json.dumps({name: written[name] for name in names}), json.dumps(
+        {name: wanted[name] for name in names}
+    )
+
+
+def _goal(goal: object) -> str:
+    if isinstance(goal, Goal):
+        return repr(goal)
+    function = goal.func if isinstance(goal, functools.partial) else goal
+    return f"{_named(function)} {_digest(goal)}"
+
+
+def _digest(value: object) -> str:
+    return digest_of(*_parts(value))[:_SHOWN]
+
+
+def _named(value: object) -> str:
+    return str(getattr(value, "__qualname__", type(value).__qualname__))
+
+
+def _parts(value: object, closure: bool = True) -> Iterator[object]:
+    """Yield parts, which have a digest, that distinguish a value from others.
+
+    Of a function, that is its code, its defaults and the values of functions around it, not what it finds by
+    global names. Of an object that is no dataclass, it is the name of its type.
+    """
+    if isinstance(value, torch.Tensor):
+        yield value.detach().cpu()
+    elif isinstance(value, tuple | list):
+        yield len(value)
+        for part in value:
+            yield from _parts(part)
+    elif isinstance(value, Mapping):
+        yield from _parts(tuple(value.items()))
+    elif isinstance(value, functools.partial):
+        yield from _parts((value.func, *value.args, value.keywords))
+    elif isinstance(value, types.CodeType):
+        yield from (value.co_code.hex(), value.co_names)
+        yield from _parts(value.co_consts)
+    elif isinstance(value, types.FunctionType):
+        yield from _parts(value.__code__)
+        yield from _parts((*(value.__defaults__ or ()), *(value.__kwdefaults__ or {}).values()))
+        for cell in (value.__closure__ or ()) if closure else ():  # functions there may be around each other
+            yield from _parts(cell.cell_contents, closure=False)
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        yield _named(value)
+        for field in dataclasses.fields(value):
+            part = getattr(value, field.name)
+            if field.compare or hasattr(part, "__array__"):
+                yield field.name
+                yield from _parts(part)
+    elif isinstance(value, complex | bytes):
+        yield repr(value)
+    else:
+        try:
+            yield digest_of(value)
+        except TypeError:
+            yield _named(value)

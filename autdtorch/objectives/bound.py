@@ -1,24 +1,33 @@
 """Certified upper bounds on scores over all drives (docs/decisions/bound.md).
 
-Let foci reach at least t w_p, with w the pressures wanted relative to each other, and quiet points at most
-r t. Take any z > 0 of the M transducers, and any a, b >= 0 of the foci and the quiet points with
-sum a_p w_p^2 - r^2 sum b_k = 1. All drives |q_i| <= 1 have
+**Relaxation.** Let foci reach at least t w_p, with w the pressures wanted relative to each other, and quiet
+points at most r t. Take any z > 0 of the M transducers, and any a, b >= 0 of the foci and the quiet points
+with sum a_p w_p^2 - r^2 sum b_k = 1. All drives |q_i| <= 1 have
 
-    t^2 <= sum a_p |(G q)_p|^2 - sum b_k |(G q)_k|^2 <= lambda |z|^2,
+    t^2 <= sum a_p |(G q)_p|^2 - sum b_k |(G q)_k|^2 <= lambda |z|^2
 
 with lambda the largest eigenvalue of Z^-1 G^H D G Z^-1, Z = diag(z) and D = diag(a, -b). The minimum of the
 right side is the value of the semidefinite relaxation, whose dual this is. If the search ends a little above
 the minimum, the bound still holds.
+
+**Branch and bound**, for few foci. Let the phases of their pressures be within d_p of psi_p. Then
+Re(e^(-i psi_p) p_p) >= cos(d_p) |p_p|. With any a >= 0 all drives of amplitudes <= 1 have
+
+    t sum a_p cos(d_p) <= Re sum a_p e^(-i psi_p) (G q)_p <= sum_m |sum_p a_p e^(-i psi_p) G_pm|
+
+where t is the least |p_p|, of rows over the wanted pressures. Boxes that together contain all phases bound t
+by the largest of their right sides. The drive with the phases of the last sum attains a level; boxes within a
+tolerance of the highest one are not divided.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import scipy.optimize
 
-from autdtorch.objectives.phase_bound import MARGIN, phase_bound
 from autdtorch.utils.array_types import Array, ComplexArray
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import ArrayLike, complex_tensor
@@ -44,6 +53,17 @@ _ROUNDING = 10 * float(np.finfo(np.float64).eps)
 #: Smallest singular value of a background, relative to the largest, and the margin for its rounding.
 _LEAST_SINGULAR, _SINGULAR_MARGIN = 1e-8, 1e-6
 
+_MOST_FOCI = 6  # With more, boxes are too many
+_TOLERANCE = 3e-3  # Relative distance of the bound to the highest level attained
+_PARTS = 3  # of the circle of each phase in the beginning; more than 2, for a cosine > 0
+_MOST_WORK = 3e8  # Products of boxes, foci, transducers and iterations: about half a second
+_BOX_WORK = 60  # of a box, beside foci and transducers
+_MOST_BOXES = 50_000  # at once
+_ITERATIONS = 8  # of the weights a, which begin at those of the box that was divided
+_LARGEST_STEP = 2.0  # of the logarithm of a weight
+_MARGIN = 1e-12
+"""Relative margin on top of a bound; rounding of the bound and of a pressure is below 1e-13."""
+
 
 def focus_bound(G: ArrayLike) -> float:
     """Return an upper bound on the pressure of the weakest focus over all drives.
@@ -53,8 +73,8 @@ def focus_bound(G: ArrayLike) -> float:
 
     Returns:
         Bound [Pa] on min_p |(G q)_p| over all drives q of amplitudes <= 1. For up to four foci, and
-        mostly for five or six, it is within 0.3 % of the highest attainable pressure; otherwise it is that of
-        a semidefinite relaxation.
+        mostly for five or six, it is within 0.3 % of the highest attainable pressure; otherwise it is the
+        value of a semidefinite relaxation.
 
     Raises:
         ValueError: not finite complex numbers, or not (P, M) with P, M >= 1.
@@ -65,8 +85,8 @@ def focus_bound(G: ArrayLike) -> float:
 
 @one_library_thread()
 def least_bound(foci: ComplexArray, wanted: Array) -> float:
-    """Return the lower one of `level_bound` and `phase_bound`."""
-    return phase_bound(foci, wanted, level_bound(foci, wanted)[0])
+    """Return the lower bound of both on the level t of foci that reach t `wanted`."""
+    return _phase_bound(foci, wanted, level_bound(foci, wanted)[0])
 
 
 def checked_matrix(G: ArrayLike, name: str = "G") -> ComplexArray:
@@ -126,7 +146,7 @@ def level_bound(
             bounds=limits,
             options={"maxcor": 40, "maxiter": 2000, "ftol": 1e-14, "gtol": 1e-10},
         ).x
-    bound = alone.min() * math.exp(_certified(x, rows, importance)) * (1 + MARGIN)
+    bound = alone.min() * math.exp(_certified(x, rows, importance)) * (1 + _MARGIN)
     if norm:  # |z|^2 is the number of transducers
         bound /= math.sqrt(len(start))
     return bound, float(x[count : count + len(silent)].sum())
@@ -144,9 +164,9 @@ def contrast_bound(foci: ComplexArray, background: ComplexArray) -> float:
     Returns:
         The bound; infinite where B has a rank below M, for drives can silence the background then.
     """
-    heard = (np.abs(foci).max(axis=0) > 0) | (np.abs(background).max(axis=0) > 0)
-    foci, background = foci[:, heard], background[:, heard]
-    if not heard.any():
+    audible = (np.abs(foci).max(axis=0) > 0) | (np.abs(background).max(axis=0) > 0)
+    foci, background = foci[:, audible], background[:, audible]
+    if not audible.any():
         return 0.0
     _, singular, right = np.linalg.svd(background, full_matrices=False)
     if len(background) < foci.shape[1] or singular[-1] <= _LEAST_SINGULAR * singular[0]:
@@ -158,19 +178,18 @@ def contrast_bound(foci: ComplexArray, background: ComplexArray) -> float:
 
 def _certified(x: Array, rows: ComplexArray, importance: Array) -> float:
     """Return the logarithm of the bound that x certifies, whatever the rounding; see `_log_bound`."""
-    split, found = len(rows), []
+    split, bounds = len(rows), []
     for width in _RANGES:
         log_z = x[split:].clip(x[split:].max() - width)
         z, columns, signed = _dual(np.concatenate([x[:split], log_z]), rows, importance)
-        scaled = (
-            np.sqrt(np.abs(signed))[:, None] * columns
-        )  # before, as the SVD errs in proportion to its norm
+        # scaled before, as the SVD errs in proportion to its norm
+        scaled = np.sqrt(np.abs(signed))[:, None] * columns
         left, singular, _ = np.linalg.svd(scaled, full_matrices=False)
         signs = left.conj().T * np.sign(signed)
         largest = np.linalg.eigvalsh((singular[:, None] * signs @ left) * singular)[-1]
         rounding = _ROUNDING * len(rows) * (np.abs(scaled) ** 2).sum()
-        found.append(math.log(max(largest, 0.0) + rounding) / 2 + math.log(np.linalg.norm(z)))
-    return min(found)
+        bounds.append(math.log(max(largest, 0.0) + rounding) / 2 + math.log(np.linalg.norm(z)))
+    return min(bounds)
 
 
 def _dual(x: Array, rows: ComplexArray, importance: Array) -> tuple[Array, ComplexArray, Array]:
@@ -213,3 +232,86 @@ def _log_bound(x: Array, rows: ComplexArray, importance: Array, order: float) ->
     slope_prices = weights @ at_points[:foci] / mean - at_points[foci:]
     slope_log_z = z**2 / np.sum(z**2) - 2 * at_transducers
     return float(log_bound), np.concatenate([slope_weights, slope_prices, slope_log_z])
+
+
+class _Boxes(NamedTuple):
+    """Boxes of phases: centres (B, P) [rad], half of their edges (B, P) [rad], and weights a (B, P)."""
+
+    centres: Array
+    halves: Array
+    weights: Array
+
+
+def _phase_bound(foci: ComplexArray, wanted: Array, known: float) -> float:
+    """Return a bound on the level t of foci that reach t `wanted`, at most a known one.
+
+    Args:
+        foci: their rows of the transfer matrix (P, M) [Pa].
+        wanted: pressures (P,) > 0, relative to each other.
+        known: a bound that holds.
+    """
+    if len(foci) > _MOST_FOCI:
+        return known
+    rows = foci / wanted[:, None]
+    alone = np.abs(rows).sum(axis=1)  # level that each focus reaches alone
+    if alone.min() == 0:
+        return known
+    boxes, work = _whole((alone.min() / alone) ** 2), float((rows.size + _BOX_WORK) * _ITERATIONS)
+    attained, done, left = 0.0, 0.0, _MOST_WORK / work
+    while len(boxes.centres):
+        left -= len(boxes.centres)
+        if left < 0 or len(boxes.centres) > _MOST_BOXES:
+            return known
+        bounds, weights, level = _bounded(rows, boxes)
+        attained = max(attained, level)
+        open_ = np.minimum(bounds, known) > attained * (1 + _TOLERANCE)
+        done = max(done, bounds[~open_].max(initial=0.0))
+        boxes = _divided(_Boxes(boxes.centres[open_], boxes.halves[open_], weights[open_]))
+    return min(known, done * (1 + _MARGIN))
+
+
+def _whole(weights: Array) -> _Boxes:
+    """Return boxes that contain all phases, with first weights (P,).
+
+    The phase of the first focus is 0: a common phase changes nothing.
+    """
+    foci, half = len(weights), math.pi / _PARTS
+    along = half * (2 * np.arange(_PARTS) + 1)
+    centres = np.stack(np.meshgrid(0.0, *[along] * (foci - 1), indexing="ij"), axis=-1).reshape(-1, foci)
+    halves = np.full_like(centres, half)
+    halves[:, 0] = 0
+    return _Boxes(centres, halves, np.tile(weights, (len(centres), 1)))
+
+
+def _bounded(rows: ComplexArray, boxes: _Boxes) -> tuple[Array, Array, float]:
+    """Return the least bounds (B,) that iterations find, their weights (B, P), and the highest level."""
+    turn, cosine, weights = np.exp(-1j * boxes.centres), np.cos(boxes.halves), boxes.weights
+    least, best, attained = np.full(len(turn), np.inf), weights, 0.0
+    for number in range(_ITERATIONS):
+        sums = (weights * turn) @ rows
+        size = np.abs(sums)
+        bounds = size.sum(axis=1) / (weights * cosine).sum(axis=1)
+        lower = bounds < least
+        least, best = np.where(lower, bounds, least), np.where(lower[:, None], weights, best)
+        pressure = (sums.conj() / np.maximum(size, np.finfo(np.float64).tiny)) @ rows.T
+        attained = max(attained, float(np.abs(pressure).min(axis=1).max()))
+        # the weight of a focus grows as much as its pressure is below the bound
+        missing = 1 - (turn * pressure).real / (cosine * bounds[:, None])
+        weights = weights * np.exp((4 / (2 + number) * missing).clip(-_LARGEST_STEP, _LARGEST_STEP))
+        weights = weights / weights.max(axis=1, keepdims=True)
+    return least, best, attained
+
+
+def _divided(boxes: _Boxes) -> _Boxes:
+    """Return the halves of boxes, divided across their longest edge.
+
+    The weights are no guide: a focus has a small weight as long as its edge is long.
+    """
+    each = np.arange(len(boxes.centres))
+    longest = boxes.halves.argmax(axis=1)
+    halves = boxes.halves.copy()
+    halves[each, longest] /= 2
+    centres = np.concatenate([boxes.centres, boxes.centres])
+    centres[each, longest] -= halves[each, longest]
+    centres[len(each) + each, longest] += halves[each, longest]
+    return _Boxes(centres, np.concatenate([halves, halves]), np.concatenate([boxes.weights, boxes.weights]))

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from autdtorch.objectives.bound import checked_matrix, least_bound, level_bound
-from autdtorch.objectives.objective import Score, checked_pressure, weakest_focus
+from autdtorch.objectives.objective import GoalFunction, checked_pressure, weakest_focus
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import ArrayLike, invalid, real_tensor
 
@@ -21,7 +21,7 @@ from autdtorch.utils.validation import ArrayLike, invalid, real_tensor
 class Goal(ABC):
     """Base of all goals: a function of pressures (..., P) [Pa] that gives scores (...) to maximise.
 
-    A goal of one's own is a frozen dataclass with `__call__`; gradient and bound are optional. Methods take
+    A user's goal is a frozen dataclass with `__call__`; gradient and bound are optional. Methods take
     any function of pressures, too.
 
     Attributes:
@@ -71,9 +71,9 @@ class Goal(ABC):
 
     def checked(self, pressure: ArrayLike) -> torch.Tensor:
         """Return pressures (..., P) [Pa] after checking them, and that the goal has as many points."""
-        found = checked_pressure(pressure)
-        self.check(found.shape[-1])
-        return found
+        pressure = checked_pressure(pressure)
+        self.check(pressure.shape[-1])
+        return pressure
 
 
 @dataclass(frozen=True)
@@ -98,12 +98,12 @@ class WeakestFocus(Goal):
         return self.levels(self.checked(pressure)).amin(dim=-1)
 
     def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
-        """Return those of the smooth minimum -T log sum_p exp(-|p_p| / (w_p T))."""
+        """Return the derivatives of the smooth minimum -T log sum_p exp(-|p_p| / (w_p T))."""
         levels = self.levels(pressure)
-        hardness = 1 / (smoothing * levels.mean(dim=-1, keepdim=True)).clamp_min(
+        temperature = (smoothing * levels.mean(dim=-1, keepdim=True)).clamp_min(
             torch.finfo(levels.dtype).tiny
         )
-        return self.levels(torch.softmax(-levels * hardness, dim=-1))
+        return self.levels(torch.softmax(-levels * (1 / temperature), dim=-1))
 
     def bound(self, G: ArrayLike) -> float:
         """Return the bound [Pa], for few foci nearly attained; see `Goal.bound`."""
@@ -173,7 +173,7 @@ class TargetPressures(Goal):
         return -total / math.sqrt(len(self.targets))
 
     def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
-        """Return those of minus half the sum of squares."""
+        """Return the derivatives of minus half the sum of squares."""
         return -self._deviation(pressure) / pressure.new_tensor(self.targets)
 
     def bound(self, G: ArrayLike) -> float:
@@ -199,12 +199,12 @@ WEAKEST_FOCUS = WeakestFocus()
 """The paper's goal."""
 
 
-def goal_of(score: Score) -> Score:
-    """Return the goal that a function is, or the function."""
-    return WEAKEST_FOCUS if score is weakest_focus else score
+def goal_of(function: GoalFunction) -> GoalFunction:
+    """Return the `Goal` that is a function, where there is one, or the function."""
+    return WEAKEST_FOCUS if function is weakest_focus else function
 
 
-def scores_of(goal: Score, pressure: torch.Tensor) -> torch.Tensor:
+def scores_of(goal: GoalFunction, pressure: torch.Tensor) -> torch.Tensor:
     """Return the scores (...) of a goal or any function for magnitudes (..., P), after checking them.
 
     They are on the CPU, without a gradient. The function gets a copy, which it may change.
@@ -212,38 +212,38 @@ def scores_of(goal: Score, pressure: torch.Tensor) -> torch.Tensor:
     return _checked_scores(goal, pressure).detach().cpu()
 
 
-def _checked_scores(goal: Score, pressure: torch.Tensor) -> torch.Tensor:
-    found = real_tensor("score", goal(pressure.clone()))
-    if found.shape != pressure.shape[:-1]:
+def _checked_scores(goal: GoalFunction, pressure: torch.Tensor) -> torch.Tensor:
+    score = real_tensor("score", goal(pressure.clone()))
+    if score.shape != pressure.shape[:-1]:
         accepted = f"must be {tuple(pressure.shape[:-1])}, one number for each drive"
-        raise ValueError(f"score: shape {tuple(found.shape)}; {accepted}")
-    return found
+        raise ValueError(f"score: shape {tuple(score.shape)}; {accepted}")
+    return score
 
 
-def differentiable_scores(goal: Score, pressure: torch.Tensor) -> torch.Tensor:
+def differentiable_scores(goal: GoalFunction, pressure: torch.Tensor) -> torch.Tensor:
     """Return the scores of magnitudes that require a gradient, with it; `ValueError` where they have none."""
     accepted = "must be differentiable by PyTorch, for a method that climbs it"
     try:
         score = _checked_scores(goal, pressure)
     except RuntimeError as error:  # of PyTorch, such as for a conversion to NumPy
-        raise invalid("score", goal, f"{accepted} ({error})") from error
+        raise invalid("goal", goal, f"{accepted} ({error})") from error
     if pressure.requires_grad and not score.requires_grad:
-        raise invalid("score", goal, accepted)
+        raise invalid("goal", goal, accepted)
     return score
 
 
-def slope_of(goal: Score, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
+def slope_of(goal: GoalFunction, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
     """Return the derivatives (..., P) of a goal or of any function of magnitudes; see `Goal.slope`."""
     return goal.slope(pressure, smoothing) if isinstance(goal, Goal) else derivative(goal, pressure)
 
 
-def derivative(goal: Score, pressure: torch.Tensor) -> torch.Tensor:
+def derivative(goal: GoalFunction, pressure: torch.Tensor) -> torch.Tensor:
     """Return the derivatives (..., P) of scores by magnitudes (..., P), by automatic differentiation."""
     with torch.enable_grad():
         magnitude = pressure.detach().requires_grad_()
         score = differentiable_scores(goal, magnitude)
-        found = torch.autograd.grad(score.sum(), magnitude, allow_unused=True)[0]
-    return torch.zeros_like(pressure) if found is None else found
+        slope = torch.autograd.grad(score.sum(), magnitude, allow_unused=True)[0]
+    return torch.zeros_like(pressure) if slope is None else slope
 
 
 def _positive(name: str, values: object, unit: str = "") -> tuple[float, ...]:

@@ -19,7 +19,7 @@ class FocusMetrics:
         min: pressure (...) of the weakest focus [Pa].
         std: standard deviation (...) among the foci [Pa], of the population (Fig. 3c).
         uniformity: (...), 1 - (max - min) / (max + min), from 0 to 1; 1 where all foci are equal.
-        area: area (...) a focus [m^2] (Fig. 3b), or None where no plane was given.
+        area: area (...) a focus [m^2] (Fig. 3b), or None without a plane.
     """
 
     mean: torch.Tensor
@@ -51,7 +51,7 @@ def focus_metrics(
         pressure: magnitudes at the foci (..., P) [Pa].
         plane_pressure: magnitudes in the cells of the observation plane (..., Nu, Nv) [Pa], with the same
             leading shape; only for the area.
-        cell_area: area of one cell [m^2], > 0; given exactly where `plane_pressure` is.
+        cell_area: area of one cell [m^2], > 0; with `plane_pressure` alone.
 
     Raises:
         ValueError: not finite, negative, shapes that do not fit, or only one of the last two.

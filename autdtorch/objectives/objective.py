@@ -19,8 +19,8 @@ from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid, real_
 
 logger = logging.getLogger(__name__)
 
-Score: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
-"""A goal: function of pressures (..., P) [Pa] that gives the scores (...) to maximise."""
+GoalFunction: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
+"""A goal, such as a `Goal`: a function of pressures (..., P) [Pa] that gives the scores (...) to maximise."""
 
 
 @runtime_checkable

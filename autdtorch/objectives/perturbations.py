@@ -3,7 +3,7 @@
 The innermost perturbation acts last on the drive: ``Quantised(Drift(FailedTransducers(objective, [3]),
 phase=0.1), levels=32)`` rounds the drive, then lets the transducers drift, then switches one off. `Noise` may
 come anywhere. All random choices follow from the seeds, and go on from row to row, however the rows are
-divided among calls. A trial that must not depend on other trials therefore needs an objective of its own.
+divided among calls. A trial that must not depend on others therefore needs a separate objective.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Perturbation:
         return validate_drive(drive, len(self.scene.array))
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return the drives (..., M) that `inner` is given for drives (..., M), at present."""
+        """Return the drives (..., M) that `inner` gets for drives (..., M), at present."""
         return self.quantised(drive)
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
@@ -110,12 +110,12 @@ class FailedTransducers(Perturbation):
         """
         super().__init__(objective)
         count = len(self.scene.array)
-        self._alive = torch.ones(count, **REAL)
-        self._alive[indices("transducers", transducers, count)] = 0
+        self._working = torch.ones(count, **REAL)
+        self._working[indices("transducers", transducers, count)] = 0
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
         """Return `drive` (..., M) without the failed transducers."""
-        return super().emitted(drive) * self._alive
+        return super().emitted(drive) * self._working
 
 
 class Drift(Perturbation):

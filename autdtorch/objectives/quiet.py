@@ -48,7 +48,7 @@ class QuietPoints(Goal):
         """Check the fields."""
         require_kind("goal", self.goal, Goal)
         if isinstance(self.goal, QuietPoints | Contrast):
-            raise invalid("goal", self.goal, "must be a goal without quiet points of its own")
+            raise invalid("goal", self.goal, "must be a goal without quiet points")
         object.__setattr__(self, "points", _indices(self.points))
         object.__setattr__(self, "ratio", positive("ratio", self.ratio))
 
@@ -73,18 +73,18 @@ class QuietPoints(Goal):
         return score - _PENALTY * excess
 
     def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
-        """Return those of the goal, and of a penalty for the smooth maximum of the excess."""
+        """Return the derivatives of the goal and of a penalty for the smooth maximum of the excess."""
         loud, quiet = _parts(pressure, self.points)
         tiny = torch.finfo(loud.dtype).tiny
         least = (_LEAST * loud.mean(dim=-1, keepdim=True)).clamp_min(math.sqrt(tiny))
-        own, weakest = self.goal.slope(loud, smoothing), WEAKEST_FOCUS.slope(loud, smoothing)
+        rise, weakest = self.goal.slope(loud, smoothing), WEAKEST_FOCUS.slope(loud, smoothing)
         limit = self.ratio * loud.amin(dim=-1, keepdim=True).maximum(least)
         excess = (quiet.clamp_min(tiny) / limit).log() / smoothing
         weights = torch.softmax(torch.cat([torch.zeros_like(limit), excess], dim=-1), dim=-1)[..., 1:]
-        penalty = _PENALTY * (own.abs() * loud).sum(dim=-1, keepdim=True)  # of the size of the score
+        penalty = _PENALTY * (rise.abs() * loud).sum(dim=-1, keepdim=True)  # of the size of the score
         raised = penalty * weights.sum(dim=-1, keepdim=True) * weakest * self.ratio / limit
         slope = torch.zeros_like(pressure)
-        slope[..., _others(self.points, pressure.shape[-1])] = own + raised
+        slope[..., _others(self.points, pressure.shape[-1])] = rise + raised
         slope[..., list(self.points)] = -penalty * weights / quiet.clamp_min(tiny)
         return slope
 
@@ -106,9 +106,9 @@ class QuietPoints(Goal):
             before = (levels * factor).max()
             ratio = self.ratio * weights.max() * math.exp(excess[worst])
             level, price = level_bound(loud, weights, quiet, ratio)
-            left = (
-                1 - price * np.expm1(2 * (excess[1:] - excess[worst])) if price > 0 else np.ones(_INTERVALS)
-            )
+            left = np.ones(_INTERVALS)
+            if price > 0:
+                left -= price * np.expm1(2 * (excess[1:] - excess[worst]))
             levels[left > 0] = np.minimum(levels[left > 0], level / np.sqrt(left[left > 0]))
             scores = levels * factor
             worst = min(int(scores.argmax()) + 1, _INTERVALS - 1)
@@ -152,7 +152,7 @@ class Contrast(Goal):
         return ratio
 
     def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
-        """Return those of the logarithm, with a smooth minimum."""
+        """Return the derivatives of the logarithm, with a smooth minimum."""
         foci, background = _parts(pressure, self.points)
         tiny = torch.finfo(foci.dtype).tiny
         weakest = foci.amin(dim=-1, keepdim=True).clamp_min(tiny)

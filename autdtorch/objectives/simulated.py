@@ -40,7 +40,7 @@ class SimulatedObjective:
             propagator: simulates the scene.
             mode: "transfer" simulates the transfer matrix G once, here, and observes |G q|, since the field
                 is linear in the drive. "replay" asks the propagator for the field of every drive: a
-                simulation for each, as in the paper, unless the propagator has kept its outgoing field.
+                simulation for each, as in the paper, unless the propagator has stored its outgoing field.
         """
         require_kind("scene", scene, Scene)
         require_kind("propagator", propagator, Propagator)

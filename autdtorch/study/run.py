@@ -7,6 +7,7 @@ import inspect
 import logging
 import math
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ import torch
 
 from autdtorch.io.goal_section import goal_section, require_score
 from autdtorch.methods.base import Method, Problem
-from autdtorch.methods.driver import run
+from autdtorch.methods.run import run
 from autdtorch.methods.seeds import TRIAL_BYTES, Trials
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
@@ -54,7 +55,7 @@ logger = logging.getLogger(__name__)
 StudyMethod: TypeAlias = Method | Callable[..., Solution]
 """A `Method`, or a function of an objective with its settings bound. A function that has parameters `trials`
 and `seed` is given the numbers of the trials to run, as many as it is to return, and the study's seed. One
-that has a parameter `score` is given the goal."""
+that has a parameter `goal` is given the goal."""
 
 BLOCK = Method.block
 """Trials that are run and saved together. The end of the process costs the block in work at most."""
@@ -211,9 +212,18 @@ def _require_goal_taken(name: str, method: StudyMethod, goal: Goal) -> None:
     """Refuse a function that maximises the weakest focus, whatever the goal."""
     if goal == WEAKEST_FOCUS or isinstance(method, Method):
         return
-    if "score" not in inspect.signature(method).parameters:
-        accepted = f"must have a parameter `score`, for the goal {goal.name}"
+    if goal_keyword(method) is None:
+        accepted = f"must have a parameter `goal`, for the goal {goal.name}"
         raise invalid(f"method {name}", name_of(method), accepted)
+
+
+def goal_keyword(method: Callable[..., Solution]) -> str | None:
+    """Return the name of the parameter for the goal of a function, if it has one."""
+    taken = inspect.signature(method).parameters
+    if "goal" in taken or "score" not in taken:
+        return "goal" if "goal" in taken else None
+    warnings.warn(f"{name_of(method)}: the parameter `score` is now `goal`", DeprecationWarning, stacklevel=2)
+    return "score"
 
 
 def _goals_of(goal: Goal) -> list[Goal]:
@@ -247,10 +257,10 @@ def solve(
 ) -> Solution:
     """Run trials of a method on an objective, from drives (T, M) where it begins at any."""
     if isinstance(method, Method):
-        return run(method, objective, trials, seed, score=goal, start=start)
+        return run(method, objective, trials, seed, goal=goal, start=start)
     taken = inspect.signature(method).parameters
-    given = {"trials": trials, "seed": seed, "score": goal}
-    return method(objective, **{key: value for key, value in given.items() if key in taken})
+    known = {"trials": trials, "seed": seed, goal_keyword(method) or "goal": goal}
+    return method(objective, **{key: value for key, value in known.items() if key in taken})
 
 
 def _run_scene(

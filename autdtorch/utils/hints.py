@@ -7,6 +7,7 @@ import functools
 import inspect
 import re
 import sys
+import warnings
 from collections.abc import Callable, Collection
 from functools import partial
 from typing import Any, TypeVar
@@ -68,6 +69,31 @@ def suggesting(function: Function) -> Function:
 
     setattr(call, _SUGGESTS, True)
     return call  # type: ignore[return-value]
+
+
+def renamed_keywords(**names: str) -> Callable[[Function], Function]:
+    """Return a decorator of functions that still take keywords by old names, with a DeprecationWarning.
+
+    Args:
+        names: the new name of each old one.
+    """
+
+    def decorate(function: Function) -> Function:
+        current = suggesting(function)
+
+        @functools.wraps(current)
+        def call(*arguments: Any, **keywords: Any) -> Any:
+            for old, new in names.items():
+                if old in keywords:
+                    if new in keywords:
+                        raise TypeError(f"{old}: has the new name {new}, which is given too")
+                    warnings.warn(f"{old}= is now {new}=", DeprecationWarning, stacklevel=2)
+                    keywords[new] = keywords.pop(old)
+            return current(*arguments, **keywords)
+
+        return call  # type: ignore[return-value]
+
+    return decorate
 
 
 def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:

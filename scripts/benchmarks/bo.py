@@ -22,7 +22,7 @@ from shared.document import table
 from shared.scenes import PAPER, paper_scene
 
 import autdtorch as at
-from autdtorch.methods.bayes.bayes import NOISE, drives_at
+from autdtorch.methods.bayes_opt import NOISE, drives_at
 from autdtorch.methods.seeds import trial_seeds
 from autdtorch.objectives.objective import weakest_focus
 

@@ -37,15 +37,15 @@ METHODS = {
 }
 TARGETS = at.TargetPressures([6.0, 4.0, 6.0, 4.0])
 FOR_TARGETS = {
-    "GABS": lambda objective, seed: at.gabs(objective, seed=seed, score=TARGETS),
-    "GABS, 3 passes": lambda objective, seed: at.gabs(objective, passes=3, seed=seed, score=TARGETS),
-    "GABS, 5 passes": lambda objective, seed: at.gabs(objective, passes=5, seed=seed, score=TARGETS),
-    "BO": lambda objective, seed: at.bayes_opt(objective, 150, seed=seed, score=TARGETS),
+    "GABS": lambda objective, seed: at.gabs(objective, seed=seed, goal=TARGETS),
+    "GABS, 3 passes": lambda objective, seed: at.gabs(objective, passes=3, seed=seed, goal=TARGETS),
+    "GABS, 5 passes": lambda objective, seed: at.gabs(objective, passes=5, seed=seed, goal=TARGETS),
+    "BO": lambda objective, seed: at.bayes_opt(objective, 150, seed=seed, goal=TARGETS),
     "BO, circle": lambda objective, seed: at.bayes_opt(
-        objective, 150, kernel="circle", seed=seed, score=TARGETS
+        objective, 150, kernel="circle", seed=seed, goal=TARGETS
     ),
     "BO, foci": lambda objective, seed: at.bayes_opt(
-        objective, 80, initial=4, model="foci", kernel="phasor", noise="inferred", seed=seed, score=TARGETS
+        objective, 80, initial=4, model="foci", kernel="phasor", noise="inferred", seed=seed, goal=TARGETS
     ),
 }
 SNR = 30.0  # dB

@@ -130,7 +130,7 @@ def check_goals(count: int, seed: int) -> int:
         for goal, objective in goals:
             bound = goal.bound(objective.transfer_matrix)
             ascent, *others = (
-                solve(objective, score=goal).score.item()
+                solve(objective, goal=goal).score.item()
                 for solve in (at.gradient_ascent, at.gabs, at.random_search)
             )
             if not max(ascent, *others) <= bound + ROUNDING * abs(bound):
@@ -153,7 +153,7 @@ def check_paper_scenes() -> None:
     weights = (1 + 2 * torch.rand(20, 4, dtype=torch.float64, generator=generator)).tolist()
     for name, objective in paper_objectives().items():
         plain, *weighted = (
-            1 - at.gradient_ascent(objective, score=goal).score.item() / goal.bound(objective.transfer_matrix)
+            1 - at.gradient_ascent(objective, goal=goal).score.item() / goal.bound(objective.transfer_matrix)
             for goal in (at.WeakestFocus(), *map(at.WeakestFocus, weights))
         )
         gaps = f"median {np.median(weighted):.3%}, most {max(weighted):.3%} with weights from 1 to 3"

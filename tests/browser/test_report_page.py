@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 from small_scenes import AIR, CUBE, small_scene
 
-from autdtorch.methods.gabs import gabs
-from autdtorch.methods.lssg import lssg
+from autdtorch.methods.functions import gabs, lssg
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.scene import Scene
 from autdtorch.study.report.study_report import write_report

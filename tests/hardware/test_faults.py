@@ -13,7 +13,7 @@ from faulty_bus import FAULTS, Disturbed, FaultyBus
 
 from autdtorch import hardware as hw
 from autdtorch.hardware.emulator.bus import EmulatedBus
-from autdtorch.methods.gabs import gabs
+from autdtorch.methods.functions import gabs
 from autdtorch.methods.solution import Solution
 
 METHOD = partial(gabs, levels=2, order="given")

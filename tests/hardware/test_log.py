@@ -11,7 +11,7 @@ from faulty_bus import Disturbed
 from filelock import FileLock, Timeout
 
 from autdtorch.hardware import EmulatedSensor, LogError
-from autdtorch.methods.driver import observed
+from autdtorch.methods.run import observed
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.json_lines import SET_ASIDE, line_of, row_of
 

@@ -15,7 +15,7 @@ from faulty_bus import Disturbed
 
 from autdtorch import hardware as hw
 from autdtorch.hardware.sensors.sensor import checked_reading
-from autdtorch.methods.driver import observed
+from autdtorch.methods.run import observed
 
 FULL = torch.ones(16, dtype=torch.complex128)
 

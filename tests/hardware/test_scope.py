@@ -12,7 +12,7 @@ import torch
 from autdtorch import hardware as hw
 from autdtorch.hardware.emulator.bus import EmulatedBus, stall, time_out
 from autdtorch.hardware.emulator.emulated_scope import EmulatedInstrument
-from autdtorch.methods.gabs import gabs
+from autdtorch.methods.functions import gabs
 from autdtorch.objectives.perturbations import random_rms
 from autdtorch.scene.drive import drive_from_phases
 

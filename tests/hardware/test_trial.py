@@ -8,9 +8,7 @@ import torch
 from faulty_bus import Disturbed
 
 from autdtorch import hardware as hw
-from autdtorch.methods.gabs import gabs
-from autdtorch.methods.identify import identify
-from autdtorch.methods.lssg import lssg
+from autdtorch.methods.functions import gabs, identify, lssg
 from autdtorch.objectives.perturbations import random_rms
 from autdtorch.scene.drive import drive_from_phases
 

@@ -57,15 +57,15 @@ def test_score_that_never_changes_is_no_error(make_objective, matrix, options):
         evaluations=6,
         initial=3,
         fixed_transducer=0,
-        score=lambda p: 1 + 0 * p[..., 0],
+        goal=lambda p: 1 + 0 * p[..., 0],
         **options,
     )
     assert solution.score.tolist() == [1.0]
 
 
 def test_goal_without_a_derivative_is_refused_for_the_foci(make_objective, matrix):
-    with pytest.raises(ValueError, match=r"score: .*; must be differentiable"):
-        at.bayes_opt(make_objective(matrix), score=lambda p: torch.ones_like(p[..., 0]), **SMALL, **FOCI)
+    with pytest.raises(ValueError, match=r"goal: .*; must be differentiable"):
+        at.bayes_opt(make_objective(matrix), goal=lambda p: torch.ones_like(p[..., 0]), **SMALL, **FOCI)
 
 
 @pytest.mark.parametrize("dark", [1, slice(None)])
@@ -91,7 +91,7 @@ def test_goal_of_ones_own_is_reached_by_the_foci(make_objective, random_matrix):
     """A goal is improved by its samples, without the smooth minimum: the pressure at the first focus."""
     matrix = random_matrix(2, 4, 3)
     highest = matrix[0].abs().sum()
-    options = dict(evaluations=24, initial=6, fixed_transducer=0, score=lambda p: p[..., 0], **FOCI)
+    options = dict(evaluations=24, initial=6, fixed_transducer=0, goal=lambda p: p[..., 0], **FOCI)
     found = at.bayes_opt(make_objective(matrix), **options)
     assert 0.98 * highest < found.score.item() <= highest * (1 + 1e-6)
 

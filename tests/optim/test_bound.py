@@ -6,8 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autdtorch.methods.gabs import gabs
-from autdtorch.methods.gradient import climb, gradient_ascent, random_drives
+from autdtorch.methods.functions import gabs, gradient_ascent
+from autdtorch.methods.gradient import climb, random_drives
 from autdtorch.objectives.bound import _certified, focus_bound
 from autdtorch.objectives.goals import WeakestFocus
 from autdtorch.objectives.quiet import QuietPoints

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 import autdtorch as at
+from autdtorch.methods.doubtful_readings import gross_outliers, range_ends, reads_finely
 from autdtorch.methods.gradient import random_drives
-from autdtorch.methods.magnitudes import gross_outliers, range_ends, reads_finely
-from autdtorch.methods.phase_retrieval import retrieve
+from autdtorch.methods.matrix_fit import retrieve
 
 
 class Faulty:
@@ -94,7 +94,7 @@ def test_outliers_change_nothing_and_are_told(share, change):
     # Without outliers 0.9999; a hundredth is a tenth of what noise 20 dB below the readings takes.
     assert reached > 0.99
     assert "outliers" in said
-    assert "dead" not in said
+    assert "failed" not in said
 
 
 def test_good_readings_are_not_doubted(share):
@@ -156,7 +156,7 @@ def test_phases_are_retrieved_once_for_all_screenings(paper_objective, monkeypat
         calls.append(arguments)
         return retrieve(*arguments)
 
-    monkeypatch.setattr("autdtorch.methods.matrix_fits.retrieve", counted)
+    monkeypatch.setattr("autdtorch.methods.matrix_fit.retrieve", counted)
     at.identify(Faulty(paper_objective, times(3, [11], 1)), 64)
     assert (
         "evaluation 11 at control point 1" in caplog.text
@@ -182,10 +182,10 @@ def test_a_saturated_sensor_gives_lower_limits(share):
 @pytest.mark.parametrize(
     "reading", [lambda number: 0.0, lambda number: 3.0, lambda number: 2 + math.sin(number**2)]
 )
-def test_a_dead_sensor_is_named(share, reading):
+def test_a_failed_sensor_is_named(share, reading):
     said = share(replaced(2, reading), evaluations=64)[1]
     assert "control point 2 reads up to" in said
-    assert "dead" in said
+    assert "failed" in said
     assert not any(f"control point {point} reads up to" in said for point in (0, 1, 3))
 
 

@@ -4,8 +4,7 @@ import math
 import pytest
 import torch
 
-from autdtorch.methods.gabs import gabs
-from autdtorch.methods.lssg import lssg
+from autdtorch.methods.functions import gabs, lssg
 from autdtorch.methods.seeds import trial_seed
 
 

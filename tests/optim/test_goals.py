@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autdtorch.methods.base import Problem
-from autdtorch.methods.gabs import GABS, gabs
+from autdtorch.methods.functions import gabs, identify
+from autdtorch.methods.gabs import GABS
 from autdtorch.methods.gradient import climb, random_drives
-from autdtorch.methods.identify import identify
 from autdtorch.methods.state_file import load_state, save_state
 from autdtorch.objectives.goals import (
     Goal,
@@ -108,7 +108,7 @@ def test_a_quiet_point_like_its_focus_costs_all_that_the_penalty_leaves():
 def test_gabs_finds_foci_beside_quiet_points(make_objective, random_matrix):
     # the first transducers alone cannot leave a point quiet: a lower score must not look better to them
     objective = make_objective(random_matrix(4, 24, 0))
-    solution = gabs(objective, passes=2, score=QuietPoints(WeakestFocus(), [3], 0.1))
+    solution = gabs(objective, passes=2, goal=QuietPoints(WeakestFocus(), [3], 0.1))
     alone = gabs(make_objective(random_matrix(4, 24, 0)[:3]), passes=2)
     assert solution.score > 0.6 * alone.score  # 0.9 was measured
     assert solution.pressure[0, 3] < 0.15 * solution.pressure[0, :3].min()
@@ -207,7 +207,7 @@ def test_a_saved_state_goes_on_under_its_own_goal_alone(tmp_path):
 def test_methods_that_see_magnitudes_reach_targets(make_objective, random_matrix, method):
     objective = make_objective(random_matrix(3, 12, 0))
     goal = TargetPressures([1.0, 2.0, 1.5])  # far below what 12 transducers of about 1 Pa reach
-    solution = method(objective, score=goal)
+    solution = method(objective, goal=goal)
     assert goal.bound(objective.transfer_matrix) == 0
     # identify fits the matrix; 16 phases of amplitude 1 leave GABS several per cent
     assert (solution.pressure / torch.tensor(goal.targets) - 1).abs().max() < (

@@ -3,7 +3,7 @@ import pytest
 import scipy.optimize
 import torch
 
-from autdtorch.methods.gradient import gradient_ascent
+from autdtorch.methods.functions import gradient_ascent
 
 
 def polished(matrix, starts):

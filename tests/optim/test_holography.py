@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 
 import autdtorch
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.methods.driver import run
-from autdtorch.methods.holography.holography import _SOLVERS, Holography, _within_largest, holography
+from autdtorch.methods.holography.algorithms import SOLVERS, within_largest
+from autdtorch.methods.holography.holography import Holography, holography
+from autdtorch.methods.run import run
 from autdtorch.objectives.bound import focus_bound
 from autdtorch.objectives.goals import TargetPressures, WeakestFocus
 from autdtorch.objectives.quiet import QuietPoints
@@ -93,7 +94,7 @@ def test_a_batch_is_its_sets_one_by_one(random_matrix, algorithm):
 def test_kernels_on_cpus_are_the_definitions(random_matrix, algorithm, free):
     matrix = torch.stack([random_matrix(3, 10, seed) for seed in range(21)])  # a block and a part
     wanted = torch.rand(21, 3, 1, generator=torch.Generator().manual_seed(0)).double() + 0.5
-    exact = _SOLVERS[algorithm](matrix, wanted, 20, _within_largest if free else torch.sgn)
+    exact = SOLVERS[algorithm](matrix, wanted, 20, within_largest if free else torch.sgn)
     found = holography(matrix, wanted[..., 0], algorithm, 20, free)
     # free amplitudes are scaled to the wanted level; twenty iterations spread rounding of 1e-16
     assert torch.allclose(
@@ -132,10 +133,10 @@ def test_as_a_method_it_is_one_evaluation_below_the_bound(make_objective, random
 def test_goals_tell_the_wanted_pressures(make_objective, random_matrix):
     objective = make_objective(random_matrix(3, 30, 0))
     targets = TargetPressures([4.0, 2.0, 3.0])
-    assert run(Holography("diff_pat"), objective, score=targets).score[0] > -0.01
-    weights = run(Holography("wgs"), objective, score=WeakestFocus([2, 1, 1])).pressure[0]
+    assert run(Holography("diff_pat"), objective, goal=targets).score[0] > -0.01
+    weights = run(Holography("wgs"), objective, goal=WeakestFocus([2, 1, 1])).pressure[0]
     assert weights[0] == pytest.approx(2 * float(weights[1]), rel=1e-2)
-    quiet = run(Holography("diff_pat"), objective, score=QuietPoints(WeakestFocus(), [1], 0.05)).pressure[0]
+    quiet = run(Holography("diff_pat"), objective, goal=QuietPoints(WeakestFocus(), [1], 0.05)).pressure[0]
     assert quiet[1] < 0.05 * quiet[[0, 2]].min()
 
 

@@ -5,10 +5,10 @@ import pytest
 import scipy.optimize
 import torch
 
-from autdtorch.methods.gradient import gradient_ascent, random_drives
-from autdtorch.methods.identify import identify
-from autdtorch.methods.magnitudes import Magnitudes
-from autdtorch.methods.phase_retrieval import _fit
+from autdtorch.methods.doubtful_readings import Magnitudes
+from autdtorch.methods.functions import gradient_ascent, identify
+from autdtorch.methods.gradient import random_drives
+from autdtorch.methods.matrix_fit import _least_squares
 from autdtorch.objectives.bound import focus_bound
 from autdtorch.objectives.perturbations import Noise, Quantised
 
@@ -63,7 +63,7 @@ def test_the_fit_is_that_of_least_squares(random_matrix):
     columns = zip(observed.T, true.T, strict=True)
     best = torch.stack([least_squares(drives, *column) for column in columns], dim=1)
     read = Magnitudes(observed, torch.zeros_like(observed, dtype=torch.bool))
-    distance = (in_phase(_fit(drives, torch.linalg.pinv(drives), read, true), best) - best).norm()
+    distance = (in_phase(_least_squares(drives, torch.linalg.pinv(drives), read, true), best) - best).norm()
     # Measured: 0.0005; after a tenth of its steps it would be 0.27.
     assert distance < 0.05 * (in_phase(best, true) - true).norm()
 

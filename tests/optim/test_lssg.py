@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from autdtorch.methods.lssg import lss, lssg
+from autdtorch.methods.functions import lss, lssg
 from autdtorch.objectives.objective import weakest_focus
 from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise
 

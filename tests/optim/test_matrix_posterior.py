@@ -5,9 +5,9 @@ import pytest
 import torch
 
 import autdtorch as at
+from autdtorch.methods.doubtful_readings import Magnitudes
 from autdtorch.methods.gradient import random_drives
-from autdtorch.methods.magnitudes import Magnitudes
-from autdtorch.methods.matrix_fits import posteriors
+from autdtorch.methods.matrix_fit import posteriors
 from autdtorch.methods.matrix_posterior import MatrixPosterior, MatrixPrior, _Linearised
 from autdtorch.objectives.perturbations import Noise
 

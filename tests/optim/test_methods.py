@@ -106,7 +106,7 @@ def test_a_method_of_ones_own_runs_as_ours_do(objective):
 
 
 def test_the_goal_is_a_function_of_its_own(objective):
-    solution = at.run(at.RandomSearch(6), objective, score=lambda pressure: pressure.mean(dim=-1))
+    solution = at.run(at.RandomSearch(6), objective, goal=lambda pressure: pressure.mean(dim=-1))
     assert torch.equal(solution.score, solution.pressure.mean(dim=-1))
 
 
@@ -121,7 +121,7 @@ class Broken:
 
 
 @pytest.mark.parametrize(
-    ("pressure", "score", "message"),
+    ("pressure", "goal", "message"),
     [
         (torch.full((2, 3), torch.nan), at.weakest_focus, "pressure of the objective: .*nan.* Pa"),
         (torch.ones(2, 2), at.weakest_focus, r"objective: shape \(2, 2\); must be \(2, 3\)"),
@@ -130,9 +130,9 @@ class Broken:
     ],
     ids=["nan", "shape", "complex", "score"],
 )
-def test_pressures_and_scores_of_another_kind_are_refused(objective, pressure, score, message):
+def test_pressures_and_scores_of_another_kind_are_refused(objective, pressure, goal, message):
     with pytest.raises(ValueError, match=message):
-        at.run(at.RandomSearch(evaluations=2), Broken(objective, pressure), score=score)
+        at.run(at.RandomSearch(evaluations=2), Broken(objective, pressure), goal=goal)
 
 
 WRONG_SCORES = {
@@ -148,10 +148,10 @@ WRONG_SCORES = {
 }
 
 
-@pytest.mark.parametrize("score", WRONG_SCORES.values(), ids=WRONG_SCORES)
+@pytest.mark.parametrize("goal", WRONG_SCORES.values(), ids=WRONG_SCORES)
 @each([*METHODS[1:3], METHODS[6], METHODS[7], *METHODS[8:]])
-def test_a_goal_that_gives_no_scores_is_refused_by_every_method(objective, method, score):
-    problem = at.Problem.of(objective, score)
+def test_a_goal_that_gives_no_scores_is_refused_by_every_method(objective, method, goal):
+    problem = at.Problem.of(objective, goal)
     with pytest.raises(ValueError, match=r"^score") as refused:
         method.tell(state := method.start(problem), objective(method.ask(state)))
     assert "\n" not in str(refused.value)
@@ -159,19 +159,19 @@ def test_a_goal_that_gives_no_scores_is_refused_by_every_method(objective, metho
 
 @each([at.Identify(evaluations=20), at.GradientAscent(steps=5)])
 def test_a_method_that_climbs_refuses_goals_without_a_gradient(objective, method):
-    for score in (
+    for goal in (
         lambda pressure: pressure.detach().amin(dim=-1),
         lambda pressure: pressure.amin(-1).numpy(),
     ):
-        with pytest.raises(ValueError, match=r"score: .*must be differentiable"):
-            at.run(method, objective, score=score)
+        with pytest.raises(ValueError, match=r"goal: .*must be differentiable"):
+            at.run(method, objective, goal=goal)
 
 
 def test_a_goal_that_changes_its_argument_harms_nothing(objective):
-    def score(pressure):
+    def goal(pressure):
         return pressure.mul_(-1).amax(dim=-1).neg()
 
-    found, expected = (at.run(at.GABS(levels=4), objective, score=goal) for goal in (score, at.weakest_focus))
+    found, expected = (at.run(at.GABS(levels=4), objective, goal=one) for one in (goal, at.weakest_focus))
     assert torch.equal(found.pressure, expected.pressure)
 
 
@@ -382,6 +382,6 @@ def test_bayes_opt_needs_two_transducers(make_objective, random_matrix):
 @each(METHODS)
 def test_scores_of_a_goal_with_parameters_carry_no_gradient(objective, method):
     weight = torch.ones((), dtype=torch.float64, requires_grad=True)
-    found = at.run(method, objective, score=lambda pressure: weight * pressure.amin(dim=-1))
+    found = at.run(method, objective, goal=lambda pressure: weight * pressure.amin(dim=-1))
     assert not found.score.requires_grad
     assert not found.history.requires_grad

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from autdtorch.methods.random_search import random_search
+from autdtorch.methods.functions import random_search
 from autdtorch.objectives.objective import weakest_focus
 from autdtorch.scene.drive import drive_from_phases
 

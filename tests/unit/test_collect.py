@@ -7,8 +7,7 @@ import pytest
 import yaml
 
 from autdtorch.io.scene_file import load_scene
-from autdtorch.methods.gabs import gabs
-from autdtorch.methods.lssg import lssg
+from autdtorch.methods.functions import gabs, lssg
 from autdtorch.study.report.tables import save_summary
 from autdtorch.study.results_file import RESULTS_FILE
 from autdtorch.study.run import run_study

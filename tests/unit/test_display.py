@@ -7,7 +7,7 @@ import pytest
 import torch
 from small_scenes import CUBE, small_scene
 
-from autdtorch.methods.gabs import gabs
+from autdtorch.methods.functions import gabs
 from autdtorch.objectives.metrics import focus_metrics
 from autdtorch.objectives.perturbations import Noise
 from autdtorch.objectives.simulated import SimulatedObjective

@@ -12,7 +12,7 @@ from scipy.stats import kstest, rice
 from small_scenes import small_scene
 
 from autdtorch.methods.base import Problem
-from autdtorch.methods.gabs import gabs
+from autdtorch.methods.functions import gabs
 from autdtorch.objectives.perturbations import (
     Drift,
     FailedTransducers,

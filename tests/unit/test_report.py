@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 from small_scenes import AIR, CUBE, small_scene
 
 import autdtorch.study.report.study_report
-from autdtorch.methods.gabs import gabs
-from autdtorch.methods.lssg import lssg
+from autdtorch.methods.functions import gabs, lssg
 from autdtorch.objectives.bound import focus_bound
 from autdtorch.objectives.goals import TargetPressures
 from autdtorch.scene.geometry import Plane

@@ -12,10 +12,11 @@ from small_scenes import AIR, CUBE, small_scene
 import autdtorch.study.run
 from autdtorch.analytic.green import green
 from autdtorch.io.goal_section import load_goal
-from autdtorch.methods.gabs import GABS, gabs
+from autdtorch.methods.functions import gabs, lssg
+from autdtorch.methods.gabs import GABS
 from autdtorch.methods.gradient import GradientAscent
 from autdtorch.methods.identify import Identify
-from autdtorch.methods.lssg import LSSG, lssg
+from autdtorch.methods.lssg import LSSG
 from autdtorch.methods.prior import Prior
 from autdtorch.objectives.goals import Goal, MeanPressure, TargetPressures
 from autdtorch.objectives.quiet import Contrast, QuietPoints
@@ -238,7 +239,7 @@ def test_a_function_that_takes_no_score_is_refused_for_another_goal(tmp_path):
     def weakest(objective):
         return lssg(objective)
 
-    with pytest.raises(ValueError, match="method own: 'weakest'; must have a parameter `score`"):
+    with pytest.raises(ValueError, match="method own: 'weakest'; must have a parameter `goal`"):
         run_study({"a": scene()}, {"own": weakest}, tmp_path, solver=FREE_SPACE, goal=MeanPressure())
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from small_scenes import CUBE, small_scene
 
-from autdtorch.methods.gabs import gabs
+from autdtorch.methods.functions import gabs
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.scene import Scene
 from autdtorch.study.folder import PREVIOUS

@@ -11,7 +11,7 @@ from checks.kills import SUBJECTS, finish, wait
 from filelock import FileLock
 from small_scenes import small_scene
 
-from autdtorch.methods.gabs import gabs
+from autdtorch.methods.functions import gabs
 from autdtorch.study.run import run_study
 
 STUDY = SUBJECTS["study"]

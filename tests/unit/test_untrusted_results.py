@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
 from autdtorch.io.scene_file import load_scene
-from autdtorch.methods.gabs import gabs
+from autdtorch.methods.functions import gabs
 from autdtorch.study.report.document import as_page, code, fenced, table
 from autdtorch.study.report.study_report import write_report
 from autdtorch.study.report.tables import SUMMARY_FILE, save_summary

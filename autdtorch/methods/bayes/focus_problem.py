@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import torch
+import warnings
 
-from autdtorch.methods.bayes.bayes import drives_at, require_transducer
-from autdtorch.methods.bayes.packages import BaseTestProblem
+import torch
+from botorch.test_functions.base import BaseTestProblem
+
+from autdtorch.methods.bayes_opt import drives_at, require_transducer
 from autdtorch.objectives.goals import WEAKEST_FOCUS
-from autdtorch.objectives.objective import (
-    Objective,
-    Score,
-    observe_drives,
-    require_objective,
-)
+from autdtorch.objectives.objective import GoalFunction, Objective, observe_drives, require_objective
+from autdtorch.utils.hints import renamed_keywords
 from autdtorch.utils.validation import boolean, integer_at_least, not_negative, real_tensor, require_callable
 
 
@@ -26,11 +24,12 @@ class FocusProblem(BaseTestProblem):
     num_objectives = 1
     _is_minimization_by_default = False
 
+    @renamed_keywords(score="goal")
     def __init__(
         self,
         objective: Objective,
         fixed_transducer: int = 0,
-        score: Score = WEAKEST_FOCUS,
+        goal: GoalFunction = WEAKEST_FOCUS,
         noise_std: float | None = None,
         negate: bool = False,
     ) -> None:
@@ -39,7 +38,7 @@ class FocusProblem(BaseTestProblem):
         Args:
             objective: is evaluated; each point is an evaluation.
             fixed_transducer: index of the transducer whose phase stays 0.
-            score: function of pressures (..., P) [Pa] that gives the scores (...).
+            goal: function of pressures (..., P) [Pa] that gives the scores (...).
             noise_std: standard deviation of noise that is added to scores [Pa].
             negate: whether scores are negated, for loops that minimise.
 
@@ -47,7 +46,7 @@ class FocusProblem(BaseTestProblem):
             ValueError: an argument of another kind or out of range.
         """
         require_objective(objective)
-        require_callable("score", score)
+        require_callable("goal", goal)
         transducers = len(objective.scene.array)
         fixed_transducer = integer_at_least("fixed_transducer", fixed_transducer, 0)
         require_transducer(fixed_transducer, transducers)
@@ -58,8 +57,14 @@ class FocusProblem(BaseTestProblem):
         self._bounds = [(0.0, 1.0)] * self.dim
         self.continuous_inds = list(range(self.dim))
         super().__init__(noise_std, negate)
-        self.objective, self.score = objective, score
+        self.objective, self.goal = objective, goal
         self.fixed_transducer = fixed_transducer
+
+    @property
+    def score(self) -> GoalFunction:
+        """The goal, by its name of version 0.1."""
+        warnings.warn("FocusProblem.score is now FocusProblem.goal", DeprecationWarning, stacklevel=2)
+        return self.goal
 
     def pressures(self, X: torch.Tensor) -> torch.Tensor:
         """Return the pressures (..., P) [Pa] at points (..., M - 1).
@@ -73,4 +78,4 @@ class FocusProblem(BaseTestProblem):
         return observe_drives(self.objective, drives_at(X, self.fixed_transducer), self.dim + 1)
 
     def _evaluate_true(self, X: torch.Tensor) -> torch.Tensor:
-        return self.score(self.pressures(X)).to(X)
+        return self.goal(self.pressures(X)).to(X)

@@ -6,8 +6,8 @@ import math
 from typing import Any
 
 import torch
+from gpytorch.kernels import Kernel
 
-from autdtorch.methods.bayes.packages import Kernel
 from autdtorch.utils.validation import complex_tensor, invalid, real_tensor, require_one_of
 
 
@@ -37,7 +37,7 @@ class PhasorKernel(Kernel):  # type: ignore[misc]
                 transducer, whichever it is, keeps phase 0, and is the last of a row. "drives": inputs
                 (..., 2 M) are the real parts of drives, then their imaginary parts.
             rows: g0 (..., M), complex; the dimensions before are those of a batch. 0 by default.
-            variance: s^2 (...), > 0, given with `rows`. Without them 1 / M: intensities are in units of their
+            variance: s^2 (...), > 0, with `rows` alone. Without them 1 / M: intensities are in units of their
                 mean at full drive.
             settings: of `gpytorch.kernels.Kernel`.
 

@@ -6,15 +6,13 @@ import math
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import torch
+from botorch.fit import fit_gpytorch_mll
+from botorch.models import SingleTaskGP
+from gpytorch.kernels import MaternKernel
+from gpytorch.means import ZeroMean
+from gpytorch.mlls import ExactMarginalLogLikelihood
 
 from autdtorch.methods.bayes.kernels import PhasorKernel, on_circle, phasors
-from autdtorch.methods.bayes.packages import (
-    ExactMarginalLogLikelihood,
-    MaternKernel,
-    SingleTaskGP,
-    ZeroMean,
-    fit_gpytorch_mll,
-)
 from autdtorch.utils.array_types import REAL
 
 KernelName: TypeAlias = Literal["phases", "circle", "phasor"]
@@ -27,8 +25,8 @@ _LEAST_VARIANCE = 1e-12
 _JITTER = 1e-5
 """Variance added to intensities, in variances of the process, so that their covariance can be inverted."""
 
-_DARK = 1e-12  # least mean intensity of a focus, in those of the strongest
-_TINY = 1e-30  # and where all are dark [Pa^2]
+_DARK = 1e-12  # least mean intensity of a focus, relative to the strongest
+_TINY = 1e-30  # least mean intensity where all foci are dark [Pa^2]
 _PHASOR_REACH = 0.2  # [turns]
 
 _NOISES = 10.0 ** torch.linspace(-6, 0, 25, **REAL)
@@ -126,7 +124,7 @@ class Processes:
     def at(self, points: torch.Tensor) -> Posterior:
         """Return the posterior at points (T, C, D), in the units of scores, or of intensities.
 
-        It is that of the model, written out from the model's caches: no covariance between points is needed.
+        It equals the model's, written out from its caches: no covariance between points is needed.
         """
         features = self._features(points)
         there = self._by_output(features)
@@ -153,7 +151,7 @@ class Processes:
 def standardised(
     kernel: KernelName, values: torch.Tensor, noise: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return what a process models of values (T, N, K), with its mean and its unit (T, 1, K)."""
+    """Return the values (T, N, K) as a process models them, their mean and their unit (T, 1, K)."""
     if kernel != "phasor":
         mean, unit = values.mean(dim=1, keepdim=True), values.std(dim=1, keepdim=True)
         unit = unit.clamp_min(1e-6 * mean.abs()).clamp_min(_LEAST_VARIANCE)  # values that never change
@@ -176,14 +174,14 @@ def fitted(
         noise: as in `Fit`; "inferred" to fit it, too.
     """
     shape = values.shape[0], values.shape[2]
-    given = torch.full(shape, 0.0 if isinstance(noise, str) else noise, **REAL)
+    fixed = torch.full(shape, 0.0 if isinstance(noise, str) else noise, **REAL)
     if kernel == "phasor":
-        ones = torch.ones_like(given)
-        return Fit(ones, _likeliest_noise(points, values) if isinstance(noise, str) else given)
-    standard = standardised(kernel, values, given)[0]
+        ones = torch.ones_like(fixed)
+        return Fit(ones, _likeliest_noise(points, values) if isinstance(noise, str) else fixed)
+    standard = standardised(kernel, values, fixed)[0]
     fits = [
-        [_fit_alone(kernel, own, column[:, None], noise) for column in columns.T]
-        for own, columns in zip(points, standard, strict=True)
+        [_fit_alone(kernel, turns, column[:, None], noise) for column in columns.T]
+        for turns, columns in zip(points, standard, strict=True)
     ]
     length_scale, variance = torch.tensor(fits, **REAL).unbind(dim=-1)
     return Fit(length_scale, variance)
@@ -213,9 +211,8 @@ def _likeliest_noise(points: torch.Tensor, values: torch.Tensor) -> torch.Tensor
     noise = variance / (mean - variance).clamp_min(0.1 * mean)
     unit = 1 + noise
     spread = share.clamp_min(0)[..., None] + _intensity_variance(noise)[:, :, None]
-    fit = len(seen[0]) * unit.log() - 0.5 * (spread.log() + unit[:, :, None].square() * seen / spread).sum(
-        dim=2
-    )
+    misfit = (spread.log() + unit[:, :, None].square() * seen / spread).sum(dim=2)
+    fit = len(seen[0]) * unit.log() - 0.5 * misfit
     return noise[fit.sum(dim=-1).argmax(dim=0), torch.arange(len(mean), device="cpu")]
 
 
@@ -231,7 +228,7 @@ def _intensity_variance(noise: torch.Tensor, expected: torch.Tensor | float = 1.
 
 
 def _kernel(kernel: KernelName, fit: Fit, rows: Rows | None, unit: torch.Tensor) -> Any:
-    """Return the covariance of what is modelled; `unit` of intensities (T, K)."""
+    """Return the covariance of the modelled values; `unit` of intensities (T, K)."""
     if kernel != "phasor":
         matern = MaternKernel(2.5, batch_shape=fit.length_scale.shape[:1])
         matern.lengthscale = fit.length_scale[..., None]

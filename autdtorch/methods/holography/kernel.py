@@ -1,4 +1,4 @@
-"""Holography on CPUs, in numba: the algorithms of `holography.py`, for blocks of sets at once.
+"""Holography on CPUs, in numba: the algorithms of `algorithms.py`, for blocks of sets at once.
 
 A block packs the matrices of `_LANES` sets entry by entry, so that every operation is one on vectors, and its
 matrices stay in the cache through all iterations. Arrays are flat with unsigned indices, real and imaginary
@@ -16,7 +16,7 @@ import torch
 from numba import njit
 
 from autdtorch.fdtd.kernels.compiled import INNER, entry
-from autdtorch.methods.holography.holography import DAMPING, TINY, UNREACHED
+from autdtorch.methods.holography.algorithms import DAMPING, TINY, UNREACHED
 from autdtorch.utils.threads import even_parts, spread, thread_count
 
 _LANES = np.uint64(16)  # Sets of a block
@@ -53,9 +53,9 @@ def _back_propagate(matrix, wanted, first, last, free, drive):  # type: ignore[n
         out, rows = drive[n].reshape(-1), matrix[n].reshape(points, -1)
         out[:] = 0
         for p in range(points):
-            own, size = rows[p], wanted[n, p]
+            row, size = rows[p], wanted[n, p]
             for k in range(len(out)):
-                out[k] += size * own[k]
+                out[k] += size * row[k]
         largest = tiny
         for m in range(transducers if free else 0):
             largest = max(largest, math.sqrt(out[2 * m] ** 2 + out[2 * m + 1] ** 2))

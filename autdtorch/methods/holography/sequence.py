@@ -14,7 +14,8 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from autdtorch.methods.holography.holography import DAMPING, TINY, UNREACHED, checked_targets
+from autdtorch.methods.holography.algorithms import DAMPING, TINY, UNREACHED
+from autdtorch.methods.holography.holography import checked_targets
 from autdtorch.utils.array_types import Array, ComplexArray
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import (
@@ -111,13 +112,13 @@ def _closed(rows: ComplexArray, drives: ComplexArray, limit: float, iterations: 
     missed = np.angle(pressure[-1] * pressure[0].conj())
     left = 1 - np.arange(len(rows))[:, None] / len(rows)
     imposed = np.exp(1j * (np.angle(pressure[:-1]) + missed * left))
-    found, weights = np.concatenate([lap[-1:], lap[1:-1]]), np.ones(rows.shape[1])
+    second, weights = np.concatenate([lap[-1:], lap[1:-1]]), np.ones(rows.shape[1])
     for frame in range(1, len(rows)):
         reach = limit * (len(rows) - frame)
-        near = functools.partial(_near_both, found[frame - 1], found[0], limit, reach)
+        near = functools.partial(_near_both, second[frame - 1], second[0], limit, reach)
         start = near(rows[frame].conj().T @ (weights * imposed[frame]))
-        found[frame], weights = _frame(rows[frame], start, near, weights, imposed[frame], iterations)
-    return found
+        second[frame], weights = _frame(rows[frame], start, near, weights, imposed[frame], iterations)
+    return second
 
 
 def _frame(
@@ -148,8 +149,8 @@ def _near(before: ComplexArray, limit: float, drive: ComplexArray) -> ComplexArr
     """Return the drive (M,) nearest to one of any amplitudes and common phase, within a limit of `before`."""
     common = (drive * before.conj()).sum()
     step = np.angle(drive * (common.conjugate() / max(abs(common), TINY)) * before.conj())
-    found: ComplexArray = before * np.exp(1j * step.clip(-limit, limit))
-    return found
+    nearest: ComplexArray = before * np.exp(1j * step.clip(-limit, limit))
+    return nearest
 
 
 def _near_both(
@@ -164,5 +165,5 @@ def _near_both(
     if reach < math.pi:
         away = np.angle(before * first.conj())
         step = (away + step).clip(-reach, reach) - away
-    found: ComplexArray = before * np.exp(1j * step)
-    return found
+    nearest: ComplexArray = before * np.exp(1j * step)
+    return nearest

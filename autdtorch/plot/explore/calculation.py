@@ -17,8 +17,8 @@ import numpy as np
 import torch
 
 from autdtorch.methods.base import Method, Problem, State
-from autdtorch.methods.driver import observed
 from autdtorch.methods.gradient import GradientAscent
+from autdtorch.methods.run import observed
 from autdtorch.objectives.bound import focus_bound
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.plot.explore.situation import Situation

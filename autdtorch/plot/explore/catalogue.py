@@ -1,24 +1,15 @@
-"""The methods that a live view offers, with the settings of their configs."""
+"""The methods that a live view offers."""
 
 from __future__ import annotations
 
-from typing import get_args
-
 from autdtorch.methods.base import Method
-from autdtorch.methods.bayes.bayes import BayesOpt
-from autdtorch.methods.catalogue import METHODS, label_of
-from autdtorch.methods.holography.holography import Algorithm, Holography
+from autdtorch.methods.catalogue import METHODS, VARIANTS, label_of
+from autdtorch.methods.holography.holography import Holography
 
 
 def offered() -> dict[str, Method]:
-    """Return the methods by name."""
-    own: dict[str, Method] = {
-        "bayes_opt": BayesOpt(),
-        "bo_circle": BayesOpt(kernel="circle"),
-        "bo_foci": BayesOpt(evaluations=64, initial=4, model="foci", kernel="phasor", noise="inferred"),
-    }
-    others = {name: kind() for name, kind in METHODS.items() if kind not in (BayesOpt, Holography)}
-    return others | own | {name: Holography(algorithm=name) for name in get_args(Algorithm)}
+    """Return the methods by name; the algorithms of holography are methods of their own."""
+    return {name: kind() for name, kind in METHODS.items() if kind is not Holography} | VARIANTS
 
 
 def choices(methods: dict[str, Method]) -> list[tuple[str, str]]:

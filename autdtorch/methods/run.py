@@ -9,12 +9,13 @@ from typing import cast, overload
 import torch
 
 from autdtorch.methods.base import Method, Problem, State
+from autdtorch.methods.catalogue import METHODS
 from autdtorch.methods.seeds import Trials, trial_seeds
 from autdtorch.methods.solution import Solution
 from autdtorch.methods.state_file import load_state, save_state
 from autdtorch.objectives.goals import WEAKEST_FOCUS
-from autdtorch.objectives.objective import Objective, Score, require_objective
-from autdtorch.utils.hints import did_you_mean
+from autdtorch.objectives.objective import GoalFunction, Objective, require_objective
+from autdtorch.utils.hints import did_you_mean, renamed_keywords
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.validation import invalid, path_of, require_callable, within
 
@@ -26,7 +27,7 @@ def run(
     trials: Trials = 1,
     seed: int = 0,
     *,
-    score: Score = WEAKEST_FOCUS,
+    goal: GoalFunction = WEAKEST_FOCUS,
     stop: Callable[[State], bool] | None = None,
     state_file: str | Path | None = None,
     start: torch.Tensor | None = None,
@@ -38,17 +39,18 @@ def run(
     trials: Trials = 1,
     seed: int = 0,
     *,
-    score: Score = WEAKEST_FOCUS,
+    goal: GoalFunction = WEAKEST_FOCUS,
     stop: Callable[[State], bool] | None = None,
     start: torch.Tensor | None = None,
 ) -> list[Solution]: ...
+@renamed_keywords(score="goal")
 def run(
     method: Method,
     objective: Objective | Sequence[Objective],
     trials: Trials = 1,
     seed: int = 0,
     *,
-    score: Score = WEAKEST_FOCUS,
+    goal: GoalFunction = WEAKEST_FOCUS,
     stop: Callable[[State], bool] | None = None,
     state_file: str | Path | None = None,
     start: torch.Tensor | None = None,
@@ -62,10 +64,10 @@ def run(
     Args:
         method: such as ``GABS(levels=16)``.
         objective: simulated or measured; or a list of objectives, such as the poses of an obstacle, each of
-            which starts at the drives found for the one before.
+            which starts at the drives chosen for the one before.
         trials: number of trials T, >= 1, or their numbers.
         seed: of the random choices, >= 0. A trial's random choices do not depend on the other trials.
-        score: function of pressures (..., P) [Pa] that is maximised.
+        goal: function of pressures (..., P) [Pa] that is maximised.
         stop: function of the state that ends the run when it returns True; called after every step.
         state_file: file that keeps the state after every step. If it exists, the run goes on from it. Only
             of one objective.
@@ -80,12 +82,13 @@ def run(
         OSError: the state file cannot be read or written.
     """
     _require_method(method)
-    require_callable("score", score)
+    require_callable("goal", goal)
     if stop is not None:
         require_callable("stop", stop)
     path = None if state_file is None else path_of("state_file", state_file)
     if not isinstance(objective, list | tuple):
-        return _run(method, cast(Objective, objective), trials, seed, score, stop, path, start)
+        problem = Problem.of(cast(Objective, objective), goal, start)
+        return _run(method, cast(Objective, objective), problem, trials, seed, stop, path)
     if path is not None:
         raise invalid("state_file", str(path), "must be None for a sequence of objectives")
     if not objective:
@@ -93,37 +96,33 @@ def run(
     for number, pose in enumerate(objective):
         with within(f"objective[{number}]"):
             require_objective(pose)
-    found: list[Solution] = []
+    solutions: list[Solution] = []
     for pose in objective:
-        start = found[-1].drive if found else start
-        found.append(_run(method, pose, trials, seed, score, stop, None, start))
-    return found
+        solutions.append(_run(method, pose, Problem.of(pose, goal, start), trials, seed, stop))
+        start = solutions[-1].drive
+    return solutions
 
 
 def _require_method(method: object) -> None:
     """Refuse what is no method: a name, a class that is not called, or a function that runs one."""
     if isinstance(method, Method):
         return
-    from autdtorch.methods.catalogue import METHODS  # which imports this module
-
+    text = method if isinstance(method, str) else getattr(method, "__name__", "")
     classes = {name: kind.__name__ for name, kind in METHODS.items()}
-    given = method if isinstance(method, str) else getattr(method, "__name__", "")
-    name = given if given in classes else next((own for own in classes if classes[own] == given), "")
-    hint = f"such as {classes[name or 'gabs']}()" + ("" if name else did_you_mean(given, classes))
+    meant = [kind for name, kind in classes.items() if text in (name, kind)]
+    hint = f"such as {meant[0]}()" if meant else f"such as GABS(){did_you_mean(text, classes)}"
     raise invalid("method", method, f"must be a Method, {hint}")
 
 
 def _run(
     method: Method,
     objective: Objective,
+    problem: Problem,
     trials: Trials,
     seed: int,
-    score: Score,
     stop: Callable[[State], bool] | None,
-    path: Path | None,
-    start: torch.Tensor | None,
+    path: Path | None = None,
 ) -> Solution:
-    problem = Problem.of(objective, score, start)
     if path is not None and path.exists():
         state = load_state(path, method, problem)
         if state.seeds != tuple(trial_seeds(seed, trials)):

@@ -10,15 +10,14 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, State, Step, starts_of
-from autdtorch.methods.driver import run
+from autdtorch.methods.base import Method, Problem, State, Step, choice, setting, starts_of, whole
 from autdtorch.methods.gradient import climbed
-from autdtorch.methods.matrix_fits import kept, posteriors
+from autdtorch.methods.matrix_fit import posteriors, tensors_of
 from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, prior_mean, prior_of
-from autdtorch.methods.seeds import Trials, generators_of, restored, states_of
+from autdtorch.methods.seeds import generators_of, restored, states_of, uniform
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.goals import WEAKEST_FOCUS, scores_of
-from autdtorch.objectives.objective import Objective, Score
+from autdtorch.objectives.goals import scores_of
+from autdtorch.objectives.objective import GoalFunction
 from autdtorch.scene.drive import drive_from_phases, phases_of
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.threads import one_library_thread
@@ -29,12 +28,12 @@ if TYPE_CHECKING:
     from autdtorch.methods.bayes.processes import Fit, Rows
 
 NOISE = 1e-4
-"""Variance of the observation noise that the process of the score assumes, in its own variances. A fitted one
-would take the kinks of the minimum over the foci for noise, and the search would end lower."""
+"""Noise variance that the process of the score assumes, relative to its signal variance. A fitted one would
+take the kinks of the minimum over the foci for noise, and the search would end lower."""
 
 _SAMPLE_STEPS = 60  # of the climb on a sample of the matrix, from the best drive
-
 _REFIT_GROWTH = 1.2  # growth of the number of observations after which the hyperparameters are fitted again
+_PAPERS_FIXED = 6  # Transducer whose phase is fixed in the paper, its 7th
 
 
 @contextlib.contextmanager
@@ -53,7 +52,11 @@ def _defaults_of_processes() -> Iterator[None]:
         torch.set_default_dtype(before)
 
 
-_PAPERS_FIXED = 6  # Transducer whose phase is fixed in the paper, its 7th
+def _checked_noise(name: str, value: object) -> object:
+    if isinstance(value, str):
+        require_one_of(name, value, ("inferred",))
+        return value
+    return number_between(name, value, 1e-6, 1)
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ class BayesOpt(Method):
             in mean intensities of its focus (model "foci"). "inferred" fits it. The model "foci"
             spends the last evaluation at the maximum of the posterior mean, and returns the observed drive
             where the posterior mean is highest.
-        prior: what a simulation says of the transfer matrix, for the model "foci".
+        prior: simulated transfer matrix, and how far to trust it, for the model "foci".
 
     Raises:
         ValueError: a setting out of range.
@@ -96,35 +99,23 @@ class BayesOpt(Method):
     block: ClassVar[int] = 25  # a trial takes half the time of one in a block of ten
 
     evaluations: int = 256
-    initial: int = 16
-    fixed_transducer: int | None = None
-    model: Literal["weakest", "foci"] = "weakest"
-    kernel: Literal["phases", "circle", "phasor"] = "phases"
-    acquisition: Literal["ei", "log_ei"] = "ei"
-    initial_points: Literal["sobol", "random"] = "sobol"
-    noise: float | Literal["inferred"] = NOISE
-    prior: Prior | None = None
+    initial: int = whole(16, least=2)
+    fixed_transducer: int | None = whole(None, least=0)
+    model: Literal["weakest", "foci"] = choice("weakest", "foci")
+    kernel: Literal["phases", "circle", "phasor"] = choice("phases", "circle", "phasor")
+    acquisition: Literal["ei", "log_ei"] = choice("ei", "log_ei")
+    initial_points: Literal["sobol", "random"] = choice("sobol", "random")
+    noise: float | Literal["inferred"] = setting(NOISE, _checked_noise)
+    prior: Prior | None = setting(None, prior_of)
 
     def __post_init__(self) -> None:
-        """Check the settings."""
-        object.__setattr__(self, "initial", integer_at_least("initial", self.initial, 2))
-        object.__setattr__(self, "prior", prior_of("prior", self.prior))
+        """Check the settings, also against each other."""
+        super().__post_init__()
         least = self.initial + 1 if self.prior is None else 2
         evaluations = integer_at_least("evaluations", self.evaluations, least)
         object.__setattr__(self, "evaluations", evaluations)
-        if self.fixed_transducer is not None:
-            fixed = integer_at_least("fixed_transducer", self.fixed_transducer, 0)
-            object.__setattr__(self, "fixed_transducer", fixed)
-        require_one_of("model", self.model, ("weakest", "foci"))
-        require_one_of("kernel", self.kernel, ("phases", "circle", "phasor"))
         if (self.kernel == "phasor") != (self.model == "foci"):
             raise invalid("kernel", self.kernel, 'must be "phasor" with the model "foci", and only there')
-        require_one_of("acquisition", self.acquisition, ("ei", "log_ei"))
-        require_one_of("initial_points", self.initial_points, ("sobol", "random"))
-        if isinstance(self.noise, str):
-            require_one_of("noise", self.noise, ("inferred",))
-        else:
-            object.__setattr__(self, "noise", number_between("noise", self.noise, 1e-6, 1))
         if self.prior is not None and self.model != "foci":
             raise invalid("prior", self.prior, 'must be None without the model "foci"')
 
@@ -133,10 +124,6 @@ class BayesOpt(Method):
         require_transducer(self._fixed(problem.transducers), problem.transducers)
         if self.prior is not None:
             prior_mean(self.prior, problem)
-
-    def most_evaluations(self, problem: Problem) -> int:
-        """Return `evaluations`."""
-        return self.evaluations
 
     def numbers_kept(self, problem: Problem) -> float:
         """Return the numbers of the processes: a few matrices of all pairs of evaluations."""
@@ -153,9 +140,9 @@ class BayesOpt(Method):
         elif self.initial_points == "sobol":
             points = torch.stack([_sobol(self.initial, dimensions, seed) for seed in seeds])
         else:
-            points = torch.stack([_uniform(own, self.initial, dimensions) for own in generators])
-        if (given := starts_of(problem, len(seeds))) is not None:
-            points[:, 0] = self._points(given)
+            points = torch.stack([uniform(draws, self.initial, dimensions) for draws in generators])
+        if (starts := starts_of(problem, len(seeds))) is not None:
+            points[:, 0] = self._points(starts)
         search = {
             "points": points,
             "values": torch.empty(len(seeds), 0, self._outputs(problem), **REAL),
@@ -187,14 +174,15 @@ class BayesOpt(Method):
         return Step(self._drives(point), search)
 
     def best(self, state: State) -> Solution:
-        """Return the best drive observed, or that of the highest posterior mean (model "foci")."""
-        found = super().best(state)
+        """Return the best drive observed, or the one of the highest posterior mean (model "foci")."""
+        solution = super().best(state)
         if not state.done or self.model == "weakest":
-            return found
-        chosen = torch.arange(len(found.score), device="cpu"), state.search["answer"]
+            return solution
+        chosen = torch.arange(len(solution.score), device="cpu"), state.search["answer"]
         drive = state.problem.quantise(self._drives(state.search["points"][chosen]))
         pressure = state.search["values"][chosen]
-        return replace(found, drive=drive, pressure=pressure, score=scores_of(state.problem.goal, pressure))
+        score = scores_of(state.problem.goal, pressure)
+        return replace(solution, drive=drive, pressure=pressure, score=score)
 
     def _outputs(self, problem: Problem) -> int:
         return 1 if self.model == "weakest" else problem.foci
@@ -225,7 +213,7 @@ class BayesOpt(Method):
         points: torch.Tensor,
         generators: Sequence[torch.Generator],
     ) -> tuple[Fit, Rows | None]:
-        """Return hyperparameters and rows; `search` keeps what the next fit begins with."""
+        """Return hyperparameters and rows; `search` gets the tensors that the next fit begins with."""
         from autdtorch.methods.bayes.processes import Fit, fitted
 
         count = search["values"].shape[1]
@@ -249,7 +237,7 @@ class BayesOpt(Method):
         variance = None if isinstance(self.noise, str) else 0.5 * self.noise / (1 + self.noise) * power
         prior = None if self.prior is None else matrix_prior(self.prior, problem)
         fits = posteriors(prior, search, drives, observed, generators, variance)
-        search |= kept(fits)
+        search |= tensors_of(fits)
         mean = torch.stack([fit.posterior.matrix for fit in fits])
         each = zip(fits, drives, generators, strict=True)
         sampled = torch.stack([fit.posterior.sample(drives, fit.read, draws) for fit, drives, draws in each])
@@ -263,7 +251,7 @@ class BayesOpt(Method):
         return fit, Rows(rows[..., self._others(problem.transducers)], spread, self._points(best))
 
     def _acquisition(
-        self, goal: Score, values: torch.Tensor, points: torch.Tensor, fit: Fit, rows: Rows | None
+        self, goal: GoalFunction, values: torch.Tensor, points: torch.Tensor, fit: Fit, rows: Rows | None
     ) -> Acquisition:
         from autdtorch.methods.bayes.acquisition import FocusAcquisition, ScoreAcquisition
         from autdtorch.methods.bayes.processes import Processes
@@ -272,29 +260,6 @@ class BayesOpt(Method):
         if self.model == "weakest":
             return ScoreAcquisition(processes, points, values, self.acquisition == "log_ei")
         return FocusAcquisition(processes, points, goal, None if rows is None else rows.best)
-
-
-def bayes_opt(
-    objective: Objective,
-    evaluations: int = 256,
-    initial: int = 16,
-    trials: Trials = 1,
-    seed: int = 0,
-    fixed_transducer: int | None = None,
-    score: Score = WEAKEST_FOCUS,
-    *,
-    model: Literal["weakest", "foci"] = "weakest",
-    kernel: Literal["phases", "circle", "phasor"] = "phases",
-    acquisition: Literal["ei", "log_ei"] = "ei",
-    initial_points: Literal["sobol", "random"] = "sobol",
-    noise: float | Literal["inferred"] = NOISE,
-    prior: Prior | None = None,
-) -> Solution:
-    """Run `BayesOpt` with these settings on an objective; see `BayesOpt` and `run`."""
-    method = BayesOpt(
-        evaluations, initial, fixed_transducer, model, kernel, acquisition, initial_points, noise, prior
-    )
-    return run(method, objective, trials, seed, score=score)
 
 
 def require_transducer(fixed_transducer: int, transducers: int) -> None:
@@ -317,8 +282,3 @@ def _sobol(count: int, dimensions: int, seed: int) -> torch.Tensor:
     points = sequence.draw(count, dtype=torch.float64)
     points[0] = sequence.shift.double() / 2**sequence.MAXBIT  # the engine rounds it to PyTorch's default
     return points
-
-
-def _uniform(generator: torch.Generator, *shape: int) -> torch.Tensor:
-    """Return random numbers in [0, 1)."""
-    return torch.rand(shape, dtype=torch.float64, generator=generator, device="cpu")

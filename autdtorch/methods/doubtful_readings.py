@@ -1,0 +1,198 @@
+"""Doubtful readings: outliers, ends of sensors' ranges, failed sensors, and lone scores.
+
+`Magnitudes` says how far readings are to be believed; the other functions describe for the log what is wrong.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+
+logger = logging.getLogger(__name__)
+
+_GROSS = 4.5  # times the median; of random phases, one magnitude in a million exceeds it
+_NOTHING = 1e-3  # times the median; one in a million is below it
+_EQUAL = 1e-6  # relative difference of readings at the end of a sensor's range
+_SATURATED = 4  # different drives that have this reading
+_ENOUGH = 8  # readings below the end of a range from which on the sensor's steps are judged
+_DISTINCT = 0.9  # share of these that differ, of a sensor that reads finely
+_ALIKE = 0.999  # overlap of drives above which they count as one
+
+_LONE = 3.0  # ratio of the highest score to the next one above which it may be an outlier
+_COMPARED = 8  # least number of scores to compare
+_RESPONSE = 2.0  # variance that each unknown of a row explains over the rest's; noise alone has 1
+_CONSTANT = 1e-6  # relative deviation of constant readings
+_UNEXPLAINED = 0.3  # rms residual of the fit over rms readings; noise 10 dB below them leaves 0.22
+_SURPRISE = 6.0  # deviation of the last reading, in standard deviations of the noise, of an outlier
+_LEAST_SURPRISE = 0.3  # its least deviation relative to the fitted pressure
+_SHOWN = 3  # outliers that are listed
+
+
+@dataclass(frozen=True, eq=False)
+class Magnitudes:
+    """Readings of which some are lower limits: those of a sensor at the end of its range.
+
+    An outlier says nothing: its lower limit is 0.
+
+    Attributes:
+        value: (N, P) [Pa].
+        limit: True for lower limits (N, P), bool.
+    """
+
+    value: torch.Tensor
+    limit: torch.Tensor
+
+    @classmethod
+    def of(cls, observed: torch.Tensor, outliers: torch.Tensor, highest: torch.Tensor) -> Magnitudes:
+        """Return readings (N, P) [Pa] without `outliers` (N, P), of sensors that end at `highest` (P,)."""
+        limit = outliers | (observed >= (1 - _EQUAL) * highest)
+        return cls(observed.masked_fill(outliers, 0), limit)
+
+    @property
+    def outliers(self) -> torch.Tensor:
+        """Readings that say nothing (N, P), bool."""
+        return self.limit & (self.value == 0)
+
+    @property
+    def power(self) -> torch.Tensor:
+        """Mean square of each control point (P,) [Pa^2], without outliers."""
+        return self.value.square().sum(dim=0) / (~self.outliers).sum(dim=0).clamp_min(1)
+
+    def column(self, point: int) -> Magnitudes:
+        """Return the readings of one control point (N, 1)."""
+        return Magnitudes(self.value[:, point, None], self.limit[:, point, None])
+
+    def first(self, count: int) -> Magnitudes:
+        """Return the readings of the first drives (count, P)."""
+        return Magnitudes(self.value[:count], self.limit[:count])
+
+    def nearest(self, magnitude: torch.Tensor) -> torch.Tensor:
+        """Return the magnitudes nearest to some (N, ...) [Pa] that the readings allow."""
+        if not self.limit.any():
+            return self.value
+        return torch.where(self.limit & (magnitude > self.value), magnitude, self.value)
+
+    def decided(self, magnitude: torch.Tensor) -> torch.Tensor:
+        """Return the readings (N, P) that constrain magnitudes (N, P) [Pa]: no lower limit that they meet."""
+        return ~self.limit | (magnitude < self.value)
+
+
+def gross_outliers(observed: torch.Tensor) -> torch.Tensor:
+    """Return the readings (N, P), bool, that are far above or far below the others of random phases."""
+    middle = observed.median(dim=0).values
+    return ((observed > _GROSS * middle) | (observed < _NOTHING * middle)) & (middle > 0)
+
+
+def range_ends(drives: torch.Tensor, observed: torch.Tensor) -> torch.Tensor:
+    """Return the possible end of each sensor's range (P,) [Pa], infinite where no reading (N, P) shows it.
+
+    There, several different drives (N, M) have the same highest reading, but not all of them. It is the end
+    of the range if the sensor `reads_finely`; coarse steps make equal readings, too.
+    """
+    unit = drives / drives.norm(dim=1, keepdim=True).clamp_min(1e-300)
+    ends = torch.full_like(observed[0], torch.inf)
+    for point, column in enumerate(observed.T):
+        highest = column.max()
+        at_end = unit[column >= (1 - _EQUAL) * highest]
+        if _SATURATED <= len(at_end) < len(column):
+            alike = ((at_end @ at_end.mH).abs() > _ALIKE).sum(dim=1)
+            if (1 / alike).sum() >= _SATURATED:
+                ends[point] = highest
+    return ends
+
+
+def reads_finely(observed: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
+    """Return the sensors (P,), bool, with enough readings (N, P) below the `ends`, nearly all different."""
+    fine = torch.zeros_like(ends, dtype=torch.bool)
+    for point, column in enumerate(observed.T):
+        lower = column[(column > 0) & (column < (1 - _EQUAL) * ends[point])].sort().values
+        distinct = int((lower.diff() > _EQUAL * lower[1:]).sum()) + 1
+        fine[point] = len(lower) >= _ENOUGH and distinct >= _DISTINCT * len(lower)
+    return fine
+
+
+def log_doubts(label: str, doubts: Sequence[Iterable[str]]) -> None:
+    """Log in one line the doubts about the first of the trials that have any."""
+    doubtful = [(trial, text) for trial, texts in enumerate(doubts) if (text := "; ".join(texts))]
+    if doubtful:
+        trial, text = doubtful[0]
+        more = f" ({len(doubtful) - 1} more trials have doubtful readings)" if len(doubtful) > 1 else ""
+        logger.warning("%s, trial %d: %s%s", label, trial, text, more)
+
+
+def lone_score(history: torch.Tensor) -> Iterator[str]:
+    """Describe a highest score far above all others of a trial (E,), which are -inf after its end."""
+    score = history[history.isfinite()]
+    if len(score) >= _COMPARED:
+        second, first = score.topk(2).values.flip(0).tolist()
+        if 0 < _LONE * second < first:
+            which = f"the score {first:.3g} of evaluation {int(score.argmax())}, counted from 0,"
+            yield f"{which} is {first / second:.3g} times the next highest: observe its drive again"
+
+
+def sensor_doubts(drives: torch.Tensor, read: Magnitudes, fitted: torch.Tensor) -> Iterator[str]:
+    """Describe sensors that do not respond to the array, or not in all of its range.
+
+    Args:
+        drives: (N, M).
+        read: magnitudes (N, P).
+        fitted: magnitudes (N, P) [Pa] by the fitted matrix.
+    """
+    silent = _silent(read.nearest(fitted), fitted, 2 * drives.shape[1] - 1)
+    at_end = read.limit & ~read.outliers
+    for point, column in enumerate(read.value.T):
+        if silent[point]:
+            reads = f"control point {point} reads up to {float(column.max()):.3g} Pa"
+            yield f"{reads}, hardly depending on the drive: has its sensor failed, or is it always saturated?"
+        elif at_end[:, point].any():
+            count, end = int(at_end[:, point].sum()), float(column[at_end[:, point]].min())
+            yield f"control point {point} reads {end:.3g} Pa {count} times, and no more: its sensor saturates"
+
+
+def _silent(observed: torch.Tensor, fitted: torch.Tensor, unknowns: int) -> torch.Tensor:
+    """Return the points (P,), bool, whose fitted row of `unknowns` explains (N, P) no better than noise."""
+    total = (observed - observed.mean(dim=0)).square().sum(dim=0)
+    rest = (observed - fitted).square().sum(dim=0)
+    constant = total <= len(observed) * (_CONSTANT * observed.amax(dim=0)).square()
+    spare = len(observed) - unknowns
+    if unknowns == 1 or spare < 1:  # one transducer alone makes the same magnitude at any phase
+        return constant & (observed.amax(dim=0) == 0)
+    return constant | ((total - rest) / unknowns < _RESPONSE * rest / spare)
+
+
+def reading_doubts(
+    observed: torch.Tensor,
+    read: Magnitudes,
+    fitted: torch.Tensor,
+    deviation: torch.Tensor,
+    prior: bool,
+) -> Iterator[str]:
+    """Describe outliers, a last reading far from the fit, and a large residual of the fit.
+
+    Args:
+        observed: magnitudes (N, P) [Pa], outliers as they were read.
+        read: as they were used.
+        fitted: magnitudes (N, P) [Pa] by the fitted matrix, which does not know the last readings.
+        deviation: of the noise that was fitted (P,) [Pa].
+        prior: whether a prior is behind the fit, which may be wrong instead.
+    """
+    away = (read.nearest(fitted) - fitted)[-1].abs()
+    outliers = read.outliers
+    outliers[-1] |= (away > _SURPRISE * deviation) & (away > _LEAST_SURPRISE * fitted[-1])
+    places = outliers.nonzero().tolist()
+    shown = [
+        f"evaluation {row} at control point {point} (read {float(observed[row, point]):.3g} Pa, "
+        f"fitted {float(fitted[row, point]):.3g} Pa)"
+        for row, point in places[:_SHOWN]
+    ]
+    if len(places) > _SHOWN:
+        shown.append(f"{len(places) - _SHOWN} more")
+    if shown:
+        cause = "; the readings or the prior are wrong" if prior else ""
+        yield f"outliers, counted from 0: {', '.join(shown)}{cause}"
+    level, rest = float(read.power.mean().sqrt()), float(deviation.max())
+    if rest > _UNEXPLAINED * level:
+        yield f"the fit leaves {rest:.3g} of {level:.3g} Pa rms: the drive may be far from the best"

@@ -1,0 +1,107 @@
+"""The algorithms of holography by their definitions, in PyTorch; `kernel.py` has them in numba for CPUs.
+
+G are the matrices (..., P, M), t the wanted pressures (..., P) and q the drives (..., M); sgn(x) = x / |x|,
+like products by *, is taken entry by entry:
+
+- "naive": q = sgn(G^H t), back-propagation;
+- "gs": p = t * sgn(G q), q = sgn(G^H p) in turns (Gerchberg and Saxton 1972), iterative back-propagation of
+  Marzo and Drinkwater (2019), doi:10.1073/pnas.1813047115;
+- "wgs": p = b * sgn(G q), q = sgn(G^H p), after which b is multiplied by (t / |G q|)^(1/2) and divided by its
+  largest entry. Di Leonardo, Ianni and Ruocco (2007), doi:10.1364/OE.15.001913, have the power 1, with which
+  close foci change places for ever. The result is the q of the highest weakest pressure over its target;
+- "gs_pat": p = G G^H (t * sgn(p)) in turns, and in the end q = sgn(G^H (t^2 * p / |p|^2)) (Martinez Plasencia
+  et al. 2020), doi:10.1145/3386569.3392492;
+- "diff_pat": Adam on the phases, from those of "wgs", for the least sum of (|p| - t)^2 (Fushimi, Yamamoto and
+  Ochiai 2021), doi:10.1038/s41598-021-91880-2.
+
+With free amplitudes, drives are divided by their largest entry in place of sgn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, TypeAlias
+
+import torch
+
+Algorithm: TypeAlias = Literal["naive", "gs", "wgs", "gs_pat", "diff_pat"]
+Project: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
+
+TINY = 1e-30
+DAMPING = 0.5
+"""Power of wanted over present pressure in the weights of "wgs"; 1 overshoots."""
+
+UNREACHED = 1e-6
+"""Pressure, relative to the loudest point, below which a point gets no more weight."""
+
+_RATES = 0.1, 0.001  # first and last step of Adam [rad, or amplitudes]
+_MOMENTS = 0.9, 0.99  # shares of the old means of gradients and their squares in the new ones
+
+
+def within_largest(drive: torch.Tensor) -> torch.Tensor:
+    """Return drives (..., M, 1) over the largest amplitude of each."""
+    return drive / drive.abs().amax(dim=-2, keepdim=True).clamp_min(TINY)
+
+
+def _naive(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
+    return project(matrix.mH @ wanted.to(matrix.dtype))
+
+
+def _in_turns(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
+    back, drive = matrix.mH.resolve_conj(), torch.ones_like(matrix[..., :1, :]).mT
+    for _ in range(iterations):
+        drive = project(back @ (wanted * (matrix @ drive).sgn()))
+    return drive
+
+
+def _weighted(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
+    back, drive = matrix.mH.resolve_conj(), torch.ones_like(matrix[..., :1, :]).mT
+    weights, best, highest = wanted, drive, torch.zeros_like(wanted[..., :1, :])
+    for _ in range(iterations):
+        drive = project(back @ (weights * (matrix @ drive).sgn()))
+        size = (matrix @ drive).abs()
+        loudest = size.amax(dim=-2, keepdim=True).clamp_min(TINY)
+        # the weight of a point that no transducer reaches would outgrow all others
+        share = torch.where(size > UNREACHED * loudest, size, loudest) / wanted
+        level = share.amin(dim=-2, keepdim=True)
+        worse = level <= highest  # not where a matrix is not finite, which is refused later
+        best, highest = torch.where(worse, best, drive), torch.maximum(level, highest)
+        weights = torch.where(wanted > 0, weights / share.pow(DAMPING), 0.0)
+        weights = weights / weights.amax(dim=-2, keepdim=True)
+    return best
+
+
+def _at_points(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
+    both, pressure = matrix @ matrix.mH, wanted.to(matrix.dtype)
+    both = both / both.abs().amax(dim=(-2, -1), keepdim=True).clamp_min(TINY)  # against overflow
+    for _ in range(iterations):
+        pressure = both @ (wanted * pressure.sgn())
+    return project(matrix.mH @ (wanted.square() * pressure.sgn() / pressure.abs().clamp_min(TINY)))
+
+
+SOLVERS = {"naive": _naive, "gs": _in_turns, "wgs": _weighted, "gs_pat": _at_points}
+"""The algorithms by name: functions of matrices (..., P, M), wanted pressures (..., P, 1), iterations and
+`torch.sgn` or `within_largest`."""
+
+
+def descent(
+    matrix: torch.Tensor, wanted: torch.Tensor, drive: torch.Tensor, iterations: int, free: bool
+) -> torch.Tensor:
+    """Return drives (..., M, 1) with the least sum of (|p| - t)^2 that Adam finds from drives (..., M, 1)."""
+    phase, size, back = drive.angle(), drive.abs(), matrix.mH.resolve_conj()
+    means, squares = torch.zeros_like(drive), torch.zeros_like(drive)
+    for step in range(1, iterations + 1):
+        drive = torch.polar(size, phase)
+        pressure = matrix @ drive
+        flow = (back @ ((pressure.abs() - wanted) * pressure.sgn())).conj() * drive.sgn()
+        # by the amplitude, and by the phase times the amplitude
+        slope = torch.complex(flow.real, -flow.imag * size)
+        means = _MOMENTS[0] * means + (1 - _MOMENTS[0]) * slope
+        square = torch.complex(slope.real.square(), slope.imag.square())
+        squares = _MOMENTS[1] * squares + (1 - _MOMENTS[1]) * square
+        rate = _RATES[0] * (_RATES[1] / _RATES[0]) ** (step / iterations)
+        mean, spread = means / (1 - _MOMENTS[0] ** step), squares / (1 - _MOMENTS[1] ** step)
+        phase = phase - rate * mean.imag / (spread.imag.sqrt() + TINY)
+        if free:
+            size = (size - rate * mean.real / (spread.real.sqrt() + TINY)).clamp(0, 1)
+    return torch.polar(size, phase)

@@ -1,0 +1,217 @@
+"""The fit of transfer matrices to readings without outliers, from phase retrieval or from a prior on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+
+from autdtorch.methods.doubtful_readings import Magnitudes, gross_outliers, range_ends, reads_finely
+from autdtorch.methods.matrix_posterior import MatrixPosterior, MatrixPrior
+from autdtorch.utils.threads import one_library_thread
+
+_OF_POSTERIOR = ("factors", "entries", "variance")  # its tensors, from which the next fit goes on
+_SCREENINGS = 8  # fits, each without the outliers that the one before shows
+_BETTER = 0.5  # largest ratio of the deviations with and without limits at which limits are believed
+
+_GUESSES = 16  # rows from which the search for each row begins
+_APART = 0.5  # random part of these rows, relative to the common part
+_RELAXATION = 0.7  # of the splitting; 1 takes half as many steps again
+_SEARCH_STEPS = 300
+_LONG_SEARCH_STEPS = 10_000  # with fewer than 3 M - 2 readings, unless all rows are explained before
+_CHECKED = 100  # steps of a long search after which the rows are compared with the readings
+_EXPLAINED = 1e-3  # relative error of the readings, rms, at which a row explains them
+_LEAST_SQUARES_STEPS = 100
+_FAINT = 0.02  # least intensity in the weights of readings, relative to the mean
+
+
+class Fit(NamedTuple):
+    """The posterior of a trial, and the readings as they were taken.
+
+    Attributes:
+        posterior: of the matrix.
+        read: magnitudes (N, P), of which some are outliers or limits.
+        ends: end of each sensor's range (P,) [Pa]; infinite where it was not reached.
+    """
+
+    posterior: MatrixPosterior
+    read: Magnitudes
+    ends: torch.Tensor
+
+
+def posteriors(
+    prior: MatrixPrior | None,
+    search: Mapping[str, torch.Tensor],
+    drives: torch.Tensor,
+    observed: torch.Tensor,
+    generators: Sequence[torch.Generator],
+    variance: torch.Tensor | None = None,
+) -> list[Fit]:
+    """Return the posteriors of T trials by all their readings but outliers.
+
+    Args:
+        prior: of the matrix; None if nothing is known, for at least 3 M - 2 readings.
+        search: tensors of `tensors_of` after fewer readings, if there were any.
+        drives: (T, N, M).
+        observed: magnitudes (T, N, P).
+        generators: of the trials, for the first search without a prior.
+        variance: of the magnitudes' noise (T, P) [Pa^2]; None to infer it.
+    """
+    fits = []
+    for trial, generator in enumerate(generators):
+        # Copies: products of a part of a tensor may round by its place in memory.
+        played, seen = drives[trial].clone(), observed[trial].clone()
+        names = [name for name in (*_OF_POSTERIOR, "spread", "outliers") if name in search]
+        before = {name: search[name][trial].clone() for name in names}
+        scaled = None if prior is None else prior.in_units_of(played, seen)
+        noise = None if variance is None else variance[trial]
+        fits.append(_Trial(scaled, before, played, seen, generator, noise).fit())
+    return fits
+
+
+def tensors_of(fits: Sequence[Fit]) -> dict[str, torch.Tensor]:
+    """Return tensors from which `posteriors` goes on."""
+    tensors = {name: torch.stack([getattr(fit.posterior, name) for fit in fits]) for name in _OF_POSTERIOR}
+    return {
+        **tensors,
+        "spread": torch.stack([fit.posterior.prior.spread for fit in fits]),
+        "outliers": torch.stack([fit.read.outliers for fit in fits]),
+        "ends": torch.stack([fit.ends for fit in fits]),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """The data of a trial's fit; see `posteriors`."""
+
+    prior: MatrixPrior | None
+    before: Mapping[str, torch.Tensor]
+    drives: torch.Tensor
+    observed: torch.Tensor
+    generator: torch.Generator
+    variance: torch.Tensor | None
+
+    def fit(self) -> Fit:
+        """Return the fit without outliers, where readings at the end of a sensor's range are limits.
+
+        A sensor that reads in coarse steps has equal highest readings near the best drive, too. These fit
+        like all others; readings at the end of a range spoil a fit that does not take them as limits.
+        """
+        ends = range_ends(self.drives, self.observed)
+        limited = self._screened(ends, None)
+        unsure = ends.isfinite() & ~reads_finely(self.observed, ends)
+        if not unsure.any():
+            return limited
+        plain = self._screened(ends.masked_fill(unsure, torch.inf), limited.posterior.matrix)
+        rest, plain_rest = (fit.posterior.deviations(self.drives, fit.read) for fit in (limited, plain))
+        ends = ends.masked_fill(unsure & (rest > _BETTER * plain_rest), torch.inf)
+        for fit in (limited, plain):
+            if torch.equal(ends, fit.ends):
+                return fit
+        return self._screened(ends, plain.posterior.matrix)
+
+    def _screened(self, ends: torch.Tensor, matrix: torch.Tensor | None) -> Fit:
+        """Return the fit that shows no further outlier; the first begins at a matrix (P, M), if any."""
+        outliers = torch.zeros_like(self.observed, dtype=torch.bool)
+        if self.before:
+            outliers[: len(self.before["outliers"])] = self.before["outliers"]
+        elif self.prior is None:
+            outliers = gross_outliers(self.observed)
+        for _ in range(_SCREENINGS):
+            read = Magnitudes.of(self.observed, outliers, ends)
+            start = self._start(read, matrix)
+            if self.variance is not None:
+                start = replace(start, variance=self.variance)
+            fit = start.fitted(self.drives, read, infer_noise=self.variance is None)
+            shown, matrix = fit.outliers(self.drives, read, self.observed), fit.matrix
+            if torch.equal(shown, outliers):
+                break
+            outliers = shown
+        return Fit(fit, read, ends)
+
+    def _start(self, read: Magnitudes, matrix: torch.Tensor | None) -> MatrixPosterior:
+        """Return the posterior at which a fit begins: the one before, or the prior's.
+
+        Without either, the rows are those of the matrix, or of phase retrieval, which takes longest of all.
+        """
+        prior = self.prior or MatrixPrior.unknown(read, self.drives.shape[1])
+        if before := self.before:
+            known = replace(prior, spread=before["spread"])
+            return MatrixPosterior(known, *(before[name] for name in _OF_POSTERIOR))
+        start = MatrixPosterior.start(prior)
+        if self.prior is not None:
+            return start
+        rows = retrieve(self.drives, read, self.generator).T if matrix is None else matrix
+        return replace(start, entries=rows / prior.spread[:, None])
+
+
+@one_library_thread()
+def retrieve(drives: torch.Tensor, read: Magnitudes, generator: torch.Generator) -> torch.Tensor:
+    """Return rows of the transfer matrix (M, P) that explain magnitudes (N, P) read for `drives` (N, M).
+
+    Relaxed Douglas-Rachford splitting (Elser, SIAM J. Appl. Algebra Geometry 2 (2018) 150) seeks phasors that
+    have the observed magnitudes and that some row produces, from spectral estimates of the rows. The rows are
+    then fitted, and the best fit is taken.
+    """
+    inverse = torch.linalg.pinv(drives)
+    short = len(drives) < 3 * drives.shape[1] - 2
+    best = []
+    for point in range(read.value.shape[1]):
+        magnitude = read.column(point)
+        rows = _searched(drives, inverse, magnitude, short, generator)
+        rows = _least_squares(drives, inverse, magnitude, rows)
+        best.append(rows[:, _misfit(drives, magnitude, rows).argmin()])
+    return torch.stack(best, dim=1)
+
+
+def _searched(
+    drives: torch.Tensor,
+    inverse: torch.Tensor,
+    read: Magnitudes,
+    short: bool,
+    generator: torch.Generator,
+) -> torch.Tensor:
+    """Return candidates (M, K) for a row that explains magnitudes (N, 1), after a long search if `short`."""
+    start = _spectral(drives, read)[:, None]
+    guesses = torch.randn((len(start), _GUESSES), dtype=torch.complex128, generator=generator, device="cpu")
+    phasors = drives @ (start + _APART * start.norm() / guesses.norm(dim=0) * guesses)
+    enough = _EXPLAINED**2 * read.value.square().sum()
+    for step in range(_LONG_SEARCH_STEPS if short else _SEARCH_STEPS):
+        right = read.nearest(phasors.abs()) * phasors.sgn()
+        phasors = phasors + _RELAXATION * (drives @ (inverse @ (2 * right - phasors)) - right)
+        if step % _CHECKED == 0 and (_misfit(drives, read, inverse @ phasors) <= enough).any():
+            break
+    rows: torch.Tensor = inverse @ phasors
+    return rows
+
+
+def _spectral(drives: torch.Tensor, read: Magnitudes) -> torch.Tensor:
+    """Return the estimate (M,) of a row from magnitudes (N, 1): the main direction of loud drives.
+
+    The weights 1 - 1 / intensity need the fewest readings (Mondelli and Montanari, Foundations of
+    Computational Mathematics 19 (2019) 703).
+    """
+    intensity, least = read.value[:, 0].square(), torch.finfo(read.value.dtype).tiny
+    relative = intensity / read.power.clamp(min=least)
+    weight = (1 - 1 / relative.clamp(min=_FAINT)).masked_fill(read.outliers[:, 0], 0)
+    direction: torch.Tensor = torch.linalg.eigh((drives.mH * weight) @ drives).eigenvectors[:, -1]
+    row: torch.Tensor = direction * (read.value.norm() / (drives @ direction).norm().clamp(min=least))
+    return row
+
+
+def _least_squares(
+    drives: torch.Tensor, inverse: torch.Tensor, read: Magnitudes, rows: torch.Tensor
+) -> torch.Tensor:
+    """Return least-squares fits (M, K) of rows to magnitudes (N, 1): phases and rows in turn."""
+    for _ in range(_LEAST_SQUARES_STEPS):
+        phasors = drives @ rows
+        rows = inverse @ (read.nearest(phasors.abs()) * phasors.sgn())
+    return rows
+
+
+def _misfit(drives: torch.Tensor, read: Magnitudes, rows: torch.Tensor) -> torch.Tensor:
+    """Return the sum of squares (K,) of the differences of rows (M, K) to magnitudes (N, 1)."""
+    magnitude = (drives @ rows).abs()
+    return (magnitude - read.nearest(magnitude)).square().sum(dim=0)
