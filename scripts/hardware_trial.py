@@ -12,7 +12,7 @@ from autdtorch.cli import main as command_line
 
 
 def main() -> None:
-    """Run the command line. The help has that of `autdtorch` after this docstring."""
+    """Run the command line; its help begins with the docstring of this file."""
     if {"-h", "--help"} & set(sys.argv[1:]):
         print(__doc__)
     if not any(word.startswith("hardware=") for word in sys.argv[1:]):

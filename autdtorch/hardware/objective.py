@@ -30,7 +30,7 @@ class HardwareObjective:
     Attributes:
         scene: the scene on the bench.
         log: of the evaluations.
-        transfer_matrix: simulated G (P, M) [Pa]; None where none was given.
+        transfer_matrix: simulated G (P, M) [Pa], or None.
     """
 
     def __init__(
@@ -53,8 +53,8 @@ class HardwareObjective:
             settings: further settings that identify the trial, values of JSON: method, seed, sensor. A log
                 of other settings, or of another scene, device or amplitude, is refused.
             watch: function that is called with every evaluation, those from the log included.
-            transfer_matrix: G (P, M) [Pa] of a simulation of the scene, for a `Prior` and `GradientAscent`. A
-                common factor does not matter to them, such as that of the amplitude limit.
+            transfer_matrix: G (P, M) [Pa] of a simulation of the scene, for a `Prior` and `GradientAscent`,
+                up to a factor.
 
         Raises:
             ValueError: no scene or sensor; the link is not limited, or plays another number of transducers

@@ -45,8 +45,8 @@ class Wiring:
 class AmplitudeScale:
     """The scale between a trial's drives and the device's, whose amplitude `largest` is 1 in the trial.
 
-    Transducers of a calibrated device have levels of their own. None is driven above the highest of its
-    levels within the limit, so that rounding exceeds the limit nowhere.
+    Transducers of a calibrated device differ in their levels. None is driven above the highest of its levels
+    within the limit, so that rounding exceeds the limit nowhere.
     """
 
     def __init__(self, wiring: Wiring, amplitude: float) -> None:
@@ -62,7 +62,7 @@ class AmplitudeScale:
             raise invalid("amplitude", limit, accepted)
 
     def asked(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return the drive to ask of the device, in its own scale, for a trial's `drive` (M,)."""
+        """Return the drive to ask of the device, in the device's scale, for a trial's `drive` (M,)."""
         wanted = self.largest * validate_single_drive(drive, len(self._most))
         return torch.polar(wanted.abs().minimum(self._most), wanted.angle())
 

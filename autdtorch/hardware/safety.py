@@ -232,14 +232,14 @@ class LimitedLink:
         points = integer_at_least("points", points, 1)
         self.require_on()
         try:
-            found = checked_reading(sensor, points, self._on_until - time.monotonic() + _GRACE)
+            reading = checked_reading(sensor, points, self._on_until - time.monotonic() + _GRACE)
         except SensorError:
             if time.monotonic() >= self._on_until:
                 self.off()
             self.require_on()
             raise
         self.require_on()
-        return found
+        return reading
 
     def require_on(self) -> None:
         """Raise `LimitError` if the outputs went off since `play`, and the readings meanwhile are void."""

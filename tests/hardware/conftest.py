@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,21 +37,37 @@ class Trial:
     def played(self, device: hw.Device = hw.SONICSURFACE, amplitude: float = 1.0) -> hw.Played:
         return hw.Played(self.simulated, device, TRANSDUCERS, amplitude)
 
-    def objective(self, link: hw.Link, sensor: hw.Sensor, **settings: object) -> hw.HardwareObjective:
-        limited = hw.LimitedLink(link, hw.Limits(amplitude=1.0))
+    @contextmanager
+    def limited(
+        self,
+        device: hw.Device = hw.SONICSURFACE,
+        failed: Sequence[int] = (),
+        amplitude: float = 1.0,
+        **limits: float,
+    ) -> Iterator[tuple[hw.EmulatedBench, hw.LimitedLink]]:
+        """A bench, and a link to it with limits."""
+        bench = self.bench(device, failed)
+        with self.link(bench, device) as link:
+            yield bench, hw.LimitedLink(link, hw.Limits(amplitude, **limits))  # type: ignore[arg-type]
+
+    def objective(
+        self, link: hw.Link | hw.LimitedLink, sensor: hw.Sensor, **settings: object
+    ) -> hw.HardwareObjective:
+        limited = hw.LimitedLink(link, hw.Limits(1.0)) if isinstance(link, hw.Link) else link
         return hw.HardwareObjective(self.scene, limited, sensor, self.log, settings)
 
 
-def a_scene() -> tuple[Scene, SimulatedObjective]:
+@pytest.fixture(scope="session")
+def simulated() -> SimulatedObjective:
     scene = Scene(
         TransducerArray.grid((4, 4), pitch=10.5e-3, center=(0, 0, 0)),
         Medium(1.2, 340.0),
         frequency=40e3,
         control_points=[(80e-3, 10e-3, 0.0), (80e-3, -20e-3, 5e-3)],
     )
-    return scene, SimulatedObjective(scene, make_propagator(scene, method="free_space"))
+    return SimulatedObjective(scene, make_propagator(scene, method="free_space"))
 
 
 @pytest.fixture
-def trial(tmp_path: Path) -> Trial:
-    return Trial(*a_scene(), tmp_path / "trial.jsonl")
+def trial(simulated: SimulatedObjective, tmp_path: Path) -> Trial:
+    return Trial(simulated.scene, simulated, tmp_path / "trial.jsonl")

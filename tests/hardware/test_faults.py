@@ -44,6 +44,9 @@ def is_off(bench: hw.EmulatedBench) -> bool:
     return not bench.firmware.drive().any()
 
 
+devices = pytest.mark.parametrize("device", [hw.SONICSURFACE, hw.OPENMPD], ids=lambda device: device.name)
+
+
 def bytes_before(device: hw.Device, evaluations: int) -> int:
     """The number of bytes before a fault in mid-frame of an evaluation; off frames are sent in pairs."""
     frame = len(device.frame(torch.zeros(256, dtype=torch.complex128)))
@@ -62,7 +65,7 @@ def require_that_it_goes_on(trial, device: hw.Device = hw.SONICSURFACE) -> None:
     torch.testing.assert_close(found.history, expected.history, rtol=1e-12, atol=0)  # another order of sums
 
 
-@pytest.mark.parametrize("device", [hw.SONICSURFACE, hw.OPENMPD], ids=lambda device: device.name)
+@devices
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_of_the_bus_ends_the_trial_with_the_outputs_off(trial, fault, device):
     bench = trial.bench(device)
@@ -139,7 +142,7 @@ def test_a_signal_ends_the_trial_with_the_outputs_off(trial, number):
     require_that_it_goes_on(trial)
 
 
-@pytest.mark.parametrize("device", [hw.SONICSURFACE, hw.OPENMPD], ids=lambda device: device.name)
+@devices
 def test_signals_in_mid_frame_and_while_switching_off_leave_the_outputs_off(trial, device):
     class Interrupting(EmulatedBus):
         armed = False
@@ -169,10 +172,8 @@ def test_a_signal_amid_or_just_before_the_last_off_frame_leaves_the_outputs_off(
         signal.raise_signal(signal.SIGTERM)
 
     def arm(link: hw.Link) -> None:
-        if interrupted == "recovery":
-            monkeypatch.setattr(bench.bus, "clear_halt", interrupt)
-        else:
-            monkeypatch.setattr(link, "off", interrupt)
+        where = (bench.bus, "clear_halt") if interrupted == "recovery" else (link, "off")
+        monkeypatch.setattr(*where, interrupt)
 
     bench = trial.bench()
     bench.bus = FaultyBus([bench.chip], "time-out", 258 * (2 + 1) + 100)
@@ -184,17 +185,13 @@ def test_a_signal_amid_or_just_before_the_last_off_frame_leaves_the_outputs_off(
 @pytest.mark.usefixtures("not_ignored")
 @pytest.mark.parametrize("number", [signal.SIGINT])
 def test_two_signals_at_once_end_the_trial_by_the_first(monkeypatch, number):
-    def both() -> None:
-        with hw.ended_by_signals():
-            signal.pthread_sigmask(signal.SIG_BLOCK, {number, signal.SIGTERM})
-            signal.raise_signal(number)  # to this thread, as other threads do not block it
-            signal.raise_signal(signal.SIGTERM)
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, {number, signal.SIGTERM})
-
     lost: list[object] = []
     monkeypatch.setattr(sys, "unraisablehook", lost.append)
-    with pytest.raises(hw.Signalled, match="SIGINT"):
-        both()
+    with pytest.raises(hw.Signalled, match="SIGINT"), hw.ended_by_signals():  # noqa: PT012
+        signal.pthread_sigmask(signal.SIG_BLOCK, {number, signal.SIGTERM})
+        signal.raise_signal(number)  # to this thread, as other threads do not block it
+        signal.raise_signal(signal.SIGTERM)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {number, signal.SIGTERM})
     assert not lost
 
 
@@ -233,17 +230,32 @@ def test_a_signal_during_a_finaliser_ends_the_trial_after_it(monkeypatch):
     dropped: list[object] = []
     monkeypatch.setattr(sys, "unraisablehook", dropped.append)
 
-    def trial() -> None:
-        with hw.ended_by_signals():
-            Finalised()
-            time.sleep(30)
-
     begin = time.monotonic()
-    with pytest.raises(hw.Signalled, match="SIGTERM"):
-        trial()
+    with pytest.raises(hw.Signalled, match="SIGTERM"), hw.ended_by_signals():  # noqa: PT012
+        Finalised()
+        time.sleep(30)
     assert time.monotonic() - begin < 20  # the wait is interrupted
     assert ended == [True]
     assert not dropped
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_a_link_that_cannot_be_switched_off_is_closed_and_ends(trial, monkeypatch, error):
+    def fail(*_: object) -> None:
+        attempts.append(error)
+        raise error("stuck")
+
+    attempts: list[type[BaseException]] = []
+    bench = trial.bench()
+    link = trial.link(bench)
+    monkeypatch.setattr(link._port, "write", fail)
+    with pytest.raises(hw.OffError if error is RuntimeError else error, match="stuck"):
+        link.close()
+    assert 2 <= len(attempts) <= 40
+    monkeypatch.undo()
+    link.close()  # nothing is left to do
+    with trial.link(bench):  # the chip is free again
+        assert is_off(bench)
 
 
 @pytest.mark.parametrize("handlers_set", [2, 7], ids=["begins", "ends"])  # of 6, and 6 as they were

@@ -12,6 +12,8 @@ import weakref
 import pytest
 import torch
 from faulty_bus import Disturbed
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from autdtorch import hardware as hw
 from autdtorch.hardware.sensors.sensor import checked_reading
@@ -20,44 +22,64 @@ from autdtorch.methods.run import observed
 FULL = torch.ones(16, dtype=torch.complex128)
 
 
-@contextlib.contextmanager
-def limited(trial, failed=(), **limits):
-    """A bench, and a link to it with limits."""
-    bench = trial.bench(failed=failed)
-    with trial.link(bench) as link:
-        yield bench, hw.LimitedLink(link, hw.Limits(1.0, **limits))
-
-
-def objective_on(trial, link: hw.LimitedLink, sensor) -> hw.HardwareObjective:
-    return hw.HardwareObjective(trial.scene, link, sensor, trial.log)
-
-
 def test_an_invalid_drive_is_not_scaled_into_a_valid_one_and_starts_no_clock(trial):
-    bench = trial.bench(hw.OPENMPD)
-    with trial.link(bench, hw.OPENMPD) as link:
-        link = hw.LimitedLink(link, hw.Limits(0.5))
+    with trial.limited(hw.OPENMPD, amplitude=0.5) as (bench, link):
         for drive, message in ((FULL[None], r"shape \(1, 16\)"), (1.5 * FULL, r"drive: amplitude 1\.5")):
             with pytest.raises(ValueError, match=message):
                 link.play(drive)
         assert link.seconds_on == 0
         assert link._timer is None
-    assert hw.EmulatedSensor(bench).read().max() == 0
+        assert hw.EmulatedSensor(bench).read().max() == 0
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("amplitude", 0), ("amplitude", 1.1), ("evaluations", 0), ("seconds", 0), ("duty_cycle", float("nan"))],
-)
-def test_limits_out_of_range_are_refused(name: str, value: float):
-    with pytest.raises(ValueError, match=name):
-        hw.Limits(**{"amplitude": 1.0, name: value})
+POWERS = st.floats(-330, 309).map(lambda power: 10.0**power if power < 308 else 1.7e308)  # 0 to the largest
+NUMBERS = st.one_of(POWERS, st.floats(), st.sampled_from([0.0, 5e-324, 1.0, 1e-12]))
+DAY = 86_400.0
+
+
+@given(NUMBERS, NUMBERS, NUMBERS, NUMBERS)
+def test_limits_are_refused_or_reached_by_a_timer_and_in_a_lifetime(amplitude, seconds, in_a_row, duty_cycle):
+    try:
+        limits = hw.Limits(amplitude, 10, seconds, in_a_row, duty_cycle)
+    except ValueError as error:
+        assert str(error).startswith(("amplitude", "seconds", "duty_cycle"))  # noqa: PT017
+        return
+    assert 0 < limits.amplitude <= 1
+    longest = min(limits.seconds, limits.seconds_in_a_row)
+    assert 0 < longest <= threading.TIMEOUT_MAX
+    assert longest * (1 / limits.duty_cycle - 1) <= DAY * (1 + 1e-9)
+    assert 0.1 * (1 / limits.duty_cycle - 1) <= DAY  # after a stretch that a busy machine has made longer
+
+
+def test_usual_limits_are_accepted_and_an_amplitude_is_required():
+    hw.Limits(0.01, 1, 1e-3, 1e-3, 1e-3)
+    hw.Limits(1.0, 10**9, DAY, DAY, 0.5)
+    with pytest.raises(ValueError, match="evaluations: 0"):
+        hw.Limits(1.0, evaluations=0)
     with pytest.raises(TypeError, match="amplitude"):
         hw.Limits()
 
 
+@settings(max_examples=30)
+@given(NUMBERS)
+def test_no_wait_is_longer_than_a_trial(value):
+    bench = hw.EmulatedBench(hw.OPENMPD, torch.ones(2, 16).cdouble(), range(16))
+    waits = {
+        "settle": lambda: hw.open_link(hw.OPENMPD, range(16), backend=bench.bus, settle=value).close(),
+        "timeout": lambda: hw.FileSensor("readings", 2, timeout=value),
+        "settle ": lambda: hw.FileSensor("readings", 2, settle=value),
+    }
+    for name, make in waits.items():
+        if 0 <= value <= 60 and (value > 0 or name != "timeout"):
+            make()
+        elif not value <= DAY:
+            with pytest.raises(ValueError, match=name.strip()):
+                make()
+
+
 def test_the_outputs_rest_as_the_duty_cycle_asks(trial):
     begin = time.monotonic()
-    with limited(trial, seconds_in_a_row=0.2, duty_cycle=0.25) as (_, link):
+    with trial.limited(seconds_in_a_row=0.2, duty_cycle=0.25) as (_, link):
         while link.seconds_on < 0.25:
             link.play(FULL)
             time.sleep(0.002)
@@ -85,8 +107,8 @@ def test_while_a_sensor_takes_too_long_the_outputs_go_off(trial, limits, message
         amplitudes.append(float(bench.drive().abs().max()))
 
     amplitudes: list[float] = []
-    with limited(trial, **limits) as (bench, link):
-        objective = objective_on(trial, link, Disturbed(bench, wait))
+    with trial.limited(**limits) as (bench, link):
+        objective = trial.objective(link, Disturbed(bench, wait))
         if in_main_thread:  # the reading is interrupted
             measure()
             assert amplitudes == [0.0]
@@ -130,8 +152,8 @@ WAITS = {
 @pytest.mark.parametrize("kind", WAITS)
 def test_a_sensor_that_never_returns_ends_the_trial(trial, tmp_path, kind: str):
     begin, before = time.monotonic(), [signal.getsignal(one) for one in signal.valid_signals()]
-    with limited(trial, seconds_in_a_row=0.1) as (bench, link):
-        objective = objective_on(trial, link, Hung(bench, functools.partial(WAITS[kind], tmp_path), at=3))
+    with trial.limited(seconds_in_a_row=0.1) as (bench, link):
+        objective = trial.objective(link, Hung(bench, functools.partial(WAITS[kind], tmp_path), at=3))
         with pytest.raises(hw.LimitError, match="longer than the outputs may stay on"):
             objective(FULL.expand(5, -1))
         assert bench.drive().abs().max() == 0
@@ -142,15 +164,15 @@ def test_a_sensor_that_never_returns_ends_the_trial(trial, tmp_path, kind: str):
 
 def test_a_sensor_that_never_returns_in_silence_ends_the_check(trial, monkeypatch):
     monkeypatch.setattr(checked_reading, "__defaults__", (0.1,))
-    with limited(trial) as (bench, link):
+    with trial.limited() as (bench, link):
         with pytest.raises(hw.SensorError, match="no reading within"):
             hw.check_transducers(link, Hung(bench, lambda: time.sleep(60), at=2), 2)
         assert link.seconds_on == 0
 
 
 def test_a_signal_that_comes_while_a_sensor_hangs_ends_the_trial_at_once(trial):
-    with limited(trial) as (bench, link), hw.ended_by_signals():
-        objective = objective_on(trial, link, Hung(bench, lambda: time.sleep(60)))
+    with trial.limited() as (bench, link), hw.ended_by_signals():
+        objective = trial.objective(link, Hung(bench, lambda: time.sleep(60)))
         threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGTERM)).start()
         with pytest.raises(hw.Signalled):
             objective(FULL[None])
@@ -175,7 +197,7 @@ def test_while_the_sound_settles_the_timer_may_switch_off(trial):
 
 
 def test_a_timer_that_comes_late_reaches_neither_the_next_stretch_nor_the_next_link(trial):
-    with limited(trial, seconds_in_a_row=0.5) as (bench, link):
+    with trial.limited(seconds_in_a_row=0.5) as (bench, link):
         link.play(FULL)
         late = link._timer
         assert late.daemon  # for another Python would wait before it exits and switches off
@@ -201,8 +223,8 @@ def test_a_timer_that_cannot_switch_off_says_so_at_once_and_ends_the_trial(trial
     def fail() -> None:
         raise error
 
-    with limited(trial, seconds_in_a_row=0.02) as (bench, link):
-        objective = objective_on(trial, link, Disturbed(bench, wait))
+    with trial.limited(seconds_in_a_row=0.02) as (bench, link):
+        objective = trial.objective(link, Disturbed(bench, wait))
         monkeypatch.setattr(link.link, "off", fail)
         with pytest.raises(type(error), match="stuck"):
             objective(FULL[None])
@@ -217,9 +239,9 @@ def test_an_error_of_the_sensor_leaves_the_outputs_off_on_an_open_link(trial):
         if bench.drive().any():
             raise OSError("gone")
 
-    with limited(trial) as (bench, link):
+    with trial.limited() as (bench, link):
         with pytest.raises(OSError, match="gone"):
-            objective_on(trial, link, Disturbed(bench, fail))(FULL[None])
+            trial.objective(link, Disturbed(bench, fail))(FULL[None])
         assert bench.firmware.drive().abs().max() == 0
         with pytest.raises(OSError, match="gone"):
             hw.check_transducers(link, Disturbed(bench, fail), points=2)
@@ -244,8 +266,8 @@ def test_a_link_left_open_is_switched_off_when_python_exits_and_a_closed_one_is_
 
 def test_the_number_of_evaluations_is_limited_over_all_of_a_trial(trial):
     def observe(rows: int, most: int) -> None:
-        with limited(trial, evaluations=most) as (bench, link):
-            observed(objective_on(trial, link, hw.EmulatedSensor(bench)), FULL.expand(rows, -1), 0)
+        with trial.limited(evaluations=most) as (bench, link):
+            observed(trial.objective(link, hw.EmulatedSensor(bench)), FULL.expand(rows, -1), 0)
 
     observe(3, most=3)
     with pytest.raises(hw.LimitError, match="4 evaluations are made, the limit"):
@@ -254,16 +276,16 @@ def test_the_number_of_evaluations_is_limited_over_all_of_a_trial(trial):
 
 
 def test_the_time_on_goes_on_with_the_trial(trial):
-    with limited(trial, seconds=60.0) as (bench, link):  # a test does not take that long
+    with trial.limited(seconds=60.0) as (bench, link):  # a test does not take that long
         trial.objective(link.link, hw.EmulatedSensor(bench)).log.append(FULL, torch.ones(2), 60.0)
-        objective = objective_on(trial, link, hw.EmulatedSensor(bench))
+        objective = trial.objective(link, hw.EmulatedSensor(bench))
         with pytest.raises(hw.LimitError, match="on for 60 s, the limit"):
             observed(objective, FULL.expand(2, -1), 0)  # one is in the log
         assert link.seconds_on == 60.0
 
 
 def test_a_trial_that_goes_on_rests_no_longer_than_its_limits_promise(trial):
-    with limited(trial, seconds=0.1, seconds_in_a_row=1e6, duty_cycle=0.5) as (_, link):
+    with trial.limited(seconds=0.1, seconds_in_a_row=1e6, duty_cycle=0.5) as (_, link):
         link.go_on(0.0)
         begin = time.monotonic()
         link.play(FULL)
@@ -271,22 +293,22 @@ def test_a_trial_that_goes_on_rests_no_longer_than_its_limits_promise(trial):
 
 
 def test_the_time_of_an_earlier_check_counts_and_is_rested_from(trial):
-    with limited(trial) as (bench, link):
+    with trial.limited() as (bench, link):
         sensor = hw.EmulatedSensor(bench)
-        log = objective_on(trial, link, sensor).log
+        log = trial.objective(link, sensor).log
         hw.check_transducers(link, sensor, points=2)
         log.end(link.seconds_on)
         before = link.seconds_on
         again = hw.LimitedLink(link.link, hw.Limits(1.0, seconds_in_a_row=0.05, duty_cycle=0.25))
         begin = time.monotonic()
-        objective = objective_on(trial, again, sensor)
+        objective = trial.objective(again, sensor)
         assert again.seconds_on == before > 0
         objective(FULL[None])
         assert time.monotonic() - begin >= 0.05 * (1 / 0.25 - 1)
         assert objective.log.seconds_on > before
         # Nor does a second objective on the same link count anything twice.
         once = again.seconds_on
-        objective_on(trial, again, sensor)
+        trial.objective(again, sensor)
         assert again.seconds_on == once
 
 
@@ -306,7 +328,7 @@ def test_a_chip_that_does_not_confirm_the_off_frame_is_an_error(trial, monkeypat
 @pytest.mark.parametrize("snr", [None, 30.0])
 def test_the_check_finds_the_failed_transducers(trial, snr):
     read: list[str] = []
-    with limited(trial, failed=[3, 9]) as (bench, link):
+    with trial.limited(failed=[3, 9]) as (bench, link):
         sensor = hw.EmulatedSensor(bench, snr)
         check = hw.check_transducers(link, sensor, points=2, watch=read.append)
         assert check.failed == [3, 9]
@@ -317,6 +339,15 @@ def test_the_check_finds_the_failed_transducers(trial, snr):
         assert not hw.hears_silence(sensor, check, points=2)
 
 
+@pytest.mark.parametrize("count", [2**62, 10_001, 0])
+def test_numbers_of_readings_are_such_as_end(trial, count):
+    with trial.limited() as (bench, link):
+        for name in ("readings", "background"):
+            with pytest.raises(ValueError, match=name):
+                hw.check_transducers(link, hw.EmulatedSensor(bench), 2, **{name: count})
+        assert link.seconds_on == 0
+
+
 def test_a_transducer_20_db_below_the_others_has_failed_where_silence_is_read_as_0(trial):
     class Leaking(hw.EmulatedSensor):
         leak = 0.0
@@ -325,7 +356,7 @@ def test_a_transducer_20_db_below_the_others_has_failed_where_silence_is_read_as
             return super().read() + self.leak * float(bench.firmware.drive().abs().max())
 
     typical = float(trial.simulated.transfer_matrix.abs().median())
-    with limited(trial, failed=[3]) as (bench, link):
+    with trial.limited(failed=[3]) as (bench, link):
         sensor = Leaking(bench)
         for share, failed in ((0.05, [3]), (0.2, [])):  # of the amplitude; 20 dB are 0.1
             sensor.leak = share * typical

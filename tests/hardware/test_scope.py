@@ -8,6 +8,8 @@ import re
 
 import pytest
 import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from autdtorch import hardware as hw
 from autdtorch.hardware.emulator.bus import EmulatedBus, stall, time_out
@@ -270,6 +272,42 @@ def test_a_method_finds_the_simulations_focus_through_a_noisy_oscilloscope(trial
 
 
 @pytest.mark.parametrize("microphones", [[], [hw.Microphone(1, 0.01, 1.0), hw.Microphone(1, 0.01, 1.0)]])
-def test_microphones_without_inputs_of_their_own_are_refused(microphones):
-    with pytest.raises(ValueError, match=r"microphones: .*at inputs of their own"):
+def test_microphones_at_one_input_are_refused(microphones):
+    with pytest.raises(ValueError, match=r"microphones: .*at different inputs"):
         hw.ScopeSensor(Bench([1.0, 2.0]).open, FREQUENCY, microphones)
+
+
+SIZES = st.one_of(
+    st.floats(-330, 308).map(lambda power: 10.0**power),
+    *[st.floats(-10, 6).map(lambda power: 10.0**power)] * 3,
+)
+MATRIX = torch.polar(torch.ones(2, 16).double(), torch.arange(32.0).double().view(2, 16))
+
+
+@settings(max_examples=60)
+@given(SIZES, SIZES, SIZES)
+@example(1.0, 10.0, 1.75)  # at the coarsest scale
+def test_an_oscilloscope_reads_what_it_can_resolve_or_says_why_not(sensitivity, gain, loudest):
+    bench = hw.EmulatedBench(hw.SONICSURFACE, MATRIX, range(16))
+    try:
+        microphones = [hw.Microphone(number, sensitivity, loudest, gain) for number in (1, 2)]
+    except ValueError as error:
+        assert str(error).startswith(("sensitivity", "gain", "loudest"))  # noqa: PT017
+        return
+    hw.EmulatedScope(bench.pressure, FREQUENCY, sensitivity * gain, (0, 1)).plug_into(bench, CHIP)
+    truth = MATRIX.sum(dim=1).abs()
+    with (
+        hw.open_scope(CHIP, backend=bench.bus) as scope,
+        hw.open_link(hw.SONICSURFACE, range(16), backend=bench.bus) as link,
+    ):
+        sensor = hw.ScopeSensor(scope, FREQUENCY, microphones)
+        link.play(torch.ones(16).cdouble())
+        try:
+            read = sensor.read()
+        except hw.SensorError as error:
+            assert "clipped" in str(error)  # noqa: PT017
+            assert truth.max() > 0.9 * loudest
+            return
+    step = 8 * 1e-3 / 256 / (sensitivity * gain)  # of the converter on its finest scale [Pa]
+    assert read.isfinite().all()
+    torch.testing.assert_close(read, truth, rtol=0.05, atol=2 * step)

@@ -12,9 +12,7 @@ from autdtorch.methods.functions import gabs, identify, lssg
 from autdtorch.objectives.perturbations import random_rms
 from autdtorch.scene.drive import drive_from_phases
 
-
-def full_on() -> torch.Tensor:
-    return drive_from_phases(torch.zeros(16))
+FULL = torch.ones(16, dtype=torch.complex128)
 
 
 @pytest.mark.parametrize(
@@ -27,12 +25,10 @@ def full_on() -> torch.Tensor:
     ids=["SonicSurface", "OpenMPD", "Ultraino"],
 )
 def test_without_noise_a_method_finds_the_same_drive_as_in_simulation(trial, device, method, amplitude):
-    bench = trial.bench(device)
-    with trial.link(bench, device) as link:
-        limited = hw.LimitedLink(link, hw.Limits(amplitude))
-        measured = hw.HardwareObjective(trial.scene, limited, hw.EmulatedSensor(bench), trial.log)
+    with trial.limited(device, amplitude=amplitude) as (bench, link):
+        measured = trial.objective(link, hw.EmulatedSensor(bench))
         found = method(measured)
-        limited.play(found.drive[0])
+        link.play(found.drive[0])
         full = bench.drive().abs().max()
         torch.testing.assert_close(bench.drive(), full * found.drive[0], rtol=0, atol=1e-12)
     played = trial.played(device, amplitude)
@@ -53,8 +49,7 @@ def test_a_drive_in_any_guise_is_measured_and_comes_back_from_the_log(trial):
     phases = torch.linspace(-3, 3, 16)
     drive = torch.polar(torch.ones(16), phases)
     guises = [drive, drive.conj(), drive.cdouble().requires_grad_(), torch.stack([drive, drive]).T[:, 1]]
-    bench = trial.bench()
-    with trial.link(bench) as link:
+    with trial.limited() as (bench, link):
         objective = trial.objective(link, hw.EmulatedSensor(bench))
         measured = torch.stack([objective(one) for one in guises])
         again = trial.objective(link, hw.EmulatedSensor(bench))
@@ -67,8 +62,7 @@ def test_a_drive_in_any_guise_is_measured_and_comes_back_from_the_log(trial):
 def test_drives_of_any_leading_dimensions_are_played_in_a_row(trial, leading):
     phases = 7 * torch.rand(*leading, 16, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     drives = drive_from_phases(phases)
-    bench = trial.bench()
-    with trial.link(bench) as link:
+    with trial.limited() as (bench, link):
         objective = trial.objective(link, hw.EmulatedSensor(bench))
         measured = objective(drives)
         asked = torch.stack([evaluation.drive for evaluation in objective.log.evaluations])
@@ -80,13 +74,10 @@ def test_drives_of_any_leading_dimensions_are_played_in_a_row(trial, leading):
 
 
 def test_an_evaluation_is_logged_before_the_next_is_played(trial):
-    def watch(_: int) -> None:
-        lines.append(trial.log.read_bytes().count(b"\n"))
-
     lines: list[int] = []
-    bench = trial.bench()
-    with trial.link(bench) as link:
-        trial.objective(link, Disturbed(bench, watch))(full_on().expand(3, -1))
+    with trial.limited() as (bench, link):
+        sensor = Disturbed(bench, lambda _: lines.append(trial.log.read_bytes().count(b"\n")))
+        trial.objective(link, sensor)(FULL.expand(3, -1))
     assert lines == [1, 2, 3]  # the first says what the trial is
 
 
@@ -96,7 +87,7 @@ def test_the_outputs_are_off_before_and_after_however_it_ends(trial, error: type
     assert bench.firmware.drive().abs().min() > 0.9  # the device starts with all transducers on
     with pytest.raises(error), trial.link(bench) as link:  # noqa: PT012
         assert bench.firmware.drive().abs().max() == 0
-        link.play(full_on())
+        link.play(FULL)
         assert bench.drive().abs().min() > 0.9
         raise error
     assert bench.firmware.drive().abs().max() == 0
@@ -109,7 +100,7 @@ def test_the_outputs_are_off_before_and_after_however_it_ends(trial, error: type
 def test_the_outputs_are_off_after_a_frame_that_broke_off(trial, device: hw.Device, sent: int):
     bench = trial.bench(device)
     with trial.link(bench, device) as link:
-        link.play(full_on())
+        link.play(FULL)
         bench.chip.write(device.frame(torch.ones(device.transducers, dtype=torch.complex128))[:sent])
     assert bench.firmware.drive().abs().max() == 0
     if device is hw.SONICSURFACE:
@@ -118,11 +109,10 @@ def test_the_outputs_are_off_after_a_frame_that_broke_off(trial, device: hw.Devi
 
 
 def test_the_sensor_reads_with_the_noise_of_its_snr(trial):
-    bench = trial.bench()
-    sensor = hw.EmulatedSensor(bench, snr=10.0)
-    variance = random_rms(bench.transfer_matrix) ** 2 / 10
-    with trial.link(bench) as link:
-        for drive in (full_on(), 0 * full_on()):
+    with trial.limited() as (bench, link):
+        sensor = hw.EmulatedSensor(bench, snr=10.0)
+        variance = random_rms(bench.transfer_matrix) ** 2 / 10
+        for drive in (FULL, 0 * FULL):
             link.play(drive)
             power = torch.stack([sensor.read() for _ in range(1000)]).square()
             expected = bench.pressure().abs().square() + variance  # E|p + n|^2
@@ -130,27 +120,24 @@ def test_the_sensor_reads_with_the_noise_of_its_snr(trial):
             assert ((power.mean(dim=0) - expected).abs() < 5 * power.std(dim=0) / 1000**0.5).all()
 
 
-def test_a_scene_of_other_transducers_is_refused(trial):
+def test_links_matrices_and_settings_of_another_trial_are_refused(trial):
     bench = trial.bench()
-    with hw.open_link(hw.SONICSURFACE, torch.tensor([5, 3]), backend=bench.bus) as link:
+    sensor, link_of = hw.EmulatedSensor(bench), partial(hw.open_link, hw.SONICSURFACE, backend=bench.bus)
+    with link_of(torch.tensor([5, 3])) as link:
         assert link.transducers.tolist() == [5, 3]
-    with (
-        hw.open_link(hw.SONICSURFACE, backend=bench.bus) as link,
-        pytest.raises(ValueError, match="must be 16"),
-    ):
-        trial.objective(link, hw.EmulatedSensor(bench))
-    with trial.link(bench) as link, pytest.raises(ValueError, match="no trial without an amplitude limit"):
-        hw.HardwareObjective(trial.scene, link, hw.EmulatedSensor(bench), trial.log)
+    with link_of() as link, pytest.raises(ValueError, match="must be 16"):
+        trial.objective(link, sensor)
     with trial.link(bench) as link:
-        limited, matrix = hw.LimitedLink(link, hw.Limits(1.0)), trial.simulated.transfer_matrix.T
-        rest = hw.EmulatedSensor(bench), trial.log
+        with pytest.raises(ValueError, match="no trial without an amplitude limit"):
+            hw.HardwareObjective(trial.scene, link, sensor, trial.log)
+        objective = partial(
+            hw.HardwareObjective, trial.scene, hw.LimitedLink(link, hw.Limits(1.0)), sensor, trial.log
+        )
         with pytest.raises(ValueError, match=r"transfer_matrix: shape \(16, 2\); must be \(2, 16\)"):
-            hw.HardwareObjective(trial.scene, limited, *rest, transfer_matrix=matrix)
-    for settings in ({1}, {"gain": torch.ones(1)}):
-        with trial.link(bench) as link:
-            limited = hw.LimitedLink(link, hw.Limits(1.0))
+            objective(transfer_matrix=trial.simulated.transfer_matrix.T)
+        for settings in ({1}, {"gain": torch.ones(1)}):
             with pytest.raises(ValueError, match=r"settings: .* what JSON can hold"):
-                hw.HardwareObjective(trial.scene, limited, hw.EmulatedSensor(bench), trial.log, settings)
+                objective(settings)
     with pytest.raises(ValueError, match="from 0 to 255, each once"):
-        hw.open_link(hw.SONICSURFACE, [3, 3], backend=bench.bus)
+        link_of([3, 3])
     assert bench.firmware.drive().abs().max() == 0

@@ -63,7 +63,7 @@ class OpenMPDBoard:
 
     Attributes:
         name: first line of the file; drivers take it as the serial number of the USB chip.
-        positions: (M, 3) [m], float64, in the board's own axes; it emits along z.
+        positions: (M, 3) [m], float64, in the axes of the board, which emits along z.
         pins: place of each transducer in a message to the board, a permutation of 0 to M - 1.
         phase_offsets: (M,) [rad], float64, by which each transducer is ahead in arg q.
             That the file counts them in degrees is inferred from its values.
@@ -133,7 +133,7 @@ class OpenMPDBoard:
         source_strength: float = OPENMPD_SOURCE_STRENGTH,
         radius: float | None = TRANSDUCER_RADIUS,
     ) -> TransducerArray:
-        """Return the board in space; by default in its own axes.
+        """Return the board in space; by default in its axes of the file.
 
         Args:
             center: place of the origin of its axes (3,) [m].
@@ -268,7 +268,7 @@ OPENMPD = _OpenMPD(
 def openmpd_boards(boards: Sequence[OpenMPDBoard]) -> Device:
     """Return `boards` of OpenMPD as their files describe them: in the files' order, calibrated, by pin.
 
-    A board has 256 transducers, and is found by its name as the serial number of its chip. Boards change over
+    A board has 256 transducers, and its name is the serial number of its chip. Boards change to a new drive
     one after the other, as their messages arrive.
 
     `ValueError` for no board, one of another number of transducers, or two of the same name.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 
@@ -32,7 +33,7 @@ class EmulatedBench:
         transducers: Sequence[int] | torch.Tensor | None = None,
         failed: Sequence[int] = (),
         *,
-        dead: Sequence[int] | None = None,
+        dead: Any = None,
     ) -> None:
         """Plug the device in, on its usual chip.
 

@@ -1,6 +1,6 @@
 """Sensors of the pressure at the control points: an oscilloscope, a person, a file.
 
-A sensor is its class, with that of its config, in a module, and a line in `SENSORS`.
+A sensor is a class and the class of its config, in a module, and a line in `SENSORS`.
 """
 
 from autdtorch.hardware.sensors.by_hand import ManualConfig

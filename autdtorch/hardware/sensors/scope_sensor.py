@@ -61,7 +61,7 @@ class Fit(NamedTuple):
 class LockIn:
     """A fit of an offset and a sine of known frequency: least squares, weighted by a Hann window.
 
-    Offset and sine are found exactly for any number of periods. The window suppresses hum, slow drift and
+    Offset and sine are exact for any number of periods. The window suppresses hum, slow drift and
     harmonics, which disturb a plain fit where that number is not whole. White noise causes an error sqrt(3/2)
     times the lowest bound of unbiased estimates (Rife and Boorstyn 1974, doi:10.1109/TIT.1974.1055282).
 
@@ -173,7 +173,7 @@ class ScopeSensor:
         self.recaptures = 0
         if not self._scales or len(self._scales) < len(self._microphones):
             inputs = [one.input for one in self._microphones]
-            raise invalid("microphones", inputs, "must be at inputs of their own, at least one")
+            raise invalid("microphones", inputs, "must be at different inputs, at least one")
         scope.set_up(self._scales.keys(), _PERIODS_A_DIVISION / self._frequency)
 
     def read(self) -> torch.Tensor:
@@ -195,7 +195,7 @@ class ScopeSensor:
 
     def _capture(self) -> torch.Tensor:
         """Return powers (P, 2) [Pa^2] at the frequency, and of the noise in them, on fitting scales."""
-        once_clipped: set[int] = set()  # not on a finer scale again in this reading, so that it ends
+        once_clipped: set[int] = set()  # inputs that get no finer scale in this reading, so that it ends
         while True:
             waveforms = self._scope.capture(self._scales)
             lock_in = self._lock_in(waveforms)

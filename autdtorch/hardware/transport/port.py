@@ -32,7 +32,7 @@ def closed_on_error(close: Callable[[], None]) -> Iterator[None]:
 class Port(Protocol):
     """A port that takes the bytes for one device; methods that fail raise `LinkError`.
 
-    A port that subclasses this does nothing in the methods that it leaves out.
+    A subclass does nothing in the methods that it leaves out.
     """
 
     def write(self, data: bytes) -> None:
@@ -40,15 +40,12 @@ class Port(Protocol):
 
     def flush(self) -> None:
         """Wait until all bytes have left the chip, if the chip can say so."""
-        return
 
     def recover(self) -> None:
         """Clear a stall and drop waiting bytes after a write that broke off."""
-        return
 
     def close(self) -> None:
         """Release the device."""
-        return
 
 
 @dataclass
@@ -131,11 +128,8 @@ class SerialPort:
         try:
             yield
         except Exception as error:  # termios.error is no OSError
-            there = f". Ports: {_listed()}" if hint else ""
+            from serial.tools.list_ports import comports
+
+            ports = [f"{port.device} ({port.description})" for port in comports()] if hint else []
+            there = f". Ports: {', '.join(ports) or 'none'}" if hint else ""
             raise LinkError(f"{self._name} cannot {what}: {error}{there}") from error
-
-
-def _listed() -> str:
-    from serial.tools.list_ports import comports
-
-    return ", ".join(f"{port.device} ({port.description})" for port in comports()) or "none"

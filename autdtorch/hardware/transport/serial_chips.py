@@ -25,7 +25,7 @@ _TRANSMITTER_EMPTY = 0x40  # of the second status byte
 _FLUSH_SECONDS = 1.0
 _EIGHTHS = (0, 3, 2, 4, 1, 5, 6, 7)  # code of the fraction 0/8 ... 7/8 of a baud divisor
 
-_VENDOR_QUESTION = 0xC0  # bmRequestType: vendor's own, from the device
+_VENDOR_QUESTION = 0xC0  # bmRequestType: of the vendor, from the device
 _CDC_REQUEST, _CDC_LINE_CODING = 0x21, 0x20  # to the interface, of its class
 _READ_MS = 50
 
@@ -67,7 +67,7 @@ class FtdiUart(FtdiFifo):
 
 
 class CdcUart(UsbPort):
-    """A serial port of USB's own class, as on an Arduino Mega 2560: 8 bits, no parity, 1 stop bit.
+    """A serial port of the USB class CDC, as on an Arduino Mega 2560: 8 bits, no parity, 1 stop bit.
 
     A thread reads and drops all input, as cdc_acm does: an Ultraino echoes commands and the bytes for its
     next board. Older firmwares of the Arduino's chip (Arduino-usbserial on LUFA 100807) pause for 0.1 s at

@@ -12,7 +12,7 @@ from autdtorch.utils.validation import require_kind
 
 #: Rules that let users write to the devices on Linux; to be copied to /etc/udev/rules.d.
 UDEV_RULES = Path(__file__).with_name("70-autdtorch.rules")
-#: bmRequestType: vendor's own, recipient device; to the device.
+#: bmRequestType: of the vendor, to the device.
 VENDOR_REQUEST = 0x40
 
 _DIRECTION, _TRANSFER_TYPE, _BULK = 0x80, 0x03, 0x02
@@ -65,10 +65,10 @@ class UsbPort(Port):
         """Send all of `data`."""
         sent = 0
         while sent < len(data):
-            taken = self._call("be written to", self._out.write, data[sent:], self._timeout_ms)
-            if taken == 0:
+            written = self._call("be written to", self._out.write, data[sent:], self._timeout_ms)
+            if written == 0:
                 raise LinkError(f"{_described(self._device)} took {sent} of {len(data)} bytes")
-            sent += taken
+            sent += written
 
     def recover(self) -> None:
         """Clear a stall, and drop waiting bytes if the chip has a request for that."""
@@ -82,13 +82,15 @@ class UsbPort(Port):
         usb.util.dispose_resources(self._device)
         try:
             while self._detached:
-                self._call("be given back", self._device.attach_kernel_driver, self._detached.pop())
+                self._call("be released", self._device.attach_kernel_driver, self._detached.pop())
         finally:
             usb.util.dispose_resources(self._device)
 
-    def _set_up(self) -> None: ...
+    def _set_up(self) -> None:
+        """Send the settings of the chip."""
 
-    def _purge(self) -> None: ...
+    def _purge(self) -> None:
+        """Drop bytes that wait in the chip."""
 
     def _take(self) -> None:
         import usb.util
