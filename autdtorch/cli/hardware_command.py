@@ -183,7 +183,7 @@ class _Trial:
 @contextlib.contextmanager
 def _silence_expected() -> Iterator[None]:
     """Keep an oscilloscope from warning of silence."""
-    scope = logging.getLogger("autdtorch.hardware.sensors.scope_sensor")
+    scope = logging.getLogger("autdtorch.hardware.sensors")
     scope.setLevel(logging.ERROR)
     try:
         yield

@@ -78,9 +78,8 @@ class Link(contextlib.AbstractContextManager["Link"]):
     def play(self, drive: torch.Tensor) -> None:
         """Play a drive (M,) on the nearest levels, until the next; return when the sound is steady.
 
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-            LinkError: the device does not take the bytes, or is closed.
+        `ValueError` for another shape, not finite complex numbers or an amplitude above 1; `LinkError` if the
+        link is closed.
         """
         self.begin(drive)
         self.wait_for_sound()
@@ -178,8 +177,8 @@ def open_link(
 
     Raises:
         LinkError: none or several such devices, or it does not take the bytes.
-        ValueError: no `Device`; `transducers` that it does not have, or one twice; `settle` out of range; a
-            `serial` for a device of several boards; or a `port` for one without a serial line.
+        ValueError: as of `Link`; a `serial` for a device of several boards, or a `port` for one without a
+            serial line.
     """
     require_device(device)
     opened = device.open_port({"serial": serial, "port": port}, backend)
@@ -202,11 +201,8 @@ def open_autd3(
         network: `autd3.UdpOption` or `autd3.ServerLink`; by default UDP on the interface that finds them.
         settle: time that a drive plays before its pressure is read [s].
 
-    Raises:
-        LinkError: they are not there, or do not take the commands.
-        ImportError: the packages autd3 and autd3-pattern are missing.
-        ValueError: `boards` out of range; `transducers` that they do not have, or one twice; or `settle`
-            out of range.
+    `LinkError` if they are not there or do not take the commands, `ImportError` without the packages autd3
+    and autd3-pattern, `ValueError` as of `Link` or for `boards` out of range.
     """
     device = AUTD3.with_boards(boards)
     return Link(device, device.open_port({"network": network}), transducers, settle)

@@ -50,10 +50,10 @@ class EvaluationLog:
     """A file with a line of JSON for the trial's settings, for each evaluation, and for each process's end.
 
     A line is on disk before the next evaluation begins: a process that ends at any moment loses at most the
-    evaluation in flight. The log is locked until `end`, or until this object is released.
+    evaluation in progress. The log is locked until `end`, or until this object is released.
 
-    Attributes are its `path`, the `origin`, `goes_on`, true if the file has existed before, and `seconds_on`,
-    the total time that the outputs were on, by its lines [s].
+    Attributes are its `path`, the `origin`, `goes_on`, true if the file existed before, and `seconds_on`, the
+    total time that the outputs were on [s].
     """
 
     def __init__(self, path: str | Path, origin: Mapping[str, Any], transducers: int, points: int) -> None:
@@ -98,10 +98,9 @@ class EvaluationLog:
     def recorded(self, number: int, drive: torch.Tensor) -> Evaluation | None:
         """Return the evaluation of a `number`, from 0, and a requested `drive` (M,); None if it must be made.
 
-        An evaluation whose line was lost is made again, and its reading may differ. A later evaluation stays
-        valid if the method asks for the recorded drive, and is made again otherwise.
-
-        `LogError` if it has another drive, and no earlier line was lost.
+        An evaluation whose line was lost is made again, and its reading may differ. A later one stays valid
+        if the method asks for its drive, and is made again otherwise. `LogError` if the evaluation has
+        another drive although no earlier line was lost.
         """
         evaluation = self._evaluations.get(number)
         if evaluation is None or torch.equal(evaluation.drive, drive):

@@ -102,10 +102,9 @@ class HardwareObjective:
         Raises:
             ValueError: no drive, another shape, not finite complex numbers, or an amplitude above 1; or a
                 sensor that does not give a finite magnitude for each control point.
-            LogError: the log is of other drives, or has changed meanwhile.
+            LogError: the log has changed meanwhile.
             LimitError: a limit of the trial is reached.
-            LinkError: the device does not take the bytes.
-            OSError: the log cannot be written.
+            OSError: the device does not take the bytes, or the log cannot be written.
         """
         return observe_drives(self._observe, drive, len(self.scene.array))
 

@@ -47,7 +47,7 @@ class LimitError(RuntimeError):
 
 
 class Signalled(KeyboardInterrupt):
-    """A signal, by its `number`, ends the trial."""
+    """The signal of a `number` ends the trial."""
 
     def __init__(self, number: int) -> None:
         """Name the signal."""
@@ -59,15 +59,11 @@ class Signalled(KeyboardInterrupt):
 def ended_by_signals() -> Iterator[None]:
     """Raise `Signalled` at signals that end or stop a process, so that links are closed on the way out.
 
-    The signals are Ctrl-C, Ctrl-Z, SIGTERM, SIGHUP, SIGQUIT and SIGTTIN; an ignored one, as by ``nohup``,
-    stays ignored. While a `Signalled` is on its way out, further signals do not raise: they must not
-    interrupt the switching off. Python drops what is raised in a ``__del__``: a signal that comes there comes
-    again when it has ended. After what is dropped elsewhere, as in a callback, the next signal does raise.
-    Use it around the link.
-
-    Raises:
-        Signalled: such a signal came.
-        ValueError: it is used outside of the main thread, which alone receives signals.
+    Use it around the link, in the main thread, which alone receives signals; elsewhere `ValueError`. The
+    signals are Ctrl-C, Ctrl-Z, SIGTERM, SIGHUP, SIGQUIT and SIGTTIN; an ignored one, as by ``nohup``, stays
+    ignored. While a `Signalled` is on its way out, further signals do not raise: they must not interrupt the
+    switching off. Python drops errors in a ``__del__``: a signal that comes there is sent again after it.
+    Where Python drops a `Signalled` elsewhere, as in a callback, the next signal raises.
     """
     outside = sys.exception()
 
@@ -101,7 +97,7 @@ def ended_by_signals() -> Iterator[None]:
 
 
 def _finalises(frame: FrameType | None) -> bool:
-    """Tell whether a frame runs in a ``__del__``."""
+    """Return true if a frame runs in a ``__del__``."""
     while frame is not None:
         if frame.f_code.co_name == "__del__":
             return True
@@ -153,7 +149,7 @@ class LimitedLink:
     """A link that plays within the `limits` of a trial, and switches off by itself when the time is up.
 
     Methods raise `LinkError` if the device does not take the bytes. Attributes are the `link`, the `limits`,
-    and `logs`, the files of the trials that it plays for; the time on before each is counted.
+    and `logs`, the logs whose time on was counted.
     """
 
     def __init__(self, link: Link, limits: Limits) -> None:
@@ -193,9 +189,8 @@ class LimitedLink:
 
         The time may end while the sound settles: `reading` and `require_on` raise then.
 
-        Raises:
-            LimitError: the time limit of the outputs is reached.
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+        `LimitError` if the time limit of the outputs is reached; `ValueError` for another shape, not finite
+        complex numbers or an amplitude above 1.
         """
         asked = self._scale.asked(drive)
         if self._stretch() > self.limits.seconds_in_a_row / 2:  # leave the other half to the sensor
@@ -222,11 +217,8 @@ class LimitedLink:
     def reading(self, sensor: Sensor, points: int) -> torch.Tensor:
         """Return the reading (P,) [Pa] of a sensor while the outputs are on.
 
-        Raises:
-            LimitError: the outputs went off meanwhile; a reading that goes on is interrupted, as
-                `checked_reading` does.
-            SensorError: the sensor gives no trustworthy reading.
-            ValueError: no sensor, `points` below 1, or a reading that is not P finite magnitudes.
+        `LimitError` if they go off meanwhile, which interrupts the reading; `SensorError` if the sensor has
+        no trustworthy reading; `ValueError` for no sensor, or for other than P >= 1 finite magnitudes.
         """
         require_kind("sensor", sensor, Sensor)
         points = integer_at_least("points", points, 1)

@@ -41,7 +41,7 @@ def on_the_wire(device: hw.Device, drive: torch.Tensor) -> bytes:
 
 
 # Phase phi [rad] and amplitude of one transducer, then place and value of its byte. The byte is
-# round(-32 phi / 2 pi) mod 32, at 1 + the channel that the SonicSurface's own table gives.
+# round(-32 phi / 2 pi) mod 32, at 1 + the channel that SonicSurface's table gives.
 SONICSURFACE_EXAMPLES = [
     (0, 0.0, 1.0, 1, 0),
     (0, math.pi / 2, 1.0, 1, 24),  # a quarter of a period early is three quarters late

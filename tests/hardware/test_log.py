@@ -130,6 +130,7 @@ def test_an_evaluation_that_cannot_have_been_measured_is_measured_again(trial, b
         lambda lines: [*lines[:4], lines[3], *lines[4:]],
         lambda lines: [*lines[:3], lines[5], lines[4], lines[3], *lines[6:]],
         lambda lines: [*lines, *lines],
+        lambda lines: [*lines[:-1], lines[-1][:-2]],
     ],
 )
 def test_damage_costs_the_evaluations_it_touches_alone(trial, bench, begin, damage, caplog):
@@ -140,8 +141,8 @@ def test_damage_costs_the_evaluations_it_touches_alone(trial, bench, begin, dama
     sensor = Noisy(bench)
     again = observed(begin(sensor), drives(), 0)
     assert sensor.readings == len(set(lines[1:]) - set(damaged))
-    kept = (again == measured).all(dim=1)
-    assert int(kept.sum()) == len(set(lines[1:]) & set(damaged))
+    same = (again == measured).all(dim=1)
+    assert int(same.sum()) == len(set(lines[1:]) & set(damaged))
     caplog.clear()
     assert torch.equal(observed(begin(sensor), drives(), 0), again)
     assert not caplog.messages

@@ -266,9 +266,9 @@ def test_a_method_finds_the_simulations_focus_through_a_noisy_oscilloscope(trial
     with trial.link(bench) as link, hw.open_scope(CHIP, backend=bench.bus) as oscilloscope:
         microphones = [hw.Microphone(number, SENSITIVITY, loudest) for number in (1, 2)]
         sensor = hw.ScopeSensor(oscilloscope, FREQUENCY, microphones)
-        found = gabs(trial.objective(link, sensor), levels=4)
+        solution = gabs(trial.objective(link, sensor), levels=4)
     expected = gabs(trial.played(), levels=4).score
-    assert float(trial.simulated(found.drive).min()) == pytest.approx(float(expected), rel=0.05)
+    assert float(trial.simulated(solution.drive).min()) == pytest.approx(float(expected), rel=0.05)
 
 
 @pytest.mark.parametrize("microphones", [[], [hw.Microphone(1, 0.01, 1.0), hw.Microphone(1, 0.01, 1.0)]])

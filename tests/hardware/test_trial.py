@@ -27,16 +27,16 @@ FULL = torch.ones(16, dtype=torch.complex128)
 def test_without_noise_a_method_finds_the_same_drive_as_in_simulation(trial, device, method, amplitude):
     with trial.limited(device, amplitude=amplitude) as (bench, link):
         measured = trial.objective(link, hw.EmulatedSensor(bench))
-        found = method(measured)
-        link.play(found.drive[0])
+        solution = method(measured)
+        link.play(solution.drive[0])
         full = bench.drive().abs().max()
-        torch.testing.assert_close(bench.drive(), full * found.drive[0], rtol=0, atol=1e-12)
+        torch.testing.assert_close(bench.drive(), full * solution.drive[0], rtol=0, atol=1e-12)
     played = trial.played(device, amplitude)
     expected = method(played)
-    assert torch.equal(found.drive, expected.drive)
+    assert torch.equal(solution.drive, expected.drive)
     # The same products, summed in another order.
-    torch.testing.assert_close(found.pressure, full * expected.pressure, rtol=1e-12, atol=0)
-    assert measured.evaluations == played.evaluations == int(found.evaluations)
+    torch.testing.assert_close(solution.pressure, full * expected.pressure, rtol=1e-12, atol=0)
+    assert measured.evaluations == played.evaluations == int(solution.evaluations)
 
     lines = [json.loads(line) for line in trial.log.read_text().splitlines()[1:]]
     assert len(lines) == measured.evaluations
@@ -106,6 +106,45 @@ def test_the_outputs_are_off_after_a_frame_that_broke_off(trial, device: hw.Devi
     if device is hw.SONICSURFACE:
         bench.chip.write(b"\xfd")  # swaps the two patterns
         assert bench.firmware.drive().abs().max() == 0
+
+
+@pytest.mark.parametrize("snr", [None, 30.0])
+def test_the_check_finds_the_failed_transducers(trial, snr):
+    read: list[str] = []
+    with trial.limited(failed=[3, 9]) as (bench, link):
+        sensor = hw.EmulatedSensor(bench, snr)
+        check = hw.check_transducers(link, sensor, points=2, watch=read.append)
+        assert check.failed == [3, 9]
+        assert read == ["silence, outputs off", *(f"transducer {n} of 16" for n in range(1, 17))]
+        assert bench.firmware.drive().abs().max() == 0
+        assert hw.hears_silence(sensor, check, points=2)
+        link.play(FULL)
+        assert not hw.hears_silence(sensor, check, points=2)
+
+
+@pytest.mark.parametrize("count", [2**62, 10_001, 0])
+def test_numbers_of_readings_are_such_as_end(trial, count):
+    with trial.limited() as (bench, link):
+        for name in ("readings", "background"):
+            with pytest.raises(ValueError, match=name):
+                hw.check_transducers(link, hw.EmulatedSensor(bench), 2, **{name: count})
+        assert link.seconds_on == 0
+
+
+def test_a_transducer_20_db_below_the_others_has_failed_where_silence_is_read_as_0(trial):
+    class Leaking(hw.EmulatedSensor):
+        leak = 0.0
+
+        def read(self):
+            return super().read() + self.leak * float(bench.firmware.drive().abs().max())
+
+    typical = float(trial.simulated.transfer_matrix.abs().median())
+    with trial.limited(failed=[3]) as (bench, link):
+        sensor = Leaking(bench)
+        for share, failed in ((0.05, [3]), (0.2, [])):  # of the amplitude; 20 dB are 0.1
+            sensor.leak = share * typical
+            check = hw.check_transducers(link, sensor, points=2)
+            assert (check.silence, check.failed) == (0, failed)
 
 
 def test_the_sensor_reads_with_the_noise_of_its_snr(trial):

@@ -1,4 +1,4 @@
-"""Devices on USB as pyusb sees them: chips found and set up, bytes sent, errors explained."""
+"""Devices on USB as pyusb sees them: chips looked up and set up, bytes sent, errors explained."""
 
 import errno
 import sys

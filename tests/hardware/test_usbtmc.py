@@ -16,7 +16,7 @@ CHIP = (0x1AB1, 0x04CE)
 
 
 class Echo:
-    """Answers with what it was given to say."""
+    """Answers every line alike."""
 
     def __init__(self, said: bytes) -> None:
         self.said = said

@@ -24,7 +24,10 @@ _BITS = 10  # of a byte on a serial line: start, 8, stop
 
 
 class Firmware(Protocol):
-    """The emulated firmware of a device, from its sources; `baud` [bits/s] of its line, None for a FIFO."""
+    """Emulated firmware, written from a device's sources.
+
+    `baud` [bits/s] is the rate of its serial line; None for a FIFO.
+    """
 
     baud: ClassVar[int | None]
 
@@ -149,7 +152,7 @@ class Device(ABC):
         return self.phase_levels.nearest(checked.detach())
 
     def drive(self, *levels: ArrayLike) -> torch.Tensor:
-        """Return the drive (..., M), complex128, that the device emits for levels as of `levels`.
+        """Return the drive (..., M), complex128, that the device emits for integer levels, by column.
 
         `ValueError` for another number of levels, other shapes, or not integers of their range.
         """
@@ -157,7 +160,7 @@ class Device(ABC):
         return self.phase_levels.drive(*self._checked(levels, most))
 
     def quantised(self, drive: ArrayLike) -> torch.Tensor:
-        """Return the drive (..., M) that the device emits for another: the nearest on its levels."""
+        """Return the nearest drive (..., M) that the device can emit."""
         return self.drive(*self.levels(drive))
 
     def frame(self, drive: ArrayLike) -> bytes:

@@ -51,10 +51,10 @@ class _Ultraino(Device):
 class _UltrainoFirmware:
     """Boards in a row (DriverMEGA.ino).
 
-    A board starts with all pins high in the first half of the period. Bytes whose lower half is 1 are for it;
-    others it passes on, less 1, and commands as they are. There are two buffers of 32 patterns: one is
-    emitted, pattern after pattern for their durations in periods; the other is written. The switch alone
-    takes the place of writing back to the start.
+    A board starts with all pins high in the first half of the period. It takes bytes whose low half is 1, and
+    passes others on, less 1; commands are passed on unchanged. Of two buffers of 32 patterns, one is emitted,
+    each pattern for its duration in periods, and the other is written. Only the switch of the buffers moves
+    writing back to the start.
     """
 
     baud: ClassVar[int | None] = 115_200

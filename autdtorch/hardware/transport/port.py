@@ -40,12 +40,15 @@ class Port(Protocol):
 
     def flush(self) -> None:
         """Wait until all bytes have left the chip, if the chip can say so."""
+        return
 
     def recover(self) -> None:
         """Clear a stall and drop waiting bytes after a write that broke off."""
+        return
 
     def close(self) -> None:
         """Release the device."""
+        return
 
 
 @dataclass
