@@ -62,7 +62,7 @@ def require_that_it_goes_on(trial, device: hw.Device = hw.SONICSURFACE) -> None:
     assert sensor.readings == EVALUATIONS - SURVIVED
     expected = METHOD(trial.played(device))
     assert torch.equal(solution.drive, expected.drive)
-    torch.testing.assert_close(solution.history, expected.history, rtol=1e-12, atol=0)  # another order of sums
+    torch.testing.assert_close(solution.history, expected.history, rtol=1e-12, atol=0)  # sums reordered
 
 
 @devices
