@@ -54,7 +54,7 @@ NOT_CALLED_BY_USERS = {
 #: Methods that the driver calls, and that authors of methods implement.
 INSIDE_METHODS = {"advance", "begin", "check", "most_at_once", "most_evaluations", "numbers_kept"}
 INSIDE_METHODS |= {"checked", "forward", "levels", "recorded", "require_fit", "slope"}
-INSIDE_METHODS |= {"wanted"}
+INSIDE_METHODS |= {"at", "farthest", "near", "section", "wanted", "write_file"}
 
 
 class Made(NamedTuple):

@@ -1,10 +1,20 @@
+"""Arrays, and files of them."""
+
 import math
 
 import numpy as np
 import pytest
 import torch
 
-from autdtorch.scene.arrays import AUTD3_UNIT, PAPER_SOURCE_STRENGTH, TransducerArray
+from autdtorch.hardware.devices.openmpd import OpenMPDBoard
+from autdtorch.io.array_file import load_array
+from autdtorch.io.scene_file import load_scene
+from autdtorch.scene.arrays import (
+    AUTD3_UNIT,
+    OPENMPD_SOURCE_STRENGTH,
+    PAPER_SOURCE_STRENGTH,
+    TransducerArray,
+)
 from autdtorch.scene.geometry import circle_points
 from autdtorch.utils.spatial import distances
 
@@ -123,3 +133,140 @@ def test_devices_go_where_they_are_put(device):
     assert turned.normals[0].tolist() == [0, 1, 0]
     assert turned.radius == 4.5e-3
     assert make((0, 0, 0), source_strength=2.0, radius=0).source_strength == 2.0
+
+
+BOARD = """FT123456
+4
+128
+(-0.005, 0.005, 0.0),(-0.005, -0.005, 0.0),(0.005, 0.005, 0.0),(0.005, -0.005, 0.0),
+2,0,
+3,1,
+90,-45,0,
+180,
+1.000000,0.500000,1.000000,1.000000,
+"""
+
+
+@pytest.fixture
+def board(tmp_path):
+    path = tmp_path / "board_1.pat"
+    path.write_text(BOARD)
+    return path
+
+
+def test_board_is_read_in_full(board):
+    read = OpenMPDBoard.load(board)
+    assert (read.name, read.pins) == ("FT123456", (2, 0, 3, 1))
+    assert read.positions.tolist() == [[-5e-3, 5e-3, 0], [-5e-3, -5e-3, 0], [5e-3, 5e-3, 0], [5e-3, -5e-3, 0]]
+    assert read.phase_offsets.tolist() == pytest.approx([math.pi / 2, -math.pi / 4, 0, math.pi])
+    assert read.gains.tolist() == [1, 0.5, 1, 1]
+
+
+def test_calibrated_drive_takes_off_the_offsets_and_multiplies_by_the_gains(board):
+    sent = OpenMPDBoard.load(board).calibrated([1 + 0j, 1 + 0j, 1j, 1 + 0j])
+    # A transducer that is a quarter of a period ahead in arg q is sent a quarter less.
+    expected = torch.tensor([-1j, 0.5 * np.exp(0.25j * np.pi), 1j, -1 + 0j], dtype=torch.complex128)
+    torch.testing.assert_close(sent, expected, rtol=0, atol=1e-15)
+
+
+def test_a_drive_by_pin_has_each_transducer_at_its_pin(board):
+    drive = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.complex128)
+    assert OpenMPDBoard.load(board).by_pin(drive).tolist() == [0.2, 0.4, 0.1, 0.3]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("(0.005, 0.005, 0.0)", "(0.005, 0.005)"), r"board_1.pat, line 4: position .*; must be \(x, y, z\)"),
+        (("(-0.005, 0.005, 0.0),", ""), r"board_1.pat: 3 positions \(x, y, z\); must be 4"),
+        (("(-0.005,", "(abc,"), r"line 4: position 'abc'; must be a finite number"),
+        (("3,1,", "3,3,"), r"line 6: pin '3'; must be one of 0 to 3, each once"),
+        (("2,0,", "2,0.5,"), r"line 5: pin '0.5'; must be an integer"),
+        (("180,", "nan,"), r"line 8: phase offset 'nan'; must be a finite number"),
+        (("180,", ""), r"board_1.pat: 11 numbers after the positions; must be 4 pins, 4 phase offsets"),
+        (("0.500000", "1.5"), r"line 9: gain '1.5'; must be in \[0, 1\]"),
+        (("\n128\n", "\n256\n"), r"line 3: number of phase levels '256'; must be 128"),
+        (("\n4\n", "\nfour\n"), r"line 2: number of transducers 'four'; must be an integer"),
+        ((BOARD, "1\n"), r"board_1.pat: 1 lines; must hold"),
+    ],
+)
+def test_what_is_wrong_with_a_board_is_said_with_its_line(board, change, message):
+    board.write_text(BOARD.replace(*change))
+    with pytest.raises(ValueError, match=message):
+        OpenMPDBoard.load(board)
+
+
+def test_board_becomes_the_array_of_a_scene(board):
+    (board.parent / "scene.yaml").write_text("""
+frequency: 40e3
+medium: {density: 1.2, sound_speed: 343.0}
+array: {type: file, path: board_1.pat, center: [0, 0, 20e-3], normal: [0, 0, -1], radius: 0}
+control_points: {type: points, positions: [[0, 0, -80e-3]]}
+""")
+    array = load_scene(board.parent / "scene.yaml").array
+    # Facing -z, (u, v) is (x, -y), so that the board is turned over about x.
+    expected = OpenMPDBoard.load(board).positions * torch.tensor([1.0, -1.0, -1.0])
+    expected[:, 2] += 20e-3
+    torch.testing.assert_close(array.positions, expected, rtol=0, atol=1e-15)
+    assert (array.normals == torch.tensor([0.0, 0.0, -1.0])).all()
+    assert (array.source_strength, array.radius) == (OPENMPD_SOURCE_STRENGTH, 0)
+
+
+def test_csv_is_read_in_its_units_and_pointed_up_by_default(tmp_path):
+    path = tmp_path / "array.csv"
+    path.write_text("# my array\nz [m], x [mm], y [mm]\n0.5, 10, 20\n\n0.5, -10, 20\n")
+    array = load_array(path, source_strength=2.0)
+    torch.testing.assert_close(
+        array.positions, torch.tensor([[10e-3, 20e-3, 0.5], [-10e-3, 20e-3, 0.5]]).double(), rtol=0, atol=1e-9
+    )
+    assert array.normals.tolist() == [[0, 0, 1], [0, 0, 1]]
+    assert (array.source_strength, array.radius) == (2.0, 0)
+
+
+@pytest.mark.parametrize(
+    "text", ["x [mm];y [mm];z [mm]\n0;0;0\n10,5;0;0\n", "# mm\nx [mm]\ty [mm]\tz [mm]\n0\t0\t0\n10.5\t0\t0\n"]
+)
+def test_semicolons_and_tabs_separate_too(tmp_path, text):
+    (tmp_path / "array.csv").write_text(text, "utf-8")
+    positions = load_array(tmp_path / "array.csv").positions
+    assert positions.tolist() == [[0.0, 0.0, 0.0], [pytest.approx(10.5e-3), 0.0, 0.0]]
+
+
+def test_normals_turn_with_the_array(tmp_path):
+    path = tmp_path / "array.csv"
+    path.write_text("x [m],y [m],z [m],nx,ny,nz\n0.01,0,0,1,0,0\n0,0,0,0,0,2\n")
+    array = load_array(path, center=(0, 0, 1), normal=(1, 0, 0))
+    # Facing +x, the file's x goes to u = y and its z to x.
+    assert array.positions.tolist() == [[0, 0.01, 1], [0, 0, 1]]
+    assert array.normals.tolist() == [[0, 1, 0], [1, 0, 0]]
+
+
+def test_npz_needs_positions_and_normals_alone(tmp_path):
+    array = TransducerArray.grid((2, 3), 10e-3, (0, 0, 0), radius=4e-3)
+    np.savez(tmp_path / "array.npz", positions=array.positions, normals=array.normals)
+    read = load_array(tmp_path / "array.npz")
+    assert torch.equal(read.positions, array.positions)
+    assert torch.equal(read.normals, array.normals)
+    assert (read.source_strength, read.radius) == (PAPER_SOURCE_STRENGTH, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.csv", "x,y [m],z [m]\n", r"a.csv, line 1: column 'x'; must be x \[m\] or x \[mm\]"),
+        ("a.csv", "x [m],y [m],zz [m]\n", r"a.csv, line 1: unknown column 'zz'.*; allowed columns: x, y"),
+        ("a.csv", "x [m],x [mm]\n", r"line 1: columns x, x; every name must occur once"),
+        ("a.csv", "x [m],y [m]\n1,2\n", r"a.csv: no column z; must have x, y, z"),
+        ("a.csv", "x [m],y [m],z [m]\n1,2,3\n1,2\n", r"line 3: 2 cells; must be 3 as in the header"),
+        ("a.csv", "x [m],y [m],z [m]\n\n1,2,a\n", r"line 3, z: 'a'; must be a finite number"),
+        ("a.csv", "x [m],y [m],z [m]\n", r"a.csv: no row under the header"),
+        ("a.csv", "", r"a.csv: empty"),
+        ("a.csv", "x [m],y [m],z [m]\n0,0,0\n0,0,0\n", r"a.csv: TransducerArray.positions: points 0 and 1"),
+        ("a.npz", "text", r"a.npz: .*; must hold plain NumPy arrays"),
+        ("a.txt", "", r"path: .*a.txt'; must end in one of .csv, .npz, .pat"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_said_with_its_line(tmp_path, name, text, message):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=message):
+        load_array(tmp_path / name)

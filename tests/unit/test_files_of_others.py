@@ -103,7 +103,7 @@ def test_what_is_ambiguous_is_refused_with_what_to_write(tmp_path, text, message
 
 @given(
     st.lists(st.tuples(st.floats(-1, 1), st.floats(1e-3, 10), st.floats(0, 4e-3)), min_size=1, max_size=6),
-    st.sampled_from([".csv", ".npz"]),
+    st.sampled_from([".csv", ".NPZ"]),
     st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda n: math.hypot(*n) > 0.1),
 )
 @settings(max_examples=40, deadline=None)

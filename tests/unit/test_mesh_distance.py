@@ -1,6 +1,5 @@
 """Signed distances to meshes, and where the solver asks for them."""
 
-import pickle
 from dataclasses import replace
 
 import igl
@@ -65,13 +64,6 @@ def test_parts_that_touch_at_an_edge_know_their_insides():
     bodies = [CUBOID, replace(CUBOID, center=(2.0, 3.0, 0.0))]
     nearest = torch.stack([body.signed_distance(points) for body in bodies]).amin(dim=0)
     assert torch.allclose(mesh.signed_distance(points), nearest, rtol=0, atol=1e-12)
-
-
-def test_a_mesh_can_be_pickled_after_its_use():
-    mesh = Mesh.from_surface(CUBOID.surface(), rigid=True)
-    points = torch.rand(9, 3, dtype=torch.float64)
-    found = mesh.signed_distance(points)
-    assert torch.equal(pickle.loads(pickle.dumps(mesh)).signed_distance(points), found)
 
 
 BODIES = {

@@ -75,23 +75,6 @@ def test_overlapping_obstacles_of_different_materials_are_named():
     assert caught[0].filename == __file__
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"frequency": 40.0},
-        {
-            "array": TransducerArray.grid((4, 4), pitch=10.0, center=(1.0, 50.0, 50.0)),
-            "control_points": circle_points((80.0, 50.0, 50.0), 30.0, 4, (1, 0, 0)),
-        },
-    ],
-    ids=["kHz", "mm"],
-)
-def test_a_scene_that_seems_to_be_in_other_units_is_told(changes):
-    with pytest.warns(ScaleWarning, match="are lengths in m and the frequency in Hz") as caught:
-        paper_scene(**changes)
-    assert caught[0].filename == __file__
-
-
 def test_a_mesh_in_millimetres_is_told_how_to_scale_it():
     surface = Sphere((50.0, 50.0, 50.0), 8.0, rigid=True).surface()
     assert paper_scene(obstacles=[Mesh.from_surface(surface, 1e-3, rigid=True)])
