@@ -90,7 +90,7 @@ def reflection(normal, offset, spacing, incidence, azimuth=0.0, fluid=None):
 
 
 def _inner_wavenumber(incidence, fluid):
-    """The wavenumber across the surface inside a fluid, relative to that of air."""
+    """The wavenumber across the surface inside a fluid, relative to air."""
     speed = fluid.sound_speed / AIR.sound_speed if fluid else 1.0
     return cmath.sqrt(1 / speed**2 - math.sin(incidence) ** 2)
 
@@ -108,12 +108,12 @@ def _rows(cells, stencil, grid, middle, normal):
     values = around @ normal
     aside = np.linalg.norm(around - values[:, None] * normal / (normal @ normal), axis=1)
     most = math.ceil(DEPTH * np.linalg.norm(normal))
-    index = {int(flat): number for number, flat in enumerate(cells.index)}
+    index = {int(flat): place for place, flat in enumerate(cells.index)}
     rows = {}
-    for own in np.argsort(aside, kind="stable"):
-        place = int(values[own])
+    for number in np.argsort(aside, kind="stable"):
+        place = int(values[number])
         if abs(place) <= most and place not in rows:
-            flat = int(np.ravel_multi_index(tuple(middle + around[own]), grid.shape))
+            flat = int(np.ravel_multi_index(tuple(middle + around[number]), grid.shape))
             rows[place] = cells.weight[index[flat]] if flat in index else stencil.weights
             if flat in cells.sound_hard:
                 rows[place] = None

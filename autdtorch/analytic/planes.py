@@ -165,7 +165,7 @@ class Layering:
 
     Responses are pressures over the incident pressure at the front face, for horizontal wavenumbers kappa
     [rad/m]. They also hold for complex kappa, on the sheet that `vertical_wavenumber` defines. The transfer
-    matrix of a slab is multiplied by e^{i gamma_1 d}, so that decaying waves do not overflow, and contains
+    matrix of a slab is multiplied by e^{i gamma_1 d}, so that decaying waves do not overflow. It contains
     sin(gamma_1 x) / gamma_1, so that gamma_1 = 0 needs no special case.
 
     Source: Brekhovskikh & Godin, Acoustics of Layered Media I (1990), section 2.2 and chapter 2.

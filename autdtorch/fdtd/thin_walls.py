@@ -28,7 +28,7 @@ _PARALLEL = 0.85  # Least cosine of the angle between the faces of a wall
 _ALIKE = 2.0  # Ratio of densities up to which a thin wall of fluid causes only a small error
 
 _THINNEST = 0.32  # Least thickness of a rigid sheet [cells]
-_OPEN = 1e-9  # Thickness [cells] up to which a surface is not closed, such as that of a half-space
+_OPEN = 1e-9  # Thickness [cells] up to which a surface is open, as of a half-space
 _WIDE = 2.0  # Least extent [cells] of a sheet along two axes: needles would become much thicker than they are
 
 

@@ -1,4 +1,4 @@
-"""The adjoint run of the CPU kernel against autograd through the reference kernel, and against itself."""
+"""Gradients of records: the adjoint run of the CPU kernel, and autograd through the reference kernel."""
 
 from __future__ import annotations
 
@@ -11,7 +11,15 @@ from small_scenes import assembled_parts, small_scene
 
 from autdtorch.fdtd import adjoint
 from autdtorch.fdtd.adjoint import recorded
-from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources, State
+from autdtorch.fdtd.kernels.contract import (
+    Coefficients,
+    Columns,
+    Kernel,
+    Receivers,
+    Sources,
+    State,
+    uniform_state,
+)
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import Assembly
@@ -41,9 +49,9 @@ def differentiable(assembly: Assembly, sources: Sources) -> tuple[Assembly, Sour
     return replace(assembly, coefficients=coefficients), replace(sources, force=force)
 
 
-def gradients(given: Parts, kernel: Kernel | None) -> Gradients:
+def gradients(case: Parts, kernel: Kernel | None) -> Gradients:
     """Return the record and the derivatives of a random loss, by plain autograd without a kernel."""
-    assembly, sources, receivers, signal = given
+    assembly, sources, receivers, signal = case
     assembly, sources = differentiable(assembly, sources)
     if kernel is None:
         state, c = assembly.silence(sources), assembly.coefficients
@@ -58,17 +66,17 @@ def gradients(given: Parts, kernel: Kernel | None) -> Gradients:
 # float64: rounding over the steps; float32: the design's parity figure, of which rounding takes a tenth
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
 def test_gradients_are_those_of_the_reference_kernel(dtype: torch.dtype, tolerance: float) -> None:
-    given = parts(dtype, HEAVY, RIGID)
-    for value, oracle in zip(gradients(given, CpuKernel()), gradients(given, None), strict=True):
+    case = parts(dtype, HEAVY, RIGID)
+    for value, oracle in zip(gradients(case, CpuKernel()), gradients(case, None), strict=True):
         assert (value - oracle).abs().max() <= tolerance * oracle.abs().max()
 
 
 def test_walls_through_the_layers_keep_the_gradients_exact() -> None:
     """Derivatives by rows in the layers are zero; all others are those of autograd."""
-    given = parts(torch.float64, HEAVY, WALL)
-    inside = torch.from_numpy(given[0].grid.inside(given[0].heterogeneous.index))
+    case = parts(torch.float64, HEAVY, WALL)
+    inside = torch.from_numpy(case[0].grid.inside(case[0].heterogeneous.index))
     assert 0 < inside.sum() < len(inside)
-    (_, force, weight), (_, by_force, by_weight) = (gradients(given, each) for each in (CpuKernel(), None))
+    (_, force, weight), (_, by_force, by_weight) = (gradients(case, each) for each in (CpuKernel(), None))
     assert not weight[~inside].any()
     # rows within 1e-9 of air's are taken for air's, which leaves that much asymmetry
     assert (force - by_force).abs().max() <= 1e-10 * by_force.abs().max()
@@ -76,25 +84,25 @@ def test_walls_through_the_layers_keep_the_gradients_exact() -> None:
 
 
 def test_segments_do_not_change_the_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
-    given = parts(torch.float64, HEAVY, RIGID)
-    whole = gradients(given, CpuKernel())
+    case = parts(torch.float64, HEAVY, RIGID)
+    whole = gradients(case, CpuKernel())
     monkeypatch.setattr(adjoint, "_cuts", lambda *_: [0, 9, 10, STEPS])
-    for part, one in zip(gradients(given, CpuKernel()), whole, strict=True):
+    for part, one in zip(gradients(case, CpuKernel()), whole, strict=True):
         # sums in another order
         assert (part - one).abs().max() <= 1e-13 * one.abs().max()
 
 
 def test_cuts_bound_the_memory() -> None:
-    """At 100^3 heterogeneous cells the states kept and the record of a segment stay below 1 GiB."""
+    """At 100^3 heterogeneous cells the stored states and the record of a segment stay below 1 GiB."""
     state = State(torch.zeros((118,) * 3), torch.zeros(0), ())
     cells = 102**3
     for steps in (10, 1000, 10_000):
         cuts = adjoint._cuts(steps, state, cells)
         longest = max(end - start for start, end in pairwise(cuts))
         assert (cuts[0], cuts[-1]) == (0, steps)
-        kept = (len(cuts) - 1) * 2 * state.now.numel() + 2 * longest * cells
+        stored = (len(cuts) - 1) * 2 * state.now.numel() + 2 * longest * cells
         # the minimum is 2 sqrt(steps x state x row); the record of short runs is 128 MiB, twice
-        assert 4 * kept <= max(2.1 * 4 * (steps * 4 * state.now.numel() * cells) ** 0.5, 600 * 2**20)
+        assert 4 * stored <= max(2.1 * 4 * (steps * 4 * state.now.numel() * cells) ** 0.5, 600 * 2**20)
 
 
 @pytest.mark.parametrize("kernel", [CpuKernel(), ReferenceKernel()], ids=["cpu", "reference"])
@@ -118,3 +126,41 @@ def test_a_constant_loss_has_no_gradient() -> None:
     (0 * record).sum().backward()
     assert not sources.force.grad.any()
     assert not assembly.coefficients.heterogeneous_weight.grad.any()
+
+
+SHAPE = (7, 8, 9)
+CELL = 3 * 72 + 4 * 9 + 4
+
+
+def pressure(force: torch.Tensor, weight: torch.Tensor, steps: int) -> torch.Tensor:
+    """Return the record of two receivers on a tiny grid with two heterogeneous cells and layers of two."""
+    heterogeneous = torch.tensor([CELL, CELL + 1])
+    profile = torch.tensor([2.0, 1.5, 1.0, 0.5, 0.1], dtype=torch.float64)
+    decay = torch.exp(-profile - 0.1)
+    gain = profile / (profile + 0.1) * (decay - 1)
+    columns = Columns(
+        torch.tensor([[CELL - 4, CELL - 3, CELL - 2, CELL - 1]]),
+        torch.tensor([[-81, -72, -63, -9, 0, 9, 63, 72, 81]]),
+        weight[:1, :9],
+    )
+    scaled = torch.tensor([CELL]), torch.tensor([1.3], dtype=torch.float64)
+    crossed = Columns(columns.index, columns.offset[:, 3:6], weight[1:, 9:12])
+    coefficients = Coefficients(
+        0.19, 0.12, 0.06, 0.045, 0.99, heterogeneous, weight, torch.tensor([CELL + 3]), decay, gain, *scaled,
+        columns, crossed, torch.tensor([[2, 2, 0, 1]]),
+    )  # fmt: skip
+    receivers = Receivers(torch.tensor([[CELL + 9], [CELL - 72]]), torch.ones((2, 1), dtype=torch.float64))
+    signal = torch.stack(
+        (torch.cos(torch.arange(steps) * 0.6), torch.sin(torch.arange(steps) * 0.6)), 1
+    ).double()
+    state = uniform_state(SHAPE, coefficients, 0.0)
+    sources = Sources(torch.tensor([CELL - 1, CELL + 9]), force)
+    _, recorded = ReferenceKernel().advance(state, coefficients, sources, receivers, signal)
+    return recorded
+
+
+def test_gradients_by_source_and_medium() -> None:
+    generator = torch.Generator().manual_seed(0)
+    force = torch.randn((2, 2), generator=generator, dtype=torch.float64).requires_grad_()
+    weight = (0.05 * torch.rand((2, 27), generator=generator, dtype=torch.float64)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda f, w: pressure(f, w, steps=5), (force, weight))

@@ -73,9 +73,9 @@ def noise(shape: tuple[int, int, int], c: Coefficients) -> State:
     return state
 
 
-def advance(kernel: Kernel, given: Parts, blocks: tuple[int, ...]) -> tuple[State, torch.Tensor]:
+def advance(kernel: Kernel, case: Parts, blocks: tuple[int, ...]) -> tuple[State, torch.Tensor]:
     """Step from noise in calls of several steps each."""
-    shape, coefficients, sources, receivers = given
+    shape, coefficients, sources, receivers = case
     state, recorded = noise(shape, coefficients), []
     signal = torch.randn((sum(blocks), 3), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     for part in signal.to(coefficients.layer_decay.dtype).split(blocks):
@@ -107,13 +107,13 @@ def assert_same(one: tuple[State, torch.Tensor], other: tuple[State, torch.Tenso
 def test_cuda_kernel_is_the_reference_kernel(
     obstacles: tuple[Obstacle, ...], absorption: float, dtype: torch.dtype, tolerance: float
 ) -> None:
-    given = parts(obstacles, dtype, absorption)
-    c = given[1]
+    case = parts(obstacles, dtype, absorption)
+    c = case[1]
     assert (len(c.heterogeneous_index) > 0) == bool(obstacles)
     assert (len(c.sound_hard_index) > 0) == (RIGID in obstacles)
     assert (len(c.columns.index) > 0 and len(c.crossed.index) > 0) == (WALL in obstacles)
-    expected = advance(ReferenceKernel(), given, (2,))
-    assert_same(advance(CudaKernel(BLOCKS), given, (1, 1)), expected, tolerance)
+    expected = advance(ReferenceKernel(), case, (2,))
+    assert_same(advance(CudaKernel(BLOCKS), case, (1, 1)), expected, tolerance)
 
 
 def test_programs_run_in_any_order(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,22 +123,22 @@ def test_programs_run_in_any_order(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         builder, "set_grid_idx", lambda self, x, y, z: place(self, self.grid_dim[0] - 1 - x, y, z)
     )
-    given = parts((RIGID, WALL), torch.float64)
-    expected = advance(ReferenceKernel(), given, (1,))
-    assert_same(advance(CudaKernel(Blocks(x=16, y=16, z=8, lanes=256)), given, (1,)), expected, 1e-12)
+    case = parts((RIGID, WALL), torch.float64)
+    expected = advance(ReferenceKernel(), case, (1,))
+    assert_same(advance(CudaKernel(Blocks(x=16, y=16, z=8, lanes=256)), case, (1,)), expected, 1e-12)
 
 
 def test_a_returned_state_stays_while_another_is_stepped() -> None:
-    given = parts((), torch.float64)
+    case = parts((), torch.float64)
     kernel = CudaKernel(BLOCKS)
-    state, _ = advance(kernel, given, (1,))
+    state, _ = advance(kernel, case, (1,))
     pressure = state.now.clone()
-    advance(kernel, given, (1,))
+    advance(kernel, case, (1,))
     assert torch.equal(state.now, pressure)
 
 
-def small_propagator(**given: object) -> SimulatedPropagator:
-    return make_propagator(small_scene((HEAVY,), SIZE), "full", **given)
+def small_propagator(**options: object) -> SimulatedPropagator:
+    return make_propagator(small_scene((HEAVY,), SIZE), "full", **options)
 
 
 @pytest.mark.parametrize("name", ["device", "kernel"])
@@ -165,7 +165,7 @@ def test_a_device_chooses_its_kernel(device: object, monkeypatch: pytest.MonkeyP
     assert plan(scene, device=device, kernel="cuda").kernel == "cuda"
     assert plan(scene, device="cpu").kernel == "cpu"
     assert plan(scene, device=torch.device("cpu"), kernel="reference").kernel == "reference"
-    for given, message in (
+    for options, message in (
         ({"device": device, "kernel": "cpu"}, "device: 'cuda.*'; must fit kernel 'cpu'"),
         ({"device": "cpu", "kernel": "cuda"}, "device: 'cpu'; must fit kernel 'cuda'"),
         ({"device": "cuda:1"}, "device: 'cuda:1'; must be the current one, cuda:0"),
@@ -173,7 +173,7 @@ def test_a_device_chooses_its_kernel(device: object, monkeypatch: pytest.MonkeyP
         ({"device": "gpu"}, "device: 'gpu'; must be 'cpu', 'cuda' or a torch.device"),
     ):
         with pytest.raises(ValueError, match=message):
-            plan(scene, **given)
+            plan(scene, **options)
 
 
 def test_every_launch_compiles_for_a_gpu(tmp_path: Path) -> None:
@@ -192,9 +192,9 @@ def test_every_launch_compiles_for_a_gpu(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 1e-4)])
 def test_captured_steps_are_those_of_the_cpu_kernel(dtype: torch.dtype, tolerance: float) -> None:
     """Odd blocks, so that graphs are captured for both fields in turn; the design's parity figures."""
-    given = parts((RIGID, WALL), dtype, 40.0)
-    expected = advance(CpuKernel(), given, (53, 53, 53))
-    assert_same(advance(CudaKernel(), given, (53, 53, 53)), expected, tolerance)
+    case = parts((RIGID, WALL), dtype, 40.0)
+    expected = advance(CpuKernel(), case, (53, 53, 53))
+    assert_same(advance(CudaKernel(), case, (53, 53, 53)), expected, tolerance)
 
 
 @needs_gpu
@@ -203,5 +203,5 @@ def test_transfer_matrix_is_that_of_the_cpu_kernel() -> None:
     on_gpu, on_cpu = (make_propagator(scene, spacing=2e-3, device=device) for device in ("cuda", "cpu"))
     matrix, drive = on_gpu.transfer_matrix(), drive_from_phases([0.0, 1.0, 2.0, 3.0])
     assert relative_error(matrix, on_cpu.transfer_matrix()) < 1e-4  # rounding in float32, of all of a run
-    found = on_gpu.field(drive.cuda(), scene.control_points)
-    assert relative_error(found, on_cpu.field(drive, scene.control_points)) < 1e-4
+    by_gpu = on_gpu.field(drive.cuda(), scene.control_points)
+    assert relative_error(by_gpu, on_cpu.field(drive, scene.control_points)) < 1e-4

@@ -46,23 +46,23 @@ def test_a_hollow_rigid_ball_is_a_solid_one(wall):
     solid = pyvista.Icosphere(radius=RADIUS, nsub=4)
     vertices = solid.points.astype(np.float64) + CENTER
     bodies = hollow_ball(wall), Mesh.from_surface((vertices, solid.faces.reshape(-1, 4)[:, 1:]), rigid=True)
-    found = [
+    matrices = [
         make_propagator(small_scene((body,)), "box", SPACING, SETTLED).transfer_matrix() for body in bodies
     ]
-    assert relative_error(*found) < 10 * SETTLED  # the same geometry, up to the order of triangles
+    assert relative_error(*matrices) < 10 * SETTLED  # the same geometry, up to the order of triangles
 
 
 def test_a_hollow_mask_is_a_solid_one():
     mask = np.ones((8, 8, 8), bool)
     hollow = mask.copy()
     hollow[3:5, 3:5, 3:5] = False
-    found = [
+    matrices = [
         make_propagator(
             small_scene((VoxelMask(each, 1e-3, (8e-3,) * 3, rigid=True),)), "box", SPACING, SETTLED
         ).transfer_matrix()
         for each in (mask, hollow)
     ]
-    assert torch.equal(*found)
+    assert torch.equal(*matrices)
 
 
 @pytest.mark.parametrize("method", ["box", "full"])
@@ -127,7 +127,7 @@ def test_a_ball_beside_a_closed_room_opens_no_wall(method):
 
 @pytest.mark.parametrize("half", [4e-3, 20e-3])
 def test_a_transducer_in_a_closed_room_is_refused(half):
-    """Also where its distance from the walls lets its field be kept."""
+    """Also where its distance from the walls allows its field to be stored."""
     empty, domain = small_scene(), ((-0.02,) * 3, (0.05,) * 3)
     inside = TransducerArray([CENTER], (0, 0, 1))
     scene = Scene(inside, empty.medium, 40e3, [(0.0, 0.0, 0.045)], room(1e-3, half), domain=domain)
@@ -153,7 +153,7 @@ def test_a_run_ends_where_a_drive_cancels(method, balls):
 
 
 def test_air_cut_from_a_rigid_cube_is_a_notch_between_plates():
-    """A point in the notch hears what it does between plates that leave the notch free."""
+    """The pressure at a point in the notch is equal to the one between plates that leave the notch free."""
     x, y, z = CENTER
     cube = Box(CENTER, (10e-3,) * 3, rigid=True)
     air = Box((x + 2e-3, y, z), (10e-3, 4e-3, 4e-3), density=1.293, sound_speed=340.0)

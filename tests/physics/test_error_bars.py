@@ -130,11 +130,11 @@ def test_estimates_lean_towards_the_usual_error(spacing, scattered, logarithm):
     free = torch.ones(1, 3, dtype=torch.complex128)
     matrix, usual = free * (1 + scattered), 1.3 * LAW.growth(spacing) * scattered / (1 + scattered)
     coarser = matrix * (1 + 10**logarithm), 1.3 * spacing
-    (told,), (found,) = (
+    (told,), (claim,) = (
         of(matrix, free, spacing, [coarser], LAW).tolist() for of in (errors_by_grids, grid_errors)
     )
-    assert found >= 0.36 * usual
-    assert found <= max(told, 0.38 * usual, min(usual, 1.59 * told))
+    assert claim >= 0.36 * usual
+    assert claim <= max(told, 0.38 * usual, min(usual, 1.59 * told))
     (agreed,) = grid_errors(matrix, free, spacing, [(matrix, 1.3 * spacing)], LAW).tolist()
     assert agreed == pytest.approx(0.37 * usual)
 

@@ -1,26 +1,26 @@
-"""Point sources in free space against the equations that define them; all in float64."""
+"""Point sources and pistons in free space against the equations that define them; all in float64."""
+
+from __future__ import annotations
 
 import cmath
 import math
 
+import numpy as np
 import pytest
 import torch
-from exact_fields import piston_directivity
+from exact_fields import WAVELENGTH, K, piston_directivity
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from scipy.special import j0, struve
 
 from autdtorch.analytic.green import free_space_matrix, green, piston_field
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import drive_from_phases, focus_phases
 from autdtorch.utils.spatial import distances
 
-WAVELENGTH = 8.5e-3
-WAVENUMBER = 2 * math.pi / WAVELENGTH
-
+PISTON = 5e-3
 points = hnp.arrays(float, (5, 3), elements=st.floats(-0.1, 0.1))
-
-
 ARRAY = TransducerArray.grid((4, 4), pitch=10e-3, center=(1e-3, 50e-3, 50e-3), source_strength=0.7)
 
 
@@ -33,15 +33,15 @@ def test_green_solves_the_helmholtz_equation_away_from_the_source(target):
     """
     h = WAVELENGTH / 400
     steps = torch.cat([torch.zeros(1, 3), torch.eye(3), -torch.eye(3)]).double()
-    values = green(torch.tensor(target, dtype=torch.float64) + h * steps, [[0.0, 0.0, 0.0]], WAVENUMBER)[:, 0]
+    values = green(torch.tensor(target, dtype=torch.float64) + h * steps, [[0.0, 0.0, 0.0]], K)[:, 0]
     laplacian = (values[1:].sum() - 6 * values[0]) / h**2
-    residual = (laplacian + WAVENUMBER**2 * values[0]).abs() / (WAVENUMBER**2 * values[0].abs())
-    assert residual < 4 / 3 * (WAVENUMBER * h) ** 2 / 12
+    residual = (laplacian + K**2 * values[0]).abs() / (K**2 * values[0].abs())
+    assert residual < 4 / 3 * (K * h) ** 2 / 12
 
 
 def test_green_is_outgoing_and_of_unit_strength():
     r = torch.tensor([1e-6, 1e-3, 1e-3 + WAVELENGTH / 4], dtype=torch.float64)
-    values = green(torch.stack([r, 0 * r, 0 * r], dim=1), [[0.0, 0.0, 0.0]], WAVENUMBER)[:, 0]
+    values = green(torch.stack([r, 0 * r, 0 * r], dim=1), [[0.0, 0.0, 0.0]], K)[:, 0]
     # Near the source g is 1/(4 pi r), up to k r = 7e-4.
     assert abs(4 * math.pi * r[0] * values[0] - 1) < 1e-3
     # With e^{-i w t}, a quarter of a wavelength outwards turns the phase by +90 degrees.
@@ -52,51 +52,51 @@ def test_green_is_outgoing_and_of_unit_strength():
 def test_green_is_reciprocal(here, there):
     assume(distances(torch.from_numpy(here), torch.from_numpy(there)).min() > 1e-6)
     # The two distances are sums of the same squares: equal to the last bit.
-    assert torch.equal(green(here, there, WAVENUMBER), green(there, here, WAVENUMBER).T)
+    assert torch.equal(green(here, there, K), green(there, here, K).T)
 
 
 def test_matrix_is_equation_2_term_by_term():
     targets = [(80e-3, 50e-3, 50e-3), (80e-3, 20e-3, 50e-3), (33e-3, 1e-3, 99e-3)]
-    matrix = free_space_matrix(targets, ARRAY, WAVENUMBER)
+    matrix = free_space_matrix(targets, ARRAY, K)
     for row, target in zip(matrix.tolist(), targets, strict=True):
         for entry, source in zip(row, ARRAY.positions.tolist(), strict=True):
             r = math.dist(target, source)
             # Phases reach k r = 80 rad: 1e-14 of rounding.
-            assert cmath.isclose(entry, 0.7 * cmath.exp(1j * WAVENUMBER * r) / r, rel_tol=1e-13)
+            assert cmath.isclose(entry, 0.7 * cmath.exp(1j * K * r) / r, rel_tol=1e-13)
 
 
 def test_absorption_lets_every_contribution_fall_by_its_path():
     targets, alpha = [(80e-3, 50e-3, 50e-3), (33e-3, 1e-3, 99e-3)], 4.6
-    lossless = free_space_matrix(targets, ARRAY, WAVENUMBER)
+    lossless = free_space_matrix(targets, ARRAY, K)
     path = distances(torch.tensor(targets, dtype=torch.float64), ARRAY.positions)
-    lossy = free_space_matrix(targets, ARRAY, complex(WAVENUMBER, alpha))
+    lossy = free_space_matrix(targets, ARRAY, complex(K, alpha))
     torch.testing.assert_close(lossy, lossless * torch.exp(-alpha * path), rtol=1e-14, atol=0)
 
 
 @pytest.mark.parametrize("ka", [0.5, 3.7, 6.0])
 def test_far_field_of_a_disc_has_the_directivity_of_a_piston(ka):
     """S e^{ikr}/r 2 J1(ka sin t)/(ka sin t) at all angles up to 90 degrees, and the same behind."""
-    radius, distance = ka / WAVENUMBER, 1e5
+    radius, distance = ka / K, 1e5
     disc = TransducerArray([[0, 0, 0]], (0, 0, 1), source_strength=0.7, radius=radius)
     angle = torch.linspace(1e-3, math.pi - 1e-3, 91, dtype=torch.float64)
     turn = 2.4 * torch.arange(91, dtype=torch.float64)  # around the axis, everywhere
     across = torch.sin(angle)
     points = distance * torch.stack([across * turn.cos(), across * turn.sin(), angle.cos()], dim=1)
-    pressure = free_space_matrix(points, disc, WAVENUMBER)[:, 0] * distance / 0.7
+    pressure = free_space_matrix(points, disc, K)[:, 0] * distance / 0.7
     directivity = piston_directivity(angle, ka)
     # The rule is good to 1e-6; phases of 7e7 rad are rounded to 1e-8, and k a^2 / 2 r is 1e-7.
-    assert (pressure * cmath.exp(-1j * WAVENUMBER * distance) - directivity).abs().max() < 1e-6
+    assert (pressure * cmath.exp(-1j * K * distance) - directivity).abs().max() < 1e-6
 
 
 @pytest.mark.parametrize(("height", "tolerance"), [(0.5, 1e-4), (1.0, 5e-6), (4.0, 1e-6)])
 def test_disc_near_by_is_a_piston(height, tolerance):
     """On its axis and off it; the tolerances are the accuracy that `TransducerArray.nodes` states."""
-    radius = 6.0 / WAVENUMBER
+    radius = 6.0 / K
     disc = TransducerArray([[0, 0, 0]], (0, 0, 1), source_strength=0.7, radius=radius)
     along = torch.linspace(0, 2 * radius, 21, dtype=torch.float64)
     points = torch.stack([0.8 * along, 0.6 * along, 0 * along + height * radius], dim=1)
-    exact = 4 * math.pi * 0.7 * piston_field(points, [[0, 0, 0]], WAVENUMBER, radius, (0, 0, 1))
-    pressure = free_space_matrix(points, disc, WAVENUMBER)
+    exact = 4 * math.pi * 0.7 * piston_field(points, [[0, 0, 0]], K, radius, (0, 0, 1))
+    pressure = free_space_matrix(points, disc, K)
     assert (pressure - exact).abs().max() < tolerance * exact.abs().max()
 
 
@@ -105,10 +105,66 @@ def test_disc_near_by_is_a_piston(height, tolerance):
     phases=hnp.arrays(float, 16, elements=st.floats(0, 2 * math.pi)),
 )
 def test_equation_3_puts_every_contribution_in_phase_at_the_focus(focus, phases):
-    row = free_space_matrix(focus[None], ARRAY, WAVENUMBER)[0]
+    row = free_space_matrix(focus[None], ARRAY, K)[0]
     limit = (0.7 / distances(torch.from_numpy(focus[None]), ARRAY.positions)).sum()
-    focused = row @ drive_from_phases(focus_phases(ARRAY.positions, focus, WAVENUMBER))
+    focused = row @ drive_from_phases(focus_phases(ARRAY.positions, focus, K))
     # Phases reach k r = 130 rad: 3e-14 of rounding; the sum of S/r is real, so the phase of p is zero too.
     torch.testing.assert_close(focused, limit.to(torch.complex128), rtol=1e-13, atol=0)
     # No other phases do better.
     assert (row @ drive_from_phases(phases)).abs() <= limit * (1 + 1e-13)
+
+
+def test_piston_on_its_axis_is_the_closed_form_near_and_far():
+    z = torch.tensor([0.0, 1e-4, 5e-3, 0.1, 3.0, 1e3], dtype=torch.float64)
+    points = torch.stack([z, 0 * z, 0 * z], dim=1)
+    field = piston_field(points, [[0.0, 0.0, 0.0]], K, PISTON, (2.0, 0.0, 0.0))[:, 0]
+    # (e^{ik sqrt(z^2 + a^2)} - e^{ikz}) / (2 pi i k a^2) as a product, which does not cancel far away
+    path = torch.hypot(z, 0 * z + PISTON) + z
+    amplitude = torch.sinc(K * PISTON**2 / path / (2 * math.pi)) / (2 * math.pi * path)
+    # Rounding of k z = 7e5 at the farthest.
+    assert torch.allclose(field, amplitude * torch.exp(0.5j * K * path), rtol=1e-9, atol=0)
+    # Fresnel's phase k a^2 / 4z = 5e-6 is left at 1 km.
+    assert abs(field[-1] / green(points[-1:], [[0.0, 0.0, 0.0]], K) - 1) < 1e-5
+
+
+@pytest.mark.parametrize("reach", [0.1, 3.7, 30.0])
+def test_piston_far_away_is_its_directivity(reach):
+    """At 1e5 a^2 / wavelength and 1e4 wavelengths, Fresnel's phase and the 1 / (k r) terms are below 1e-4."""
+    radius = reach / K
+    distance = 1e4 * WAVELENGTH * max(1, reach**2)
+    angle = torch.linspace(1e-3, math.pi / 2, 9, dtype=torch.float64)
+    points = distance * torch.stack([torch.sin(angle), 0 * angle, torch.cos(angle)], dim=1)
+    field = piston_field(points, [[0.0, 0.0, 0.0]], K, radius, (0.0, 0.0, 1.0))
+    ratio = (field / green(points, [[0.0, 0.0, 0.0]], K))[:, 0]
+    assert (ratio - piston_directivity(angle, reach)).abs().max() < 1e-4
+
+
+def test_piston_near_is_the_sum_over_its_disc():
+    """Gauss quadrature in radius and trapezoids in angle: exponential at points a radius off the disc."""
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    rho, rho_weights = PISTON * (nodes + 1) / 2, PISTON * weights / 2
+    phi = np.arange(120) * 2 * math.pi / 120
+    grid = np.stack(
+        [
+            np.outer(rho, np.cos(phi)).ravel(),
+            np.outer(rho, np.sin(phi)).ravel(),
+            np.zeros(rho.size * phi.size),
+        ],
+        axis=1,
+    )
+    area = torch.tensor(np.repeat(rho * rho_weights, phi.size) * 2 * math.pi / phi.size)
+    points = [[0.3 * PISTON, 0.0, PISTON], [0.0, PISTON, -PISTON], [2.5 * PISTON, 0.0, 0.0]]
+    expected = green(points, grid, K) @ area.to(torch.complex128) / (math.pi * PISTON**2)
+    field = piston_field(points, [[0.0, 0.0, 0.0]], K, PISTON, (0.0, 0.0, 1.0))
+    assert torch.allclose(field[:, 0], expected, rtol=1e-10, atol=0)
+
+
+def test_piston_on_its_rim_is_the_closed_form():
+    """The disc is seen over half a turn: chords 2 a cos phi give a Bessel and a Struve function."""
+    reach = 2 * K * PISTON
+    chords = j0(reach) + 1j * struve(0, reach) - 1
+    expected = chords / (4j * math.pi * K * PISTON**2)
+    point = torch.tensor([[PISTON, 0.0, 0.0]], dtype=torch.float64)
+    field = piston_field(point, [[0.0, 0.0, 0.0]], K, PISTON, (0.0, 0.0, 1.0))
+    # Rounding.
+    assert abs(field[0, 0] / expected - 1) < 1e-10

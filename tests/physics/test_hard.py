@@ -43,10 +43,10 @@ EMPTY = small_scene()
 def test_steel_is_rigid():
     steel, rigid = (Box(CENTER, (5e-3,) * 3, **each) for each in (STEEL, {"rigid": True}))
     inside = torch.tensor([CENTER], dtype=torch.float64)
-    found, expected = (make_propagator(small_scene((box,)), "box", 1.3e-3) for box in (steel, rigid))
-    assert torch.equal(found.transfer_matrix(), expected.transfer_matrix())
-    assert found.time_step == expected.time_step
-    assert found.transfer_matrix(inside).abs().max() == 0
+    heavy, expected = (make_propagator(small_scene((box,)), "box", 1.3e-3) for box in (steel, rigid))
+    assert torch.equal(heavy.transfer_matrix(), expected.transfer_matrix())
+    assert heavy.time_step == expected.time_step
+    assert heavy.transfer_matrix(inside).abs().max() == 0
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_others_keep_their_material(body, tolerance):
 
 @pytest.mark.parametrize(("density", "thickness"), [(60.0, 5e-3), (150.0, 3e-3)])
 def test_what_passes_a_heavy_plate_counts_in_its_shadow(density, thickness):
-    """It is below the tolerance relative to the field in free space, and far above it behind the plate."""
+    """The sound through a plate is below the tolerance relative to the free field, and above it behind it."""
     plate = Box((0.0, 0.0, 0.0), (60e-3, 60e-3, thickness), density=density, sound_speed=1200.0)
     array = TransducerArray([(x, 2e-3, -25e-3) for x in (-8e-3, 0.0, 8e-3)], (0, 0, 1))
     scene = Scene(array, AIR, 40e3, [(3e-3, 1e-3, 12e-3), (-5e-3, 4e-3, 14e-3)], (plate,))

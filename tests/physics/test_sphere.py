@@ -33,7 +33,7 @@ def exact(scene: Scene, scattered: bool) -> torch.Tensor:
 
 
 def scattered_error(scene: Scene, spacing: float) -> float:
-    """Of the transfer matrix, relative to the scattered part."""
+    """Return the error of the transfer matrix, relative to the scattered part."""
     simulated = make_propagator(scene, "full", spacing, tolerance=1e-4).transfer_matrix()
     whole = exact(scene, scattered=False)
     size = float(exact(scene, scattered=True).norm() / whole.norm())
@@ -50,7 +50,7 @@ def test_scattered_wave_of_a_sphere(rigid: bool) -> None:
 def test_the_error_of_a_sphere_is_of_second_order(rigid: bool) -> None:
     scene = sphere_scene(rigid)
     coarse, fine = scattered_error(scene, 1.3e-3), scattered_error(scene, 0.65e-3)
-    # Halving the spacing divides the error by 4, but for the sphere's place between the cells: measured 3.7
+    # Half the spacing divides the error by 4, apart from the sphere's place between the cells: measured 3.7
     # and 5.6. First order, as of staircases, would be 2.
     assert fine < coarse / 3
 
@@ -63,10 +63,10 @@ def test_spheres_merged_into_one_mesh_are_their_union(rigid: bool) -> None:
     apart = [Mesh.from_surface(sphere, **material) for sphere in spheres]
     merged = Mesh.from_surface(spheres[0].append_polydata(spheres[1]), **material)
     exact = [Sphere(place, RADIUS, **material) for place in places]
-    found, union, round_ = (
+    joined, union, round_ = (
         make_propagator(small_scene(obstacles), "full", 1.2e-3).transfer_matrix()
         for obstacles in ([merged], apart, exact)
     )
     # Measured: 1e-5 and 0.4 % if rigid, 0.1 and 1 % if not. With triangles inside the union, 10 % and more.
-    assert relative_error(found, union) < 5e-3
-    assert relative_error(found, round_) < 0.02
+    assert relative_error(joined, union) < 5e-3
+    assert relative_error(joined, round_) < 0.02

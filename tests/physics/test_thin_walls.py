@@ -1,4 +1,4 @@
-"""Walls thinner than a cell, oblique to the grid: rigid ones are there, and all are told of."""
+"""Walls thinner than a cell, oblique to the grid: rigid ones reflect, and a warning names all."""
 
 import math
 

@@ -39,7 +39,7 @@ def slab(normal: int = 0, begin: float = FACE, thickness: float = 5e-3, density:
 @pytest.mark.parametrize(
     ("shift", "thickness", "exact", "bound"),
     [
-        # the grid's own error in air is 3e-4, and the run ends 1e-3 from steady
+        # the grid's error in air is 3e-4, and the run ends 1e-3 from steady
         (0.0, 1.0, analytic.rigid_plane, 1.5e-3),
         (0.0, 1.0, analytic.fluid_half_space, 2e-3),
         # required: 1 %. Faces half-way between cell centres are exact head on
@@ -57,9 +57,11 @@ def test_walls_reflect_and_slabs_transmit(
     if exact is analytic.fluid_slab:
         what["thickness"] = thickness
     scene = layered_scene((wall,), BEHIND if exact is analytic.fluid_slab else FRONT)
-    found = make_propagator(scene, "full", 1e-3, tolerance=1e-3).transfer_matrix()
+    simulated = make_propagator(scene, "full", 1e-3, tolerance=1e-3).transfer_matrix()
     where = (scene.control_points, scene.array.positions, scene.wavenumber, (face, 0, 0), (-1, 0, 0))
-    assert relative_error(found, 4 * math.pi * scene.array.source_strength * exact(*where, **what)) < bound
+    assert (
+        relative_error(simulated, 4 * math.pi * scene.array.source_strength * exact(*where, **what)) < bound
+    )
 
 
 @pytest.mark.parametrize("density", [77.0, 3.0, 0.01])

@@ -22,8 +22,8 @@ RIGID = 1e5
 
 def assembled(density: float, kappa: float, slowness: float) -> float:
     """Return the density with which waves keep their flow at a face to air."""
-    own = kappa * slowness
-    return density * (math.sin(own) / own) / (math.sin(kappa) / kappa)
+    inner = kappa * slowness
+    return density * (math.sin(inner) / inner) / (math.sin(kappa) / kappa)
 
 
 def wave(wavenumber: float, place: float) -> complex:
@@ -37,9 +37,9 @@ def response(layers: list[tuple[float, float, float]], kappa: float) -> tuple[co
     """
     width = np.array([[each[0] for each in layers]])
     density = np.array([[assembled(each[1], kappa, each[2]) for each in layers]])
-    own = kappa * np.array([[each[2] for each in layers]])
-    port = two_port(width, density, own, kappa)
-    ends = np.array([own[0, 0], own[0, -1]])
+    wavenumber = kappa * np.array([[each[2] for each in layers]])
+    port = two_port(width, density, wavenumber, kappa)
+    ends = np.array([wavenumber[0, 0], wavenumber[0, -1]])
     mass = (port.thickness[0] + 0.5) * 4 * np.sin(ends / 2) ** 2 / density[0, [0, -1]]
     matrix, right = np.zeros((2, 2), complex), np.zeros(2, complex)
     first, last = density[0, 0], density[0, -1]
@@ -75,8 +75,8 @@ def test_a_wave_is_reflected_exactly_wherever_the_face_falls(
     """The error is of fourth order; its largest coefficient in 18,000 random cases was 0.11."""
     for kappa in (0.1, 0.3, 0.7):
         layers = [(place, 1.0, 1.0), (1 - place, density, slowness)]
-        found, exact = response(layers, kappa)[0], exact_response(layers, kappa)[0]
-        assert abs(found - exact) < 0.4 * kappa**4
+        simulated, exact = response(layers, kappa)[0], exact_response(layers, kappa)[0]
+        assert abs(simulated - exact) < 0.4 * kappa**4
 
 
 @settings(max_examples=100)
@@ -84,12 +84,12 @@ def test_a_wave_is_reflected_exactly_wherever_the_face_falls(
 def test_a_layer_thinner_than_a_cell_reflects_and_transmits_exactly(
     density: float, slowness: float, width: float, share: float
 ) -> None:
-    """Where it is between two planes of cells, and however thin; the largest coefficient was 0.32."""
+    """The layer may be anywhere between two planes of cells, and thin; the largest coefficient was 0.32."""
     place = share * (1 - width)
     layers = [(place, 1.0, 1.0), (width, density, slowness), (1 - width - place, 1.0, 1.0)]
     for kappa in (0.1, 0.3, 0.7):
-        for found, exact in zip(response(layers, kappa), exact_response(layers, kappa), strict=True):
-            assert abs(found - exact) < kappa**4 / min(1, density)
+        for simulated, exact in zip(response(layers, kappa), exact_response(layers, kappa), strict=True):
+            assert abs(simulated - exact) < kappa**4 / min(1, density)
 
 
 def corner(place: tuple[float, float]) -> Section:
@@ -109,7 +109,7 @@ def materials(density: float) -> MaterialKey:
 @pytest.mark.parametrize("place", [(0.5, 0.5), (0.2, 0.7), (0.05, 0.9)])
 def test_fields_at_a_rigid_edge_grow_with_powers_of_two_thirds(place: tuple[float, float]) -> None:
     fields = plane_fields(corner(place), np.array((1.0, 0.0)), 4)
-    # the power is that of a circle, the window a square
+    # the powers are exact for a circle; the window is a square
     assert fields.order[1:] == pytest.approx(np.arange(1, 5) * 2 / 3, rel=0.02)
     # its exact field passes the elements beside the edge: r^(2/3) cos(2/3 phi)
     places = np.stack(np.meshgrid(np.arange(-1, 3), np.arange(-1, 3), indexing="ij"), axis=-1) - place
@@ -128,9 +128,9 @@ def test_fields_at_a_thin_plate_grow_with_powers_of_a_half(thickness: float) -> 
     assert fields.order[1:] == pytest.approx(np.arange(1, 5) / 2, rel=0.02)
 
 
-def whole_element(found: Prisms) -> np.ndarray:
+def whole_element(elements: Prisms) -> np.ndarray:
     """Return the stiffness matrix (8, 8) of the first element of a section."""
-    coupling, _ = stacked(np.ones(1), [Prisms(*(part[0, 0] for part in found))], 2, STENCIL)
+    coupling, _ = stacked(np.ones(1), [Prisms(*(part[0, 0] for part in elements))], 2, STENCIL)
     return stiffness_matrix(coupling[None])[0]
 
 
@@ -142,13 +142,13 @@ def whole_element(found: Prisms) -> np.ndarray:
 def test_elements_at_an_edge_have_a_positive_energy_and_the_mass_of_their_volume(
     section: Section, density: float
 ) -> None:
-    found = prisms(section, materials(density), STENCIL)
-    matrix = whole_element(found)
+    elements = prisms(section, materials(density), STENCIL)
+    matrix = whole_element(elements)
     assert np.linalg.eigvalsh(matrix).min() > -1e-9 * np.abs(matrix).max()  # rounding
     x, y = (np.diff(np.concatenate(([0.0], cuts, [1.0]))) for cuts in section.cuts)
-    own = np.array(materials(density).masses)[np.array(section.material)]
+    masses = np.array(materials(density).masses)[np.array(section.material)]
     # the sum of the masses weighs a hundred times as much as their moments
-    assert found.mass[0, 0].sum() == pytest.approx(x @ own @ y, rel=1e-3)
+    assert elements.mass[0, 0].sum() == pytest.approx(x @ masses @ y, rel=1e-3)
 
 
 @pytest.mark.parametrize("density", [RIGID, 77.0, 0.1])
@@ -162,8 +162,8 @@ def test_images_of_an_edge_have_images_of_its_elements(density: float) -> None:
 
 def test_an_edge_of_air_in_air_is_none() -> None:
     """The fit ends where it starts: the stencil's coupling reproduces long waves."""
-    found = prisms(corner((0.3, 0.8)), materials(1.0), STENCIL)
+    elements = prisms(corner((0.3, 0.8)), materials(1.0), STENCIL)
     # fields at the rim of the mesh are no polynomials: 1.3e-3 measured
-    assert whole_element(found) == pytest.approx(
+    assert whole_element(elements) == pytest.approx(
         stiffness_matrix(uniform_coupling(STENCIL)[None])[0], abs=2e-2
     )

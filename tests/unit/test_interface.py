@@ -1,7 +1,9 @@
-"""Interface elements: planes and spheres through the cube between eight cell centres.
+"""Interface elements: planes and spheres through the cube between eight cell centres, and their forces.
 
 In units of a cell and of air. Materials of which one has a mass and the other none show where mass goes.
 """
+
+from __future__ import annotations
 
 import math
 
@@ -20,6 +22,14 @@ from autdtorch.fdtd.assembly.element import (
     uniform_coupling,
 )
 from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
+from autdtorch.fdtd.assembly.smooth_faces import (
+    Surface,
+    face_forces,
+    fields,
+    forces,
+    smooth_stiffness,
+    surfaces,
+)
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
 
 STENCIL = tuned_stencil(2 * math.pi / 8.5)
@@ -84,9 +94,9 @@ def test_an_element_of_one_material_is_the_tuned_stencil_over_its_density(densit
 def test_eight_elements_of_air_add_up_to_the_tuned_stencil() -> None:
     matrix = stiffness_matrix(uniform_coupling(STENCIL)[None])[0]
     sums = np.zeros((3, 3, 3))
-    for own, vertex in enumerate(VERTICES):
+    for one, vertex in enumerate(VERTICES):
         for other, target in enumerate(VERTICES):
-            sums[tuple(target - vertex + 1)] -= matrix[own, other]
+            sums[tuple(target - vertex + 1)] -= matrix[one, other]
     sums[1, 1, 1] = 0
     assert np.allclose(sums.ravel(), STENCIL.weights, rtol=1e-14)
 
@@ -199,8 +209,8 @@ def test_of_two_obstacles_the_later_wins_and_touching_ones_leave_no_air() -> Non
     lower, deeper = plane(np.array((1, 0, 0)), 0.3), plane(np.array((1, 0, 0)), -0.1)
     tilted, other = plane(np.array((0.6, 0.0, 0.8)), 0.1), plane(-np.array((0.6, 0.0, 0.8)), -0.1)
 
-    def share(first: np.ndarray, second: np.ndarray, own: int) -> float:
-        return element(first, second, density=(1, 5, 9), mass=tuple(np.eye(3)[own])).mass.sum()
+    def share(first: np.ndarray, second: np.ndarray, material: int) -> float:
+        return element(first, second, density=(1, 5, 9), mass=tuple(np.eye(3)[material])).mass.sum()
 
     for first, second, shares in ((lower, deeper, (0.2, 0.4, 0.4)), (deeper, lower, (0.2, 0.0, 0.8))):
         cut = element(first, second, density=(1, 5, 9), stencil=LONG)
@@ -265,3 +275,50 @@ def _energy_along(chain: list[np.ndarray], axis: int, wave: np.ndarray) -> np.nd
             np.add.at(matrix, (level[:, None], level[None, :]), waved)
         matrices.append(matrix)
     return matrices[0] - matrices[1]
+
+
+def planes(ratio: float, normal: np.ndarray, depth: np.ndarray) -> Surface:
+    """Return flat surfaces with normals (n, 3), at a signed distance (n,) from the centres."""
+    level = depth[:, None] + normal @ (LATTICE - 0.5).T
+    _, surface = surfaces(level, np.tile((1.0, ratio), (len(depth), 1)))
+    return surface
+
+
+def random_planes(ratio: float) -> Surface:
+    random = np.random.default_rng(1)
+    normal = random.normal(size=(200, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return planes(ratio, normal, random.uniform(-0.5, 0.5, 200))
+
+
+RATIOS = pytest.mark.parametrize("ratio", [0.14, 1.5, 8.0, 77.0])
+
+
+@RATIOS
+def test_elements_sharing_a_face_get_opposite_forces(ratio: float) -> None:
+    """No net force at the vertices of flat surfaces, for all fields along the surface and across it."""
+    here = random_planes(ratio)
+    middle = here.level[:, len(LATTICE) // 2]
+    for axis in range(3):
+        beyond = planes(ratio, here.normal, middle + here.normal[:, axis])
+        assert np.allclose(face_forces(here, 2 * axis + 1), -face_forces(beyond, 2 * axis), atol=1e-11)
+
+
+@RATIOS
+def test_stiffness_gives_the_fields_their_forces(ratio: float) -> None:
+    here = random_planes(ratio)
+    uniform, mobility = np.full(28, 0.1), np.full((200, 64), 1 / 64)
+    coupling, weight = smooth_stiffness(here, mobility, np.tile(uniform, (200, 1)), uniform)
+    assert (weight == 1).mean() > 0.99  # the others' energy would not be positive
+    matrix, local, force = stiffness_matrix(coupling), fields(here), forces(here)
+    forced = weight == 1
+    assert np.allclose((matrix @ local)[forced], force[forced], atol=1e-9)
+    assert np.linalg.eigvalsh(matrix).min() > -1e-9
+
+
+def test_in_one_material_forces_are_those_of_linear_pressures() -> None:
+    here = random_planes(1.0)
+    slope = np.concatenate((here.tangents, here.normal[:, None]), axis=1)
+    at_vertices = np.array(list(np.ndindex((2,) * 3))) - 0.5
+    # half of the flow through each face that a vertex touches: a quarter of it, from each of three faces
+    assert np.allclose(forces(here), at_vertices @ slope.transpose(0, 2, 1) / 2, atol=0.01)

@@ -53,16 +53,16 @@ def test_points_next_to_excluded_cells_use_the_others(cells: float) -> None:
     kappa = 2 * math.pi / cells
     field, vector = wave(kappa, seed=2)
     positions = np.array([[10.2, 9.6, 8.3], [10.6, 9.1, 8.8], [10.95, 9.0, 8.5], [11.01, 9.0, 8.5]])
-    found = interpolate_points(positions, SHAPE, FIRST, LAST, kappa)
-    excluded = np.unravel_index(found.index, SHAPE)[0] > 10
-    weights = exclude_cells(found, positions, excluded, SHAPE, kappa)
+    whole = interpolate_points(positions, SHAPE, FIRST, LAST, kappa)
+    excluded = np.unravel_index(whole.index, SHAPE)[0] > 10
+    weights = exclude_cells(whole, positions, excluded, SHAPE, kappa)
     assert not weights.weight[excluded].any()
     assert not weights.weight[3].any()
     read = (field[weights.index] * weights.weight).sum(1)
     # a line through the last two cells would miss up to kappa^2, 0.14 and 0.55; a parabola kappa^3
     assert np.abs(read - np.exp(1j * positions @ vector))[:3].max() < 0.1
-    kept = exclude_cells(found, positions, np.zeros_like(excluded), SHAPE, kappa)
-    assert np.array_equal(kept.weight, found.weight)
+    same = exclude_cells(whole, positions, np.zeros_like(excluded), SHAPE, kappa)
+    assert np.array_equal(same.weight, whole.weight)
 
 
 def test_a_point_on_a_cell_centre_is_that_cell() -> None:

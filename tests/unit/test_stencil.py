@@ -77,7 +77,7 @@ def test_largest_symbol_bounds_every_wave_and_is_reached(kappa: float) -> None:
 
 
 def test_source_factor_tends_to_that_of_the_continuum_on_fine_grids() -> None:
-    # naive normalisation: 4 pi (c dt / h)^2; the grid's own differs by kappa^2 / 6 or so
+    # naive normalisation: 4 pi (c dt / h)^2; the grid's factor differs by kappa^2 / 6 or so
     stencil = tuned_stencil(0.05)
     courant = 2 * math.pi / 40 / 0.05
     assert stencil.source_factor(40) == pytest.approx(4 * math.pi * courant**2, rel=5e-3)

@@ -53,7 +53,7 @@ class Elements:
 
 
 def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
-    """Return the material of every element, that of the last body there, and the interface elements."""
+    """Return the material of every element, set by the last body there, and the interface elements."""
     bodies, materials = unions_of(region, grid, stencil)
     blocks = _blocks(bodies, grid)
     bodies = [body.measured(grid.spacing) for body in bodies]
