@@ -13,7 +13,7 @@ from autdtorch.fdtd.grid import FINE_LAYER_CELLS, Extent
 
 DOMAIN, BOX = (Extent((0, 0, 0), (1, 1, 1), 0, thinner, 1) for thinner in (0, 2))
 # cells per wavelength and steps per period: largest reflection up to 60 degrees and at 75 [dB], and largest
-# energy that evanescent fields gain: measured 0.08, 0.02, 0.01 and 0.02, and in a box 0.17, 0.12, 0.05 and 0.03.
+# energy that evanescent fields gain: measured 0.08, 0.02, 0.01 and 0.02, in a box 0.17, 0.12, 0.05 and 0.03.
 # With a tenth of the frequency shift it is 0.48, 0.35, 0.28 and 0.19.
 LAYERS = [
     (DOMAIN, 34.0, 43, -90, -70, None),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from autdtorch.fdtd.assembly.element import VERTICES, InterfaceElements, Materials, uniform_coupling
-from autdtorch.fdtd.assembly.layers import layered_elements, two_port
+from autdtorch.fdtd.assembly.layers import layered_elements
 from autdtorch.fdtd.assembly.prisms import Prisms, prisms, stacked
 from autdtorch.fdtd.assembly.sections import MaterialKey, Section
 from autdtorch.fdtd.stencil import Stencil
@@ -177,9 +177,7 @@ def _layered(
         ends = np.concatenate(([0.0], planes.cuts(kind[axis]), [1.0]))
         width[number, : last - first + 1] = np.diff(ends)
         layer[number] = columns[place][np.minimum(first + np.arange(most), last)]
-    wavenumber = stencil.kappa * materials.slowness[layer]
-    ports = two_port(width, _densities(materials)[layer], wavenumber, stencil.kappa)
-    return layered_elements(axis, ports, layer[:, [0, -1]], materials, stencil)
+    return layered_elements(axis, width, layer, _densities(materials), materials, stencil)
 
 
 def _prismatic(

@@ -113,20 +113,23 @@ def _flows(width: Array, density: Array, wavenumber: Array, across: float) -> tu
 
 
 def layered_elements(
-    axis: int, ports: TwoPort, ends: Index, materials: Materials, stencil: Stencil
+    axis: int, width: Array, layer: Index, density: Array, materials: Materials, stencil: Stencil
 ) -> tuple[Array, Array]:
     """Return coupling (n, 28) and mass (n, 8) of elements with layers across an axis.
 
-    `ends` (n, 2) are the materials of the two planes. The energy has a part g (p1 - p0)^T W (p1 - p0) of the
-    pressures p0 and p1 in the planes, where W averages along a plane in air. Each plane adds its energy in
-    air times a mobility. All parts are positive: waves would grow in a boundary layer otherwise.
+    Layers have widths (n, L) [cells] and materials (n, L), and these densities (m,). The energy has a part g
+    (p1 - p0)^T W (p1 - p0) of the pressures p0 and p1 in the planes, where W averages along a plane in air.
+    Each plane adds its energy in air times a mobility. All parts are positive: waves would grow in a boundary
+    layer otherwise.
     """
+    wavenumber = stencil.kappa * materials.slowness[layer]
+    ports = two_port(width, density[layer], wavenumber, stencil.kappa)
     across, side = EDGES_BETWEEN[:, axis] == 1, VERTICES[:, axis]
     uniform = uniform_coupling(stencil)
     beside = np.where(across, 0, coupling_by_edges(stencil)[np.minimum(EDGES_BETWEEN.sum(axis=1) + 1, 3)])
     along = ports.mobility[:, side[PAIRS[:, 0]]]
     link = np.where(across, uniform, -beside) * ports.link[:, None]
-    mass = (ports.thickness * materials.mass[ends] / 4)[:, side]
+    mass = (ports.thickness * materials.mass[layer[:, [0, -1]]] / 4)[:, side]
     return np.where(across, 0, along * (uniform + beside)) + link, mass
 
 
@@ -198,9 +201,7 @@ def flat_elements(
     for row, (widths, inside) in enumerate(stacks):
         width[row, : len(widths)], layer[row] = widths, inside[-1]
         layer[row, : len(widths)] = inside
-    wavenumber = stencil.kappa * materials.slowness[layer]
-    ports = two_port(width, materials.density[layer], wavenumber, stencil.kappa)
-    return layered_elements(axis, ports, layer[:, [0, -1]], materials, stencil)
+    return layered_elements(axis, width, layer, materials.density, materials, stencil)
 
 
 def _layers(line: Array, material: Index) -> tuple[Array, Index]:

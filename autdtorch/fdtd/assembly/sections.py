@@ -253,13 +253,9 @@ def _rim_fields(section: Section, mobility: Array, nodes: list[Array], count: in
     place = np.concatenate((up, wide + right, wide + tall + back, 2 * wide + tall + left))
     step = np.diff(place, append=whole)
     middle = place + step / 2
-    sides = [middle < wide, middle < wide + tall, middle < 2 * wide + tall]
-    x = np.select(sides, [low_x + middle, np.full_like(middle, high_x), high_x - middle + wide + tall], low_x)
-    y = np.select(
-        sides,
-        [np.full_like(middle, low_y), low_y + middle - wide, np.full_like(middle, high_y)],
-        high_y - middle + 2 * wide + tall,
-    )
+    corners = np.cumsum([0.0, wide, tall, wide, tall])
+    x = np.interp(middle, corners, (low_x, high_x, high_x, low_x, low_x))
+    y = np.interp(middle, corners, (low_y, low_y, high_y, high_y, low_y))
     value, order = _smoothest(step, mobility[np.array(section.material)[section.blocks_at(x, y)]], count)
     at = np.full((len(nodes[0]), len(nodes[1])), np.nan)
     at[0], at[:, -1] = 2 * wide + tall + high_y - nodes[1], wide + tall + high_x - nodes[0]

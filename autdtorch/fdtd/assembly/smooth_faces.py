@@ -170,8 +170,7 @@ def smooth_stiffness(
 ) -> tuple[Array, Array]:
     """Return the coupling (n, 28) of elements with a smooth surface, and the share (n,) of forces in it.
 
-    `mobility` (n, 64) is that of the sub-cells, `coupling` (n, 28) the coupling in series, and `uniform`
-    (28,) the coupling in air.
+    Sub-cells have `mobility` (n, 64). The coupling in series is `coupling` (n, 28), in air `uniform` (28,).
     """
     weight = weight_of_forces(surface)
     total = np.zeros((len(weight), 8, 8))
