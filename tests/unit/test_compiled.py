@@ -39,7 +39,11 @@ def run(cache: Path) -> tuple[str, int]:
     """Run `SCRIPT` in a new process; return the digest of its results and the number of kernels compiled."""
     command = [sys.executable, "-c", SCRIPT, str(TESTS)]
     process = subprocess.run(
-        command, capture_output=True, text=True, check=True, env=os.environ | {"NUMBA_CACHE_DIR": str(cache)}
+        command,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        env=os.environ | {"NUMBA_CACHE_DIR": str(cache)},
     )
     digest, compiled_now = process.stdout.split()
     return digest, int(compiled_now)
