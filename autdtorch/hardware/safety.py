@@ -235,11 +235,12 @@ class LimitedLink:
 
     def require_on(self) -> None:
         """Raise `LimitError` if the outputs went off since `play`, and the readings meanwhile are void."""
-        self._raise_failure()
-        if self._on_since is None:
-            self._seconds_left()
-            most = f"{self.limits.seconds_in_a_row:g} s in a row"
-            raise LimitError(f"settling and reading took longer than the outputs may stay on, {most}")
+        with self._lock:  # against the timer, which may be switching off
+            self._raise_failure()
+            if self._on_since is None:
+                self._seconds_left()
+                most = f"{self.limits.seconds_in_a_row:g} s in a row"
+                raise LimitError(f"settling and reading took longer than the outputs may stay on, {most}")
 
     def off(self) -> None:
         """Switch all outputs off, and begin the rest of the duty cycle."""

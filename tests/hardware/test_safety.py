@@ -1,13 +1,13 @@
 """Limits of a trial, and outputs off in every case."""
 
 import contextlib
-import functools
 import os
 import signal
 import sys
 import threading
 import time
 import weakref
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autdtorch import hardware as hw
+from autdtorch.hardware import safety
 from autdtorch.hardware.sensors.sensor import checked_reading
 from autdtorch.methods.run import observed
 
@@ -77,15 +78,23 @@ def test_no_wait_is_longer_than_a_trial(value):
                 make()
 
 
-def test_the_outputs_rest_as_the_duty_cycle_asks(trial):
-    begin = time.monotonic()
-    with trial.limited(seconds_in_a_row=0.2, duty_cycle=0.25) as (_, link):
-        while link.seconds_on < 0.25:
+@pytest.fixture
+def clock(monkeypatch):
+    """The clock of limits: `now` [s] goes on in sleeps alone, and timers of many seconds do not go off."""
+    clock = SimpleNamespace(now=0.0, monotonic=lambda: clock.now)
+    clock.sleep = lambda seconds: setattr(clock, "now", clock.now + seconds)
+    monkeypatch.setattr(safety, "time", clock)
+    return clock
+
+
+def test_the_outputs_rest_as_the_duty_cycle_asks(trial, clock):
+    with trial.limited(seconds_in_a_row=100, duty_cycle=0.25) as (_, link):
+        while link.seconds_on < 125:
             link.play(FULL)
-            time.sleep(0.002)
+            clock.sleep(1)
             link.require_on()
         # The last stretch has not rested yet; it is shorter than what is allowed in a row.
-        assert time.monotonic() - begin >= (link.seconds_on - 0.2) / 0.25
+        assert clock.now >= (link.seconds_on - 100) / 0.25
 
 
 @pytest.mark.parametrize(
@@ -98,42 +107,27 @@ def test_the_outputs_rest_as_the_duty_cycle_asks(trial):
 @pytest.mark.parametrize("in_main_thread", [True, False])
 def test_while_a_sensor_takes_too_long_the_outputs_go_off(trial, limits, message: str, in_main_thread: bool):
     def wait(_: int) -> None:
-        time.sleep(0.2)
-        amplitudes.append(float(bench.drive().abs().max()))
+        while bench.drive().any():
+            time.sleep(60 if in_main_thread else 1e-3)  # in the main thread, the reading is interrupted
 
     def measure() -> None:
         with pytest.raises(hw.LimitError, match=message):
             objective(FULL[None])
-        amplitudes.append(float(bench.drive().abs().max()))
+        are_off.append(not bench.drive().any())
 
-    amplitudes: list[float] = []
+    are_off: list[bool] = []
     with trial.limited(**limits) as (bench, link):
         objective = trial.objective(link, Disturbed(bench, wait))
-        if in_main_thread:  # the reading is interrupted
+        if in_main_thread:
             measure()
-            assert amplitudes == [0.0]
         else:
             other = threading.Thread(target=measure)
             other.start()
             other.join()
-            assert amplitudes == [0.0, 0.0]
+        assert are_off == [True]
         assert not objective.log.evaluations
         with pytest.raises(hw.LimitError, match=message):
             hw.check_transducers(link, Disturbed(bench, wait), points=2, readings=1, background=1)
-
-
-class Hung(hw.EmulatedSensor):
-    """A sensor that waits forever from one of its readings on: in a sleep, for a file, or for an answer."""
-
-    def __init__(self, bench, wait, at=1):
-        super().__init__(bench)
-        self._wait, self._left = wait, at
-
-    def read(self):
-        self._left -= 1
-        if not self._left:
-            self._wait()
-        return super().read()
 
 
 def wait_for_pipe(folder):
@@ -152,13 +146,15 @@ WAITS = {
 @pytest.mark.parametrize("kind", WAITS)
 def test_a_sensor_that_never_returns_ends_the_trial(trial, tmp_path, kind: str):
     begin, before = time.monotonic(), [signal.getsignal(one) for one in signal.valid_signals()]
-    with trial.limited(seconds_in_a_row=0.1) as (bench, link):
-        objective = trial.objective(link, Hung(bench, functools.partial(WAITS[kind], tmp_path), at=3))
+    with trial.limited(seconds_in_a_row=0.5) as (bench, link):
+        objective = trial.objective(
+            link, Disturbed(bench, lambda reading: reading == 3 and WAITS[kind](tmp_path))
+        )
         with pytest.raises(hw.LimitError, match="longer than the outputs may stay on"):
             objective(FULL.expand(5, -1))
         assert bench.drive().abs().max() == 0
         assert objective.evaluations == 2  # what was read is in the log
-    assert time.monotonic() - begin < 5
+    assert time.monotonic() - begin < 30
     assert [signal.getsignal(one) for one in signal.valid_signals()] == before
 
 
@@ -166,14 +162,17 @@ def test_a_sensor_that_never_returns_in_silence_ends_the_check(trial, monkeypatc
     monkeypatch.setattr(checked_reading, "__defaults__", (0.1,))
     with trial.limited() as (bench, link):
         with pytest.raises(hw.SensorError, match="no reading within"):
-            hw.check_transducers(link, Hung(bench, lambda: time.sleep(60), at=2), 2)
+            hw.check_transducers(link, Disturbed(bench, lambda reading: reading == 2 and time.sleep(60)), 2)
         assert link.seconds_on == 0
 
 
 def test_a_signal_that_comes_while_a_sensor_hangs_ends_the_trial_at_once(trial):
-    with trial.limited() as (bench, link), hw.ended_by_signals():
-        objective = trial.objective(link, Hung(bench, lambda: time.sleep(60)))
+    def hang(_: int) -> None:
         threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        time.sleep(60)
+
+    with trial.limited() as (bench, link), hw.ended_by_signals():
+        objective = trial.objective(link, Disturbed(bench, hang))
         with pytest.raises(hw.Signalled):
             objective(FULL[None])
         assert bench.drive().abs().max() == 0
@@ -181,23 +180,20 @@ def test_a_signal_that_comes_while_a_sensor_hangs_ends_the_trial_at_once(trial):
 
 def test_while_the_sound_settles_the_timer_may_switch_off(trial):
     def sleep(seconds: float) -> None:
-        if seconds == 0.2:
-            time.sleep(seconds)
-            amplitudes.append(float(bench.drive().abs().max()))
+        while seconds == 0.2 and bench.emitted().any():
+            time.sleep(1e-3)
 
-    amplitudes: list[float] = []
     bench = trial.bench()
     bench.bus.sleep = sleep
     with hw.open_link(hw.SONICSURFACE, range(16), backend=bench.bus, settle=0.2) as link:
         limits = hw.LimitedLink(link, hw.Limits(1.0, seconds_in_a_row=0.02))
         limits.play(FULL)
-        assert amplitudes == [0.0]
         with pytest.raises(hw.LimitError, match="settling and reading took longer"):
             limits.require_on()
 
 
 def test_a_timer_that_comes_late_reaches_neither_the_next_stretch_nor_the_next_link(trial):
-    with trial.limited(seconds_in_a_row=0.5) as (bench, link):
+    with trial.limited() as (bench, link):
         link.play(FULL)
         late = link._timer
         assert late.daemon  # for another Python would wait before it exits and switches off
@@ -208,7 +204,7 @@ def test_a_timer_that_comes_late_reaches_neither_the_next_stretch_nor_the_next_l
         assert bench.drive().abs().min() > 0.9
     with trial.link(bench) as later:
         later.play(FULL)
-        link._timer.join()
+        link._timer.function()
         assert bench.drive().abs().min() > 0.9
     with pytest.raises(hw.LinkError, match="SonicSurface is closed"):
         later.play(FULL)
@@ -284,27 +280,25 @@ def test_the_time_on_goes_on_with_the_trial(trial):
         assert link.seconds_on == 60.0
 
 
-def test_a_trial_that_goes_on_rests_no_longer_than_its_limits_promise(trial):
-    with trial.limited(seconds=0.1, seconds_in_a_row=1e6, duty_cycle=0.5) as (_, link):
+def test_a_trial_that_goes_on_rests_no_longer_than_its_limits_promise(trial, clock):
+    with trial.limited(seconds=100, seconds_in_a_row=1e6, duty_cycle=0.5) as (_, link):
         link.go_on(0.0)
-        begin = time.monotonic()
         link.play(FULL)
-        assert time.monotonic() - begin < 5  # 0.1 s, and the times of the link; 12 days by the other limit
+        assert clock.now == 100  # 12 days by the other limit
 
 
-def test_the_time_of_an_earlier_check_counts_and_is_rested_from(trial):
+def test_the_time_of_an_earlier_check_counts_and_is_rested_from(trial, clock):
     with trial.limited() as (bench, link):
-        sensor = hw.EmulatedSensor(bench)
+        sensor = Disturbed(bench, lambda _: clock.sleep(0.1))
         log = trial.objective(link, sensor).log
         hw.check_transducers(link, sensor, points=2)
         log.end(link.seconds_on)
-        before = link.seconds_on
-        again = hw.LimitedLink(link.link, hw.Limits(1.0, seconds_in_a_row=0.05, duty_cycle=0.25))
-        begin = time.monotonic()
+        before, end = link.seconds_on, clock.now
+        again = hw.LimitedLink(link.link, hw.Limits(1.0, seconds_in_a_row=50, duty_cycle=0.25))
         objective = trial.objective(again, sensor)
         assert again.seconds_on == before > 0
         objective(FULL[None])
-        assert time.monotonic() - begin >= 0.05 * (1 / 0.25 - 1)
+        assert clock.now - end == pytest.approx(50 * (1 / 0.25 - 1) + 0.1)
         assert objective.log.seconds_on > before
         # Nor does a second objective on the same link count anything twice.
         once = again.seconds_on

@@ -23,11 +23,11 @@ def line():
     os.close(near)
 
 
-def received(far: int) -> bytes:
-    """All bytes on the line; a busy kernel passes them on late, and in pieces."""
+def received(far: int, count: int) -> bytes:
+    """A number of bytes from the line; a busy kernel passes them on late, and in pieces."""
     data = b""
-    while select.select([far], [], [], 0.2)[0]:
-        data += os.read(far, 4096)
+    while len(data) < count and select.select([far], [], [], 30)[0]:
+        data += os.read(far, count - len(data))
     return data
 
 
@@ -38,17 +38,18 @@ def test_a_device_at_a_named_port_plays_and_is_off_in_the_end(line, device, monk
     far, name = line
     firmware = device.firmware(device.transducers)
     full = torch.ones(device.transducers).cdouble()
+    frame = len(device.frame(full))
     with open_link(device, port=name, settle=0) as link:
         assert waited[0] == device.boot_time
-        firmware.receive(received(far))
+        firmware.receive(received(far, 2 * frame))
         assert not firmware.drive().any()
         os.write(far, b"an echo")  # dropped
         link.play(-full)
-        firmware.receive(received(far))
+        firmware.receive(received(far, frame))
         torch.testing.assert_close(firmware.drive(), -full, rtol=0, atol=1e-14)
         with pytest.raises(LinkError, match=f"{name} cannot be opened"):
             open_link(device, port=name)
-    firmware.receive(received(far))
+    firmware.receive(received(far, 2 * frame))
     assert not firmware.drive().any()
 
 
