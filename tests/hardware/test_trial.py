@@ -115,6 +115,8 @@ def test_the_check_finds_the_failed_transducers(trial, snr):
         sensor = hw.EmulatedSensor(bench, snr)
         check = hw.check_transducers(link, sensor, points=2, watch=read.append)
         assert check.failed == [3, 9]
+        with pytest.warns(DeprecationWarning, match="now Preflight.failed"):
+            assert check.dead == [3, 9]
         assert read == ["silence, outputs off", *(f"transducer {n} of 16" for n in range(1, 17))]
         assert bench.firmware.drive().abs().max() == 0
         assert hw.hears_silence(sensor, check, points=2)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 
@@ -14,6 +12,7 @@ from autdtorch.hardware.played import Wiring
 from autdtorch.hardware.transport.port import Port
 from autdtorch.scene.drive import amplitudes_of, phases_of
 from autdtorch.utils.array_types import REAL
+from autdtorch.utils.hints import renamed_keywords
 from autdtorch.utils.validation import complex_tensor, indices, integers
 
 
@@ -26,14 +25,13 @@ class EmulatedBench:
         transfer_matrix: (P, M) [Pa], complex128.
     """
 
+    @renamed_keywords(dead="failed")
     def __init__(
         self,
         device: Device,
         transfer_matrix: torch.Tensor,
         transducers: Sequence[int] | torch.Tensor | None = None,
         failed: Sequence[int] = (),
-        *,
-        dead: Any = None,
     ) -> None:
         """Plug the device in, on its usual chip.
 
@@ -42,14 +40,10 @@ class EmulatedBench:
             transfer_matrix: (P, M) of the scene on the bench [Pa].
             transducers: the device's transducer for each of the scene's (M,); by default all in order.
             failed: transducers of the scene that stay silent.
-            dead: the former name of `failed`.
 
         `ValueError` for `transducers` that the device does not have, or not as many as the matrix has, or
         `failed` ones that the scene does not have.
         """
-        if dead is not None:
-            warnings.warn("dead= is now failed=", DeprecationWarning, stacklevel=2)
-            failed = dead
         self._transducers = Wiring(device, transducers).transducers
         self.transfer_matrix = complex_tensor("transfer_matrix", transfer_matrix).to("cpu", torch.complex128)
         if self.transfer_matrix.ndim != 2 or self.transfer_matrix.shape[1] != len(self._transducers):
