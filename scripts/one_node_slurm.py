@@ -9,8 +9,6 @@ is bound to the cores that it asks for, and a job gets a second from SIGTERM to 
 `--requeue` are queued again after 10 s instead of Slurm's 120 s.
 """
 
-from __future__ import annotations
-
 import contextlib
 import getpass
 import os

@@ -1,44 +1,43 @@
 """Run time against error of transfer matrices: exact solutions, and the paper's cubes.
 
-Writes accuracy.json, accuracy.png and a block of benchmarks.md. Errors are complex relative L2 errors of the
-transfer matrix, for the total field and for its scattered part. Run times include the assembly of the scene.
-The paper's domain is cut to array, obstacles and first focus; symmetry makes the other three foci equal.
-Exits with 1 if an error is above its required limit.
+Writes accuracy.json, accuracy.png and a block of the documentation. Errors are complex relative L2 errors of
+the transfer matrix, for the total field and for its scattered part. Run times include the assembly of the
+scene. The paper's domain is cut to array, obstacles and first focus; symmetry makes the other three foci
+equal. Exits with 1 if an error is above its required limit.
 
     python scripts/benchmark.py accuracy                     2 to 1 mm
     python scripts/benchmark.py accuracy --fine              with 0.5 mm
     python scripts/benchmark.py accuracy --make-reference    the fine grids of the cubes, once
 """
 
-from __future__ import annotations
-
-import argparse
 import json
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from datetime import date
-from pathlib import Path
+from itertools import groupby
 
 import numpy as np
 from matplotlib.figure import Figure
 from shared import cases
 from shared.cases import Case, Simulation, cube_case, error_of, simulate, sphere_case
-from shared.document import command_line, fill_in, measured, percent, table
-from shared.scenes import relative_error
+from shared.document import Page, command_line, percent, table
+from shared.scenes import relative_error, uncached
 
-import autdtorch as at
 from autdtorch.plot.costs import plot_pareto
 from autdtorch.plot.style import TICK_SIZE, readable
 
 DOCUMENT = "benchmarks.md"
 
 SPACINGS = (2.0, 1.5, 1.0)  # [mm]
-FINE_SPACING = 0.5
-
-REFERENCE_SPACINGS = (0.3e-3, 0.2e-3)  # [m]
-
+FINE_SPACING = 0.5  # [mm]
+REFERENCE_SPACINGS = (0.3, 0.2)  # [mm]
 SHIFTED_SPHERES = ("rigid sphere", "sphere")
+
+OPTIONS = {
+    "--spacings": {"type": float, "nargs": "+", "default": SPACINGS, "metavar": "MM", "help": "two or more"},
+    "--fine": {"action": "store_true", "help": "also 0.5 mm"},
+    "--shifts": {"type": int, "default": 5, "help": "positions of the sphere on the grid"},
+    "--make-reference": {"action": "store_true", "help": "only that"},
+}
 
 
 @dataclass(frozen=True)
@@ -77,34 +76,54 @@ LIMITS = {
 }
 """Largest total and scattered error, by case, first word of the treatment, and spacing [mm]."""
 
-Orders = Mapping[tuple[str, str], float]
-"""Observed order of convergence by case and treatment."""
+
+def main(page: Page, spacings: Sequence[float], fine: bool, shifts: int, make_reference: bool) -> int:
+    """Measure, or make the reference."""
+    if make_reference:
+        store_reference()
+        return 0
+    spacings = sorted({*spacings, *([FINE_SPACING] if fine else [])}, reverse=True)
+    if len(spacings) < 2:
+        raise SystemExit(f"argument --spacings: {spacings}; must be at least two different ones")
+    failed = write_report(measure(spacings, shifts), page)
+    print(*failed, sep="\n")
+    return int(bool(failed))
 
 
-def make_reference() -> None:
+def store_reference() -> None:
     """Store the transfer matrices of the cubes on fine grids."""
     scenes: dict[str, list[dict[str, object]]] = {}
     for name in cases.CUBES:
-        scene, matrices = cases.close_scene(name), []
-        for spacing in REFERENCE_SPACINGS:
-            propagator = at.make_propagator(scene, "box", spacing, tolerance=1e-5, cache=False)
-            matrices.append(propagator.transfer_matrix(scene.control_points[:1]))
-            print(f"{name} at {spacing * 1e3:.4g} mm done", flush=True)
+        scene = cases.close_scene(name)
+        matrices = [uncached(scene, "box", h, 1e-5).transfer_matrix() for h in REFERENCE_SPACINGS]
         print(f"{name}: {relative_error(*matrices):.1e} between the grids", flush=True)
         scenes[name] = [
-            {"spacing": h, "real": g.real.tolist(), "imag": g.imag.tolist()}
-            for h, g in zip(REFERENCE_SPACINGS, matrices, strict=True)
+            {"spacing": 1e-3 * h, "real": matrix.real.tolist(), "imag": matrix.imag.tolist()}
+            for h, matrix in zip(REFERENCE_SPACINGS, matrices, strict=True)
         ]
-    cases.CUBE_MATRICES.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"command": command_line(), "scenes": scenes}, indent=1)
     cases.CUBE_MATRICES.write_text(text + "\n", "utf-8")
 
 
-def compare(case: Case, treatment: str, spacing: float, found: Simulation) -> Row:
+def measure(spacings: Sequence[float], shifts: int) -> list[Row]:
+    """Measure every case."""
+    simulate(sphere_case("sphere"), 2.8)  # compiles the kernel
+    swept = [cases.free_space_case(), *map(sphere_case, cases.SPHERES), *map(cube_case, cases.CUBES)]
+    rows = [compare(case, "default", h, simulate(case, h)) for case in swept for h in spacings]
+    if shifts:
+        rows += [worst_shift(name, h, shifts) for name in SHIFTED_SPHERES for h in spacings]
+    for case in (cases.slab_case(), cases.wall_case()):
+        rows.append(compare(case, "default", 1.0, simulate(case, 1.0)))
+    return [*rows, worst_point()]
+
+
+def compare(case: Case, treatment: str, spacing: float, simulation: Simulation) -> Row:
     """Return the errors of a transfer matrix."""
-    total, scattered = error_of(case, found.matrix)
-    print(f"{case.name}, {treatment}, {spacing:g} mm: {percent(total)}, {found.seconds:.1f} s", flush=True)
-    return Row(case.name, treatment, spacing, total, scattered, found.seconds, found.settled)
+    total, scattered = error_of(case, simulation.matrix)
+    print(
+        f"{case.name}, {treatment}, {spacing:g} mm: {percent(total)}, {simulation.seconds:.1f} s", flush=True
+    )
+    return Row(case.name, treatment, spacing, total, scattered, simulation.seconds, simulation.settled)
 
 
 def worst_shift(name: str, spacing: float, count: int) -> Row:
@@ -115,31 +134,22 @@ def worst_shift(name: str, spacing: float, count: int) -> Row:
     for shift in shifts.tolist():
         case = sphere_case(name, shift)
         rows.append(compare(case, f"worst of {count} shifts", spacing, simulate(case, spacing)))
-    return max(rows, key=lambda one: one.total)
+    return max(rows, key=lambda row: row.total)
 
 
 def worst_point(spacing: float = 1.0) -> Row:
     """Return the error of the piston's worst direction, relative to the pressure there."""
     case = cases.piston_case()
-    found = simulate(case, spacing)
-    worst = cases.worst_point_error(case, found.matrix)
-    return Row(case.name, "default, worst point", spacing, worst, None, found.seconds, found.settled)
+    done = simulate(case, spacing)
+    worst = float(((done.matrix - case.exact).abs() / case.exact.abs()).max())
+    return Row(case.name, "default, worst point", spacing, worst, None, done.seconds, done.settled)
 
 
-def measure(spacings: Sequence[float], shifts: int) -> list[Row]:
-    """Measure every case."""
-    simulate(sphere_case("sphere"), 2.8)  # compiles the kernel
-    swept = [cases.free_space_case(), *map(sphere_case, cases.SPHERES)]
-    if cases.CUBE_MATRICES.exists():
-        swept += map(cube_case, cases.CUBES)
-    else:
-        print("the cubes are left out: they need --make-reference once", flush=True)
-    rows = [compare(case, "default", h, simulate(case, h)) for case in swept for h in spacings]
-    if shifts:
-        rows += [worst_shift(name, h, shifts) for name in SHIFTED_SPHERES for h in spacings]
-    for case in (cases.slab_case(), cases.wall_case()):
-        rows.append(compare(case, "default", 1.0, simulate(case, 1.0)))
-    return [*rows, worst_point()]
+def series(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
+    """Return the rows by case and treatment, all treatments of a case in a row."""
+    cases = list(dict.fromkeys(row.case for row in rows))
+    ordered = sorted(rows, key=lambda row: (cases.index(row.case), row.treatment))
+    return {key: list(group) for key, group in groupby(ordered, lambda row: (row.case, row.treatment))}
 
 
 def observed_order(spacings: Sequence[float], errors: Sequence[float]) -> float:
@@ -147,103 +157,62 @@ def observed_order(spacings: Sequence[float], errors: Sequence[float]) -> float:
     return float(np.polyfit(np.log(spacings), np.log(errors), 1)[0])
 
 
-def series(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
-    """Return the rows by case and treatment."""
-    found: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        found.setdefault((row.case, row.treatment), []).append(row)
-    return found
-
-
-def orders(rows: Sequence[Row]) -> Orders:
-    """Return the observed order of each series with more than one spacing."""
-    return {
-        key: observed_order([one.spacing for one in mine], [one.total for one in mine])
-        for key, mine in series(rows).items()
-        if len(mine) > 1
-    }
-
-
 def exceeded(rows: Sequence[Row]) -> tuple[int, list[str]]:
     """Return the number of limits that apply to the rows, and a line for each exceeded one."""
     count, lines = 0, []
     for row in rows:
-        key = (row.case, row.treatment.split()[0].rstrip(","), row.spacing)
-        found = (("total", row.total), ("scattered", row.scattered))
-        for (part, error), most in zip(found, LIMITS.get(key, (None, None)), strict=True):
-            if most is not None and error is not None:
-                count += 1
-                if not error <= most:
-                    what = f"{row.case}, {row.treatment}, {row.spacing:g} mm, {part}"
-                    lines.append(f"{what}: {percent(error)}, required at most {percent(most)}")
+        limits = LIMITS.get((row.case, row.treatment.split()[0].rstrip(","), row.spacing), (None, None))
+        for part, limit in zip(("total", "scattered"), limits, strict=True):
+            error = getattr(row, part)
+            if limit is None or error is None:
+                continue
+            count += 1
+            if not error <= limit:
+                what = f"{row.case}, {row.treatment}, {row.spacing:g} mm, {part}"
+                lines.append(f"{what}: {percent(error)}, required at most {percent(limit)}")
     return count, lines
 
 
-def errors(rows: Sequence[Row]) -> str:
+def error_table(rows: Sequence[Row]) -> str:
     """Return a table with a row for each case and treatment."""
     spacings = sorted({row.spacing for row in rows}, reverse=True)
-    cases = list(dict.fromkeys(row.case for row in rows))
-    found, by_series, lines = orders(rows), series(rows), []
-    for case, treatment in sorted(by_series, key=lambda one: cases.index(one[0])):
-        at_spacing = {row.spacing: row for row in by_series[case, treatment]}
-        total = [percent(at_spacing[h].total) if h in at_spacing else "" for h in spacings]
-        one = at_spacing.get(1.0)
-        scattered = "" if one is None or one.scattered is None else percent(one.scattered)
-        seconds = "" if one is None else f"{one.seconds:.3g} s{'' if one.settled else ', not settled'}"
-        order = f"{found[case, treatment]:.2f}" if (case, treatment) in found else ""
-        lines.append([readable(case), treatment, *total, scattered, seconds, order])
+    lines = []
+    for (case, treatment), group in series(rows).items():
+        by_spacing = {row.spacing: row for row in group}
+        total = [percent(by_spacing[h].total) if h in by_spacing else "" for h in spacings]
+        row = by_spacing.get(1.0)
+        scattered = "" if row is None or row.scattered is None else percent(row.scattered)
+        seconds = "" if row is None else f"{row.seconds:.3g} s{'' if row.settled else ', not settled'}"
+        order = observed_order(list(by_spacing), [row.total for row in group]) if len(group) > 1 else None
+        cells = [*total, scattered, seconds, "" if order is None else f"{order:.2f}"]
+        lines.append([readable(case), treatment, *cells])
     header = [*(f"{h:g} mm" for h in spacings), "scattered, 1 mm", "time, 1 mm", "order"]
     return table(["case", "treatment", *header], lines)
 
 
 def figure(rows: Sequence[Row]) -> Figure:
     """Plot the error of the field over the run time, a panel for each case with more than one spacing."""
-    swept = {case: mine for (case, name), mine in series(rows).items() if name == "default" and len(mine) > 1}
+    swept = {
+        readable(case): group
+        for (case, name), group in series(rows).items()
+        if name == "default" and len(group) > 1
+    }
     plotted = plot_pareto(
-        {
-            readable(case): {"autdtorch": [(r.seconds, 100 * r.total) for r in mine]}
-            for case, mine in swept.items()
-        },
+        {case: {"autdtorch": [(r.seconds, 100 * r.total) for r in group]} for case, group in swept.items()},
         "run time [s]",
         "relative error of the field [%]",
-        names={
-            readable(case): {"autdtorch": [f"{r.spacing:g}" for r in mine]} for case, mine in swept.items()
-        },
+        names={case: {"autdtorch": [f"{r.spacing:g}" for r in group]} for case, group in swept.items()},
     )
     plotted.supxlabel(f"numbers on the front: spacing [mm]\n{command_line()}", fontsize=TICK_SIZE)
     return plotted
 
 
-def write_report(rows: Sequence[Row], folder: Path) -> list[str]:
-    """Write accuracy.json, accuracy.png and benchmarks.md into `folder`; return the exceeded limits."""
+def write_report(rows: Sequence[Row], page: Page) -> list[str]:
+    """Write the block, accuracy.json and accuracy.png; return the exceeded limits."""
     count, failed = exceeded(rows)
     limits = "\n".join(failed) if failed else f"All {count} required limits are kept."
     legend = "Total error by spacing; scattered error and run time at 1 mm; observed order."
-    parts = (measured(), "![Error over run time](accuracy.png)", f"{legend} {limits}", errors(rows))
-    fill_in(DOCUMENT, "benchmark.py accuracy", parts, folder)
-    made = {"command": command_line(), "date": date.today().isoformat(), "cores": os.cpu_count()}
-    content = json.dumps({**made, "rows": [asdict(row) for row in rows]}, indent=1)
-    (folder / "accuracy.json").write_text(content + "\n", encoding="utf-8")
-    figure(rows).savefig(folder / "accuracy.png")
+    page.write("![Error over run time](accuracy.png)", f"{legend} {limits}", error_table(rows))
+    page.write_rows("accuracy.json", map(asdict, rows))
+    page.save("accuracy.png", figure(rows))
     return failed
-
-
-OPTIONS = {
-    "--spacings": {"type": float, "nargs": "+", "default": SPACINGS, "metavar": "MM", "help": "two or more"},
-    "--fine": {"action": "store_true", "help": "also 0.5 mm"},
-    "--shifts": {"type": int, "default": 5, "help": "positions of the sphere on the grid"},
-    "--make-reference": {"action": "store_true", "help": "only that"},
-}
-
-
-def main(given: argparse.Namespace) -> int:
-    """Measure, or make the reference."""
-    if given.make_reference:
-        make_reference()
-        return 0
-    spacings = sorted({*given.spacings, *([FINE_SPACING] if given.fine else [])}, reverse=True)
-    if len(spacings) < 2:
-        raise SystemExit(f"argument --spacings: {given.spacings}; must be at least two different ones")
-    failed = write_report(measure(spacings, given.shifts), given.output)
-    print(*failed, sep="\n")
-    return int(bool(failed))

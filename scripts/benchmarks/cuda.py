@@ -1,30 +1,26 @@
 """Rates and run times on a GPU, beside those of the CPU kernel on the same machine.
 
-Fills in a block of performance.md. A cell of uniform air in float32 needs 12 bytes a step; the bandwidth is
-that of a copy within the GPU's memory. Matrices come from propagators of their own, preparing included, the
-faster of two. Holograms are of random matrices of 256 transducers and 8 points.
+Fills in a block of the documentation. A cell of uniform air in float32 needs 12 bytes a step; the bandwidth
+is measured by a copy within the GPU's memory. Each matrix has a new propagator, preparing included; the
+faster of two counts. Holograms are of random matrices of 256 transducers and 8 points.
 
     python scripts/benchmark.py cuda              about a minute, with an NVIDIA GPU
 """
 
-from __future__ import annotations
-
-import argparse
 import math
-import time
 from collections.abc import Iterator
 
 import torch
-from benchmarks.kernels import assemblies, fastest, uniform
-from shared.document import fill_in, measured, percent, table
-from shared.scenes import autd3_array, paper_scene, relative_error
+from benchmarks.kernels import assemblies, cell_rate, fastest, uniform
+from shared.document import Page, percent, printed, table
+from shared.scenes import autd3_array, paper_scene, relative_error, uncached
+from shared.timing import shortest
 
 import autdtorch as at
-from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, uniform_state
 from autdtorch.fdtd.kernels.cuda import CudaKernel
-from autdtorch.propagators.moved_boxes import forget_assemblies
 
 DOCUMENT = "performance.md"
+OPTIONS = {"--seconds": {"type": float, "default": 0.2, "help": "of each repeat"}}
 
 CELL_BYTES = 12
 COPIED = 2**28
@@ -33,6 +29,21 @@ SIDES = (112, 256)
 REPEATS = 2
 SETS, POINTS, TRANSDUCERS, ITERATIONS = 4096, 8, 256, 100
 PHONE = at.Box((40e-3, 50e-3, 50e-3), (8e-3, 70e-3, 140e-3), rotation=(0.1, 0.2, 0.3), rigid=True)
+
+
+def main(page: Page, seconds: float) -> None:
+    """Measure, and write the block."""
+    if not torch.cuda.is_available():
+        raise SystemExit("cuda: needs an NVIDIA GPU")
+    copied = bandwidth(seconds)
+    page.write(
+        f"{torch.cuda.get_device_name()}, whose memory copies {copied / 1e12:.2f} TB/s. A step:",
+        table(["grid", "time", "Gcell/s", "of the bandwidth"], printed(rates(copied, seconds))),
+        "Transfer matrices, preparing on the CPU included, and the difference of the two:",
+        table(["scene", "CPU", "GPU", "ratio", "difference"], printed(matrices())),
+        f"Holograms a second, {TRANSDUCERS} transducers, {POINTS} points, {ITERATIONS} iterations:",
+        table(["algorithm", "a second"], printed(holograms())),
+    )
 
 
 def bandwidth(seconds: float) -> float:
@@ -48,44 +59,18 @@ def bandwidth(seconds: float) -> float:
     return fastest(copy, 8.0 * COPIED, seconds)
 
 
-def cell_rate(shape: tuple[int, int, int], coefficients: Coefficients, seconds: float) -> float:
-    """Return the cells stepped per second, without sources and receivers."""
-    kernel, state = CudaKernel(), uniform_state(shape, coefficients, 1e-20)
-    sources = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((0, 2)))
-    receivers = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1)))
-
-    def step(times: int) -> None:
-        nonlocal state
-        state, _ = kernel.advance(state, coefficients, sources, receivers, torch.zeros((times, 2)))
-        torch.cuda.synchronize()
-
-    return fastest(step, float(math.prod(shape)), seconds)
-
-
 def rates(copied: float, seconds: float) -> Iterator[list[str]]:
     """Measure the kernel on uniform air and on the paper's scenes."""
-    found = assemblies()
-    air = uniform(found["free space"])
+    scenes = assemblies()
+    air = uniform(scenes["free space"])
     cases = [(f"uniform air, {side}^3, no layers", (side,) * 3, air) for side in SIDES]
-    for name, each in found.items():
-        shape = each.grid.shape
-        cases.append((f"{name}, {' x '.join(map(str, shape))}", shape, each.coefficients))
+    for name, assembly in scenes.items():
+        shape = assembly.grid.shape
+        cases.append((f"{name}, {' x '.join(map(str, shape))}", shape, assembly.coefficients))
     for name, shape, coefficients in cases:
-        rate = cell_rate(shape, coefficients, seconds)
+        rate = cell_rate(CudaKernel(), shape, coefficients, seconds, torch.cuda.synchronize)
         share = percent(CELL_BYTES * rate / copied)
         yield [name, f"{1e6 * math.prod(shape) / rate:.1f} us", f"{rate / 1e9:.1f}", share]
-
-
-def matrix(scene: at.Scene, spacing: float, device: str) -> tuple[torch.Tensor, float]:
-    """Return the transfer matrix and its shortest time [s]."""
-    spent = []
-    for _ in range(REPEATS):
-        forget_assemblies()
-        begin = time.perf_counter()
-        propagator = at.make_propagator(scene, "box", spacing, tolerance=1e-3, cache=False, device=device)
-        found = propagator.transfer_matrix()
-        spent.append(time.perf_counter() - begin)
-    return found, min(spent)
 
 
 def phone_scene(points: int) -> at.Scene:
@@ -99,13 +84,18 @@ def phone_scene(points: int) -> at.Scene:
 def matrices() -> Iterator[list[str]]:
     """Time transfer matrices on the CPU and on the GPU."""
     cases = [
-        (f"{name.replace('_', ' ')}, {1e3 * spacing:g} mm", paper_scene(name), spacing)
+        (f"{name.replace('_', ' ')}, {spacing:g} mm", paper_scene(name), spacing)
         for name in ("three_cubes", "two_cubes")
-        for spacing in (1e-3, 0.5e-3)
+        for spacing in (1.0, 0.5)
     ]
-    cases += [(f"phone, AUTD3, {points} points, 1 mm", phone_scene(points), 1e-3) for points in (4, 64)]
+    cases += [(f"phone, AUTD3, {points} points, 1 mm", phone_scene(points), 1.0) for points in (4, 64)]
     for name, scene, spacing in cases:
-        (on_cpu, slow), (on_gpu, fast) = (matrix(scene, spacing, device) for device in ("cpu", "cuda"))
+        (on_cpu, slow), (on_gpu, fast) = (
+            shortest(
+                lambda s=scene, h=spacing, d=d: uncached(s, "box", h, device=d).transfer_matrix(), REPEATS
+            )
+            for d in ("cpu", "cuda")
+        )
         difference = f"{relative_error(on_gpu.cpu(), on_cpu):.1e}"
         yield [name, f"{slow:.2f} s", f"{fast:.2f} s", f"{slow / fast:.1f}", difference]
 
@@ -122,34 +112,3 @@ def holograms() -> Iterator[list[str]]:
             torch.cuda.synchronize()
 
         yield [algorithm, f"{fastest(solve, SETS, 0.1):,.0f}"]
-
-
-def printed(rows: Iterator[list[str]]) -> list[list[str]]:
-    """Return all rows, printed as they come."""
-    found = []
-    for row in rows:
-        print(row, flush=True)
-        found.append(row)
-    return found
-
-
-OPTIONS: dict[str, dict[str, object]] = {
-    "--seconds": {"type": float, "default": 0.2, "help": "of each repeat"}
-}
-
-
-def main(given: argparse.Namespace) -> None:
-    """Measure, and write the block."""
-    if not torch.cuda.is_available():
-        raise SystemExit("cuda: needs an NVIDIA GPU")
-    copied = bandwidth(given.seconds)
-    parts = (
-        measured(),
-        f"{torch.cuda.get_device_name()}, whose memory copies {copied / 1e12:.2f} TB/s. A step:",
-        table(["grid", "time", "Gcell/s", "of the bandwidth"], printed(rates(copied, given.seconds))),
-        "Transfer matrices, preparing on the CPU included, and the difference of the two:",
-        table(["scene", "CPU", "GPU", "ratio", "difference"], printed(matrices())),
-        f"Holograms a second, {TRANSDUCERS} transducers, {POINTS} points, {ITERATIONS} iterations:",
-        table(["algorithm", "a second"], printed(holograms())),
-    )
-    fill_in(DOCUMENT, "benchmark.py cuda", parts, given.output)

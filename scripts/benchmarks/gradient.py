@@ -2,21 +2,18 @@
 
 The paper's two cubes at 1 mm, 100^3 cells and their boundary layers, in 1008 steps; gradients by the drive,
 also by the materials of the cubes, and also by density and sound speed of every cell. Each case has a
-process of its own, which compiles the kernel first. Fills in a block of performance.md.
+process of its own, which compiles the kernel first. Fills in a block of the documentation.
 
     python scripts/benchmark.py gradient            5 minutes on 2 idle cores
 """
 
-from __future__ import annotations
-
-import argparse
-import time
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
-from shared.document import fill_in, measured, table
-from shared.processes import in_new_process, peak_memory
+from shared.document import Page, printed, table
 from shared.scenes import paper_scene
+from shared.timing import in_new_process, peak_memory, timed
 
 import autdtorch as at
 
@@ -24,6 +21,21 @@ DOCUMENT = "performance.md"
 
 STEPS_PER_PERIOD, PERIODS = 14, 72
 CASES = {"drive": "drive", "cubes": "drive, cubes' materials", "maps": "drive, maps of 100^3 cells"}
+OPTIONS = {"--cases": {"nargs": "+", "choices": CASES, "default": list(CASES), "help": "measured cases"}}
+
+
+def main(page: Page, cases: list[str]) -> None:
+    """Measure, and write the block."""
+    header = ["gradient by", "run without", "times that", "largest resident set", "before"]
+    page.write(table(header, printed(rows(cases))))
+
+
+def rows(cases: list[str]) -> Iterator[list[str]]:
+    """Yield a row for each case."""
+    for case in cases:
+        cost = in_new_process(measure, case)
+        memory = f"{cost.most / 2**30:.2f} GiB", f"{cost.before / 2**30:.2f} GiB"
+        yield [CASES[case], f"{cost.forward:.1f} s", f"{cost.gradient / cost.forward:.2f}", *memory]
 
 
 class Cost(NamedTuple):
@@ -56,35 +68,22 @@ def medium(case: str, spacing: float) -> tuple[at.Scene, dict[str, torch.Tensor]
 
 def gradient(case: str, spacing: float, periods: int) -> Cost:
     """Measure a case in this process."""
-    scene, given = medium(case, spacing)
+    scene, materials = medium(case, spacing)
     drive = torch.ones(len(scene.array), dtype=torch.complex128)
     settings = {"spacing": spacing, "periods": periods, "time_step": 1 / (scene.frequency * STEPS_PER_PERIOD)}
-    begin, before = time.perf_counter(), peak_memory()
-    at.differentiable_field(scene, drive, **given, **settings)
-    middle = time.perf_counter()
-    for each in (drive, *given.values()):
-        each.requires_grad_()
-    at.differentiable_field(scene, drive, **given, **settings).abs().min().backward()
-    return Cost(middle - begin, time.perf_counter() - middle, before, peak_memory())
+
+    def field() -> torch.Tensor:
+        return at.differentiable_field(scene, drive, **materials, **settings)
+
+    before = peak_memory()
+    _, forward = timed(field)
+    for parameter in (drive, *materials.values()):
+        parameter.requires_grad_()
+    _, both = timed(lambda: field().abs().min().backward())
+    return Cost(forward, both, before, peak_memory())
 
 
 def measure(case: str) -> Cost:
     """Compile the kernel, then measure."""
     gradient("cubes", 2e-3, 9)
     return gradient(case, 1e-3, PERIODS)
-
-
-OPTIONS = {"--cases": {"nargs": "+", "choices": CASES, "default": list(CASES), "help": "measured cases"}}
-
-
-def main(given: argparse.Namespace) -> None:
-    """Measure, and write the block."""
-    rows = []
-    for case in given.cases:
-        cost = in_new_process(measure, case)
-        memory = f"{cost.most / 2**30:.2f} GiB", f"{cost.before / 2**30:.2f} GiB"
-        times = f"{cost.forward:.1f} s", f"{cost.gradient / cost.forward:.2f}"
-        rows.append([CASES[case], *times, *memory])
-        print(rows[-1], flush=True)
-    header = ["gradient by", "run without", "times that", "largest resident set", "before"]
-    fill_in(DOCUMENT, "benchmark.py gradient", (measured(), table(header, rows)), given.output)

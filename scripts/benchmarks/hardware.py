@@ -1,24 +1,21 @@
 """Hardware trials on emulated devices: results, and evaluations per second.
 
-Fills in a block of hardware.md.
+Fills in a block of the documentation.
 
     python scripts/benchmark.py hardware            five to ten minutes
 """
 
-from __future__ import annotations
-
-import argparse
 import contextlib
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from shared.document import fill_in, measured, table
+from shared.document import Page, table
 from shared.scenes import paper_objectives
+from shared.timing import timed
 
 import autdtorch as at
 from autdtorch import hardware
@@ -31,22 +28,19 @@ SCENE = "three_cubes"
 DEVICES = (hardware.SONICSURFACE, hardware.OPENMPD)
 METHODS = {
     "LSSG": lambda objective, seed: at.lssg(objective),
-    "GABS": lambda objective, seed: at.gabs(objective, seed=seed),
-    "GABS, 3 passes": lambda objective, seed: at.gabs(objective, passes=3, seed=seed),
-    "identify": lambda objective, seed: at.identify(objective, seed=seed),
+    "GABS": at.gabs,
+    "GABS, 3 passes": partial(at.gabs, passes=3),
+    "identify": at.identify,
 }
 TARGETS = at.TargetPressures([6.0, 4.0, 6.0, 4.0])
+FOCI = {"initial": 4, "model": "foci", "kernel": "phasor", "noise": "inferred"}
 FOR_TARGETS = {
-    "GABS": lambda objective, seed: at.gabs(objective, seed=seed, goal=TARGETS),
-    "GABS, 3 passes": lambda objective, seed: at.gabs(objective, passes=3, seed=seed, goal=TARGETS),
-    "GABS, 5 passes": lambda objective, seed: at.gabs(objective, passes=5, seed=seed, goal=TARGETS),
-    "BO": lambda objective, seed: at.bayes_opt(objective, 150, seed=seed, goal=TARGETS),
-    "BO, circle": lambda objective, seed: at.bayes_opt(
-        objective, 150, kernel="circle", seed=seed, goal=TARGETS
-    ),
-    "BO, foci": lambda objective, seed: at.bayes_opt(
-        objective, 80, initial=4, model="foci", kernel="phasor", noise="inferred", seed=seed, goal=TARGETS
-    ),
+    "GABS": partial(at.gabs, goal=TARGETS),
+    "GABS, 3 passes": partial(at.gabs, passes=3, goal=TARGETS),
+    "GABS, 5 passes": partial(at.gabs, passes=5, goal=TARGETS),
+    "BO": partial(at.bayes_opt, evaluations=150, goal=TARGETS),
+    "BO, circle": partial(at.bayes_opt, evaluations=150, kernel="circle", goal=TARGETS),
+    "BO, foci": partial(at.bayes_opt, evaluations=80, **FOCI, goal=TARGETS),
 }
 SNR = 30.0  # dB
 
@@ -54,14 +48,46 @@ _CHIP = (0x2A8D, 0x1770)
 _SENSITIVITY = 0.01  # V/Pa
 _LOUDEST = 20.0  # Pa
 
-Method = Callable[[at.Objective], at.Solution]
+Method = Callable[..., at.Solution]
+"""A method of an objective and a `seed`."""
 Sensor = Callable[[hardware.EmulatedBench, at.Scene, int], contextlib.AbstractContextManager[hardware.Sensor]]
+
+
+OPTIONS = {"--seeds": {"type": int, "default": 10, "help": "trials of each kind"}}
+
+
+def main(page: Page, seeds: int) -> None:
+    """Measure, and write the block."""
+    simulated, seeds = paper_objectives()[SCENE], range(seeds)
+    pairs = [(device, method) for device in DEVICES for method in METHODS.values()]
+    same = [same_drive(simulated, device, method, seed) for device, method in pairs for seed in seeds]
+    noisy = [
+        [where, name, *with_noise(simulated, DEVICES[0], sensor, method, seeds)]
+        for where, sensor in (("readings", readings), ("samples", oscilloscope))
+        for name, method in METHODS.items()
+    ]
+    page.write(
+        f"The scene `{SCENE}` on emulated devices, {len(seeds)} seeds. Without noise, {sum(same)} of\n"
+        f"{len(same)} trials find the drive of the simulation.",
+        f"With noise {SNR:g} dB below the rms pressure of random drives, in every reading or in every\n"
+        "sample of an oscilloscope: true weakest focus against the simulated trial of the same seed, on\n"
+        f"{DEVICES[0].name}.",
+        table(["noise in", "method", "mean (95 % interval) [%]", "range [%]", "within 5 %"], noisy),
+        f"Targets of {TARGETS.targets} Pa with this noise in every reading: true rms\n"
+        "deviation from the targets.",
+        table(
+            ["method", "evaluations", "median [%]", "largest [%]", "within 5 %"],
+            with_targets(simulated, DEVICES[0], seeds),
+        ),
+        "Evaluations per second of GABS, on the emulated device and with the waits of a bench (frames on\n"
+        f"the line, off frames, 5 ms of settling): {'; '.join(rates(simulated, d, seeds) for d in DEVICES)}.",
+    )
 
 
 class Trial(NamedTuple):
     """A trial on an emulated device: its solution, its run time [s], and the waits of a real one [s]."""
 
-    found: at.Solution
+    solution: at.Solution
     seconds: float
     waits: float
 
@@ -112,30 +138,32 @@ def measure(
         limited = hardware.LimitedLink(link, hardware.Limits(amplitude=1.0))
         log = Path(folder) / "trial.jsonl"
         objective = hardware.HardwareObjective(simulated.scene, limited, opened, log)
-        begin, slept = time.perf_counter(), bench.bus.slept
-        found = method(objective)
-        return Trial(found, time.perf_counter() - begin, bench.bus.slept - slept)
+        slept = bench.bus.slept
+        solution, seconds = timed(lambda: method(objective, seed=seed))
+        return Trial(solution, seconds, bench.bus.slept - slept)
 
 
-def same_drive(simulated: at.SimulatedObjective, device: hardware.Device, name: str, seed: int) -> bool:
+def on_levels(simulated: at.SimulatedObjective, device: hardware.Device) -> at.Objective:
+    """Return the simulation of drives that have the levels of a device."""
+    return hardware.Played(simulated, device, range(len(simulated.scene.array)))
+
+
+def same_drive(simulated: at.SimulatedObjective, device: hardware.Device, method: Method, seed: int) -> bool:
     """Return whether a trial without noise finds the drive of the simulation."""
-    method = partial(METHODS[name], seed=seed)
-    expected = method(hardware.Played(simulated, device, range(len(simulated.scene.array))))
-    found = measure(simulated, device, noiseless, method, seed).found
-    return torch.allclose(found.drive, expected.drive, rtol=0, atol=1e-9)
+    expected = method(on_levels(simulated, device), seed=seed)
+    solution = measure(simulated, device, noiseless, method, seed).solution
+    return torch.allclose(solution.drive, expected.drive, rtol=0, atol=1e-9)
 
 
 def with_noise(
-    simulated: at.SimulatedObjective, device: hardware.Device, sensor: Sensor, name: str, seeds: range
+    simulated: at.SimulatedObjective, device: hardware.Device, sensor: Sensor, method: Method, seeds: range
 ) -> list[str]:
     """Return the cells of a method in the table of noise."""
-    on_levels = hardware.Played(simulated, device, range(len(simulated.scene.array)))
-    deviations = []
+    played, deviations = on_levels(simulated, device), []
     for seed in seeds:
-        method = partial(METHODS[name], seed=seed)
-        found = measure(simulated, device, sensor, method, seed).found
-        truly = at.weakest_focus(at.true_pressure(on_levels, found.drive))
-        deviations.append(float(truly / at.weakest_focus(method(on_levels).pressure)) - 1)
+        drive = measure(simulated, device, sensor, method, seed).solution.drive
+        true = at.weakest_focus(at.true_pressure(played, drive))
+        deviations.append(float(true / at.weakest_focus(method(played, seed=seed).pressure)) - 1)
     mean = bootstrap(torch.tensor(deviations))
     percent = [f"{100 * value:+.1f}" for value in (mean.value, mean.low, mean.high)]
     within = sum(abs(deviation) <= 0.05 for deviation in deviations)
@@ -148,57 +176,19 @@ def with_noise(
 
 def with_targets(simulated: at.SimulatedObjective, device: hardware.Device, seeds: range) -> list[list[str]]:
     """Return the rows of the table of targets: true rms deviations from the targets."""
-    on_levels, rows = hardware.Played(simulated, device, range(len(simulated.scene.array))), []
-    for name, solve in FOR_TARGETS.items():
-        found = [
-            measure(simulated, device, readings, partial(solve, seed=seed), seed).found for seed in seeds
-        ]
-        truly = torch.cat([-TARGETS(at.true_pressure(on_levels, one.drive)) for one in found])
-        cells = [f"{100 * float(value):.1f}" for value in (truly.median(), truly.max())]
-        rows.append(
-            [name, str(int(found[0].evaluations)), *cells, f"{int((truly <= 0.05).sum())} of {len(seeds)}"]
-        )
+    played, rows = on_levels(simulated, device), []
+    for name, method in FOR_TARGETS.items():
+        solutions = [measure(simulated, device, readings, method, seed).solution for seed in seeds]
+        true = torch.cat([-TARGETS(at.true_pressure(played, solution.drive)) for solution in solutions])
+        cells = [f"{100 * float(value):.1f}" for value in (true.median(), true.max())]
+        within = f"{int((true <= 0.05).sum())} of {len(seeds)}"
+        rows.append([name, str(int(solutions[0].evaluations)), *cells, within])
     return rows
 
 
 def rates(simulated: at.SimulatedObjective, device: hardware.Device, seeds: range) -> str:
     """Return the evaluations per second of GABS, the median of its trials, without and with waits."""
-    trials = [
-        measure(simulated, device, noiseless, partial(METHODS["GABS"], seed=seed), seed) for seed in seeds
-    ]
-    count = int(trials[0].found.evaluations)
+    trials = [measure(simulated, device, noiseless, METHODS["GABS"], seed) for seed in seeds]
+    count = int(trials[0].solution.evaluations)
     seconds = float(torch.tensor([trial.seconds for trial in trials]).median())
     return f"{device.name}: {count / seconds:.0f} and {count / (seconds + trials[0].waits):.0f}"
-
-
-OPTIONS = {"--seeds": {"type": int, "default": 10, "help": "trials of each kind"}}
-
-
-def main(given: argparse.Namespace) -> None:
-    """Measure, and write the block."""
-    simulated, seeds = paper_objectives()[SCENE], range(given.seeds)
-    pairs = [(device, name) for device in DEVICES for name in METHODS]
-    same = [same_drive(simulated, device, name, seed) for device, name in pairs for seed in seeds]
-    noisy = [
-        [where, name, *with_noise(simulated, DEVICES[0], sensor, name, seeds)]
-        for where, sensor in (("readings", readings), ("samples", oscilloscope))
-        for name in METHODS
-    ]
-    parts = (
-        measured(),
-        f"The scene `{SCENE}` on emulated devices, {len(seeds)} seeds. Without noise, {sum(same)} of\n"
-        f"{len(same)} trials find the drive of the simulation.",
-        f"With noise {SNR:g} dB below the rms pressure of random drives, in every reading or in every\n"
-        "sample of an oscilloscope: true weakest focus against the simulated trial of the same seed, on\n"
-        f"{DEVICES[0].name}.",
-        table(["noise in", "method", "mean (95 % interval) [%]", "range [%]", "within 5 %"], noisy),
-        f"Targets of {TARGETS.targets} Pa with this noise in every reading: true rms\n"
-        "deviation from the targets.",
-        table(
-            ["method", "evaluations", "median [%]", "largest [%]", "within 5 %"],
-            with_targets(simulated, DEVICES[0], seeds),
-        ),
-        "Evaluations per second of GABS, on the emulated device and with the waits of a bench (frames on\n"
-        f"the line, off frames, 5 ms of settling): {'; '.join(rates(simulated, d, seeds) for d in DEVICES)}.",
-    )
-    fill_in(DOCUMENT, "benchmark.py hardware", parts, given.output)

@@ -1,16 +1,15 @@
 """Share of the best weakest focus that identification reaches, by noise.
 
-Prints a Markdown table for the paper's scenes. Shares are of the true pressure of the drives found.
+Prints a Markdown table for the paper's scenes. Shares are those of the true pressure of the drives.
 
     python scripts/benchmark.py identify
 """
 
-from __future__ import annotations
+from collections.abc import Iterator
 
-import argparse
-import time
-
+from shared.document import printed, table
 from shared.scenes import paper_objectives
+from shared.timing import timed
 
 import autdtorch as at
 
@@ -20,18 +19,23 @@ CASES = ((None, 47), (None, 64), (30, 64), (20, 64), (20, 128), (20, 256), (10, 
 OPTIONS = {"--trials": {"type": int, "default": 40, "help": "trials of each case"}}
 
 
-def main(given: argparse.Namespace) -> None:
+def main(trials: int) -> None:
     """Print the table."""
-    print("| scene | SNR [dB] | evaluations | median | least | within 1 % | seconds |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    header = ["scene", "SNR [dB]", "evaluations", "median", "least", "within 1 %", "seconds"]
+    print("", table(header, printed(rows(trials))), sep="\n")
+
+
+def rows(trials: int) -> Iterator[list[str]]:
+    """Yield a row for each scene and case."""
     for name, objective in paper_objectives().items():
         best = at.gradient_ascent(objective).score
         for snr, evaluations in CASES:
             observed = objective if snr is None else at.Noise(objective, snr, seed=1)
-            start = time.perf_counter()
-            found = at.identify(observed, evaluations=evaluations, trials=given.trials)
-            seconds = time.perf_counter() - start
-            share = objective(found.drive).amin(dim=1) / best
-            near = int((share > 0.99).sum())
-            shares = f"{share.median():.4f} | {share.min():.4f} | {near} of {given.trials}"
-            print(f"| {name} | {snr or 'none'} | {evaluations} | {shares} | {seconds:.1f} |", flush=True)
+            solution, seconds = timed(lambda o=observed, n=evaluations: at.identify(o, n, trials=trials))
+            share = objective(solution.drive).amin(dim=1) / best
+            shares = [
+                f"{share.median():.4f}",
+                f"{share.min():.4f}",
+                f"{int((share > 0.99).sum())} of {trials}",
+            ]
+            yield [name, str(snr or "none"), str(evaluations), *shares, f"{seconds:.1f}"]

@@ -7,17 +7,14 @@ as large as a field.
     python scripts/benchmark.py kernels           about a minute on 2 idle cores
 """
 
-from __future__ import annotations
-
-import argparse
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
 from numba import njit, prange
-from shared.document import fill_in, measured, table
+from shared.document import Page, printed, table
 from shared.scenes import paper_scene
+from shared.timing import shortest, timed
 
 from autdtorch.fdtd.grid import make_box
 from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Kernel, Receivers, Sources, uniform_state
@@ -28,12 +25,35 @@ from autdtorch.propagators.scene_region import region_of
 from autdtorch.utils.threads import spread
 
 DOCUMENT = "performance.md"
+OPTIONS = {"--seconds": {"type": float, "default": 0.4, "help": "of each repeat"}}
 
 SIDE = 112
 LARGE = 100_000_000
 """Numbers of an array larger than all caches."""
 REPEATS = 5
 """Repeats of each measurement; the fastest counts."""
+
+
+def main(page: Page, seconds: float) -> None:
+    """Measure, and write the block."""
+    large, small = (bandwidth(numbers, seconds) / 12e9 for numbers in (LARGE, SIDE**3))
+    page.write(
+        f"At 12 bytes a cell, the memory bandwidth (triad) allows {large:.2f} Gcell/s beyond the caches and "
+        f"{small:.2f} Gcell/s at {SIDE}^3.",
+        table(["kernel", "grid", "Gcell/s"], printed(rates(seconds))),
+    )
+
+
+def rates(seconds: float) -> Iterator[list[str]]:
+    """Measure the kernels on uniform air and on the paper's scenes."""
+    scenes, cpu = assemblies(), CpuKernel()
+    rate = cell_rate(cpu, (SIDE,) * 3, uniform(scenes["free space"]), seconds)
+    yield ["cpu", f"uniform air, {SIDE}^3, no layers", f"{rate / 1e9:.3f}"]
+    cases = [("cpu", cpu, name) for name in scenes]
+    for kernel_name, kernel, name in [*cases, ("reference", ReferenceKernel(), "free space")]:
+        shape = scenes[name].grid.shape
+        rate = cell_rate(kernel, shape, scenes[name].coefficients, seconds)
+        yield [kernel_name, f"{name}, {' x '.join(map(str, shape))}", f"{rate / 1e9:.3f}"]
 
 
 @njit(parallel=True, cache=True)
@@ -46,15 +66,9 @@ def triad(a, b, c):  # type: ignore[no-untyped-def]
 def fastest(step: Callable[[int], object], work: float, seconds: float) -> float:
     """Return the work per second of `step(times)`, with about `seconds` for each repeat."""
     step(2)
-    begin = time.perf_counter()
-    step(3)
-    times = max(3, int(3 * seconds / (time.perf_counter() - begin)))
-    spent = []
-    for _ in range(REPEATS):
-        begin = time.perf_counter()
-        step(times)
-        spent.append(time.perf_counter() - begin)
-    return work * times / min(spent)
+    _, three = timed(lambda: step(3))
+    times = max(3, int(3 * seconds / three))
+    return work * times / shortest(lambda: step(times), REPEATS)[1]
 
 
 def bandwidth(numbers: int, seconds: float) -> float:
@@ -76,9 +90,16 @@ def uniform(assembly: Assembly) -> Coefficients:
 
 
 def cell_rate(
-    kernel: Kernel, shape: tuple[int, int, int], coefficients: Coefficients, seconds: float
+    kernel: Kernel,
+    shape: tuple[int, int, int],
+    coefficients: Coefficients,
+    seconds: float,
+    wait: Callable[[], None] = lambda: None,
 ) -> float:
-    """Return the cells stepped per second, without sources and receivers; small grids side by side."""
+    """Return the cells stepped per second, without sources and receivers; small grids side by side.
+
+    `wait` returns when the steps are done.
+    """
     runs = kernel.at_once(shape)
     states = [uniform_state(shape, coefficients, 1e-20) for _ in range(runs)]
     dtype = coefficients.layer_decay.dtype
@@ -89,43 +110,18 @@ def cell_rate(
         nonlocal states
         signal = torch.zeros((times, 2), dtype=dtype)
         states = spread(
-            lambda one: kernel.advance(one, coefficients, sources, receivers, signal)[0], states, runs
+            lambda state: kernel.advance(state, coefficients, sources, receivers, signal)[0], states, runs
         )
+        wait()
 
     return fastest(step, float(runs * np.prod(shape)), seconds)
 
 
 def assemblies() -> dict[str, Assembly]:
     """Assemble the scenes at 1 mm, on the whole domain and in the box."""
-    found = {"free space": assemble(region_of(paper_scene("homogeneous")), 1e-3)}
+    made = {"free space": assemble(region_of(paper_scene("homogeneous")), 1e-3)}
     for name in ("three_cubes", "two_cubes"):
-        scene, label = region_of(paper_scene(name)), name.replace("_", " ")
-        found[f"{label}, full"] = assemble(scene, 1e-3)
-        found[f"{label}, box"] = assemble_on(make_box(scene, 1e-3), scene, torch.float32, None)
-    return found
-
-
-OPTIONS = {"--seconds": {"type": float, "default": 0.4, "help": "of each repeat"}}
-
-
-def main(given: argparse.Namespace) -> None:
-    """Measure, and write the block."""
-    large, small = (bandwidth(numbers, given.seconds) / 12e9 for numbers in (LARGE, SIDE**3))
-    found = assemblies()
-    air, cpu, reference = found["free space"], CpuKernel(), ReferenceKernel()
-    rate = cell_rate(cpu, (SIDE,) * 3, uniform(air), given.seconds)
-    rows = [["cpu", f"uniform air, {SIDE}^3, no layers", f"{rate / 1e9:.3f}"]]
-    for name, kernel, scene in [
-        *(("cpu", cpu, one) for one in found),
-        ("reference", reference, "free space"),
-    ]:
-        shape = found[scene].grid.shape
-        rate = cell_rate(kernel, shape, found[scene].coefficients, given.seconds)
-        rows.append([name, f"{scene}, {' x '.join(map(str, shape))}", f"{rate / 1e9:.3f}"])
-        print(rows[-1], flush=True)
-    memory = (
-        f"At 12 bytes a cell, the memory bandwidth (triad) allows {large:.2f} Gcell/s beyond the caches and "
-        f"{small:.2f} Gcell/s at {SIDE}^3."
-    )
-    parts = (measured(), memory, table(["kernel", "grid", "Gcell/s"], rows))
-    fill_in(DOCUMENT, "benchmark.py kernels", parts, given.output)
+        region, label = region_of(paper_scene(name)), name.replace("_", " ")
+        made[f"{label}, full"] = assemble(region, 1e-3)
+        made[f"{label}, box"] = assemble_on(make_box(region, 1e-3), region, torch.float32, None)
+    return made

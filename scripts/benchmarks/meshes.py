@@ -1,24 +1,21 @@
-"""Run times of what users bring: a hand as a mesh, transducers as discs, a moved obstacle, steel.
+"""Run times of scenes that users bring: a hand as a mesh, transducers as discs, a moved obstacle, steel.
 
-Fills in a block of performance.md. The hand has a palm, four fingers and a thumb of ellipsoids, 40,000
+Fills in a block of the documentation. The hand has a palm, four fingers and a thumb of ellipsoids, 40,000
 triangles in all. Each matrix has four foci. Each time is the shortest of three, with the kernels compiled.
 
     python scripts/benchmark.py meshes            about two minutes on 2 idle cores
 """
 
-from __future__ import annotations
-
-import argparse
 import dataclasses
-import time
-from collections.abc import Iterable
+from collections.abc import Iterator
 
 import numpy as np
 import pyvista
-from shared.document import fill_in, measured, table
+from shared.document import Page, printed, table
+from shared.scenes import uncached
+from shared.timing import shortest
 
 import autdtorch as at
-from autdtorch.propagators.moved_boxes import forget_assemblies
 
 DOCUMENT = "performance.md"
 
@@ -29,6 +26,11 @@ DOMAIN = ((-0.15, -0.15, -0.01), (0.15, 0.15, 0.2))
 FINGERS = ((-32, 45, 7.5), (-11, 58, 8), (10, 55, 8), (31, 42, 7))
 """Middle across the hand, half the length and radius [mm]."""
 REPEATS = 3
+
+
+def main(page: Page) -> None:
+    """Measure, and write the block."""
+    page.write(table(["scene", "time"], printed(rows())))
 
 
 def hand() -> at.Mesh:
@@ -44,41 +46,31 @@ def hand() -> at.Mesh:
 
 def seconds(obstacle: at.Obstacle, array: at.TransducerArray, spacing: float, moved: bool = False) -> float:
     """Return the time of a transfer matrix, from the scene on; a moved obstacle was simulated before."""
-    spent = []
-    for _ in range(REPEATS):
-        if not moved:
-            forget_assemblies()
-        begin = time.perf_counter()
+
+    def work() -> None:
         scene = at.Scene(array, AIR, 40e3, FOCI, [obstacle], domain=DOMAIN)
-        at.make_propagator(scene, "box", spacing, cache=False).transfer_matrix()
-        spent.append(time.perf_counter() - begin)
-    return min(spent)
+        if moved:
+            at.make_propagator(scene, "box", 1e-3 * spacing, cache=False).transfer_matrix()
+        else:
+            uncached(scene, "box", spacing, 2e-3).transfer_matrix()
+
+    return shortest(work, REPEATS)[1]
 
 
-def rows() -> Iterable[list[str]]:
+def rows() -> Iterator[list[str]]:
     """Measure all cases."""
     discs = at.TransducerArray.autd3((0.0, 0.0, 0.0), UP)
     points = at.TransducerArray.autd3((0.0, 0.0, 0.0), UP, radius=None)
     few = at.TransducerArray.grid((4, 4), 10e-3, (0.0, 0.0, 0.0), UP)
     mesh, rigid = hand(), at.Sphere(PLACE, 8e-3, rigid=True)
-    seconds(rigid, discs, 2e-3)  # loads the kernels
+    seconds(rigid, discs, 2.0)  # loads the kernels
     moved = dataclasses.replace(mesh, offset=tuple(np.add(PLACE, (5e-3, 0.0, 0.0)).tolist()))
     steel = at.Sphere(PLACE, 8e-3, density=7800.0, sound_speed=5900.0)
     for name, *case in (
-        ("hand, AUTD3 of discs, 1 mm", mesh, discs, 1e-3),
-        ("the same, moved by 5 mm", moved, discs, 1e-3, True),
-        ("hand, AUTD3 of points, 1 mm", mesh, points, 1e-3),
-        ("steel sphere, 16 points, 0.5 mm", steel, few, 0.5e-3),
-        ("rigid sphere, 16 points, 0.5 mm", rigid, few, 0.5e-3),
+        ("hand, AUTD3 of discs, 1 mm", mesh, discs, 1.0),
+        ("the same, moved by 5 mm", moved, discs, 1.0, True),
+        ("hand, AUTD3 of points, 1 mm", mesh, points, 1.0),
+        ("steel sphere, 16 points, 0.5 mm", steel, few, 0.5),
+        ("rigid sphere, 16 points, 0.5 mm", rigid, few, 0.5),
     ):
         yield [name, f"{seconds(*case):.2f} s"]
-
-
-def main(given: argparse.Namespace) -> None:
-    """Measure, and write the block."""
-    made = []
-    for row in rows():
-        made.append(row)
-        print(row, flush=True)
-    parts = (measured(), table(["scene", "time"], made))
-    fill_in(DOCUMENT, "benchmark.py meshes", parts, given.output)

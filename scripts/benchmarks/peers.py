@@ -1,27 +1,22 @@
 """Run time against error of Deepwave, Devito, j-Wave and k-wave-python beside our own.
 
-Makes a virtual environment for each peer in `--venvs`, then writes peers.json, peers.png and a block of
-peers.md. Scenes, receivers and errors are those of `benchmark.py accuracy`: the transfer matrix of one
+Makes a virtual environment for each peer in `--venvs`, then writes peers.json, peers.png and a block of the
+documentation. Scenes, receivers and errors are those of `benchmark.py accuracy`: the transfer matrix of one
 focus, simulated from the focus by reciprocity.
 
     python scripts/benchmark.py peers --coarse     grids of 2 mm alone, as a trial
     python scripts/benchmark.py peers              all
 """
 
-from __future__ import annotations
-
-import argparse
-import json
 import logging
 import math
-import os
 import statistics
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from datetime import date
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +25,7 @@ from benchmarks.peer_scene import scene_grid
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from shared.cases import Case, cube_case, free_space_case, simulate, sphere_case
-from shared.document import command_line, fill_in, measured, percent, table
+from shared.document import Page, command_line, percent, table
 from shared.scenes import relative_error
 
 from autdtorch.plot.costs import plot_pareto
@@ -79,6 +74,28 @@ ERRORS = (0.2, 0.1, 0.05, 0.03, 0.01)
 
 STEADY = 1e-2
 """Relative distance to the end of the run within which a peer counts as steady; our default tolerance."""
+
+OPTIONS = {
+    "--coarse": {"action": "store_true", "help": "peers on grids of 2 mm alone"},
+    "--venvs": {"type": Path, "default": VENVS, "help": "folder of the peers' environments"},
+}
+
+
+def main(page: Page, coarse: bool, venvs: Path) -> None:
+    """Measure and report."""
+    logging.getLogger("autdtorch").setLevel(logging.ERROR)  # grids are coarse on purpose
+    settings = [setting for setting in SETTINGS if setting.spacing == 2 or not coarse]
+    points: list[Point] = []
+    refusals: list[Refusal] = []
+    for outcome in measure(settings, venvs):
+        if isinstance(outcome, Point):
+            points.append(outcome)
+            summary = f"{percent(outcome.error)}, {outcome.seconds:.3g} s"
+        else:
+            refusals.append(outcome)
+            summary = outcome.reason
+        print(f"{outcome.case}, {outcome.program}, {outcome.setting}: {summary}", flush=True)
+    write_report(points, refusals, page)
 
 
 @dataclass(frozen=True)
@@ -238,26 +255,22 @@ def peer_points(setting: Setting, venvs: Path) -> Iterator[Point | Refusal]:
         try:
             answer = answer_of(setting.peer, task, venvs)
         except subprocess.CalledProcessError as error:
-            yield Refusal(name, setting.peer, str(setting), reason(error))
+            reason = (error.stderr.strip() or str(error)).splitlines()[-1]
+            yield Refusal(name, setting.peer, str(setting), reason)
             return
-        found = answer.phasors @ weights.T  # transfer matrix (E, M) at the task's ends, up to a factor
-        if not np.isfinite(found).all():
+        matrices = answer.phasors @ weights.T  # transfer matrix (E, M) at the task's ends, up to a factor
+        if not np.isfinite(matrices).all():
             yield Refusal(name, setting.peer, str(setting), "the run diverged")
             continue
-        exact = case.exact[0].numpy()
+        exact, last = case.exact[0].numpy(), matrices[-1]
         if factor is None:
-            factor = np.vdot(found[-1], exact) / np.vdot(found[-1], found[-1])
+            factor = np.vdot(last, exact) / np.vdot(last, last)
         rate = answer.updated_cells * task.steps / answer.stepping_seconds
-        for end, matrix in zip(task.ends.tolist(), found, strict=True):
+        for end, matrix in zip(task.ends.tolist(), matrices, strict=True):
             seconds = answer.setup_seconds + answer.stepping_seconds * end / task.ends[-1]
             error = float(np.linalg.norm(factor * matrix - exact) / np.linalg.norm(exact))
-            left = float(np.linalg.norm(matrix - found[-1]) / np.linalg.norm(found[-1]))
+            left = float(np.linalg.norm(matrix - last) / np.linalg.norm(last))
             yield Point(name, setting.peer, str(setting), end, left, error, float(seconds), rate)
-
-
-def reason(error: subprocess.CalledProcessError) -> str:
-    """Return the last line of a failed program's messages."""
-    return (error.stderr.strip() or str(error)).splitlines()[-1]
 
 
 def our_points(name: str) -> Iterator[Point]:
@@ -265,9 +278,9 @@ def our_points(name: str) -> Iterator[Point]:
     case = CASES[name]()
     simulate(case, OUR_SPACINGS[0])  # compiles the kernel
     for spacing in OUR_SPACINGS:
-        found = [simulate(case, spacing, OUR_TOLERANCE) for _ in range(REPETITIONS)]
-        seconds = statistics.median(one.seconds for one in found)
-        error = relative_error(found[0].matrix, case.exact)
+        runs = [simulate(case, spacing, OUR_TOLERANCE) for _ in range(REPETITIONS)]
+        seconds = statistics.median(run.seconds for run in runs)
+        error = relative_error(runs[0].matrix, case.exact)
         yield Point(name, OURS, f"{spacing:g} mm", None, OUR_TOLERANCE, error, seconds, None)
 
 
@@ -279,11 +292,10 @@ def measure(settings: Sequence[Setting], venvs: Path) -> Iterator[Point | Refusa
         yield from peer_points(setting, venvs)
 
 
-def write_report(points: Sequence[Point], refusals: Sequence[Refusal], folder: Path) -> None:
-    """Write peers.json, peers.png and peers.md into `folder`."""
+def write_report(points: Sequence[Point], refusals: Sequence[Refusal], page: Page) -> None:
+    """Write the block, peers.json and peers.png."""
     steady = list(settled(points))
     parts = [
-        measured(),
         "![Error over run time](peers.png)",
         "Time of steady runs to a given error, on any grid:",
         times(steady),
@@ -293,26 +305,23 @@ def write_report(points: Sequence[Point], refusals: Sequence[Refusal], folder: P
     if refusals:
         lines = [[r.case, NAMES[r.program], r.setting, r.reason] for r in refusals]
         parts.append(table(["scene", "program", "setting", "did not run"], lines))
-    fill_in(DOCUMENT, "benchmark.py peers", parts, folder)
-    made = {"command": command_line(), "date": date.today().isoformat(), "cores": os.cpu_count()}
-    rows = ",\n ".join(json.dumps(_rounded(asdict(one))) for one in (*points, *refusals))
-    text = f'{json.dumps(made)[:-1]}, "rows": [\n {rows}\n]}}\n'
-    (folder / "peers.json").write_text(text, encoding="utf-8")
-    figure(points).savefig(folder / "peers.png")
+    page.write(*parts)
+    page.write_rows("peers.json", map(asdict, (*points, *refusals)))
+    page.save("peers.png", figure(points))
 
 
 def settled(points: Sequence[Point]) -> Iterator[Point]:
     """Yield the first point of each run after which it stays in the steady state."""
-    for run in dict.fromkeys((p.case, p.program, p.setting) for p in points):
-        mine = [p for p in points if (p.case, p.program, p.setting) == run]
-        late = [index for index, p in enumerate(mine) if p.remaining > STEADY]
-        yield mine[late[-1] + 1 if late else 0]
+    for _, run in groupby(points, lambda point: (point.case, point.program, point.setting)):
+        run = list(run)
+        late = [index for index, point in enumerate(run) if point.remaining > STEADY]
+        yield run[late[-1] + 1 if late else 0]
 
 
 def time_to(error: float, steady: Sequence[Point], case: str, *programs: str) -> float | None:
     """Return the shortest run time to an error; None if no point reaches it."""
-    mine = (p.seconds for p in steady if p.case == case and p.program in programs and p.error <= error)
-    return min(mine, default=None)
+    enough = (p.seconds for p in steady if p.case == case and p.program in programs and p.error <= error)
+    return min(enough, default=None)
 
 
 def requirements(steady: Sequence[Point]) -> str:
@@ -321,19 +330,19 @@ def requirements(steady: Sequence[Point]) -> str:
     for case, error, least in REQUIRED:
         ours, theirs = (time_to(error, steady, case, *programs) for programs in ((OURS,), tuple(NAMES)))
         if ours is not None and theirs is not None:
-            kept = "yes" if theirs >= least * ours else "**no**"
-            lines.append([case, percent(error), f"at least {least}", f"{theirs / ours:.3g}", kept])
+            met = "yes" if theirs >= least * ours else "**no**"
+            lines.append([case, percent(error), f"at least {least}", f"{theirs / ours:.3g}", met])
     return table(["scene", "error", "required", "measured", "kept"], lines)
 
 
 def times(steady: Sequence[Point]) -> str:
     """Return a table of the run times to each error."""
     cases, lines = list(dict.fromkeys(p.case for p in steady)), []
-    found = dict.fromkeys((p.case, p.program) for p in steady)
-    for case, program in sorted(found, key=lambda one: cases.index(one[0])):
+    pairs = dict.fromkeys((p.case, p.program) for p in steady)
+    for case, program in sorted(pairs, key=lambda pair: cases.index(pair[0])):
         seconds = [time_to(error, steady, case, program) for error in ERRORS]
         best = min(p.error for p in steady if (p.case, p.program) == (case, program))
-        cells = ["" if one is None else f"{one:.3g} s" for one in seconds]
+        cells = ["" if time is None else f"{time:.3g} s" for time in seconds]
         lines.append([case, NAMES.get(program, program), *cells, percent(best)])
     return table(["scene", "program", *(f"to {percent(error)}" for error in ERRORS), "best error"], lines)
 
@@ -351,30 +360,3 @@ def figure(points: Sequence[Point]) -> Figure:
     )
     drawn.supxlabel(command_line(), fontsize=TICK_SIZE)
     return drawn
-
-
-def _rounded(row: dict[str, object]) -> dict[str, object]:
-    return {name: float(f"{value:.4g}") if isinstance(value, float) else value for name, value in row.items()}
-
-
-OPTIONS = {
-    "--coarse": {"action": "store_true", "help": "peers on grids of 2 mm alone"},
-    "--venvs": {"type": Path, "default": VENVS, "help": "folder of the peers' environments"},
-}
-
-
-def main(given: argparse.Namespace) -> None:
-    """Measure and report."""
-    logging.getLogger("autdtorch").setLevel(logging.ERROR)  # grids are coarse on purpose
-    settings = [one for one in SETTINGS if one.spacing == 2 or not given.coarse]
-    points: list[Point] = []
-    refusals: list[Refusal] = []
-    for one in measure(settings, given.venvs):
-        if isinstance(one, Point):
-            points.append(one)
-            said = f"{percent(one.error)}, {one.seconds:.3g} s"
-        else:
-            refusals.append(one)
-            said = one.reason
-        print(f"{one.case}, {one.program}, {one.setting}: {said}", flush=True)
-    write_report(points, refusals, given.output)

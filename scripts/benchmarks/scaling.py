@@ -1,7 +1,7 @@
 """Growth of time and memory with spacing, domain, transducers and foci.
 
-Fills in a block of performance.md. A process of its own computes each transfer matrix, after it has loaded
-the kernels. The time includes a new propagator, the shorter of two. The memory is the increase of the
+Fills in a block of the documentation. A new process computes each transfer matrix, after it has loaded the
+kernels. The time includes a new propagator; the shorter of two counts. The memory is the increase of the
 largest resident set by the first one; memory that the kernels had freed may hide some MB. Two cubes are the
 obstacles, three in the growing domain. Symmetry saves no run for transducers and foci, as their circle lies
 off the axis, except in one point.
@@ -9,18 +9,15 @@ off the axis, except in one point.
     python scripts/benchmark.py scaling             about 5 minutes on 2 idle cores
 """
 
-from __future__ import annotations
-
-import argparse
 import dataclasses
-import time
 from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
 from typing import NamedTuple
 
 from matplotlib.figure import Figure
-from shared.document import command_line, fill_in, measured, table
-from shared.processes import in_new_process, peak_memory
+from shared.document import Page, command_line, table
 from shared.scenes import MIDDLE, autd3_array, paper_scene, uncached, with_array
+from shared.timing import in_new_process, peak_memory, timed
 
 import autdtorch as at
 from autdtorch.plot.costs import FEWEST, fit_power, plot_scaling
@@ -28,7 +25,6 @@ from autdtorch.plot.style import TICK_SIZE
 
 DOCUMENT = "performance.md"
 
-REPEATS = 2
 COARSEST = 2.0  # [mm]
 
 SPACINGS = {"box": (2.0, 4 / 3, 1.0, 2 / 3, 0.5, 0.4), "full": (2.0, 4 / 3, 1.0, 0.8, 2 / 3)}  # [mm]
@@ -53,6 +49,24 @@ GROWTHS = {
 
 COSTS = {"time": ("seconds", "s"), "memory": ("megabytes", "MB")}
 """Attribute and unit of each cost."""
+
+
+OPTIONS = {
+    "--growth": {"nargs": "+", "choices": GROWTHS, "default": list(GROWTHS), "help": "measured sizes"},
+}
+
+
+def main(page: Page, growth: list[str]) -> None:
+    """Measure, and write block and figure."""
+    points = list(measure_all([task for task in tasks() if task.growth in growth]))
+    fits, ranges = exponents(points)
+    page.write(
+        "![Time and memory over spacing, domain, transducers and foci](scaling.png)",
+        "Powers fitted to costs of at least twice the cheapest of a series.",
+        fits,
+        f"Longest over shortest time of series without a fit: {ranges or 'none'}.",
+    )
+    page.save("scaling.png", figure(points))
 
 
 class Task(NamedTuple):
@@ -85,13 +99,13 @@ def measure(task: Task) -> Point:
     """Measure a task, in a process that has done nothing else."""
     load_kernels(task.method)
     before = peak_memory()
-    spent, added = [], []
-    for _ in range(REPEATS):
-        begin = time.perf_counter()
+
+    def work() -> int:
         uncached(task.scene, task.method, task.spacing).transfer_matrix()
-        spent.append(time.perf_counter() - begin)
-        added.append(max(2**20, peak_memory() - before))
-    return Point(task.growth, task.series, task.size, min(spent), added[0] / 2**20)
+        return max(2**20, peak_memory() - before)
+
+    (memory, first), (_, second) = timed(work), timed(work)
+    return Point(task.growth, task.series, task.size, min(first, second), memory / 2**20)
 
 
 def measure_all(tasks: Sequence[Task]) -> Iterator[Point]:
@@ -134,10 +148,9 @@ def tasks() -> list[Task]:
     ]
 
 
-def each_series(points: Sequence[Point]) -> Iterator[list[Point]]:
-    """Yield the points of each series of each growth."""
-    for key in dict.fromkeys((point.growth, point.series) for point in points):
-        yield [point for point in points if (point.growth, point.series) == key]
+def each_series(points: Sequence[Point]) -> list[list[Point]]:
+    """Return the points of each series of each growth."""
+    return [list(group) for _, group in groupby(points, lambda point: (point.growth, point.series))]
 
 
 def exponents(points: Sequence[Point]) -> tuple[str, str]:
@@ -169,23 +182,3 @@ def figure(points: Sequence[Point]) -> Figure:
     drawn = plot_scaling(values)
     drawn.supxlabel(command_line(), fontsize=TICK_SIZE)
     return drawn
-
-
-OPTIONS = {
-    "--growth": {"nargs": "+", "choices": GROWTHS, "default": list(GROWTHS), "help": "measured sizes"},
-}
-
-
-def main(given: argparse.Namespace) -> None:
-    """Measure, and write block and figure."""
-    points = list(measure_all([task for task in tasks() if task.growth in given.growth]))
-    fits, ranges = exponents(points)
-    parts = (
-        measured(),
-        "![Time and memory over spacing, domain, transducers and foci](scaling.png)",
-        "Powers fitted to costs of at least twice the cheapest of a series.",
-        fits,
-        f"Longest over shortest time of series without a fit: {ranges or 'none'}.",
-    )
-    fill_in(DOCUMENT, "benchmark.py scaling", parts, given.output)
-    figure(points).savefig(given.output / "scaling.png")

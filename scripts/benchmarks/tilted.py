@@ -1,24 +1,21 @@
 """Error of a tilted cube, on a grid that turns with it and on one that does not.
 
-Fills in a block of benchmarks.md. A cube of 15 mm stands between 16 transducers and four points. All are
-turned together, so that the exact field stays the same. The reference is the aligned cube on a grid of
-0.25 mm.
+Fills in a block of the documentation. A cube of 15 mm stands between 16 transducers and four points. All turn
+together, so that the exact field stays the same. The reference is the aligned cube on a grid of 0.25 mm.
 
     python scripts/benchmark.py tilted              about 5 minutes on 2 idle cores
 """
 
-from __future__ import annotations
-
-import argparse
 import dataclasses
 import math
-import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
 
 import numpy as np
 import torch
-from shared.document import fill_in, measured, percent, table
+from shared.document import Page, percent, printed, table
 from shared.scenes import relative_error
+from shared.timing import timed
 
 import autdtorch as at
 from autdtorch.propagators.plan import plan
@@ -58,37 +55,32 @@ def cube_scene(rotation: tuple[float, float, float], material: Mapping[str, obje
     return at.Scene(turned, AIR, 40e3, points @ turn.T, [cube], domain=((-0.1,) * 3, (0.1,) * 3))
 
 
-def matrix(scene: at.Scene, spacing: float, held: bool) -> tuple[torch.Tensor, float]:
-    """Return the matrix at a spacing [mm] and its run time [s]; `held` keeps the grid from turning."""
-    begin = time.perf_counter()
+def matrix(scene: at.Scene, spacing: float, aligned: bool) -> torch.Tensor:
+    """Return the matrix at a spacing [mm]; `aligned` keeps the grid from turning."""
     planned = plan(scene, "box", spacing * 1e-3, 1e-3)
-    if held:
+    if aligned:
         axes = tuple(np.eye(3) for _ in planned.grouping.axes)
         planned = dataclasses.replace(planned, grouping=dataclasses.replace(planned.grouping, axes=axes))
-    return SimulatedPropagator(planned).transfer_matrix(), time.perf_counter() - begin
+    return SimulatedPropagator(planned).transfer_matrix()
 
 
-def rows(material: str) -> list[list[str]]:
-    """Return a row for the aligned cube and for each kind of grid, with errors and the time of a matrix."""
-    given = MATERIALS[material]
-    reference, _ = matrix(cube_scene(ALIGNED, given), REFERENCE, held=True)
-    found = []
-    for name, tilts, held in (("aligned", [ALIGNED], True), ("turned", TILTS, False), ("held", TILTS, True)):
-        errors, seconds = [], []
-        for spacing in SPACINGS:
-            each = [matrix(cube_scene(tilt, given), spacing, held) for tilt in tilts]
-            errors.append([relative_error(own, reference) for own, _ in each])
-            seconds.append(sum(duration for _, duration in each) / len(each))
-            print(material, name, spacing, [percent(error) for error in errors[-1]], flush=True)
-        shown = [f"{percent(float(np.median(own)))} ({percent(max(own))})" for own in errors]
-        found.append([material, name, *shown, f"{seconds[0]:.2g} s", f"{seconds[-1]:.2g} s"])
-    return found
+def rows() -> Iterator[list[str]]:
+    """Yield rows for the aligned cube and for each kind of grid, with errors and the time of a matrix."""
+    for name, material in MATERIALS.items():
+        reference = matrix(cube_scene(ALIGNED, material), REFERENCE, aligned=True)
+        for grid, tilts in (("aligned", [ALIGNED]), ("turned", TILTS), ("held", TILTS)):
+            cells, seconds = [], []
+            for spacing in SPACINGS:
+                scenes = [cube_scene(tilt, material) for tilt in tilts]
+                runs = [timed(partial(matrix, scene, spacing, grid != "turned")) for scene in scenes]
+                errors = [relative_error(made, reference) for made, _ in runs]
+                cells.append(f"{percent(float(np.median(errors)))} ({percent(max(errors))})")
+                seconds.append(sum(spent for _, spent in runs) / len(runs))
+            yield [name, grid, *cells, f"{seconds[0]:.2g} s", f"{seconds[-1]:.2g} s"]
 
 
-def main(given: argparse.Namespace) -> None:
+def main(page: Page) -> None:
     """Measure both cubes and write their table."""
     spacings = [f"{spacing:g} mm" for spacing in SPACINGS]
     header = ["cube", "grid", *spacings, f"time, {spacings[0]}", f"time, {spacings[-1]}"]
-    written = table(header, [row for material in MATERIALS for row in rows(material)])
-    caption = f"Median error (and the largest) over {len(TILTS)} tilts."
-    fill_in(DOCUMENT, "benchmark.py tilted", [measured(), caption, written], given.output)
+    page.write(f"Median error (and the largest) over {len(TILTS)} tilts.", table(header, printed(rows())))

@@ -1,18 +1,14 @@
 """Rigid sphere and cubes against AcousTools' BEM.
 
-Needs `pip install 'autdtorch[crosscheck]'`. Fills in a block of crosschecks.md. The sources are points:
+Needs `pip install 'autdtorch[crosscheck]'`. Fills in a block of the documentation. The sources are points:
 AcousTools' pistons with radius 0. Scenes and errors are those of `benchmark.py accuracy`, with rigid cubes.
 The reference is the exact series for the sphere, and the limit of our own grids for the cubes.
 
     python scripts/check.py acoustools
 """
 
-from __future__ import annotations
-
-import argparse
 import dataclasses
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
 
 import torch
@@ -28,8 +24,9 @@ from shared.cases import (
     simulate,
     sphere_case,
 )
-from shared.document import fill_in, measured, percent, table
+from shared.document import Page, percent, printed, table
 from shared.scenes import relative_error
+from shared.timing import timed
 
 import autdtorch as at
 
@@ -53,11 +50,26 @@ PLANE_SPACING = 1e-3
 """Spacing of the points behind the obstacles [m]."""
 
 
+def main(page: Page) -> None:
+    """Compare, and write the block."""
+    sphere, cube, cubes = sphere_case("rigid sphere"), rigid_cubes(1), rigid_cubes(3)
+    meshes = [
+        (sphere, [sphere_mesh(sphere.scene, n) for n in SPHERE_SUBDIVISIONS]),
+        *((case, [cube_mesh(case.scene, n) for n in CUBE_SUBDIVISIONS]) for case in (cube, cubes)),
+    ]
+    lines = printed(row for case, finer in meshes for row in rows(case, finer))
+    page.write(
+        f"{', '.join(f'{name} {version(name)}' for name in PACKAGES)}.",
+        table(("scene", "program", "error", "with CHIEF", "run time (CHIEF)"), lines),
+        plane_times(cubes, meshes[-1][1][0], 1.0),
+    )
+
+
 def rigid_cubes(count: int, spacing: float = FINEST) -> Case:
     """Return the paper's three cubes, rigid, or the middle one, as a grid of `spacing` [mm] has them."""
     scene = close_scene("three_cubes")
-    kept = scene.obstacles if count == 3 else scene.obstacles[1:2]
-    cubes = tuple(at.Box(one.center, one.size, rigid=True) for one in kept)
+    chosen = scene.obstacles if count == 3 else scene.obstacles[1:2]
+    cubes = tuple(at.Box(cube.center, cube.size, rigid=True) for cube in chosen)
     scene = dataclasses.replace(scene, obstacles=cubes)
     name = "three rigid cubes" if count == 3 else "rigid cube"
     empty = cubes_with(name, scene, torch.zeros(()))
@@ -104,34 +116,28 @@ def boundary_elements(case: Case, mesh: vedo.Mesh, chief: bool = True) -> torch.
 
 def timed_elements(case: Case, mesh: vedo.Mesh, chief: bool) -> Simulation:
     """Return AcousTools' matrix and its run time, without the meshing."""
-    begin = time.perf_counter()
-    matrix = boundary_elements(case, mesh, chief)
-    return Simulation(matrix, time.perf_counter() - begin, True)
+    return Simulation(*timed(lambda: boundary_elements(case, mesh, chief)))
 
 
 def repeated(measure: Callable[[], Simulation]) -> Simulation:
     """Return the fastest of several measurements; a long one is not repeated."""
-    found = [measure()]
-    while found[0].seconds < SHORT and len(found) < REPETITIONS:
-        found.append(measure())
-    return min(found, key=lambda one: one.seconds)
+    runs = [measure()]
+    while runs[0].seconds < SHORT and len(runs) < REPETITIONS:
+        runs.append(measure())
+    return min(runs, key=lambda run: run.seconds)
 
 
-def rows(case: Case, meshes: Sequence[vedo.Mesh]) -> list[list[str]]:
-    """Return the errors and run times of both programs."""
-    found = []
+def rows(case: Case, meshes: Sequence[vedo.Mesh]) -> Iterator[list[str]]:
+    """Yield the errors and run times of both programs."""
     for mesh in meshes:
         plain, chief = (repeated(lambda m=mesh, c=c: timed_elements(case, m, c)) for c in (False, True))
-        both = [percent(relative_error(one.matrix, case.exact)) for one in (plain, chief)]
-        found.append([case.name, f"AcousTools, {mesh.ncells} triangles", *both, f"{chief.seconds:.3g} s"])
-        print(found[-1], flush=True)
+        both = [percent(relative_error(run.matrix, case.exact)) for run in (plain, chief)]
+        yield [case.name, f"AcousTools, {mesh.ncells} triangles", *both, f"{chief.seconds:.3g} s"]
     simulate(case, SPACINGS[0])  # compiles the kernel
     for spacing in SPACINGS:
-        own = repeated(lambda h=spacing: simulate(case, h))
-        error = percent(relative_error(own.matrix, case.exact))
-        found.append([case.name, f"autdtorch, {spacing:g} mm", error, "", f"{own.seconds:.3g} s"])
-        print(found[-1], flush=True)
-    return found
+        run = repeated(lambda h=spacing: simulate(case, h))
+        error = percent(relative_error(run.matrix, case.exact))
+        yield [case.name, f"autdtorch, {spacing:g} mm", error, "", f"{run.seconds:.3g} s"]
 
 
 def plane_times(case: Case, mesh: vedo.Mesh, spacing: float) -> str:
@@ -145,17 +151,3 @@ def plane_times(case: Case, mesh: vedo.Mesh, spacing: float) -> str:
         f"AcousTools ({mesh.ncells} triangles, CHIEF) {theirs.seconds:.3g} s, autdtorch ({spacing:g} mm) "
         f"{ours.seconds:.3g} s. The matrices differ by {difference}."
     )
-
-
-def main(given: argparse.Namespace) -> None:
-    """Compare, and write the block."""
-    sphere, cube, cubes = sphere_case("rigid sphere"), rigid_cubes(1), rigid_cubes(3)
-    meshes = [[cube_mesh(case.scene, n) for n in CUBE_SUBDIVISIONS] for case in (cube, cubes)]
-    lines = rows(sphere, [sphere_mesh(sphere.scene, n) for n in SPHERE_SUBDIVISIONS])
-    lines += [*rows(cube, meshes[0]), *rows(cubes, meshes[1])]
-    parts = (
-        f"{measured()}\n\n{', '.join(f'{name} {version(name)}' for name in PACKAGES)}.",
-        table(("scene", "program", "error", "with CHIEF", "run time (CHIEF)"), lines),
-        plane_times(cubes, meshes[1][0], 1.0),
-    )
-    fill_in(DOCUMENT, "check.py acoustools", parts, given.output)

@@ -1,19 +1,15 @@
 """Free-space fields of an AUTD3 against the emulator of its SDK.
 
-Needs `pip install 'autdtorch[crosscheck]'`. Fills in a block of crosschecks.md. The emulator has two fields.
-"RMS" is a sum of point sources without directivity or absorption, with the phases and pulse widths of the
-emulated firmware. "Instant" is the pressure over time, of square waves filtered by a model of the
+Needs `pip install 'autdtorch[crosscheck]'`. Fills in a block of the documentation. The emulator has two
+fields. "RMS" is a sum of point sources without directivity or absorption, with the phases and pulse widths of
+the emulated firmware. "Instant" is the pressure over time, of square waves filtered by a model of the
 transducer.
 
     python scripts/check.py autd3
 """
 
-from __future__ import annotations
-
-import argparse
 import cmath
 import math
-import time
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
@@ -25,7 +21,9 @@ from autd3_core import Autd3, Duration, Geometry, Velocity
 from autd3_emulator import Emulator, Grid, InstantRecordOption, Record, Recorder, RmsRecordOption
 from autd3_pattern import IntensityBuffer, PhaseBuffer, focus, wavelength
 from numpy.typing import NDArray
-from shared.document import fill_in, measured, table
+from shared.document import Page, table
+from shared.scenes import relative_error
+from shared.timing import timed
 
 import autdtorch as at
 from autdtorch.analytic.green import free_space_matrix
@@ -56,6 +54,24 @@ PERIODS = 120
 """Recorded periods: sound takes 36 to the farthest point, a transducer some 30 to settle."""
 FULL_PULSE = 512
 """Counts of a pulse width in a period; half of them give full drive."""
+
+
+OPTIONS = {"--resolution": {"type": float, "default": 1.0, "help": "of the plane [mm]"}}
+
+
+def main(page: Page, resolution: float) -> None:
+    """Compare, and write the block."""
+    grid = plane(resolution)
+    lines, factor = rows(grid)
+    peak, late = math.sqrt(2) * abs(factor), math.degrees(cmath.phase(factor))
+    page.write(
+        f"{', '.join(f'{name} {version(name)}' for name in PACKAGES)}.",
+        table(("theirs", "ours", "relative difference", "what explains it"), lines),
+        f"Transducer positions agree within {1e9 * largest_shift():.0f} nm. The emulator's instant field is "
+        f"{abs(factor):.4f} times ours and {late:.1f} degrees late, by its model of a transducer; its "
+        f"peak is {peak:.3f} times the emulator's own RMS field, where a sine has the square root of 2.",
+        run_times(grid),
+    )
 
 
 @dataclass(frozen=True)
@@ -99,7 +115,7 @@ def play(geometry: Geometry, phases: PhaseBuffer, intensities: IntensityBuffer |
         recorder.tick(Duration.from_nanos(PERIODS * PERIOD.as_nanos()))
 
     record = Emulator(geometry).record(send)
-    last = [one.to_numpy()[:, -1].astype(np.int64) for one in (record.phase(), record.pulse_width())]
+    last = [rows.to_numpy()[:, -1].astype(np.int64) for rows in (record.phase(), record.pulse_width())]
     return Emission(record, *last)
 
 
@@ -113,7 +129,7 @@ def play_focus() -> Emission:
 
 def play_levels(levels: tuple[torch.Tensor, ...]) -> Emission:
     """Play levels of ours."""
-    phase, amplitude = (one.to(torch.uint8).numpy()[None] for one in levels)
+    phase, amplitude = (level.to(torch.uint8).numpy()[None] for level in levels)
     return play(Geometry([Autd3()]), PhaseBuffer.from_array(phase), IntensityBuffer.from_array(amplitude))
 
 
@@ -151,15 +167,10 @@ def ours(
     return free_space_matrix(points, array, complex(WAVENUMBER, attenuation)) @ drive
 
 
-def relative_difference(value: torch.Tensor, other: torch.Tensor) -> float:
-    """Return the relative L2 difference."""
-    return float((value - other).norm() / other.norm())
-
-
 def scaled(values: torch.Tensor, other: torch.Tensor) -> tuple[complex, float]:
     """Return the factor of `other` that fits `values` best, and the remaining relative L2 difference."""
     factor = complex(torch.vdot(other, values) / torch.vdot(other, other))
-    return factor, relative_difference(values, factor * other)
+    return factor, relative_error(values, factor * other)
 
 
 def random_drive(transducers: int) -> torch.Tensor:
@@ -178,20 +189,20 @@ def rows(grid: Grid) -> tuple[list[list[str]], complex]:
     factor, left = scaled(instant, ours(array, focused.drive, instant_points))
 
     def difference(field: torch.Tensor, other: torch.Tensor) -> float:
-        return relative_difference(field.abs() / math.sqrt(2), other)
+        return relative_error(field.abs() / math.sqrt(2), other)
 
     same = difference(ours(array, focused.drive, points), theirs)
     same_random = difference(ours(array, random.drive, points), theirs_random)
     wide = difference(ours(discs, focused.drive, points), theirs)
     weak = difference(ours(array, focused.drive, points, attenuation), theirs)
-    found = (
+    differences = (
         ("RMS, focus", "drive as recorded", same, "float32"),
         ("RMS, random", "drive as recorded", same_random, "float32"),
         ("instant, focus", "drive as recorded, scaled", left, "waveforms between samples"),
         ("RMS, focus", "discs of radius 4.5 mm", wide, "directivity"),
         ("RMS, focus", f"air that absorbs {ABSORPTION:g} dB/m", weak, "absorption"),
     )
-    return [[field, own, f"{value:.2g}", cause] for field, own, value, cause in found], factor
+    return [[theirs, ours, f"{value:.2g}", cause] for theirs, ours, value, cause in differences], factor
 
 
 def run_times(grid: Grid) -> str:
@@ -199,28 +210,9 @@ def run_times(grid: Grid) -> str:
     array, emission = our_array(), play_focus()
     points, _ = rms(emission, grid)
     ours(array, emission.drive, points)
-    begin = time.perf_counter()
-    rms(emission, grid)
-    middle = time.perf_counter()
-    ours(array, emission.drive, points)
-    own = f"{time.perf_counter() - middle:.2g} s here (float64, threads: {torch.get_num_threads()})"
-    return f"{len(points)} points take {middle - begin:.2g} s in the emulator (float32, all cores) and {own}."
-
-
-OPTIONS = {"--resolution": {"type": float, "default": 1.0, "help": "of the plane [mm]"}}
-
-
-def main(given: argparse.Namespace) -> None:
-    """Compare, and write the block."""
-    grid = plane(given.resolution)
-    lines, factor = rows(grid)
-    peak, late = math.sqrt(2) * abs(factor), math.degrees(cmath.phase(factor))
-    notes = (
-        f"Transducer positions agree within {1e9 * largest_shift():.0f} nm. The emulator's instant field is "
-        f"{abs(factor):.4f} times ours and {late:.1f} degrees late, by its model of a transducer; its "
-        f"peak is {peak:.3f} times the emulator's own RMS field, where a sine has the square root of 2."
+    _, emulator = timed(lambda: rms(emission, grid))
+    _, here = timed(lambda: ours(array, emission.drive, points))
+    return (
+        f"{len(points)} points take {emulator:.2g} s in the emulator (float32, all cores) and {here:.2g} s "
+        f"here (float64, threads: {torch.get_num_threads()})."
     )
-    packages = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
-    differences = table(("theirs", "ours", "relative difference", "what explains it"), lines)
-    parts = (f"{measured()}\n\n{packages}.", differences, notes, run_times(grid))
-    fill_in(DOCUMENT, "check.py autd3", parts, given.output)

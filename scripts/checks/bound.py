@@ -7,29 +7,38 @@ that it has a bound. Exits with 1 if a score is above its bound.
     python scripts/check.py bound --scenes 1000
 """
 
-from __future__ import annotations
-
-import argparse
-import time
 from collections import defaultdict
 
 import numpy as np
 import torch
 from shared.scenes import paper_objectives
+from shared.timing import timed
 
 import autdtorch as at
 from autdtorch.analytic.green import free_space_matrix
+
+OPTIONS = {
+    "--scenes": {"type": int, "default": 1000, "help": "number of random scenes"},
+    "--seed": {"type": int, "default": 0, "help": "seed of the random scenes"},
+}
 
 FREQUENCY = 40e3
 ROUNDING = 1e-12
 AIR = at.Medium(density=1.2, sound_speed=340.0)
 
 
+def main(scenes: int, seed: int) -> int:
+    """Run both checks."""
+    check_paper_scenes()
+    above = check_goals(scenes, seed)
+    return int(above + check_random_scenes(scenes, seed) > 0)
+
+
 class MatrixPropagator:
-    """A propagator with a given transfer matrix."""
+    """A propagator with any transfer matrix."""
 
     def __init__(self, scene: at.Scene, matrix: torch.Tensor) -> None:
-        """Keep the `matrix` (P, M)."""
+        """Take the `matrix` (P, M)."""
         self.scene = scene
         self._matrix = matrix
 
@@ -89,9 +98,8 @@ def check_random_scenes(count: int, seed: int) -> int:
     seconds, above = [], 0
     for _ in range(count):
         objective = random_objective(generator)
-        start = time.perf_counter()
-        bound = at.focus_bound(objective.transfer_matrix)
-        seconds.append(time.perf_counter() - start)
+        bound, spent = timed(lambda m=objective.transfer_matrix: at.focus_bound(m))
+        seconds.append(spent)
         for name, score in highest_scores(objective).items():
             gaps[name].append(1 - score / bound)
             above += not score <= bound
@@ -158,16 +166,3 @@ def check_paper_scenes() -> None:
         )
         gaps = f"median {np.median(weighted):.3%}, most {max(weighted):.3%} with weights from 1 to 3"
         print(f"{name}: gradient ascent is {plain:.3%} below the bound; {gaps}")
-
-
-OPTIONS = {
-    "--scenes": {"type": int, "default": 1000, "help": "number of random scenes"},
-    "--seed": {"type": int, "default": 0, "help": "seed of the random scenes"},
-}
-
-
-def main(given: argparse.Namespace) -> int:
-    """Run both checks."""
-    check_paper_scenes()
-    above = check_goals(given.scenes, given.seed)
-    return int(above + check_random_scenes(given.scenes, given.seed) > 0)

@@ -7,9 +7,6 @@ is compared with the wave of the source's mirror image, with the inner face of t
     python scripts/check.py boundary        a few seconds on 2 idle cores
 """
 
-from __future__ import annotations
-
-import argparse
 import math
 from dataclasses import dataclass
 from fractions import Fraction
@@ -17,6 +14,7 @@ from fractions import Fraction
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from shared.document import table
 
 from autdtorch.fdtd.boundary import tuned_profile
 from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, uniform_state
@@ -30,6 +28,22 @@ DEGREES = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)
 
 SETTLING_PERIODS = 12
 """Periods stepped after the echo has reached the last receiver with its full amplitude."""
+
+
+OPTIONS = {
+    "--cells-per-wavelength": {"type": float, "default": 8.5, "help": "of the grid"},
+    "--distance": {"type": int, "default": 9, "help": "cells to the layer"},
+    "--aside": {"type": int, "default": 12, "help": "cells to the other layers"},
+}
+
+
+def main(cells_per_wavelength: float, distance: int, aside: int) -> None:
+    """Print the table."""
+    rows = []
+    for cells in (6, 8, 10):
+        _, magnitude = measured_reflection(cells_per_wavelength, cells, np.array(DEGREES), distance, aside)
+        rows.append([str(cells), *(f"{value:.0f}" for value in 20 * np.log10(magnitude))])
+    print(table(["cells", *(f"{angle:g} degrees" for angle in DEGREES)], rows))
 
 
 def measured_reflection(
@@ -110,22 +124,3 @@ def _pressure(
         drive_signal(steps, 0, blocks * steps.numerator),
     )
     return drive_dft(recorded[-steps.numerator :], steps.denominator).numpy()
-
-
-OPTIONS = {
-    "--cells-per-wavelength": {"type": float, "default": 8.5, "help": "of the grid"},
-    "--distance": {"type": int, "default": 9, "help": "cells to the layer"},
-    "--aside": {"type": int, "default": 12, "help": "cells to the other layers"},
-}
-
-
-def main(given: argparse.Namespace) -> None:
-    """Print the table."""
-    print("| cells | " + " | ".join(f"{angle:g} degrees" for angle in DEGREES) + " |")
-    print("| --- |" + " --- |" * len(DEGREES))
-    for cells in (6, 8, 10):
-        _, magnitude = measured_reflection(
-            given.cells_per_wavelength, cells, np.array(DEGREES), given.distance, given.aside
-        )
-        decibels = " | ".join(f"{value:.0f}" for value in 20 * np.log10(magnitude))
-        print(f"| {cells} | {decibels} |", flush=True)

@@ -7,9 +7,6 @@ thread limit the threads of a multiprocessor, which has 65536 registers; spilled
     python scripts/check.py cuda --capability 80 --dtype float64
 """
 
-from __future__ import annotations
-
-import argparse
 import re
 import subprocess
 import tempfile
@@ -20,6 +17,7 @@ from unittest.mock import patch
 
 import torch
 import triton
+from shared.document import table
 from triton.backends.compiler import GPUTarget
 from triton.runtime import driver
 from triton.runtime.jit import JITFunction
@@ -35,6 +33,20 @@ from autdtorch.scene.scene import Medium, Scene
 CUOBJDUMP = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
 
 
+OPTIONS = {
+    "--capability": {"type": int, "default": 90, "help": "of the GPU, times ten; 90 is Hopper"},
+    "--dtype": {"choices": ("float32", "float64"), "default": "float32", "help": "of the fields"},
+}
+
+
+def main(capability: int, dtype: str) -> None:
+    """Print the table."""
+    rows = []
+    for name, kernel in compiled(capability, getattr(torch, dtype)).items():
+        rows.append([name, str(32 * kernel.metadata.num_warps), *map(str, usage(kernel))])
+    print(table(["launch", "threads of a program", "registers", "stack [byte]"], rows))
+
+
 def compiled(capability: int, dtype: torch.dtype) -> dict[str, Any]:
     """Return the compiled launches of a step by name."""
     wall = Box((12e-3, 12e-3, 20e-3), (40e-3, 40e-3, 2e-3), density=5.0, sound_speed=300.0)
@@ -46,10 +58,10 @@ def compiled(capability: int, dtype: torch.dtype) -> dict[str, Any]:
     sources = assembly.sources(array.positions, torch.ones(4, dtype=torch.complex128))
     receivers = assembly.receivers(scene.control_points)
     signal = drive_signal(assembly.steps_per_period, 0, 2).to(dtype)
-    found = {}
+    launches = {}
 
     def compile_only(self: Any, *args: Any, grid: Any, warmup: bool, **options: Any) -> None:
-        found[self.fn.__name__] = launch(self, *args, grid=grid, warmup=True, **options)
+        launches[self.fn.__name__] = launch(self, *args, grid=grid, warmup=True, **options)
 
     launch = JITFunction.run
     absent_gpu = SimpleNamespace(
@@ -62,7 +74,7 @@ def compiled(capability: int, dtype: torch.dtype) -> dict[str, Any]:
         shape = Cells(*assembly.grid.shape)
         medium = DeviceMedium(assembly.coefficients, shape, blocks_of(shape), torch.device("cpu"))
         DeviceRun(medium, assembly.silence(sources), sources, receivers, len(signal)).advance(signal)
-    return found
+    return launches
 
 
 def usage(kernel: Any) -> tuple[int, int]:
@@ -75,17 +87,3 @@ def usage(kernel: Any) -> tuple[int, int]:
         ).stdout
     registers, stack = (int(re.search(rf"{name}:(\d+)", text)[1]) for name in ("REG", "STACK"))
     return registers, stack
-
-
-OPTIONS = {
-    "--capability": {"type": int, "default": 90, "help": "of the GPU, times ten; 90 is Hopper"},
-    "--dtype": {"choices": ("float32", "float64"), "default": "float32", "help": "of the fields"},
-}
-
-
-def main(given: argparse.Namespace) -> None:
-    """Print the table."""
-    print("| launch | threads of a program | registers | stack [byte] |\n| --- | --- | --- | --- |")
-    for name, kernel in compiled(given.capability, getattr(torch, given.dtype)).items():
-        registers, stack = usage(kernel)
-        print(f"| {name} | {32 * kernel.metadata.num_warps} | {registers} | {stack} |")

@@ -1,15 +1,12 @@
 """Damaged files of studies and hardware trials, which must resume.
 
 Damages the files of a study and of an emulated hardware trial at random. Each must end with the numbers of
-the undisturbed run, bit for bit. Every row that the damage left whole and every damaged file must be kept,
-and the next start must log no warning.
+the undisturbed run, bit for bit. Every row that the damage left whole and every damaged file must stay on
+disk, and the next start must log no warning.
 
     python scripts/check.py damage --damages 300
 """
 
-from __future__ import annotations
-
-import argparse
 import functools
 import json
 import logging
@@ -18,7 +15,7 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass, replace
 from logging.handlers import BufferingHandler
 from pathlib import Path
 from unittest import mock
@@ -45,7 +42,21 @@ METHODS = {
     "identify": functools.partial(at.identify, evaluations=12),
 }
 
-Damage = Callable[[random.Random, bytes, bytes], bytes]
+OPTIONS = {
+    "--damages": {"type": int, "default": 300, "help": "number of damaged files"},
+    "--seed": {"type": int, "default": 0, "help": "seed of the damages"},
+}
+
+
+def main(damages: int, seed: int) -> int:
+    """Damage files, and print the problems."""
+    logging.getLogger("autdtorch").propagate = False  # hundreds of expected warnings
+    with tempfile.TemporaryDirectory() as folder:
+        counts, wrong = check(damages, seed, Path(folder))
+    for case, count in sorted(counts.items()):
+        print(f"{count:4d} {case}")
+    print(*wrong, f"{counts.total()} damages, {len(wrong)} problems", sep="\n")
+    return int(bool(wrong))
 
 
 def _scene(*obstacles: at.Box) -> at.Scene:
@@ -54,7 +65,7 @@ def _scene(*obstacles: at.Box) -> at.Scene:
 
 
 def study(folder: Path, seed: int = 0) -> list[torch.Tensor]:
-    """Start or resume a study, and return all its numbers; each seed has a cube of its own."""
+    """Start or resume a study, and return all its numbers; each seed has another cube."""
     results = run_study(
         {"empty": _scene(), "cube": _scene(replace(CUBE, density=100.0 + seed))},
         METHODS,
@@ -72,9 +83,8 @@ def study(folder: Path, seed: int = 0) -> list[torch.Tensor]:
 def trial(folder: Path, seed: int = 0) -> list[torch.Tensor]:
     """Start or resume a hardware trial on the emulated bench, and return all its numbers."""
     scene = _scene()
-    matrix = at.SimulatedObjective(scene, at.make_propagator(scene)).transfer_matrix
-    assert matrix is not None
-    channels = list(range(len(scene.array)))
+    channels = range(len(scene.array))
+    matrix = at.make_propagator(scene).transfer_matrix()
     bench = hardware.EmulatedBench(hardware.SONICSURFACE, matrix, channels)
     with hardware.open_link(hardware.SONICSURFACE, channels, backend=bench.bus) as link:
         limited = hardware.LimitedLink(link, hardware.Limits(amplitude=1.0))
@@ -87,7 +97,11 @@ def trial(folder: Path, seed: int = 0) -> list[torch.Tensor]:
 
 
 def _numbers(solution: Solution) -> list[torch.Tensor]:
-    return [getattr(solution, field.name) for field in fields(solution)]
+    return list(astuple(solution))
+
+
+Damage = Callable[[random.Random, bytes, bytes], bytes]
+"""Damages the content of a file; the last argument is the content of that file in another study or trial."""
 
 
 def _changed(rng: random.Random, content: bytes, _: bytes) -> bytes:
@@ -101,7 +115,7 @@ def _zeroed(rng: random.Random, content: bytes, _: bytes) -> bytes:
     return content[:place] + b"\0" * len(block) + content[place + len(block) :]
 
 
-def _lines_changed(change: Callable[[random.Random, list[bytes], list[bytes]], None]) -> Damage:
+def _lines_changed(change: Callable[[random.Random, list[bytes], list[bytes]], object]) -> Damage:
     def damage(rng: random.Random, content: bytes, other: bytes) -> bytes:
         lines = content.splitlines(keepends=True)
         change(rng, lines, other.splitlines(keepends=True))
@@ -135,8 +149,6 @@ OF_LINES: dict[str, Damage] = {
     "garbage line": _lines_changed(lambda rng, lines, _: _insert(rng, lines, rng.randbytes(80) + b"\n")),
     "line of another": _lines_changed(lambda rng, lines, other: _insert(rng, lines, rng.choice(other))),
 }
-"""Ways to damage any file, and a file of lines, given the content of another study or trial."""
-
 MOST_LOST = {"byte changed": 1, "end of a line damaged": 0}
 """Rows that a damage can cost; others cost the rows that they touch."""
 
@@ -169,7 +181,7 @@ def study_subject(folder: Path) -> Subject:
         try:
             study(half)
         except KeyboardInterrupt:
-            _keep_lines(half / TRIALS_FILE, 10)
+            _shorten(half / TRIALS_FILE, 10)
     return Subject(TRIALS_FILE, study, numbers, (finished, half), another)
 
 
@@ -181,12 +193,12 @@ def trial_subject(folder: Path) -> Subject:
     numbers = trial(finished)
     trial(another, seed=1)
     shutil.copytree(finished, half)
-    _keep_lines(half / LOG_FILE, 12)
+    _shorten(half / LOG_FILE, 12)
     return Subject(LOG_FILE, trial, numbers, (finished, half), another)
 
 
-def _keep_lines(path: Path, count: int) -> None:
-    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:count]))
+def _shorten(path: Path, lines: int) -> None:
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:lines]))
 
 
 def _content(path: Path) -> bytes:
@@ -198,21 +210,14 @@ def _rows(content: bytes) -> set[bytes]:
     return {line for line in content.split(b"\n")[:-1] if not line.startswith(b'{"origin": ')}
 
 
-def _made(rows: set[bytes]) -> set[bytes]:
-    """Return the rows of trials or evaluations, without the end of a log."""
-    return {row for row in rows if b'"drive": ' in row}
+def _count(rows: set[bytes]) -> int:
+    """Count the rows of trials or evaluations; a log has another row at its end."""
+    return sum(b'"drive": ' in row for row in rows)
 
 
 def _seconds_on(rows: set[bytes]) -> float:
     """Return the emission time in the rows of a log; 0 for a study."""
     return max((json.loads(row).get("seconds_on", 0.0) for row in rows), default=0.0)
-
-
-def _debris(damaged: bytes, rows: set[bytes]) -> list[bytes]:
-    """Return the parts of a damaged file of lines beside these rows."""
-    for row in rows:
-        damaged = damaged.replace(row, b"\n")
-    return [line for line in damaged.split(b"\n") if line]
 
 
 def journal_problems(before: bytes, damaged: bytes, journal: Path, most_lost: int) -> list[str]:
@@ -224,20 +229,21 @@ def journal_problems(before: bytes, damaged: bytes, journal: Path, most_lost: in
         journal: its path.
         most_lost: rows that the damage can cost.
     """
-    wrong = []
-    left = {row for row in _rows(before) if row in damaged}
-    after = _content(journal)
-    if lost := left - _rows(after):
+    wrong, content = [], _content(journal)
+    rows, whole = _rows(content), {row for row in _rows(before) if row in damaged}
+    if lost := whole - rows:
         wrong.append(f"{len(lost)} whole rows lost")
-    if len(lost := _rows(before) - _rows(after)) > most_lost:
+    if len(lost := _rows(before) - rows) > most_lost:
         wrong.append(f"{len(lost)} rows lost where the damage touched {most_lost}")
-    if _seconds_on(_rows(after)) < _seconds_on(left):
-        wrong.append(f"on for {_seconds_on(_rows(after))} s, where {_seconds_on(left)} s were left")
-    aside = _content(journal.with_name(journal.name + SET_ASIDE))
-    first = before.partition(b"\n")[0]  # a log with a part of its first line alone starts again
-    debris = [] if first.startswith(damaged) else _debris(damaged, left)
-    if any(one not in aside and one not in after for one in debris):
-        wrong.append("what was damaged is not kept")
+    if _seconds_on(rows) < _seconds_on(whole):
+        wrong.append(f"on for {_seconds_on(rows)} s, where {_seconds_on(whole)} s were left")
+    if not before.partition(b"\n")[0].startswith(damaged):  # else the log starts again
+        debris = damaged
+        for row in whole:
+            debris = debris.replace(row, b"\n")
+        aside = _content(journal.with_name(journal.name + SET_ASIDE))
+        if any(line and line not in aside and line not in content for line in debris.split(b"\n")):
+            wrong.append("damaged lines are lost")
     return wrong
 
 
@@ -246,22 +252,20 @@ def problems(subject: Subject, state: Path, folder: Path, damaged: bytes, name: 
     shutil.copytree(state, folder)
     (folder / name).write_bytes(damaged)
     before, journal = _content(state / subject.journal), folder / subject.journal
-    found = _content(journal)
-    left = {row for row in _rows(before) if row in found}
-    missing = len(_made(_rows(_content(subject.states[0] / subject.journal)))) - len(_made(left))
+    start = _content(journal)
+    whole = {row for row in _rows(before) if row in start}
+    missing = _count(_rows(_content(subject.states[0] / subject.journal))) - _count(whole)
     try:
         numbers = subject.begin(folder)
     except hardware.LogError as error:
         refused = "of another trial" in str(error) and (folder / name).read_bytes() == damaged
         return [] if refused else [f"refused: {error}"]
-    wrong = []
-    if not all(map(torch.equal, numbers, subject.numbers)):
-        wrong.append("other numbers")
-    wrong += journal_problems(before, found, journal, MOST_LOST.get(kind, len(_rows(before))))
-    if len(again := _made(_rows(_content(journal)) - left)) > missing:  # fewer if the results have them
-        wrong.append(f"{len(again)} trials or evaluations made where {missing} were missing")
+    wrong = [] if all(map(torch.equal, numbers, subject.numbers)) else ["other numbers"]
+    wrong += journal_problems(before, start, journal, MOST_LOST.get(kind, len(_rows(before))))
+    if (again := _count(_rows(_content(journal)) - whole)) > missing:  # fewer if the results have them
+        wrong.append(f"{again} trials or evaluations made where {missing} were missing")
     if name in (RESULTS_FILE, PROVENANCE_FILE) and (folder / f"{PREVIOUS}1" / name).read_bytes() != damaged:
-        wrong.append("the damaged file is not kept")
+        wrong.append("the damaged file is lost")
     warned = BufferingHandler(1000)
     warned.setLevel(logging.WARNING)
     logging.getLogger("autdtorch").addHandler(warned)
@@ -290,7 +294,7 @@ def check(damages: int, seed: int, folder: Path) -> tuple[Counter[str], list[str
         kinds = ANY | OF_LINES if name == subject.journal else ANY
         kind = rng.choice(list(kinds))
         twin = subject.another / name
-        if not twin.exists():  # a matrix has a name of its own
+        if not twin.exists():  # a matrix has another name in every study
             (twin,) = twin.parent.iterdir()
         damaged = before = (state / name).read_bytes()
         while damaged == before:
@@ -298,29 +302,9 @@ def check(damages: int, seed: int, folder: Path) -> tuple[Counter[str], list[str
         case = f"{Path(name).suffix} {kind}"
         counts[case] += 1
         try:
-            wrong += [
-                f"{number} {state.name} {case}: {one}"
-                for one in problems(subject, state, folder / str(number), damaged, name, kind)
-            ]
+            broken = problems(subject, state, folder / str(number), damaged, name, kind)
         except Exception as error:
-            wrong.append(f"{number} {state.name} {case}: {type(error).__name__}: {error}")
+            broken = [f"{type(error).__name__}: {error}"]
+        wrong += [f"{number} {state.name} {case}: {text}" for text in broken]
         shutil.rmtree(folder / str(number))
     return counts, wrong
-
-
-OPTIONS = {
-    "--damages": {"type": int, "default": 300, "help": "number of damaged files"},
-    "--seed": {"type": int, "default": 0, "help": "seed of the damages"},
-}
-
-
-def main(given: argparse.Namespace) -> int:
-    """Damage files, and print the problems."""
-    logging.getLogger("autdtorch").propagate = False  # hundreds of expected warnings
-    with tempfile.TemporaryDirectory() as folder:
-        counts, wrong = check(given.damages, given.seed, Path(folder))
-    for case, count in sorted(counts.items()):
-        print(f"{count:4d} {case}")
-    for line in (*wrong, f"{sum(counts.values())} damages, {len(wrong)} problems"):
-        print(line)
-    return int(bool(wrong))

@@ -1,14 +1,11 @@
 """Forks beside running simulations, whose children simulate too: none may hang.
 
-Two threads simulate without end, and for some of the forks compile the kernels anew. Each forked process
-must find the numbers of its parent. One that takes too long prints where it waits.
+Two threads simulate all the time; at some of the forks they compile the kernels. Each forked process must get
+the numbers of its parent. One that takes too long prints where it waits.
 
     python scripts/check.py forks --forks 60
 """
 
-from __future__ import annotations
-
-import argparse
 import faulthandler
 import os
 import random
@@ -27,8 +24,24 @@ _LONGEST = 60.0  # of a simulation in a child [s]; it takes one, and may compile
 _BETWEEN = 0.3  # longest time between forks [s]
 
 
+OPTIONS = {
+    "--forks": {"type": int, "default": 60, "help": "number of forked processes"},
+    "--seed": {"type": int, "default": 0, "help": "seed of the moments"},
+}
+
+
+def main(forks: int, seed: int) -> int:
+    """Fork, and print what went wrong."""
+    if not hasattr(os, "fork"):
+        sys.exit("this system does not fork")
+    warnings.filterwarnings("ignore", ".*multi-threaded", DeprecationWarning)  # of a fork, since Python 3.12
+    wrong = check(forks, seed)
+    print(*wrong, f"{forks} forks, {len(wrong)} problems", sep="\n")
+    return int(bool(wrong))
+
+
 def simulated() -> list[float]:
-    """Return numbers of a simulation in boxes, of a scattering operator, and of a method."""
+    """Return numbers of a simulation in boxes, of a T-matrix, and of a method."""
     array = at.TransducerArray.grid((2, 2), pitch=8e-3, center=(1.2e-3, 12e-3, 12e-3))
     ball = at.Sphere((12e-3, 12e-3, 12e-3), 3e-3, rigid=True)
     points = [[22.3e-3, 7.4e-3, 14.4e-3], [19.9e-3, 16.8e-3, 12.5e-3]]
@@ -58,15 +71,15 @@ def child(work: Callable[[], bool], said: BinaryIO) -> int:
 
 
 def check(forks: int, seed: int) -> list[str]:
-    """Fork beside simulations, and return a text for each child that hung, failed or found other numbers."""
+    """Fork beside simulations, and return a text for each child that hung, failed or got other numbers."""
     rng = random.Random(seed)
-    expected, ends = simulated(), threading.Event()
+    expected, end = simulated(), threading.Event()
 
-    def go_on() -> None:
-        while not ends.is_set():
+    def simulate_on() -> None:
+        while not end.is_set():
             simulated()
 
-    threads = [threading.Thread(target=go_on, daemon=True) for _ in range(2)]
+    threads = [threading.Thread(target=simulate_on, daemon=True) for _ in range(2)]
     for thread in threads:
         thread.start()
     wrong = []
@@ -78,23 +91,7 @@ def check(forks: int, seed: int) -> list[str]:
                 said.seek(0)
                 text = said.read().decode()
                 wrong.append(f"fork {number}: status {os.waitstatus_to_exitcode(status)}\n{text}")
-    ends.set()
+    end.set()
     for thread in threads:
         thread.join()
     return wrong
-
-
-OPTIONS = {
-    "--forks": {"type": int, "default": 60, "help": "number of forked processes"},
-    "--seed": {"type": int, "default": 0, "help": "seed of the moments"},
-}
-
-
-def main(given: argparse.Namespace) -> int:
-    """Fork, and print what went wrong."""
-    if not hasattr(os, "fork"):
-        sys.exit("this system does not fork")
-    warnings.filterwarnings("ignore", ".*multi-threaded", DeprecationWarning)  # of a fork, since Python 3.12
-    wrong = check(given.forks, given.seed)
-    print(*wrong, f"{given.forks} forks, {len(wrong)} problems", sep="\n")
-    return int(bool(wrong))

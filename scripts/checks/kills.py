@@ -6,9 +6,6 @@ repeat nothing that was finished.
     python scripts/check.py kills --kills 40
 """
 
-from __future__ import annotations
-
-import argparse
 import json
 import random
 import signal
@@ -29,7 +26,7 @@ ROOT = Path(__file__).parents[2]
 STUDY = ROOT / "tests" / "slow_study.py"  # slow enough to be killed in the middle
 TRIAL = ROOT / "scripts" / "hardware_trial.py"
 
-_OUTPUT = "said.txt"
+_OUTPUT = "output.txt"
 _POLL = 0.005  # [s]
 _TRIAL = 0.2  # [s], about the time of a trial
 _LONGEST = 600.0  # [s]
@@ -51,8 +48,9 @@ class Subject:
 
     def start(self, folder: Path) -> subprocess.Popen[bytes]:
         """Start it in a folder, with its output in a file there."""
-        with (folder / _OUTPUT).open("wb") as said:
-            return subprocess.Popen([sys.executable, *self.command], cwd=folder, stdout=said, stderr=said)
+        with (folder / _OUTPUT).open("wb") as output:
+            command = [sys.executable, *self.command]
+            return subprocess.Popen(command, cwd=folder, stdout=output, stderr=output)
 
     def lines(self, folder: Path) -> int:
         """Count the trials or evaluations in its journals."""
@@ -85,7 +83,7 @@ def of_studies(folder: Path) -> list[torch.Tensor]:
 
 
 def of_trial(folder: Path) -> list[torch.Tensor]:
-    """Return the evaluations of a hardware trial and the drive that it found."""
+    """Return the evaluations of a hardware trial and its drive."""
     rows = [json.loads(line) for line in (folder / "out" / "trial.jsonl").read_bytes().splitlines()]
     rows = [row for row in rows if "drive" in row]
     parts = [torch.tensor([row[key] for row in rows]) for key in ("evaluation", "drive", "pressure")]
@@ -111,6 +109,23 @@ SUBJECTS = {
         of_trial,
     ),
 }
+
+
+OPTIONS = {
+    "--kills": {"type": int, "default": 40, "help": "kills of each subject"},
+    "--seed": {"type": int, "default": 0, "help": "seed of the moments"},
+}
+
+
+def main(kills: int, seed: int) -> int:
+    """Check every subject."""
+    failed = False
+    for name in SUBJECTS:
+        with tempfile.TemporaryDirectory() as folder:
+            runs, wrong = check(name, kills, seed, Path(folder))
+        print(*wrong, f"{name}: {kills} kills in {runs} runs, {len(wrong)} problems", sep="\n", flush=True)
+        failed |= bool(wrong)
+    return failed
 
 
 def calm_run(subject: Subject, folder: Path) -> Calm:
@@ -194,21 +209,3 @@ def finish(process: subprocess.Popen[bytes], folder: Path) -> None:
     """
     if process.wait(_LONGEST):
         raise RuntimeError((folder / _OUTPUT).read_text(encoding="utf-8"))
-
-
-OPTIONS = {
-    "--kills": {"type": int, "default": 40, "help": "kills of each subject"},
-    "--seed": {"type": int, "default": 0, "help": "seed of the moments"},
-}
-
-
-def main(given: argparse.Namespace) -> int:
-    """Check every subject."""
-    failed = False
-    for name in SUBJECTS:
-        with tempfile.TemporaryDirectory() as folder:
-            runs, wrong = check(name, given.kills, given.seed, Path(folder))
-        for line in (*wrong, f"{name}: {given.kills} kills in {runs} runs, {len(wrong)} problems"):
-            print(line, flush=True)
-        failed |= bool(wrong)
-    return failed

@@ -1,42 +1,23 @@
-"""Tests with the newest versions that pip finds, instead of those in constraints.txt.
+"""Run tests with the newest versions that pip finds, instead of those in constraints.txt.
 
-Installs the package into a new environment in a temporary folder, prints what differs, and runs tests there.
-The newest PyTorch may bring 5 GB of CUDA; `--keep torch` takes the version of constraints.txt.
+A new environment in a temporary folder holds the packages that are newer, over those of the environment that
+runs the script. Without one, it holds all packages. Prints the differences, and runs tests there. The newest
+PyTorch may bring 5 GB of CUDA; `--keep torch` takes the version of constraints.txt.
 
     python scripts/check.py newest --keep torch -- tests/unit tests/optim
     python3.13 scripts/check.py newest                         another Python; all tests
 """
 
-from __future__ import annotations
-
-import argparse
 import os
 import re
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import venv
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-
-
-def pins(text: str) -> dict[str, str]:
-    """Return the version of each package from lines NAME==VERSION; a local version such as +cpu is cut."""
-    found = re.findall(r"^([\w.-]+)==([^\s+;]+)", text, re.MULTILINE)
-    return {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in found}
-
-
-def installed(python: Path, keep: list[str], folder: Path) -> dict[str, str]:
-    """Install the package with its extra `dev`, and packages to keep as pinned; return all versions."""
-    pinned = pins((ROOT / "constraints.txt").read_text(encoding="utf-8"))
-    kept = folder / "kept.txt"
-    kept.write_text("".join(f"{name}=={pinned[name]}\n" for name in keep), encoding="utf-8")
-    pip = [str(python), "-m", "pip", "--disable-pip-version-check", "-qq"]
-    subprocess.run([*pip, "install", "-c", str(kept), "-e", f"{ROOT}[dev]"], check=True)
-    freeze = subprocess.run([*pip, "freeze"], capture_output=True, text=True, check=True)
-    return pins(freeze.stdout)
-
 
 OPTIONS = {
     "--keep": {"nargs": "*", "default": [], "help": "packages that stay at the version of constraints.txt"},
@@ -44,19 +25,42 @@ OPTIONS = {
 }
 
 
-def main(given: argparse.Namespace) -> int:
+def main(keep: list[str], arguments: list[str]) -> int:
     """Install, compare and test; return the status of pytest."""
     pinned = pins((ROOT / "constraints.txt").read_text(encoding="utf-8"))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        venv.create(folder / "environment", with_pip=True)
-        python = folder / "environment" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
-        versions = installed(python, given.keep, folder)
+        python = new_environment(folder / "environment")
+        constraints = folder / "constraints.txt"
+        constraints.write_text("".join(f"{name}=={pinned[name]}\n" for name in keep), encoding="utf-8")
+        pip = [python, "-m", "pip", "--disable-pip-version-check", "-qq"]
+        newest = ["install", "--no-compile", "--upgrade", "--upgrade-strategy", "eager", "-c", constraints]
+        subprocess.run([*pip, *newest, "-e", f"{ROOT}[dev]"], check=True)
+        frozen = subprocess.run([*pip, "freeze"], capture_output=True, text=True, check=True).stdout
         newer = [
-            f"{name} {versions[name]}" for name in pinned if versions.get(name, pinned[name]) != pinned[name]
+            f"{name} {version}" for name, version in pins(frozen).items() if differs(name, version, pinned)
         ]
         print(f"Python {sys.version.partition(' ')[0]}; unlike constraints.txt: {', '.join(newer) or 'none'}")
-        command = [str(python), "-m", "pytest", "-q", "-n", "auto", "--maxprocesses", "8", *given.arguments]
-        return subprocess.run(
-            command, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=False
-        ).returncode
+        command = [python, "-m", "pytest", "-q", "-n", "auto", "--maxprocesses", "8", *arguments]
+        return subprocess.run(command, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}).returncode
+
+
+def new_environment(folder: Path) -> Path:
+    """Make an environment that also sees the packages of this process; return its Python."""
+    venv.create(folder, with_pip=True)
+    if sys.prefix != sys.base_prefix:
+        base = {"base": str(folder), "platbase": str(folder)}
+        own = Path(sysconfig.get_path("purelib", "venv", base))
+        (own / "zz_older.pth").write_text(f"{sysconfig.get_path('purelib')}\n", encoding="utf-8")
+    return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def pins(text: str) -> dict[str, str]:
+    """Return the version of each package from lines NAME==VERSION; a local version such as +cpu is cut."""
+    lines = re.findall(r"^([\w.-]+)==([^\s+;]+)", text, re.MULTILINE)
+    return {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in lines}
+
+
+def differs(name: str, version: str, pinned: dict[str, str]) -> bool:
+    """Return whether a version is not the one of constraints.txt, which need not name it."""
+    return pinned.get(name, version) != version

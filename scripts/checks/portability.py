@@ -6,8 +6,6 @@ Prints the failed tests of each variant. Exits with 1 if any test failed.
     python scripts/check.py portability other-cpu -m optim     one variant, some tests: arguments of pytest
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import re
@@ -38,6 +36,28 @@ VARIANTS["other-cpu"] = {key: value for one in VARIANTS.values() for key, value 
 """All variants at once; CI runs this one."""
 
 
+OPTIONS = {
+    "variant": {"nargs": "?", "choices": [*VARIANTS, "all"], "default": "all", "help": "environment"},
+    "arguments": {"nargs": argparse.REMAINDER, "help": "arguments of pytest"},
+}
+
+
+def main(variant: str, arguments: list[str]) -> int:
+    """Run the chosen variants, and name the failed ones."""
+    failed = []
+    for name in VARIANTS if variant == "all" else [variant]:
+        begin = time.monotonic()
+        settings = " ".join(f"{key}={value or '(empty)'}" for key, value in VARIANTS[name].items())
+        print(f"{name}: {settings}", flush=True)
+        with tempfile.TemporaryDirectory() as folder:
+            passed, summary = run(name, arguments, Path(folder))
+        print(f"  {summary}; {time.monotonic() - begin:.0f} s", flush=True)
+        failed += [] if passed else [name]
+    if failed:
+        print(f"failed: {', '.join(failed)}")
+    return int(bool(failed))
+
+
 def copied(folder: Path) -> Path:
     """Copy the checkout below `folder`, to a path with spaces and letters beyond ASCII."""
     place = folder / "Prüfstand 40 kHz 文"
@@ -62,25 +82,3 @@ def run(variant: str, arguments: list[str], folder: Path) -> tuple[bool, str]:
         if re.match("(FAILED|ERROR) ", line):
             print(f"  {line}", flush=True)
     return ended.returncode == 0, lines[-1].strip("= ")
-
-
-OPTIONS = {
-    "variant": {"nargs": "?", "choices": [*VARIANTS, "all"], "default": "all", "help": "environment"},
-    "arguments": {"nargs": argparse.REMAINDER, "help": "arguments of pytest"},
-}
-
-
-def main(given: argparse.Namespace) -> int:
-    """Run the chosen variants, and name the failed ones."""
-    failed = []
-    for variant in VARIANTS if given.variant == "all" else [given.variant]:
-        begin = time.monotonic()
-        settings = " ".join(f"{key}={value or '(empty)'}" for key, value in VARIANTS[variant].items())
-        print(f"{variant}: {settings}", flush=True)
-        with tempfile.TemporaryDirectory() as folder:
-            passed, summary = run(variant, given.arguments, Path(folder))
-        print(f"  {summary}; {time.monotonic() - begin:.0f} s", flush=True)
-        failed += [] if passed else [variant]
-    if failed:
-        print(f"failed: {', '.join(failed)}")
-    return int(bool(failed))

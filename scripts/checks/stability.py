@@ -9,9 +9,6 @@ must not increase. Exits with 1 if any scene fails.
     python scripts/check.py stability --seed 3 --only 17    one of them
 """
 
-from __future__ import annotations
-
-import argparse
 import logging
 import math
 import multiprocessing
@@ -47,6 +44,36 @@ WANDERING = 2.0
 """Spread of the phasors in the last quarter of a run over that in the two quarters before it."""
 STILL = {torch.float32: 1e-3, torch.float64: 1e-6}
 """Spread of steady phasors relative to their size."""
+
+
+OPTIONS = {
+    "--scenes": {"type": int, "default": 500, "help": "number of scenes"},
+    "--seed": {"type": int, "default": 0, "help": "seed of the scenes"},
+    "--only": {"type": int, "help": "number of the one scene to run"},
+    "--long-share": {"type": float, "default": LONG_SHARE, "help": f"share of {LONG_STEPS} steps"},
+    "--processes": {"type": int, "default": 2, "help": "scenes at once"},
+}
+
+
+def main(scenes: int, seed: int, only: int | None, long_share: float, processes: int) -> int:
+    """Run the scenes; print each failure when it occurs, then the tables."""
+    if only is not None:
+        outcome = _numbered((seed, only, long_share))
+        print(outcome)
+        return int(outcome.failed)
+    tasks = [(seed, number, long_share) for number in range(scenes)]
+    outcomes = []
+    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+        for outcome in tqdm(pool.imap(_numbered, tasks), total=len(tasks)):
+            outcomes.append(outcome)
+            if outcome.failed:
+                tqdm.write(f"{outcome}\n")
+    titles = {True: "Obstacles inside the domain", False: "Obstacles that may reach out of it"}
+    for inside, title in titles.items():
+        print(f"\n{title}:\n\n{summary([o for o in outcomes if o.trial.inside == inside])}")
+    refused = sum(outcome.trial.refused for outcome in outcomes)
+    print(f"\n{refused} further scenes were refused: an obstacle too slow for the spacing.")
+    return int(any(outcome.failed for outcome in outcomes))
 
 
 @dataclass(frozen=True)
@@ -134,7 +161,7 @@ class _Course:
 
 
 def _random_state(assembly: Assembly, sources: Sources, seed: int) -> State:
-    """Return random pressure at rest in the interior, none in sound-hard cells, which would keep it."""
+    """Return random pressure at rest in the interior; none in rigid cells, where it would stay."""
     grid, state = assembly.grid, assembly.silence(sources)
     inside = tuple(slice(low, high) for low, high in zip(grid.first, grid.last, strict=True))
     state.now[inside] = torch.from_numpy(np.random.default_rng(seed).standard_normal(grid.interior)).to(
@@ -193,10 +220,10 @@ def summary(outcomes: list[Outcome]) -> str:
     """Return a table of outcomes by label; a scene counts under each of its labels."""
     rows = []
     for label in ("any", *sorted({label for outcome in outcomes for label in outcome.trial.labels})):
-        own = [o for o in outcomes if label == "any" or label in o.trial.labels]
-        failed, infinite = sum(o.failed for o in own), sum(not o.finite for o in own)
-        worst = [f"{max(o.rate[run] for o in own):+.1e}" for run in ("driven", "free")]
-        rows.append([label, str(len(own)), str(failed), str(infinite), *worst])
+        chosen = [o for o in outcomes if label == "any" or label in o.trial.labels]
+        failed, infinite = sum(o.failed for o in chosen), sum(not o.finite for o in chosen)
+        worst = [f"{max(o.rate[run] for o in chosen):+.1e}" for run in ("driven", "free")]
+        rows.append([label, str(len(chosen)), str(failed), str(infinite), *worst])
     return table(["scenes with", "count", "failed", "not finite", "worst rate, driven", "free"], rows)
 
 
@@ -208,35 +235,3 @@ def _numbered(task: tuple[int, int, float]) -> Outcome:
     if outcome.failed and outcome.finite:
         outcome = run_trial(replace(trial, steps=LONGER * trial.steps))
     return outcome
-
-
-OPTIONS = {
-    "--scenes": {"type": int, "default": 500, "help": "number of scenes"},
-    "--seed": {"type": int, "default": 0, "help": "seed of the scenes"},
-    "--only": {"type": int, "help": "number of the one scene to run"},
-    "--long-share": {"type": float, "default": LONG_SHARE, "help": f"share of {LONG_STEPS} steps"},
-    "--processes": {"type": int, "default": 2, "help": "scenes at once"},
-}
-
-
-def main(given: argparse.Namespace) -> int:
-    """Run the scenes; print each failure when it occurs, then the tables."""
-    if given.only is not None:
-        outcome = _numbered((given.seed, given.only, given.long_share))
-        print(outcome)
-        return int(outcome.failed)
-    tasks = [(given.seed, number, given.long_share) for number in range(given.scenes)]
-    outcomes = []
-    with multiprocessing.get_context("spawn").Pool(given.processes) as pool:
-        for outcome in tqdm(pool.imap(_numbered, tasks), total=len(tasks)):
-            outcomes.append(outcome)
-            if outcome.failed:
-                tqdm.write(f"{outcome}\n")
-    for title, inside in (
-        ("Obstacles inside the domain", True),
-        ("Obstacles that may reach out of it", False),
-    ):
-        print(f"\n{title}:\n\n{summary([o for o in outcomes if o.trial.inside == inside])}")
-    refused = sum(outcome.trial.refused for outcome in outcomes)
-    print(f"\n{refused} further scenes were refused: an obstacle too slow for the spacing.")
-    return int(any(outcome.failed for outcome in outcomes))

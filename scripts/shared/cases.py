@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from itertools import product
 import torch
 from shared.document import DOCS
 from shared.scenes import paper_scene, relative_error, uncached
+from shared.timing import timed
 
 import autdtorch as at
 from autdtorch import analytic
@@ -62,33 +62,33 @@ class Simulation:
 
     matrix: torch.Tensor
     seconds: float
-    settled: bool
+    settled: bool = True
 
 
 def simulate(case: Case, spacing: float, tolerance: float = TOLERANCE) -> Simulation:
     """Simulate the transfer matrix at `spacing` [mm], scene assembly included in the time."""
-    begin = time.perf_counter()
-    propagator = uncached(case.scene, case.method, spacing, tolerance)
+
+    def work() -> tuple[torch.Tensor, bool]:
+        propagator = uncached(case.scene, case.method, spacing, tolerance)
+        return propagator.transfer_matrix(case.points), all(run.reached for run in propagator.runs)
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", at.SteadyStateWarning)  # `settled` reports it
-        matrix = propagator.transfer_matrix(case.points)
-    seconds = time.perf_counter() - begin
-    return Simulation(matrix, seconds, all(run.reached for run in propagator.runs))
+        (matrix, settled), seconds = timed(work)
+    return Simulation(matrix, seconds, settled)
 
 
 def close_scene(name: str, obstacles: Sequence[at.Obstacle] | None = None) -> at.Scene:
     """Load a scene of the paper with its first focus alone, in the smallest domain that holds everything.
 
-    Args:
-        name: of the scene.
-        obstacles: in place of its own.
+    `obstacles` replace those of the scene.
     """
     scene = paper_scene(name)
     obstacles, focus = scene.obstacles if obstacles is None else tuple(obstacles), scene.control_points[:1]
     corners = [torch.tensor([o.lower, o.upper], dtype=torch.float64) for o in obstacles]
-    held = torch.cat((scene.array.positions, focus, *corners))
+    inside = torch.cat((scene.array.positions, focus, *corners))
     # Whole millimetres, so that every grid lies as in the paper's domain.
-    lower, upper = 1e-3 * (1e3 * held.amin(0) - 3).floor(), 1e-3 * (1e3 * held.amax(0) + 3).ceil()
+    lower, upper = 1e-3 * (1e3 * inside.amin(0) - 3).floor(), 1e-3 * (1e3 * inside.amax(0) + 3).ceil()
     return dataclasses.replace(
         scene, obstacles=obstacles, control_points=focus, domain=torch.stack((lower, upper)),
         observation_plane=None,
@@ -105,21 +105,36 @@ def free_space_case() -> Case:
 def sphere_case(name: str, shift: Sequence[float] = (0.0, 0.0, 0.0)) -> Case:
     """Return the paper's array and foci with a sphere between them, its centre moved by `shift` (3,) [m]."""
     empty = paper_scene("homogeneous")
-    points = empty.control_points[:1]
     center = 41e-3 + shift[0], 50e-3 + shift[1], 50e-3 + shift[2]
     speed_ratio, air = SPHERES[name], empty.medium
-    where = (points, empty.array.positions, empty.wavenumber, center, SPHERE_RADIUS)
-    if speed_ratio is None:
-        sphere = at.Sphere(center, SPHERE_RADIUS, rigid=True)
-        both = [analytic.rigid_sphere(*where, scattered=scattered) for scattered in (False, True)]
+    ratios = None if speed_ratio is None else (SPHERE_DENSITY_RATIO, speed_ratio)
+    scene = close_scene("homogeneous", [sphere(center, SPHERE_RADIUS, ratios, air)])
+    exact, scattered = (sphere_matrix(scene, center, SPHERE_RADIUS, ratios, part) for part in (False, True))
+    return Case(name, scene, scene.control_points, exact, float(scattered.norm()))
+
+
+Ratios = tuple[float, float] | None
+"""Density and sound speed of a fluid relative to air; None for a rigid body."""
+
+
+def sphere(center: Sequence[float], radius: float, ratios: Ratios, air: at.Medium) -> at.Sphere:
+    """Return a sphere of a centre (3,) and radius [m]."""
+    if ratios is None:
+        return at.Sphere(tuple(center), radius, rigid=True)
+    density, speed = ratios[0] * air.density, ratios[1] * air.sound_speed
+    return at.Sphere(tuple(center), radius, density=density, sound_speed=speed)
+
+
+def sphere_matrix(
+    scene: at.Scene, center: Sequence[float], radius: float, ratios: Ratios, scattered: bool = False
+) -> torch.Tensor:
+    """Return the exact transfer matrix (P, M) [Pa] of a sphere alone, or its scattered part."""
+    where = scene.control_points, scene.array.positions, scene.wavenumber, tuple(center), radius
+    if ratios is None:
+        field = analytic.rigid_sphere(*where, scattered=scattered)
     else:
-        density, speed = SPHERE_DENSITY_RATIO * air.density, speed_ratio * air.sound_speed
-        sphere = at.Sphere(center, SPHERE_RADIUS, density=density, sound_speed=speed)
-        ratios = SPHERE_DENSITY_RATIO, speed_ratio
-        both = [analytic.fluid_sphere(*where, *ratios, scattered=scattered) for scattered in (False, True)]
-    exact, scattered = (4 * math.pi * empty.array.source_strength * part for part in both)
-    scene = close_scene("homogeneous", [sphere])
-    return Case(name, scene, points, exact, float(scattered.norm()))
+        field = analytic.fluid_sphere(*where, *ratios, scattered=scattered)
+    return 4 * math.pi * scene.array.source_strength * field
 
 
 def cube_case(name: str) -> Case:
@@ -136,34 +151,43 @@ def cubes_with(name: str, scene: at.Scene, exact: torch.Tensor) -> Case:
     return Case(name, scene, scene.control_points, exact, float(scattered.norm()))
 
 
-def slab_case() -> Case:
-    """Return a point source in front of a slab, with points on both sides."""
-    thickness, density_ratio, speed_ratio = 5e-3, 3.0, 1.5
+def slab_case(
+    thickness: float = 5e-3,
+    density: float = 3.0,
+    speed: float = 1.5,
+    face: float = FACE,
+    air: at.Medium = AIR,
+) -> Case:
+    """Return a point source in front of a slab of ratios to air, with points on both sides."""
     slab = at.Box(
-        (FACE + thickness / 2, 20e-3, 20e-3),
+        (face + thickness / 2, 20e-3, 20e-3),
         (thickness, 1.0, 1.0),
-        density=density_ratio * AIR.density,
-        sound_speed=speed_ratio * AIR.sound_speed,
+        density=density * air.density,
+        sound_speed=speed * air.sound_speed,
     )
-    ratios = {"density_ratio": density_ratio, "speed_ratio": speed_ratio}
-    exact = partial(analytic.fluid_slab, thickness=thickness, **ratios)
-    return _layered_case("slab", slab, (14.1e-3, 34.6e-3), exact)
+    exact = partial(analytic.fluid_slab, thickness=thickness, density_ratio=density, speed_ratio=speed)
+    return _layered_case("slab", slab, (14.1e-3, 34.6e-3), exact, face, air)
 
 
 def wall_case() -> Case:
     """Return a point source and points in front of a rigid wall."""
     wall = at.Box((FACE + 0.5, 20e-3, 20e-3), (1.0, 1.0, 1.0), rigid=True)
-    return _layered_case("rigid wall", wall, (14.1e-3,), analytic.rigid_plane)
+    return _layered_case("rigid wall", wall, (14.1e-3,), analytic.rigid_plane, FACE, AIR)
 
 
 def _layered_case(
-    name: str, box: at.Box, planes: Sequence[float], exact: Callable[..., torch.Tensor]
+    name: str,
+    box: at.Box,
+    planes: Sequence[float],
+    exact: Callable[..., torch.Tensor],
+    face: float,
+    air: at.Medium,
 ) -> Case:
     """Return a point source before a box that leaves the domain, with points in `planes` along x [m]."""
     array = at.TransducerArray([(8.3e-3, 19.1e-3, 20.7e-3)], (1, 0, 0))
     points = torch.tensor(list(product(planes, (9.4e-3, 21e-3), (11.7e-3, 32.2e-3))), dtype=torch.float64)
-    scene = at.Scene(array, AIR, 40e3, points, (box,), domain=((0, 0, 0), (40e-3,) * 3))
-    where = (points, array.positions, scene.wavenumber, (FACE, 0, 0), (-1, 0, 0))
+    scene = at.Scene(array, air, 40e3, points, (box,), domain=((0, 0, 0), (40e-3,) * 3))
+    where = (points, array.positions, scene.wavenumber, (face, 0, 0), (-1, 0, 0))
     strength = 4 * math.pi * array.source_strength
     total, scattered = (strength * exact(*where, scattered=part) for part in (False, True))
     return Case(name, scene, points, total, float(scattered.norm()), "full")
@@ -182,11 +206,6 @@ def piston_case() -> Case:
     field = analytic.piston_field(points, array.positions, scene.wavenumber, 5e-3, tilt)
     exact = 4 * math.pi * array.source_strength * field
     return Case("piston", scene, points, exact, None, "full")
-
-
-def worst_point_error(case: Case, matrix: torch.Tensor) -> float:
-    """Return the largest error of a point relative to its own pressure."""
-    return float(((matrix - case.exact).abs() / case.exact.abs()).max())
 
 
 def error_of(case: Case, matrix: torch.Tensor) -> tuple[float, float | None]:

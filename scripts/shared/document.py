@@ -1,22 +1,56 @@
 """Blocks of the documentation that scripts write."""
 
-from __future__ import annotations
-
+import json
 import os
 import shlex
 import sys
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
 DOCS = Path(__file__).parents[2] / "docs"
 
 
-def fill_in(document: str, command: str, parts: Iterable[str], folder: Path) -> None:
-    """Write a copy of `document` in which `parts` are the block of a command, such as "check.py autd3"."""
-    text = with_block((DOCS / document).read_text(encoding="utf-8"), command, "\n\n".join(parts))
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / document).write_text(text, encoding="utf-8")
+@dataclass(frozen=True)
+class Page:
+    """A page of the documentation, of which a command writes a block.
+
+    Attributes:
+        name: its file in the documentation.
+        command: whose block it is, such as "check.py autd3".
+        folder: where the new page, its figures and data go.
+    """
+
+    name: str
+    command: str
+    folder: Path
+
+    def write(self, *parts: str) -> None:
+        """Write a copy of the page with the paragraphs as the block, after machine, date and command."""
+        from autdtorch.utils.threads import thread_count
+
+        machine = f"{os.cpu_count()} cores ({thread_count()} threads)"
+        measured = f"Measured on {machine}, {date.today().isoformat()}:\n\n    {command_line()}"
+        text = (DOCS / self.name).read_text(encoding="utf-8")
+        self._file(self.name).write_text(
+            with_block(text, self.command, "\n\n".join((measured, *parts))), encoding="utf-8"
+        )
+
+    def write_rows(self, name: str, rows: Iterable[dict[str, object]]) -> None:
+        """Write a JSON file of rows, with command, date and cores; numbers with four digits."""
+        made = {"command": command_line(), "date": date.today().isoformat(), "cores": os.cpu_count()}
+        lines = ",\n ".join(json.dumps(_rounded(row)) for row in rows)
+        text = f'{json.dumps(made)[:-1]}, "rows": [\n {lines}\n]}}\n'
+        self._file(name).write_text(text, encoding="utf-8")
+
+    def save(self, name: str, figure: object) -> None:
+        """Save a Matplotlib figure."""
+        figure.savefig(self._file(name))
+
+    def _file(self, name: str) -> Path:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        return self.folder / name
 
 
 def with_block(text: str, command: str, block: str) -> str:
@@ -36,20 +70,32 @@ def command_line() -> str:
     return shlex.join(["python", f"scripts/{Path(sys.argv[0]).name}", *sys.argv[1:]])
 
 
-def measured() -> str:
-    """State the machine, the date and the command of a measurement."""
-    from autdtorch.utils.threads import thread_count
-
-    on = f"{os.cpu_count()} cores ({thread_count()} threads)"
-    return f"Measured on {on}, {date.today().isoformat()}:\n\n    {command_line()}"
-
-
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
+def printed(rows: Iterable[Sequence[str]]) -> list[Sequence[str]]:
+    """Return all rows, each printed as it comes."""
+    lines = []
+    for row in rows:
+        print(*row, sep=" | ", flush=True)
+        lines.append(row)
+    return lines
+
+
 def percent(share: float) -> str:
     """Format a share in percent with three digits."""
     return f"{100 * share:.3g} %"
+
+
+def spread(values: object, digits: int = 2) -> str:
+    """Format the mean and the range of a tensor."""
+    if len(values) == 1:
+        return f"{values.item():.{digits}f}"
+    return f"{values.mean():.{digits}f} ({values.min():.{digits}f} to {values.max():.{digits}f})"
+
+
+def _rounded(row: dict[str, object]) -> dict[str, object]:
+    return {name: float(f"{value:.4g}") if isinstance(value, float) else value for name, value in row.items()}

@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyvista
 import torch
+from shared import cases
+from shared.cases import Ratios
 
 import autdtorch as at
-from autdtorch import analytic
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import Vector
@@ -28,7 +29,7 @@ class Exact(NamedTuple):
 
     center: Array
     radius: float
-    ratios: tuple[float, float] | None  # None: rigid
+    ratios: Ratios
 
 
 class Drawn(NamedTuple):
@@ -116,8 +117,7 @@ def cylinder(rng: np.random.Generator) -> Drawn:
 
 def _ball(rng: np.random.Generator, radius: float, ratios: tuple[float, float]) -> Drawn:
     center = _middle(rng)
-    material = {"density": AIR.density * ratios[0], "sound_speed": AIR.sound_speed * ratios[1]}
-    return Drawn([at.Sphere(tuple(center.tolist()), radius, **material)], Exact(center, radius, ratios))
+    return Drawn([cases.sphere(center.tolist(), radius, ratios, AIR)], Exact(center, radius, ratios))
 
 
 def sphere(rng: np.random.Generator) -> Drawn:
@@ -201,14 +201,4 @@ def scene_of(family: str, seed: int) -> tuple[at.Scene, torch.Tensor | None]:
             places.append(place)
     array = at.TransducerArray(np.array(places[:3]), (1, 0, 0))
     scene = at.Scene(array, AIR, FREQUENCY, np.array(places[3:]), bodies)
-    return scene, None if exact is None else _exact_matrix(scene, exact)
-
-
-def _exact_matrix(scene: at.Scene, exact: Exact) -> torch.Tensor:
-    where = scene.control_points, scene.array.positions, scene.wavenumber, tuple(exact.center), exact.radius
-    field = (
-        analytic.rigid_sphere(*where)
-        if exact.ratios is None
-        else analytic.fluid_sphere(*where, *exact.ratios)
-    )
-    return 4 * math.pi * scene.array.source_strength * field
+    return scene, None if exact is None else cases.sphere_matrix(scene, *exact)

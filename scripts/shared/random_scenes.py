@@ -4,8 +4,6 @@ A scene is 6 to 12 cells across at 3 to 20 cells per wavelength. It holds one to
 rigid, thin, touching or overlapping, with sources and control points close to them.
 """
 
-from __future__ import annotations
-
 import math
 import tempfile
 import warnings

@@ -1,11 +1,9 @@
 """Run one of the commands in a folder of scripts: each module with a function `main` is a command.
 
-A command's `main(given)` takes the parsed options and returns an exit status or None. `OPTIONS` has the
-arguments of `add_argument` by name. A command with a constant `DOCUMENT` writes a block of that page, and
-gets the option `--output`.
+A command's `main` takes its options as keywords and returns an exit status or None. `OPTIONS` has the
+arguments of `add_argument` by name. A command with a constant `DOCUMENT` writes a block of that page: its
+`main` also takes a `page`, and there is an option `--output`.
 """
-
-from __future__ import annotations
 
 import argparse
 import ast
@@ -13,7 +11,7 @@ import importlib
 import sys
 from pathlib import Path
 
-from shared.document import DOCS
+from shared.document import DOCS, Page
 
 SCRIPTS = Path(__file__).parents[1]
 
@@ -24,15 +22,15 @@ class _Help(argparse.RawDescriptionHelpFormatter, argparse.ArgumentDefaultsHelpF
 
 def commands(folder: str) -> dict[str, str]:
     """Return the summary of each command by name, without importing any."""
-    found = {}
+    summaries = {}
     for path in sorted((SCRIPTS / folder).glob("*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         if any(isinstance(node, ast.FunctionDef) and node.name == "main" for node in tree.body):
-            found[path.stem] = (ast.get_docstring(tree) or "").partition("\n")[0]
-    return found
+            summaries[path.stem] = (ast.get_docstring(tree) or "").partition("\n")[0]
+    return summaries
 
 
-def run(folder: str, description: str) -> int:
+def run(folder: str, description: str | None) -> int:
     """Run the command that `sys.argv` names, or list the commands; return the exit status."""
     parser = argparse.ArgumentParser(description=description, formatter_class=_Help)
     names = parser.add_subparsers(metavar="NAME", dest="name")
@@ -54,9 +52,13 @@ def run(folder: str, description: str) -> int:
                 command.add_argument(flag, **settings)
             if hasattr(module, "DOCUMENT"):
                 command.add_argument("--output", type=Path, default=DOCS, help="folder of the written files")
-    given = parser.parse_args()
+    options = vars(parser.parse_args())
+    name = options.pop("name")
     if module is None:
         parser.print_usage()
         print(*(f"  {name:18}{summary}" for name, summary in commands(folder).items()), sep="\n")
         return 0
-    return int(module.main(given) or 0)
+    if hasattr(module, "DOCUMENT"):
+        command_name = f"{Path(sys.argv[0]).name} {name}"
+        options["page"] = Page(module.DOCUMENT, command_name, options.pop("output"))
+    return int(module.main(**options) or 0)

@@ -1,9 +1,8 @@
 """The paper's scenes, also with larger arrays, as scripts simulate them."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -25,10 +24,14 @@ def paper_scene(name: str) -> at.Scene:
     return at.load_scene(SCENES / f"{name}.yaml")
 
 
+def objective_of(scene: at.Scene) -> at.SimulatedObjective:
+    """Return the undisturbed objective of a scene, simulated at the default spacing."""
+    return at.SimulatedObjective(scene, at.make_propagator(scene))
+
+
 def paper_objectives() -> dict[str, at.SimulatedObjective]:
     """Return undisturbed objectives by scene, simulated at the default spacing."""
-    scenes = {name: paper_scene(name) for name in PAPER}
-    return {name: at.SimulatedObjective(scene, at.make_propagator(scene)) for name, scene in scenes.items()}
+    return {name: objective_of(paper_scene(name)) for name in PAPER}
 
 
 def autd3_array(units: tuple[int, int] = (1, 1)) -> at.TransducerArray:
@@ -45,12 +48,20 @@ def with_array(scene: at.Scene, array: at.TransducerArray) -> at.Scene:
     return dataclasses.replace(scene, array=array, domain=domain, observation_plane=None)
 
 
-def uncached(scene: at.Scene, method: str, spacing: float, tolerance: float = 1e-3) -> SimulatedPropagator:
+def uncached(
+    scene: at.Scene, method: str, spacing: float | None, tolerance: float = 1e-3, **settings: Any
+) -> SimulatedPropagator:
     """Return a propagator at `spacing` [mm] that reads nothing from disk and reuses no assembly."""
     forget_assemblies()
-    propagator = at.make_propagator(scene, method, spacing * 1e-3, tolerance=tolerance, cache=False)
+    spacing = None if spacing is None else 1e-3 * spacing
+    propagator = at.make_propagator(scene, method, spacing, tolerance=tolerance, cache=False, **settings)
     assert isinstance(propagator, SimulatedPropagator)
     return propagator
+
+
+def weakest(matrix: torch.Tensor, drive: torch.Tensor) -> torch.Tensor:
+    """Return the weakest focus (N,) [Pa] of drives (N, M) or (M,), for matrices (N, P, M)."""
+    return (matrix @ drive[..., None])[..., 0].abs().amin(dim=-1)
 
 
 def relative_error(value: torch.Tensor, exact: torch.Tensor) -> float:

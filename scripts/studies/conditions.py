@@ -1,16 +1,13 @@
 """Methods under noise, few phase levels, failed transducers and drift.
 
-Writes conditions.png and a block of conditions.md. Each trial has an objective of its own, with noise and
-drift seeded by the number of the trial. The true score is the weakest focus that the drive found produces
-without noise on the device in its final state.
+Writes conditions.png and a block of the documentation. Each trial has its noise and drift, seeded by the
+number of the trial. The true score is the weakest focus that the resulting drive makes without noise on the
+device in its final state.
 
     python scripts/study.py conditions                              all methods of the package
     python scripts/study.py conditions --methods gabs identify      two of them
 """
 
-from __future__ import annotations
-
-import argparse
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,7 +17,7 @@ from typing import Any
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from shared.document import command_line, fill_in, measured, table
+from shared.document import Page, command_line, table
 from shared.scenes import PAPER, paper_objectives
 
 import autdtorch as at
@@ -71,6 +68,33 @@ METHODS = {
 }
 
 
+OPTIONS = {
+    "--methods": {"nargs": "+", "choices": METHODS, "default": list(METHODS), "help": "compared methods"},
+    "--trials": {"type": int, "default": 20, "help": "trials of each method"},
+}
+
+
+def main(page: Page, methods: list[str], trials: int) -> None:
+    """Measure; print all tables, and write block and figure."""
+    outcomes = {}
+    for scene, objective in paper_objectives().items():
+        for condition, wrap in CONDITIONS.items():
+            for name in methods:
+                result = outcome(METHODS[name], objective, wrap, trials)
+                outcomes[scene, condition, METHODS[name].label] = result
+                print(f"{scene}, {condition}, {name}: {result.true.mean():.3f} Pa", flush=True)
+    for scene in PAPER:
+        print("", f"True weakest focus [Pa], {scene}:", "", true_scores(outcomes, scene), sep="\n")
+    error = max(result.error for result in outcomes.values())
+    page.write(
+        "![True weakest focus over the level of noise and over the number of phase levels](conditions.png)",
+        f"Mean true weakest focus [Pa] of {trials} trials in {readable(SHOWN)}; standard errors are at "
+        f"most {error:.2f} Pa.",
+        true_scores(outcomes, SHOWN),
+    )
+    page.save("conditions.png", plot_conditions(outcomes))
+
+
 def failed(objective: at.Objective, trial: int, count: int = 1) -> at.Objective:
     """Switch off transducers, different ones in each trial."""
     order = torch.randperm(len(objective.scene.array), generator=torch.Generator().manual_seed(trial))
@@ -110,7 +134,7 @@ class Outcome:
     """The trials of a method in a scene under a condition.
 
     Attributes:
-        true: weakest focus that each drive found produces (T,) [Pa].
+        true: weakest focus that each resulting drive makes (T,) [Pa].
         observed: weakest focus observed for it (T,) [Pa].
     """
 
@@ -132,7 +156,7 @@ class SideBySide:
     """Objectives of several trials as one, with an equal share of the rows for each."""
 
     def __init__(self, objectives: Sequence[at.Objective]) -> None:
-        """Keep the objectives of trials 0, 1, ..."""
+        """Join the objectives of trials 0, 1, ..."""
         self.scene = objectives[0].scene
         self.evaluations = 0
         self._objectives = objectives
@@ -141,15 +165,15 @@ class SideBySide:
         """Observe drives (T * B, M), with the rows of a trial together."""
         self.evaluations += len(drive)
         shares = drive.chunk(len(self._objectives))
-        return torch.cat([own(share) for own, share in zip(self._objectives, shares, strict=True)])
+        return torch.cat([see(share) for see, share in zip(self._objectives, shares, strict=True)])
 
 
 def solve(method: Method, objective: at.Objective, trials: Sequence[int]) -> at.Solution:
     """Run trials of a method; a method without random choices takes no `trials` and no `seed`."""
     function = getattr(at, method.function)
-    given = {"trials": list(trials), "seed": 0}
-    known = {key: value for key, value in given.items() if key in inspect.signature(function).parameters}
-    return function(objective, **method.settings, **known)
+    known = inspect.signature(function).parameters.keys() & {"trials", "seed"}
+    settings = {key: value for key, value in {"trials": list(trials), "seed": 0}.items() if key in known}
+    return function(objective, **method.settings, **settings)
 
 
 def outcome(method: Method, objective: at.Objective, wrap: Wrap, trials: int) -> Outcome:
@@ -158,10 +182,10 @@ def outcome(method: Method, objective: at.Objective, wrap: Wrap, trials: int) ->
     if method.together:
         solutions = [solve(method, SideBySide(objectives), range(trials))]
     else:
-        solutions = [solve(method, own, [trial]) for trial, own in enumerate(objectives)]
+        solutions = [solve(method, each, [trial]) for trial, each in enumerate(objectives)]
     drives = torch.cat([solution.drive for solution in solutions])
-    true = [at.true_pressure(own, drive) for own, drive in zip(objectives, drives, strict=True)]
-    return Outcome(at.weakest_focus(torch.stack(true)), torch.cat([found.score for found in solutions]))
+    true = [at.true_pressure(each, drive) for each, drive in zip(objectives, drives, strict=True)]
+    return Outcome(at.weakest_focus(torch.stack(true)), torch.cat([each.score for each in solutions]))
 
 
 def keys(outcomes: Outcomes, place: int) -> list[str]:
@@ -211,32 +235,3 @@ def _draw(ax: Axes, outcomes: list[Outcome], look: Look, label: str) -> None:
     places = range(len(outcomes))
     ax.fill_between(places, means - errors, means + errors, color=colour, alpha=0.2, lw=0)
     ax.plot(places, means, color=colour, marker=marker, linestyle=dashes, ms=4, lw=1.2, label=label)
-
-
-OPTIONS = {
-    "--methods": {"nargs": "+", "choices": METHODS, "default": list(METHODS), "help": "compared methods"},
-    "--trials": {"type": int, "default": 20, "help": "trials of each method"},
-}
-
-
-def main(given: argparse.Namespace) -> None:
-    """Measure; print all tables, and write block and figure."""
-    outcomes = {}
-    for scene, objective in paper_objectives().items():
-        for condition, wrap in CONDITIONS.items():
-            for name in given.methods:
-                found = outcome(METHODS[name], objective, wrap, given.trials)
-                outcomes[scene, condition, METHODS[name].label] = found
-                print(f"{scene}, {condition}, {name}: {found.true.mean():.3f} Pa", flush=True)
-    for scene in PAPER:
-        print("", f"True weakest focus [Pa], {scene}:", "", true_scores(outcomes, scene), sep="\n")
-    error = max(outcome.error for outcome in outcomes.values())
-    parts = (
-        measured(),
-        "![True weakest focus over the level of noise and over the number of phase levels](conditions.png)",
-        f"Mean true weakest focus [Pa] of {given.trials} trials in {readable(SHOWN)}; standard errors are at "
-        f"most {error:.2f} Pa.",
-        true_scores(outcomes, SHOWN),
-    )
-    fill_in(DOCUMENT, "study.py conditions", parts, given.output)
-    plot_conditions(outcomes).savefig(given.output / "conditions.png")

@@ -1,15 +1,12 @@
-"""The loss of the foci where obstacles are not in their assumed pose.
+"""Loss of the foci if obstacles are not in their assumed pose.
 
-Writes pose_errors.png and a block of pose_errors.md. Drives are the best for the paper's cubes at their
+Writes pose_errors.png and a block of the documentation. Drives are the best for the paper's cubes at their
 place. Then all cubes of a scene are shifted in random directions, or turned about random axes, as one body.
-Scattering operators give the transfer matrix of each pose.
+T-matrices give the transfer matrix of each pose.
 
     python scripts/study.py pose_error          about two minutes on 2 idle cores
 """
 
-from __future__ import annotations
-
-import argparse
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -18,8 +15,8 @@ from typing import NamedTuple
 import torch
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
-from shared.document import fill_in, measured, percent, table
-from shared.scenes import PAPER, paper_scene
+from shared.document import Page, percent, table
+from shared.scenes import PAPER, paper_scene, weakest
 
 import autdtorch as at
 from autdtorch.plot.style import TICK_SIZE, add_legend, looks_of, new_figure, readable, styled
@@ -44,6 +41,22 @@ OPTIONS = {
 }
 
 
+def main(page: Page, poses: int, spacing: float) -> None:
+    """Simulate, and write the figure and the block."""
+    rows = []
+    for name in SCENES:
+        for loss in losses(name, poses, 1e-3 * spacing):
+            rows.append(loss)
+            print(f"{name}, {loss.error:g} {loss.unit}: {percent(float(loss.same.median()))}", flush=True)
+    head = ["scene", "pose error", "left, median", "left in 95 % of the directions", "new drive, median"]
+    page.write(
+        "![Share of the weakest focus that is left, over shifts and turns of the obstacles](pose_errors.png)",
+        f"Weakest focus relative to that at the assumed pose, {poses} directions each:",
+        table(head, [cells(loss) for loss in rows if loss.error in SHOWN[loss.unit]]),
+    )
+    page.save("pose_errors.png", plot_losses(rows))
+
+
 class Losses(NamedTuple):
     """Shares of the weakest focus under a pose error.
 
@@ -51,15 +64,15 @@ class Losses(NamedTuple):
         scene: name.
         unit: of the error, "mm" or "degrees".
         error: the pose error.
-        kept: share that the drive keeps, for each direction (N,).
-        followed: share of a drive that was computed for the pose (N,).
+        same: share with the drive of the assumed pose, for each direction (N,).
+        new: share with a drive that was computed for the pose (N,).
     """
 
     scene: str
     unit: str
     error: float
-    kept: torch.Tensor
-    followed: torch.Tensor
+    same: torch.Tensor
+    new: torch.Tensor
 
 
 def scene_of(name: str) -> at.Scene:
@@ -88,39 +101,28 @@ def losses(name: str, count: int, spacing: float) -> Iterator[Losses]:
             else:
                 turns = Rotation.from_rotvec(math.radians(error) * directions.numpy()).as_euler("xyz")
                 poses = [body.moved(rotation=turn) for turn in turns]
-            matrices = [pose.transfer_matrix(scene.array, scene.control_points) for pose in poses]
-            matrix = torch.stack(matrices)
-            yield Losses(
-                name,
-                unit,
-                error,
-                weakest(matrix, drive) / full,
-                weakest(matrix, at.holography(matrix, starts=STARTS)) / full,
-            )
-
-
-def weakest(matrix: torch.Tensor, drive: torch.Tensor) -> torch.Tensor:
-    """Return the weakest focus (N,) [Pa] of drives (N, M) or (M,), for matrices (N, P, M)."""
-    return (matrix @ drive[..., None])[..., 0].abs().amin(dim=1)
+            matrix = torch.stack([pose.transfer_matrix(scene.array, scene.control_points) for pose in poses])
+            new = at.holography(matrix, starts=STARTS)
+            yield Losses(name, unit, error, weakest(matrix, drive) / full, weakest(matrix, new) / full)
 
 
 @styled
-def plot_losses(found: Sequence[Losses]) -> Figure:
+def plot_losses(losses: Sequence[Losses]) -> Figure:
     """Plot the share that is left over the pose error: the median, and nine of ten directions."""
     figure, looks = new_figure(6.6, 3.0), looks_of(SCENES)
     panels = figure.subplots(1, 2, sharey=True)
     for ax, unit, label in zip(panels, SHOWN, ("shift [mm]", "turn [degrees]"), strict=True):
         for name in SCENES:
-            rows = [one for one in found if (one.scene, one.unit) == (name, unit)]
-            errors = [0.0, *(one.error for one in rows)]
+            rows = [loss for loss in losses if (loss.scene, loss.unit) == (name, unit)]
+            errors = [0.0, *(loss.error for loss in rows)]
             low, middle, high = (
-                [1.0, *(float(one.kept.quantile(share)) for one in rows)] for share in (0.05, 0.5, 0.95)
+                [1.0, *(float(loss.same.quantile(share)) for loss in rows)] for share in (0.05, 0.5, 0.95)
             )
-            followed = [1.0, *(float(one.followed.median()) for one in rows)]
+            new = [1.0, *(float(loss.new.median()) for loss in rows)]
             look = looks[name]
             ax.plot(errors, middle, color=look.colour, label=readable(name))
             ax.fill_between(errors, low, high, color=look.colour, alpha=0.2, linewidth=0)
-            ax.plot(errors, followed, color=look.colour, linestyle=":", label=f"{readable(name)}, new drive")
+            ax.plot(errors, new, color=look.colour, linestyle=":", label=f"{readable(name)}, new drive")
         ax.set_xlabel(label)
         ax.set_xlim(left=0)
         ax.set_ylim(0.4, 1.1)
@@ -130,32 +132,9 @@ def plot_losses(found: Sequence[Losses]) -> Figure:
     return figure
 
 
-def rows(found: Sequence[Losses]) -> Iterator[list[str]]:
-    """Yield the cells of the table."""
-    for one in found:
-        if one.error in SHOWN[one.unit]:
-            kept = [percent(float(one.kept.quantile(share))) for share in (0.5, 0.05)]
-            yield [
-                readable(one.scene),
-                f"{one.error:g} {one.unit}",
-                *kept,
-                percent(float(one.followed.median())),
-            ]
-
-
-def main(given: argparse.Namespace) -> None:
-    """Simulate, and write the figure and the block."""
-    found = []
-    for name in SCENES:
-        for one in losses(name, given.poses, 1e-3 * given.spacing):
-            found.append(one)
-            print(f"{name}, {one.error:g} {one.unit}: {percent(float(one.kept.median()))}", flush=True)
-    head = ["scene", "pose error", "left, median", "left in 95 % of the directions", "new drive, median"]
-    parts = (
-        measured(),
-        "![Share of the weakest focus that is left, over shifts and turns of the obstacles](pose_errors.png)",
-        f"Weakest focus relative to that at the assumed pose, {given.poses} directions each:",
-        table(head, rows(found)),
-    )
-    fill_in(DOCUMENT, "study.py pose_error", parts, given.output)
-    plot_losses(found).savefig(given.output / "pose_errors.png")
+def cells(loss: Losses) -> list[str]:
+    """Return the cells of a row of the table."""
+    shares = [percent(float(loss.same.quantile(share))) for share in (0.5, 0.05)]
+    return [
+        readable(loss.scene), f"{loss.error:g} {loss.unit}", *shares, percent(float(loss.new.median()))
+    ]  # fmt: skip

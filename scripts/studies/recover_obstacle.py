@@ -1,15 +1,12 @@
 """Place and turn of the paper's two cubes, recovered from pressure magnitudes.
 
 The measurement is a simulation of the turned cubes by `box`, in cells of 0.5 mm, with 1 % of noise. The model
-is a `ScatteringOperator` of the cubes in cells of 1 mm, moved to a trial pose. Its derivatives by place and
+is a T-matrix of the cubes in cells of 1 mm, moved to a trial pose. Its derivatives by place and
 turn drive a least-squares fit from several starts. The first guess is the pose at rest.
 
     python scripts/study.py recover_obstacle            20 seconds on 2 idle cores
 """
 
-from __future__ import annotations
-
-import argparse
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -30,6 +27,30 @@ TILTS = ((0.0, 0.0), (20.0, 20.0), (20.0, -20.0), (-20.0, 20.0), (-20.0, -20.0))
 
 LIMIT = (8e-3, 45.0)
 """Largest offset [m] and rotation [degrees] by each axis in a fit: the microphones stay outside the body."""
+
+
+OPTIONS = {
+    "--spacing": {"type": float, "default": 1.0, "help": "of the model; twice that of the measurement [mm]"},
+    "--seed": {"type": int, "default": 0, "help": "of the noise"},
+}
+
+
+def main(spacing: float, seed: int) -> None:
+    """Simulate the measurement, recover the pose, and print the fit from each start."""
+    scene, true, spacing = bench(), pose_of(TRUE_OFFSET, TRUE_ROTATION), 1e-3 * spacing
+    observed = measured(scene, true, spacing / 2, seed)
+    body = at.ScatteringOperator.of(scene.obstacles, scene.medium, scene.frequency, spacing, error=1e-2)
+    starts = [pose_of(0.0, (0.0, *tilt)) for tilt in TILTS]
+    results: list[Fit] = []
+    for number, fit in enumerate(fits(body, scene, observed, starts), 1):
+        results.append(fit)
+        change = f"misfit {100 * fit.first:4.1f} % to {100 * fit.misfit:4.2f} % in {fit.steps} steps"
+        print(f"start {number}: {change}", flush=True)
+    best = min(results, key=lambda fit: fit.misfit)
+    place, turn = pose_errors(best.pose, true)
+    shift, angle = 1e3 * float(best.error[:3].norm()), math.degrees(float(best.error[3:].norm()))
+    print(f"place error {place:.3f} mm, turn error {turn:.2f} degrees")
+    print(f"(standard errors of the fit: {shift:.3f} mm, {angle:.2f} degrees)")
 
 
 @dataclass(frozen=True)
@@ -108,36 +129,13 @@ def fits(
         yield Fit(pose, misfit, first, best.nfev, variance.sqrt())
 
 
-def pose_errors(found: torch.Tensor, true: torch.Tensor) -> tuple[float, float]:
+def pose_errors(pose: torch.Tensor, true: torch.Tensor) -> tuple[float, float]:
     """Return the distance [mm] and the angle [degrees] between two poses (6,) [m], [rad] of the two cubes.
 
     A right angle about their common axis, x at rest, changes nothing: the angle is that to the nearest image.
     """
     images = [rotation_matrix((turns * math.pi / 2, 0.0, 0.0)) for turns in range(4)]
-    turned, wanted = (rotation_matrix(pose[3:].tolist()) for pose in (found, true))
+    turned, wanted = (rotation_matrix(each[3:].tolist()) for each in (pose, true))
     cosines = [(torch.trace(wanted.mT @ turned @ image) - 1) / 2 for image in images]
     angle = math.acos(min(1.0, float(max(cosines))))
-    return 1e3 * float((found - true)[:3].norm()), math.degrees(angle)
-
-
-OPTIONS = {
-    "--spacing": {"type": float, "default": 1.0, "help": "of the model; twice that of the measurement [mm]"},
-    "--seed": {"type": int, "default": 0, "help": "of the noise"},
-}
-
-
-def main(given: argparse.Namespace) -> None:
-    """Simulate the measurement, recover the pose, and print the fit from each start."""
-    scene, true, spacing = bench(), pose_of(TRUE_OFFSET, TRUE_ROTATION), 1e-3 * given.spacing
-    observed = measured(scene, true, spacing / 2, given.seed)
-    body = at.ScatteringOperator.of(scene.obstacles, scene.medium, scene.frequency, spacing, error=1e-2)
-    found: list[Fit] = []
-    for fit in fits(body, scene, observed, [pose_of(0.0, (0.0, *tilt)) for tilt in TILTS]):
-        found.append(fit)
-        change = f"misfit {100 * fit.first:4.1f} % to {100 * fit.misfit:4.2f} % in {fit.steps} steps"
-        print(f"start {len(found)}: {change}", flush=True)
-    best = min(found, key=lambda fit: fit.misfit)
-    place, turn = pose_errors(best.pose, true)
-    shift, angle = 1e3 * float(best.error[:3].norm()), math.degrees(float(best.error[3:].norm()))
-    print(f"place error {place:.3f} mm, turn error {turn:.2f} degrees")
-    print(f"(standard errors of the fit: {shift:.3f} mm, {angle:.2f} degrees)")
+    return 1e3 * float((pose - true)[:3].norm()), math.degrees(angle)

@@ -1,27 +1,35 @@
 """Effect of order, levels and passes on LSSG and GABS.
 
-Fills in a block of methods.md.
+Fills in a block of the documentation.
 
     python scripts/study.py searches            half a minute
 """
 
-from __future__ import annotations
-
-import argparse
 import math
 from collections.abc import Mapping
 from functools import partial
 
 import torch
-from shared.document import fill_in, measured, table
+from shared.document import Page, spread, table
 from shared.scenes import PAPER, paper_objectives
 
 import autdtorch as at
 
 DOCUMENT = "methods.md"
+OPTIONS = {"--trials": {"type": int, "default": 50, "help": "trials of each random search"}}
 
 Figures = tuple[torch.Tensor, torch.Tensor]
 """Scores (T,) [Pa] and evaluations (T,)."""
+
+
+def main(page: Page, trials: int) -> None:
+    """Measure, and write the block."""
+    figures = {scene: measure(objective, trials) for scene, objective in paper_objectives().items()}
+    page.write(
+        f"Weakest focus [Pa] in the paper's scenes: mean (minimum to maximum) of {trials} trials, and\n"
+        "mean evaluations of a trial. 16 levels and one pass unless stated.",
+        summary(figures),
+    )
 
 
 def best_offsets(objective: at.Objective) -> Figures:
@@ -67,26 +75,3 @@ def summary(figures: Mapping[str, Mapping[str, Figures]]) -> str:
         cells = [spread(figures[scene][name][0]) for scene in PAPER]
         rows.append([name, f"{evaluations:.0f}", *cells])
     return table(["search", "evaluations", *(scene.replace("_", " ") for scene in PAPER)], rows)
-
-
-def spread(scores: torch.Tensor) -> str:
-    """Format the mean and the range of the trials."""
-    if len(scores) == 1:
-        return f"{scores.item():.2f}"
-    return f"{scores.mean():.2f} ({scores.min():.2f} to {scores.max():.2f})"
-
-
-OPTIONS = {"--trials": {"type": int, "default": 50, "help": "trials of each random search"}}
-
-
-def main(given: argparse.Namespace) -> None:
-    """Measure, and write the block."""
-    objectives = paper_objectives()
-    figures = {scene: measure(objective, given.trials) for scene, objective in objectives.items()}
-    parts = (
-        measured(),
-        f"Weakest focus [Pa] in the paper's scenes: mean (minimum to maximum) of {given.trials} trials, and\n"
-        "mean evaluations of a trial. 16 levels and one pass unless stated.",
-        summary(figures),
-    )
-    fill_in(DOCUMENT, "study.py searches", parts, given.output)

@@ -25,10 +25,10 @@ from checks.autd3 import (
     play_focus,
     play_levels,
     random_drive,
-    relative_difference,
     rms,
     scaled,
 )
+from shared.scenes import relative_error
 
 import autdtorch as at
 from autdtorch.hardware import AUTD3
@@ -47,7 +47,7 @@ def test_a_focus_has_the_same_levels_and_the_same_field() -> None:
     # float32 may round a level the other way where it is half-way
     assert int((levels[0].numpy() != emission.phases).sum()) <= 1
     points, theirs = rms(emission, plane(20.0))
-    assert relative_difference(ours(array, emission.drive, points).abs() / math.sqrt(2), theirs) < FLOAT32
+    assert relative_error(ours(array, emission.drive, points).abs() / math.sqrt(2), theirs) < FLOAT32
 
 
 def test_amplitudes_are_what_the_pulse_widths_make_of_them() -> None:
@@ -57,7 +57,7 @@ def test_amplitudes_are_what_the_pulse_widths_make_of_them() -> None:
     # A pulse width is off by half a count at most, and the slope of sin(pi w / 512) by w is below pi / 512.
     assert float((emission.drive - AUTD3.drive(*levels)).abs().max()) < 0.5 * math.pi / FULL_PULSE
     points, theirs = rms(emission, plane(20.0))
-    assert relative_difference(ours(array, emission.drive, points).abs() / math.sqrt(2), theirs) < FLOAT32
+    assert relative_error(ours(array, emission.drive, points).abs() / math.sqrt(2), theirs) < FLOAT32
 
 
 def test_the_waveform_has_our_phases() -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from benchmarks.accuracy import Row, compare, make_reference, observed_order, worst_point, write_report
+from benchmarks.accuracy import Row, compare, observed_order, store_reference, worst_point, write_report
 from shared import cases, document
 from shared.cases import cube_case, piston_case, simulate, slab_case, sphere_case, wall_case
 
@@ -39,15 +39,16 @@ def test_cubes_reference_is_the_finest_of_the_stored_matrices(
     class PowerLaw:
         """Transfer matrices of free space times a function of the spacing."""
 
-        def __init__(self, scene: at.Scene, _: str, spacing: float, tolerance: float, cache: bool) -> None:
-            self.scene, self.factor = scene, 1 + 1e3 * spacing
+        def __init__(self, scene: at.Scene, _: str, spacing: float, tolerance: float) -> None:
+            self.scene, self.factor = scene, 1 + spacing
 
-        def transfer_matrix(self, points: torch.Tensor) -> torch.Tensor:
-            return self.factor * free_space_matrix(points, self.scene.array, self.scene.wavenumber)
+        def transfer_matrix(self) -> torch.Tensor:
+            scene = self.scene
+            return self.factor * free_space_matrix(scene.control_points, scene.array, scene.wavenumber)
 
-    monkeypatch.setattr(cases, "CUBE_MATRICES", tmp_path / "reference" / "cubes.json")
-    monkeypatch.setattr(at, "make_propagator", PowerLaw)
-    make_reference()
+    monkeypatch.setattr(cases, "CUBE_MATRICES", tmp_path / "cubes.json")
+    monkeypatch.setattr("benchmarks.accuracy.uncached", PowerLaw)
+    store_reference()
     case = cube_case("two_cubes")
     free = free_space_matrix(case.scene.control_points[:1], case.scene.array, case.scene.wavenumber)
     assert torch.allclose(case.exact, 1.2 * free, rtol=1e-10)
@@ -66,6 +67,7 @@ def test_a_report_names_the_limits_that_are_exceeded(tmp_path: Path, monkeypatch
     (tmp_path / "benchmarks.md").write_text("\n".join(marks), encoding="utf-8")
     monkeypatch.setattr(document, "DOCS", tmp_path)
     rows = [Row("sphere", "default", h, 0.02 * h, 0.05 * h, 3 / h, h > 1) for h in (2.0, 1.0)]
-    assert write_report(rows, tmp_path) == []
-    (failed,) = write_report([Row("slab", "default", 1.0, 0.02, None, 1.0, True), *rows], tmp_path)
+    page = document.Page("benchmarks.md", "benchmark.py accuracy", tmp_path)
+    assert write_report(rows, page) == []
+    (failed,) = write_report([Row("slab", "default", 1.0, 0.02, None, 1.0, True), *rows], page)
     assert failed.startswith("slab, default, 1 mm, total: 2 %")

@@ -33,7 +33,7 @@ ALL_HELP = """
 import importlib, sys
 from shared.runner import commands, run
 
-def work(given):
+def work(**options):
     raise AssertionError("the work was started")
 
 for folder in sys.argv[1:]:

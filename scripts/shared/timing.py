@@ -1,9 +1,8 @@
-"""Measurements in processes of their own."""
-
-from __future__ import annotations
+"""Run times, memory and processes of measurements."""
 
 import resource
 import sys
+import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -11,6 +10,18 @@ from typing import TypeVar
 
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
+
+
+def timed(work: Callable[[], Result], clock: Callable[[], float] = time.perf_counter) -> tuple[Result, float]:
+    """Return a result and the time it took [s]."""
+    begin = clock()
+    return work(), clock() - begin
+
+
+def shortest(work: Callable[[], Result], repeats: int) -> tuple[Result, float]:
+    """Return the last result and the shortest time [s] of some repetitions."""
+    runs = [timed(work) for _ in range(repeats)]
+    return runs[-1][0], min(seconds for _, seconds in runs)
 
 
 def in_new_process(work: Callable[[Argument], Result], argument: Argument) -> Result:
