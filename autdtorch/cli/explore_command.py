@@ -11,6 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from autdtorch.cli.settings import is_given, scene_of, section_of, solver_of
 from autdtorch.io.drive_file import load_drive
 from autdtorch.plot.explore import explore
+from autdtorch.utils.signals import signals_restored
 from autdtorch.utils.validation import invalid, path_of, require_known, within
 
 _KEYS = ("port", "browser", "drive")
@@ -37,13 +38,11 @@ def explore_scene(settings: dict[str, Any], modules: list[Any]) -> None:
             drive = load_drive(path_of("drive", file))
     scene = scene_of("scene", section_of(settings, "scene"), modules)
     spacing, port, browser = solver_of(settings)["spacing"], section["port"], section["browser"]
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
+    with signals_restored():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         explorer = explore(scene, drive, spacing=spacing, port=port, open_browser=browser)
         try:
             print(f"The live view is at {explorer.address}\nCtrl+C ends it.", flush=True)
             explorer.wait()
         except KeyboardInterrupt:
             explorer.close()
-    finally:
-        signal.signal(signal.SIGTERM, before)

@@ -76,7 +76,7 @@ def axes_of(
 
 
 def view_from(towards: Array) -> Array:
-    """Return the right and upward direction (2, 3) of a picture, given the direction (3,) to its viewer."""
+    """Return the right and upward direction (2, 3) of a picture, from the direction (3,) to its viewer."""
     right = np.cross((0.0, 0.0, 1.0), towards)
     right /= np.linalg.norm(right)
     return np.array([right, np.cross(towards / np.linalg.norm(towards), right)])
@@ -87,9 +87,7 @@ def grid_lines(lower: Array, upper: Array, ticks: Sequence[Sequence[float]]) -> 
     ends = (lower, upper)
     lines = []
     for axis, other in itertools.permutations(range(3), 2):
-        fixed = (
-            3 - axis - other
-        )  # on the side behind along `fixed`, lines along `other` at the ticks of `axis`
+        fixed = 3 - axis - other  # on the back side across `fixed`: lines along `other` at ticks of `axis`
         for place in (lower[axis], *ticks[axis], upper[axis]):
             line = np.empty((2, 3))
             line[:, axis], line[:, fixed] = place, ends[_BACK[fixed]][fixed]
@@ -113,7 +111,7 @@ class _Texts:
         self.height = size("0")[1]
 
     def place(self, text: str, point: Array, offset: Array, gap: float) -> bool:
-        """Place a text, if it is clear by a gap of those before; offset and gap in heights of a text."""
+        """Place a text unless it is within a gap of another; offset and gap in heights of a text."""
         extent, gap = np.array(self._size(text)), gap * self.height
         corner = self.height * offset + np.choose(np.sign(offset).astype(int) + 1, (-1.0, -0.5, 0.0)) * extent
         low = self._view @ (point - self._centre) + corner

@@ -57,8 +57,8 @@ def plot_pareto(
         xlabel: label of the cost, with its unit.
         ylabel: label of the result, with its unit.
         higher_is_better: True if the result is a score, not an error.
-        names: by scene and method, N names of the points; shown along the front of all methods, long ones
-            in up to three lines.
+        names: by scene and method, N names of the points; those on the front of all methods are shown, in
+            up to three lines.
 
     Raises:
         ValueError: no scene, points that are not (N, 2) finite numbers, or a cost or error <= 0.
@@ -98,11 +98,11 @@ def _pareto_front(points: Array, higher_is_better: bool) -> list[int]:
     """Return the indices of the Pareto-optimal points (N, 2), by rising cost; of equal points the first."""
     costs, results = points.T
     worse = -results if higher_is_better else results
-    kept: list[int] = []
+    front: list[int] = []
     for index in np.lexsort((worse, costs)):
-        if not kept or worse[index] < worse[kept[-1]]:
-            kept.append(int(index))
-    return kept
+        if not front or worse[index] < worse[front[-1]]:
+            front.append(int(index))
+    return front
 
 
 def _size(name: str) -> Array:
@@ -113,7 +113,7 @@ def _size(name: str) -> Array:
 
 
 def _make_room(ax: Axes, sizes: Sequence[Array]) -> None:
-    """Leave room for names of sizes [inch] left of all points, and above and below them."""
+    """Set limits with room for names of sizes [inch] left of, above and below all points."""
     width, height = np.max([*sizes, np.zeros(2)], axis=0)
     ax.margins(_MARGIN, max(_MARGIN, height / (_INSIDE - 2 * height)))
     ax.set_xscale("log")
@@ -123,7 +123,7 @@ def _make_room(ax: Axes, sizes: Sequence[Array]) -> None:
 
 
 def _name_front(ax: Axes, points: Array, names: Mapping[int, str], higher_is_better: bool) -> None:
-    """Write names on the side of the front that has no points, without those that would cover another."""
+    """Write names on the side of the front without points; leave out names that would cover another."""
     up, side = (3, "bottom") if higher_is_better else (-3, "top")
     where: Any = {"xytext": (-4, up), "textcoords": "offset points", "ha": "right", "va": side}
     place = (ax.transData + ax.transAxes.inverted()).transform(points) * _INSIDE
@@ -137,15 +137,17 @@ def _name_front(ax: Axes, points: Array, names: Mapping[int, str], higher_is_bet
             written.append((place[index], height))
 
 
-def _texts(name: str, given: Mapping[str, Sequence[str]], drawn: Mapping[str, Array]) -> list[str]:
+def _texts(name: str, names: Mapping[str, Sequence[str]], drawn: Mapping[str, Array]) -> list[str]:
     """Return the names of all points of a scene."""
-    require_each(name, given, drawn)
+    require_each(name, names, drawn)
     texts: list[str] = []
     for method, values in drawn.items():
-        own = members(f"{name}[{method!r}]", given[method], str)
-        if len(own) != len(values):
-            raise invalid(f"{name}[{method!r}]", own, f"must be {len(values)} names, one for each point")
-        texts += own
+        of_method = members(f"{name}[{method!r}]", names[method], str)
+        if len(of_method) != len(values):
+            raise invalid(
+                f"{name}[{method!r}]", of_method, f"must be {len(values)} names, one for each point"
+            )
+        texts += of_method
     return texts
 
 
@@ -179,8 +181,8 @@ def fit_power(sizes: Sequence[float] | Array, costs: Sequence[float] | Array) ->
 def plot_scaling(costs: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
     """Plot costs against sizes on logarithmic axes with fitted power laws, one row of panels per cost.
 
-    A broad pale line is a power law, fitted to the costs that are at least twice the smallest one. The legend
-    gives its exponent as slope. With fewer than three such costs it gives the ratio of largest to smallest.
+    A broad pale line is a power law, fitted to the costs of at least twice the smallest one; the legend gives
+    its exponent as slope. With fewer than three such costs, it gives the ratio of largest to smallest.
 
     Args:
         costs: sizes and costs (N, 2), all > 0, by labels of cost and size (with units) and by method.
@@ -228,11 +230,11 @@ def _mark_sizes(ax: Axes, sizes: Array) -> None:
     ax.set_xmargin(0.08)
     logarithms = np.log(np.unique(sizes))
     least = _TICKS_APART * np.ptp(logarithms)
-    kept: list[float] = []
+    ticks: list[float] = []
     for place in logarithms:
-        if not kept or place - kept[-1] >= least:
-            kept.append(place)
-    ax.xaxis.set_major_locator(FixedLocator(list(np.exp(kept))))
+        if not ticks or place - ticks[-1] >= least:
+            ticks.append(place)
+    ax.xaxis.set_major_locator(FixedLocator(list(np.exp(ticks))))
     ax.xaxis.set_minor_locator(NullLocator())
     ax.xaxis.set_major_formatter(lambda value, _: f"{value:.3g}")
     ax.tick_params(labelsize=TICK_SIZE)

@@ -41,35 +41,37 @@ def require_scenes(name: str, scenes: Mapping[str, ByMethod]) -> None:
         raise ValueError(f"{name}: scenes {list(scenes)}; {accepted}")
 
 
-def require_each(name: str, given: Mapping[str, object], wanted: Collection[str]) -> None:
+def require_each(name: str, entries: Mapping[str, object], wanted: Collection[str]) -> None:
     """Check that a mapping has an entry for each name of `wanted`."""
-    require_kind(name, given, Mapping)
-    if missing := [one for one in wanted if one not in given]:
+    require_kind(name, entries, Mapping)
+    if missing := [key for key in wanted if key not in entries]:
         raise ValueError(f"{name}: none for {missing}; must have one for each of {list(wanted)}")
 
 
 def labelled(
-    name: str, given: Mapping[str, Mapping[str, ByMethod]], *axes: str, positive: int = 0
+    name: str, numbers: Mapping[str, Mapping[str, ByMethod]], *axes: str, positive: int = 0
 ) -> dict[str, Checked]:
     """Return the numbers by label, scene and method, after checking them as `by_scene` does."""
-    require_kind(name, given, Mapping)
-    if not given:
+    require_kind(name, numbers, Mapping)
+    if not numbers:
         raise ValueError(f"{name}: empty; must have at least one")
-    names = {label: f"{name}[{label!r}]" for label in given}
-    return {label: by_scene(names[label], own, *axes, positive=positive) for label, own in given.items()}
+    return {
+        label: by_scene(f"{name}[{label!r}]", scenes, *axes, positive=positive)
+        for label, scenes in numbers.items()
+    }
 
 
-def by_scene(name: str, given: Mapping[str, ByMethod], *axes: str, positive: int = 0) -> Checked:
+def by_scene(name: str, numbers: Mapping[str, ByMethod], *axes: str, positive: int = 0) -> Checked:
     """Return the finite numbers by scene and method, after checking them.
 
-    Of the `axes`, "2" states a length, other texts are names. The first `positive` columns must be > 0.
+    Of the `axes`, "2" is a length, other texts are names. The first `positive` columns must be > 0.
     """
-    require_scenes(name, given)
+    require_scenes(name, numbers)
     checked: Checked = {}
-    for scene, methods in given.items():
-        for method, own in methods.items():
+    for scene, methods in numbers.items():
+        for method, of_method in methods.items():
             where = f"{name}[{scene!r}][{method!r}]"
-            values: Array = real_tensor(where, own).detach().cpu().numpy()
+            values: Array = real_tensor(where, of_method).detach().cpu().numpy()
             sizes = zip(axes, values.shape, strict=False)
             lengths = [int(axis) if axis.isdigit() else size for axis, size in sizes]
             if values.ndim != len(axes) or list(values.shape) != lengths or values.size == 0:
@@ -82,7 +84,7 @@ def by_scene(name: str, given: Mapping[str, ByMethod], *axes: str, positive: int
 
 
 def methods_of(scenes: Iterable[Mapping[str, object]]) -> list[str]:
-    """Return the methods of all scenes, each once, in order of first appearance."""
+    """Return the methods of all scenes, without repetition, in order of first appearance."""
     return list(dict.fromkeys(method for by_method in scenes for method in by_method))
 
 
@@ -95,9 +97,9 @@ def plane_magnitude(name: str, pressure: ArrayLike) -> Array:
 
 
 def outside_on_plane(magnitude: Array, plane: Plane, obstacles: Iterable[Obstacle]) -> Array:
-    """Return |p| (Nu, Nv) on a plane, NaN in cells whose centres are inside obstacles.
+    """Return |p| (Nu, Nv) on a plane, NaN in cells with centres inside obstacles.
 
-    The field in a body may be many times that in air, and would take up the scale of a picture.
+    The field in a body may be many times stronger than in air, and would determine the colour scale.
     """
     points = cell_centers_of(plane, (magnitude.shape[0], magnitude.shape[1]))
     return np.where(inside_any(points, obstacles).numpy(), np.nan, magnitude)
@@ -109,7 +111,7 @@ def largest(magnitude: Array) -> float:
 
 
 def pressure_unit(peak: float) -> tuple[str, float]:
-    """Return the unit for pressures up to a peak [Pa], and its size [Pa]: numbers stay short."""
+    """Return a unit in which pressures up to a peak [Pa] are short numbers, and its size [Pa]."""
     return next((name, size) for name, size, least in _UNITS if (peak or 1.0) >= least)
 
 

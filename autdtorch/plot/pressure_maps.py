@@ -36,7 +36,7 @@ _AXIS_TOLERANCE = 1e-12  # deviation from 1 of the coordinate of a unit vector a
 _OUTLINE_CELLS = 400  # samples along the longer side of a plane, to outline obstacles
 
 # Lengths [inch]
-_SIDE = 3.1  # of a square plane in a figure of its own
+_SIDE = 3.1  # of a square plane in a figure of one
 _SMALL_SIDE = 1.85  # in a figure of several
 _WIDTH = 7.0  # of the maps in a figure of several, unless they are more than three
 _LEAST_COLUMN, _LEAST_ROW = 1.4, 0.8  # for the numbers of a colour bar, and the name of a method
@@ -77,9 +77,8 @@ def plot_plane(
             can be compared.
 
     Raises:
-        ValueError: `pressure` is not (Nu, Nv), or 0 everywhere with `decibels` and no `reference`,
-            `control_points` are not points, the ends of the colours are out of range, or `reference` is given
-            without `decibels`.
+        ValueError: an argument of another shape or out of range, `pressure` of 0 everywhere with `decibels`
+            and no `reference`, or a `reference` without `decibels`.
     """
     require_kind("plane", plane, Plane)
     if ax is not None:
@@ -142,9 +141,10 @@ def plot_planes(
         ValueError: no scene, a scene without plane, an argument of another shape, or ends of the colours that
             are out of range.
     """
-    given: tuple[Any, ...] = pressure, planes, control_points, obstacles
-    by_scene = _as_one_scene(*given) if isinstance(planes, Plane) else given
-    return _rows_of_maps(*by_scene, vmin=vmin, vmax=vmax)
+    arguments: tuple[Any, ...] = pressure, planes, control_points, obstacles
+    if isinstance(planes, Plane):
+        arguments = _as_one_scene(*arguments)
+    return _rows_of_maps(*arguments, vmin=vmin, vmax=vmax)
 
 
 def _rows_of_maps(
@@ -218,7 +218,7 @@ def _rows_of_maps(
 def _panel(plane: Plane, side: float, widest: float = np.inf) -> tuple[float, float]:
     """Return the width and height [inch] of the map of a plane.
 
-    A square plane has the given `side`. The longer side of others is up to one and a half times as long.
+    A square plane has sides of `side`. The longer side of others is up to one and a half times as long.
     """
     longer = max(plane.size)
     scale = side * min(1.5, (longer / min(plane.size)) ** 0.5) / longer
@@ -234,13 +234,14 @@ def _name_row(ax: Axes, name: str) -> None:
 
 
 def _as_one_scene(pressure: Any, *others: Any) -> tuple[Any, ...]:
-    """Return arguments of one scene under a name, the empty one."""
+    """Return the arguments of one scene as mappings, by an empty name."""
     nested = isinstance(pressure, Mapping) and any(isinstance(one, Mapping) for one in pressure.values())
     if nested or not isinstance(pressure, Mapping):
         accepted = "must be maps by name, as {'gabs': p}, for one plane; plot_plane plots a single map"
         raise invalid("pressure", pressure, accepted)
-    given = [None if one is None or isinstance(one, Mapping) else {"": one} for one in others]
-    return {"": pressure}, *given
+    return {"": pressure}, *(
+        None if other is None or isinstance(other, Mapping) else {"": other} for other in others
+    )
 
 
 def _limits(
@@ -259,7 +260,7 @@ def _limits(
 
 
 def _beyond(maps: Collection[Array], limits: tuple[float, float]) -> str:
-    """Return the ends of the colour bar beyond which values lie, as Matplotlib names them."""
+    """Return Matplotlib's name for the ends of the colour bar that some values exceed."""
     low = any((values < limits[0]).any() for values in maps)
     high = any((values > limits[1]).any() for values in maps)
     return "both" if low and high else "min" if low else "max" if high else "neither"
@@ -292,7 +293,7 @@ def _draw_plane(
 def _plane_axis(plane: Plane, side: int, cells: int) -> tuple[str, Array]:
     """Return the axis label and the edges of the cells [mm] along side u (0) or v (1) of the plane.
 
-    They are x, y or z if the side is parallel to that axis, and otherwise distances from the plane's centre.
+    Along x, y or z these are coordinates, otherwise distances from the plane's centre.
     """
     direction = plane.basis[side]
     along = MM * plane.size[side] * np.linspace(-0.5, 0.5, cells + 1)

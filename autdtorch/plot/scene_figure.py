@@ -25,9 +25,9 @@ from autdtorch.utils.validation import ArrayLike, Vector, require_kind
 
 # Lengths [inch]
 _SIZE = (5.2, 4.2)  # of the figure
-_MARGIN = 0.08  # at its edges
+_MARGIN = 0.08  # at the edges of the figure
 _LEGEND_ROOM = 0.35  # above the axes
-_BAR_ROOM = 0.9  # beside them
+_BAR_ROOM = 0.9  # beside the axes
 _BAR = (1 - 0.8 / _SIZE[0], 0.2, 0.12 / _SIZE[0], 0.55)  # place of the colour bar, as shares of the figure
 _ELEVATION, _AZIMUTH = 22.0, -118.0  # of the viewer [degrees]
 
@@ -46,7 +46,7 @@ _LIGHT = _direction(50.0, -160.0)
 def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
     """Draw a scene in 3D (the paper's Fig. 1), for machines on which `view3d` cannot render.
 
-    Objects do not hide those behind them.
+    The drawing order is fixed: from the plane to obstacles and points.
 
     Args:
         scene: scene to draw.
@@ -58,7 +58,7 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
     require_kind("scene", scene, Scene)
     phases = None if drive is None else single_drive_phases(drive, len(scene.array))
     figure = new_figure(*_SIZE)
-    figure.set_layout_engine("none")  # the places of all parts are given
+    figure.set_layout_engine("none")  # all places are set here
     ax = _new_axes(figure, scene.domain, 0.0 if phases is None else _BAR_ROOM)
     if scene.observation_plane is not None:
         corners = MM * scene.observation_plane.corners[[0, 1, 3, 2]].numpy()
@@ -76,7 +76,7 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
 def _new_axes(figure: Figure, domain: tuple[Vector, Vector], right: float) -> Axes3D:
     """Return axes that show a domain [m] below the legend and left of a margin [inch], with their labels.
 
-    Matplotlib's own ticks and labels overlap if the sides of the domain differ much.
+    The ticks and labels of Matplotlib overlap if the sides of the domain differ much.
     """
     lower, upper = (MM * np.array(corner) for corner in domain)
     view, (width, height) = view_from(_TO_VIEWER), _SIZE
@@ -121,7 +121,7 @@ def _text_size(text: str) -> tuple[float, float]:
 def _add_obstacle(ax: Axes3D, obstacle: Obstacle, domain: tuple[Vector, Vector]) -> None:
     """Draw the triangles that face the viewer, shaded, and their sharp edges.
 
-    An obstacle is open where it leaves the domain. Its far side is visible there, and drawn first.
+    An obstacle is cut at the domain's edge; its far side, visible there, is drawn first.
     """
     vertices, faces = (part.numpy() for part in obstacle.surface())
     corners = vertices[faces]
@@ -146,7 +146,7 @@ def _add_obstacle(ax: Axes3D, obstacle: Obstacle, domain: tuple[Vector, Vector])
 
 
 def _hidden(obstacle: Obstacle, points: Array) -> NDArray[np.bool_]:
-    """Return for points (N, 3) [m] on the surface whether the obstacle hides them from the viewer (N,)."""
+    """Return whether the obstacle hides each point (N, 3) [m] of its surface from the viewer (N,)."""
     across = math.dist(obstacle.lower, obstacle.upper)
     steps = across * (np.arange(64) + 0.5) / 64
     return obstacle.contains(points[:, None] + steps[:, None] * _TO_VIEWER).any(dim=1).numpy()
@@ -187,12 +187,12 @@ def clipped(corners: Array, lower: Vector, upper: Vector) -> Array:
     for side in range(6):
         axis, sign, bound = side // 2, (1, -1)[side % 2], (lower, upper)[side % 2][side // 2]
         height = sign * (corners[:, axis] - bound)
-        kept = []
+        inside = []
         for here, there in enumerate(np.roll(np.arange(len(corners)), -1)):
             if height[here] >= 0:
-                kept.append(corners[here])
+                inside.append(corners[here])
             if height[here] * height[there] < 0:
                 share = height[here] / (height[here] - height[there])
-                kept.append(corners[here] + share * (corners[there] - corners[here]))
-        corners = np.array(kept).reshape(-1, 3)
+                inside.append(corners[here] + share * (corners[there] - corners[here]))
+        corners = np.array(inside).reshape(-1, 3)
     return corners

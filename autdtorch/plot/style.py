@@ -75,10 +75,10 @@ _GAP = 0.1  # between tick labels side by side [inch]
 
 
 class ShownFigure(Figure):
-    """A figure that Jupyter displays although it is not registered with pyplot."""
+    """A figure that Jupyter displays without pyplot."""
 
     def savefig(self, fname: Any, **kwargs: Any) -> None:
-        """Save the figure as Matplotlib does, in a folder that is made if it is missing."""
+        """Save the figure as Matplotlib does; make a missing folder."""
         super().savefig(in_folder(Path(fname)) if isinstance(fname, str | os.PathLike) else fname, **kwargs)
 
     def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
@@ -192,17 +192,17 @@ def log_axes(ax: Axes, which: str = "xy") -> None:
 def looks_of(names: Iterable[str]) -> dict[str, Look]:
     """Return a look for each name of a method or series.
 
-    The methods of autdtorch have one look in every figure. Other names take spare looks in the order of
-    `names`; without a method of autdtorch, they take its looks first.
+    The methods of autdtorch look alike in every figure. Other names take spare looks in the order of `names`;
+    in a figure without methods of autdtorch, they take the looks of these first.
     """
     ours = {label_of(method): look for method, look in _LOOKS.items()}
     names = list(dict.fromkeys(names))
-    found = {name: ours[label_of(name)] for name in names if label_of(name) in ours}
-    # A figure may leave out the gradient, a baseline: that must not change the looks of others.
-    beside = any(look is not _LOOKS["gradient_ascent"] for look in found.values())
+    looks = {name: ours[label_of(name)] for name in names if label_of(name) in ours}
+    # Whether a figure has the gradient, a baseline, does not change the looks of others.
+    beside = any(look is not _LOOKS["gradient_ascent"] for look in looks.values())
     free = [*_SPARE_LOOKS, *_LOOKS.values()] if beside else [*_LOOKS.values(), *_SPARE_LOOKS]
-    left = cycle(look for look in free if look not in found.values())
-    return {name: found[name] if name in found else next(left) for name in names}
+    spare = cycle(look for look in free if look not in looks.values())
+    return {name: looks[name] if name in looks else next(spare) for name in names}
 
 
 def readable(name: str) -> str:

@@ -93,7 +93,7 @@ def _trial_panels(
     if len(scenes) == 1 and width * len(data) <= _WIDTH:
         figure = style.new_figure(_WIDTH, 0.7 + _ROW)
         return figure, list(figure.subplots(1, len(data), squeeze=False)[0]), len(data)
-    sizes = (one.size for of_scenes in data.values() for own in of_scenes.values() for one in own.values())
+    sizes = (one.size for scenes in data.values() for methods in scenes.values() for one in methods.values())
     row = _ROW if max(sizes) >= _FEWEST else _LOW_ROW
     figure = style.new_figure(max(_WIDTH, width), 0.7 + max(_ROW, row * len(data)))
     return figure, list(figure.subplots(len(data), squeeze=False, sharex=True)[:, 0]), 1
@@ -174,7 +174,9 @@ def plot_convergence(
     if unknown := levels.keys() - history.keys():
         raise ValueError(f"levels: of scenes {list(unknown)}; must be of scenes in history: {list(history)}")
     heights = {
-        scene: {name: finite_number(f"levels[{scene!r}][{name!r}]", own) for name, own in by_label.items()}
+        scene: {
+            name: finite_number(f"levels[{scene!r}][{name!r}]", height) for name, height in by_label.items()
+        }
         for scene, by_label in levels.items()
     }
     level_labels = list(dict.fromkeys(name for by_label in levels.values() for name in by_label))
@@ -207,7 +209,7 @@ def plot_convergence(
 
 
 def _trial_handle(method: str, look: Look, trials: int) -> Artist:
-    """Return the entry of a method in the legend, as its most trials in a panel are drawn."""
+    """Return the legend entry of a method with this many trials, at most, in a panel."""
     label = label_of(method)
     if trials >= _FEWEST:
         return Patch(facecolor=(look.colour, 0.4), edgecolor=look.colour, label=label)

@@ -40,26 +40,22 @@ def test_the_pose_of_a_picture_is_that_of_the_obstacle(obstacle, center, angles)
     turn, pivot, offset = body.pose
     moved = (obstacle.surface()[0] - pivot) @ turn.mT + pivot + offset
     # A cylinder's polygon may begin elsewhere on its rim; its axis has ten decimals
-    found, tolerance = (body.obstacle.surface()[0], 1e-9)
+    surface, tolerance = (body.obstacle.surface()[0], 1e-9)
     if obstacle is PEG:
-        found, moved = (torch.stack([part.amin(dim=0), part.amax(dim=0)]) for part in (found, moved))
+        surface, moved = (torch.stack([part.amin(dim=0), part.amax(dim=0)]) for part in (surface, moved))
         tolerance = 1e-5
-    torch.testing.assert_close(found, moved, rtol=0, atol=tolerance)
+    torch.testing.assert_close(surface, moved, rtol=0, atol=tolerance)
 
 
-@pytest.mark.parametrize("obstacle", [CUBE, PEG, WEDGE, at.Sphere((0, 0, 0), 1e-3, rigid=True)])
-def test_an_obstacle_that_has_not_moved_is_itself(obstacle):
-    assert Body.of(obstacle).obstacle is obstacle
-
-
-def test_angles_of_boxes_are_theirs():
-    assert Body(CUBE, CUBE.center, (0.0, 0.0, 0.7)).obstacle.rotation == pytest.approx((0, 0, 0.7), abs=1e-9)
-
-
-def test_a_sphere_moves_and_does_not_turn():
-    ball = Body(at.Sphere((0, 0, 0), 1e-3, rigid=True), (1e-3, 0, 0), (1.0, 0, 0))
-    assert ball.obstacle.center == (1e-3, 0, 0)
-    assert not ball.turns
+def test_bodies_stand_for_their_obstacles():
+    ball = at.Sphere((0, 0, 0), 1e-3, rigid=True)
+    for obstacle in (CUBE, PEG, WEDGE, ball):
+        assert Body.of(obstacle).obstacle is obstacle
+    turned = Body(CUBE, CUBE.center, (0.0, 0.0, 0.7)).obstacle
+    assert turned.rotation == pytest.approx((0, 0, 0.7), abs=1e-9)
+    body = Body(ball, (1e-3, 0, 0), (1.0, 0, 0))
+    assert body.obstacle.center == (1e-3, 0, 0)
+    assert not body.turns
 
 
 def test_a_plane_without_observation_plane_passes_through_the_foci():
@@ -89,14 +85,11 @@ def test_an_oblique_observation_plane_moves_along_its_normal():
     steps = torch.tensor(moved.sheet.center) - torch.tensor(situation.sheet.center)
     assert steps.tolist() == pytest.approx([2e-3 / math.sqrt(2), 2e-3 / math.sqrt(2), 0], abs=1e-9)
     assert moved.with_plane("x").with_plane(SCENE_PLANE).sheet == situation.sheet
-
-
-def test_unknown_planes_are_refused():
     with pytest.raises(ValueError, match="plane: 'w'"):
-        Situation.of(small_scene(), DRIVE).with_plane("w")
+        moved.with_plane("w")
 
 
-def test_a_drag_is_undone_in_one_step():
+def test_a_drag_is_undone_and_repeated_in_one_step():
     first = Situation.of(small_scene(), DRIVE)
     history = History(first)
     for height in (1e-3, 2e-3, 3e-3):
@@ -110,17 +103,12 @@ def test_a_drag_is_undone_in_one_step():
     history.redo()
     assert history.now is last
     assert not history.can_redo
-
-
-def test_a_change_after_undo_forgets_what_was_undone():
-    first = Situation.of(small_scene(), DRIVE)
-    history = History(first)
     history.change(first.with_plane("z"))
     history.undo()  # also of a step that has not ended
-    assert history.now is first
+    assert history.now is last
     history.change(first.with_plane("y"))
     history.settle()
-    assert not history.can_redo
+    assert not history.can_redo  # a change forgets the undone step
 
 
 def test_what_changes_nothing_is_no_step():
@@ -136,7 +124,7 @@ def test_what_changes_nothing_is_no_step():
     assert history.now is situation
 
 
-def test_few_steps_are_kept_of_large_meshes(monkeypatch):
+def test_the_history_of_large_meshes_is_short(monkeypatch):
     scene = small_scene()
     mesh = at.Mesh.from_surface(WEDGE.triangles, offset=(10e-3, 10e-3, 10e-3), rigid=True)
     scene = at.Scene(scene.array, AIR, scene.frequency, scene.control_points, (mesh,), None, scene.domain)
@@ -181,15 +169,15 @@ def test_all_methods_begin_with_few_transducers(rows):
 )
 def test_what_is_dragged_stays_at_its_height_or_on_its_vertical(sight, place, offset, upright):
     sight, place, near = np.array(sight), np.array(place), np.add(place, offset)
-    found = followed(place, near, sight, upright)
-    moved = np.abs(found - place)
+    point = followed(place, near, sight, upright)
+    moved = np.abs(point - place)
     assert (moved[:2] == 0).all() if upright else moved[2] == 0
     assert moved.max() <= 6 * math.hypot(*offset) + 1e-12  # also where one looks along the table
     slope = abs(sight[2]) / np.linalg.norm(sight)
-    away = np.linalg.norm(np.cross(found - near, sight)) / np.linalg.norm(sight)
+    away = np.linalg.norm(np.cross(point - near, sight)) / np.linalg.norm(sight)
     if not upright and slope > 0.25:
         assert away < 1e-9  # it is below the mouse
     if upright and slope < 0.9:
-        beside = place + np.array([[0, 0, 1e-4], [0, 0, -1e-4]]) + found - place
+        beside = place + np.array([[0, 0, 1e-4], [0, 0, -1e-4]]) + point - place
         others = np.linalg.norm(np.cross(beside - near, sight), axis=1) / np.linalg.norm(sight)
         assert away <= others.min() + 1e-9  # no other height is nearer to it

@@ -16,7 +16,7 @@ from small_scenes import scene_of_all_kinds, small_scene
 
 import autdtorch as at
 from autdtorch.plot.view3d import animate3d, rendering_problem, view3d
-from autdtorch.plot.view3d.still_axes import STILL_AXES
+from autdtorch.plot.view3d.labels import STILL_AXES
 
 SPACING = 5e-3  # m, cells of the plane in the pictures
 
@@ -253,6 +253,7 @@ def test_exports_are_self_contained(scene: at.Scene, tmp_path: Path) -> None:
     view3d(scene, field=field, reference=1.5, save=tmp_path / "scene.html").close()
     assert handlers == [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     assert signal.set_wakeup_fd(-1) == -1
+    assert "trame_vtklocal" not in sys.modules  # which downloads from the network
     page = (tmp_path / "scene.html").read_text(encoding="utf-8")
     assert all(text in page for text in ("pressure [dB]<div", "0 dB = 1.5 Pa"))
     assert 'src="http' not in page

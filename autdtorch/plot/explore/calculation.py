@@ -77,7 +77,7 @@ class Result:
 
     Attributes:
         request: the request.
-        drive: the drive (M,), that of the situation or of a search.
+        drive: drive (M,) of the situation or of a search.
         spacing: edge of a cell of the simulation [m]; None for a closed form.
         pressure: magnitude at the control points (P,) [Pa].
         field: complex pressure on the plane (Nu, Nv) [Pa], NaN in obstacles and next to transducers.

@@ -30,41 +30,21 @@ CAMERA = {
 }
 """Buttons of the camera, by action."""
 
-_SLIDER = """
-<label class="slider"><span>{label}</span>
-  <input type="range" id="{name}" v-model.number="{name}" :min="{low}" :max="{high}" step="{step}"
-    :disabled="{disabled}" @change="settled += 1">
-  <input type="number" id="{name}_number" aria-label="{spoken}" v-model.lazy.number="{name}" :min="{low}"
-    :max="{high}" step="any" :disabled="{disabled}" @change="settled += 1">
-</label>"""
-_CHOICE = """
-<label>{label}
-  <select id="{name}" v-model="{name}">
-    <option v-for="one in {options}" :key="one[0]" :value="one[0]">{{{{ one[1] }}}}</option>
-  </select>
-</label>"""
-_NUMBER = """
-<label>{label}
-  <input type="number" id="{name}" v-model.lazy.number="{name}" step="any">
-</label>"""
-_BOX = """
-<label class="box"><input type="checkbox" id="{name}" v-model="{name}"><span>{label}</span></label>"""
-_BUTTON = """
-<button type="button" id="{name}" @click="trigger('{name}')" :disabled="{disabled}">{label}</button>"""
-_LOOK = """
-<button type="button" id="{name}" title="{title}" aria-label="{title}"
-  @click="trigger('{name}')">{label}</button>"""
-
 
 def _slider(
     name: str, label: str, low: str, high: str, step: float, disabled: str = "false", spoken: str = ""
 ) -> str:
     """Return a slider and a number; `spoken` is the label for screen readers, if it differs."""
-    bounds = {"low": low, "high": high, "step": step, "disabled": disabled}
-    return _SLIDER.format(name=name, label=label, spoken=spoken or label, **bounds)
+    return f"""
+<label class="slider"><span>{label}</span>
+  <input type="range" id="{name}" v-model.number="{name}" :min="{low}" :max="{high}" step="{step}"
+    :disabled="{disabled}" @change="settled += 1">
+  <input type="number" id="{name}_number" aria-label="{spoken or label}" v-model.lazy.number="{name}"
+    :min="{low}" :max="{high}" step="any" :disabled="{disabled}" @change="settled += 1">
+</label>"""
 
 
-def _place(name: str, disabled: str = "false") -> str:
+def _position(name: str, disabled: str = "false") -> str:
     """Return sliders for the coordinates of a body or a focus."""
     return "".join(
         _slider(f"{name}_{axis}", f"{axis} [mm]", f"range_{axis}[0]", f"range_{axis}[1]", 0.1, disabled)
@@ -73,19 +53,35 @@ def _place(name: str, disabled: str = "false") -> str:
 
 
 def _choice(name: str, label: str, options: str) -> str:
-    return _CHOICE.format(name=name, label=label, options=options)
+    return f"""
+<label>{label}
+  <select id="{name}" v-model="{name}">
+    <option v-for="one in {options}" :key="one[0]" :value="one[0]">{{{{ one[1] }}}}</option>
+  </select>
+</label>"""
 
 
 def _number(name: str, label: str) -> str:
-    return _NUMBER.format(name=name, label=label)
+    return f"""
+<label>{label}
+  <input type="number" id="{name}" v-model.lazy.number="{name}" step="any">
+</label>"""
 
 
 def _box(name: str, label: str) -> str:
-    return _BOX.format(name=name, label=label)
+    return f"""
+<label class="box"><input type="checkbox" id="{name}" v-model="{name}"><span>{label}</span></label>"""
 
 
 def _button(name: str, label: str, disabled: str = "false") -> str:
-    return _BUTTON.format(name=name, label=label, disabled=disabled)
+    return f"""
+<button type="button" id="{name}" @click="trigger('{name}')" :disabled="{disabled}">{label}</button>"""
+
+
+def _camera_button(name: str, look: Look) -> str:
+    return f"""
+<button type="button" id="{name}" title="{look.title}" aria-label="{look.title}"
+  @click="trigger('{name}')">{look.label}</button>"""
 
 
 def page(view: str) -> str:
@@ -94,7 +90,7 @@ def page(view: str) -> str:
         "height", f"{{{{ plane === '{SCENE_PLANE}' ? 'shifted by' : 'at' }}}} [mm]", "range_height[0]",
         "range_height[1]", 0.5, spoken="place of the plane [mm]",
     )  # fmt: skip
-    looks = "".join(_LOOK.format(name=name, **look._asdict()) for name, look in CAMERA.items())
+    looks = "".join(_camera_button(name, look) for name, look in CAMERA.items())
     turns = "".join(
         _slider(f"turn_{axis}", f"turn about {axis} [°]", "-180", "180", 1, "!body_turns") for axis in "xyz"
     )
@@ -148,10 +144,10 @@ def page(view: str) -> str:
   </section>
   <section class="controls" aria-label="controls">
     <fieldset v-if="bodies.length"><legend>Obstacle</legend>
-      {_choice("body", "obstacle", "bodies")} {_place("body", "!body_moves")} {turns}
+      {_choice("body", "obstacle", "bodies")} {_position("body", "!body_moves")} {turns}
     </fieldset>
     <fieldset><legend>Focus</legend>
-      {_choice("focus", "focus", "foci")} {_place("focus")}
+      {_choice("focus", "focus", "foci")} {_position("focus")}
       <div class="row">{_button("add_focus", "Add a focus")}
         {_button("remove_focus", "Remove it", "foci.length < 2")}</div>
     </fieldset>

@@ -11,8 +11,7 @@ import torch
 
 from autdtorch.plot import colours
 from autdtorch.plot.data import MM, outside_on_plane, plane_magnitude, single_drive_phases
-from autdtorch.plot.view3d.font import use_font
-from autdtorch.plot.view3d.still_axes import add_still_axes
+from autdtorch.plot.view3d.labels import add_still_axes, use_font
 from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.drive import amplitudes_of
 from autdtorch.scene.geometry import Plane
@@ -67,7 +66,8 @@ def new_plotter(scene: Scene, off_screen: bool, bars: tuple[bool, bool]) -> pyvi
     for obstacle in scene.obstacles:
         add_obstacle(plotter, obstacle, scene.domain)
     points = pyvista.PolyData(MM * scene.control_points.numpy())
-    spheres = points.glyph(orient=False, scale=False, geom=point_mesh(scene))
+    sphere = pyvista.Sphere(radius=MM * scene.wavelength / 5)
+    spheres = points.glyph(orient=False, scale=False, geom=sphere)
     plotter.add_mesh(spheres, color=POINT_COLOUR, ambient=0.3)
     plotter.enable_anti_aliasing("ssaa")
     return plotter
@@ -96,9 +96,9 @@ def look_at(plotter: pyvista.Plotter, domain: tuple[Vector, Vector]) -> None:
 def add_axes(
     plotter: pyvista.Plotter, domain: tuple[Vector, Vector], ink: str = "black", letters: float | None = None
 ) -> None:
-    """Draw axes around a domain [m], in place of those that are there.
+    """Draw axes around a domain [m], in place of the present ones.
 
-    Letters have the size of VTK's screen units; by default that of a picture shown at half its size.
+    The size of letters is in VTK's screen units; the default suits a picture shown at half its size.
     """
     plotter.remove_bounds_axes()
     titles = {f"{name}title": f"{name} [mm]" for name in "xyz"}
@@ -118,13 +118,6 @@ def _bounds(domain: tuple[Vector, Vector]) -> list[float]:
     return [MM * corner[axis] for axis in range(3) for corner in (lower, upper)]
 
 
-def point_mesh(scene: Scene) -> pyvista.PolyData:
-    """Return the sphere that stands for a control point."""
-    import pyvista
-
-    return pyvista.Sphere(radius=MM * scene.wavelength / 5)
-
-
 def emitted_phases(drive: ArrayLike, transducers: int) -> Array:
     """Return the phases (M,) in [0, 2 pi) [rad] of one drive; NaN for silent transducers."""
     phases = single_drive_phases(drive, transducers)
@@ -136,8 +129,7 @@ def add_transducers(
 ) -> pyvista.PolyData:
     """Draw the transducers as discs, coloured by their phases (M,) [rad], NaN for silent ones.
 
-    The mesh of all discs is returned, with the phases over pi as "phase" if given. A colour bar is drawn for
-    them, unless the view has its own.
+    Return the mesh of all discs; with phases, "phase" holds them over pi. `bar` adds their colour bar.
     """
     import pyvista
 
@@ -270,10 +262,10 @@ def plane_mesh(plane: Plane, values: Array) -> pyvista.PolyData:
 def add_isosurface(
     plotter: pyvista.Plotter, scene: Scene, level: Array, height: float, name: str = "isosurface"
 ) -> bool:
-    """Draw the surface where the level (Nx, Ny, Nz) [dB], at the domain's cell centres, is `height`.
+    """Draw the surface of level `height` of the levels (Nx, Ny, Nz) [dB] at the domain's cell centres.
 
-    It is limited to the surroundings of the control points: near the array it would hide everything. Return
-    False where there is none.
+    The surface ends near the control points: around the array it would hide everything. Return False if there
+    is none.
     """
     import pyvista
 

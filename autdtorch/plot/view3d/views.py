@@ -1,8 +1,13 @@
-"""Rendered views of a scene and its field, and animations of the wave over one period."""
+"""Views of a scene and its field: rendered, exported to files, and animated over one period."""
 
 from __future__ import annotations
 
+import contextlib
+import importlib.util
+import json
 import math
+import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,12 +16,14 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor
 
 from autdtorch.plot.colours import FLOOR, WAVE_MAP
-from autdtorch.plot.data import in_decibels, largest, pressure_text, pressure_unit, zero_level
+from autdtorch.plot.data import MM, in_decibels, largest, pressure_text, pressure_unit, zero_level
 from autdtorch.plot.view3d import meshes
-from autdtorch.plot.view3d.export import export_path, write
+from autdtorch.plot.view3d.labels import STILL_AXES
 from autdtorch.plot.view3d.opengl import require_rendering
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.files import in_folder
+from autdtorch.utils.hints import with_extra
+from autdtorch.utils.signals import signals_restored
 from autdtorch.utils.validation import (
     ArrayLike,
     boolean,
@@ -33,6 +40,18 @@ if TYPE_CHECKING:
 _FRAME_TIME = 80  # ms; GIF counts hundredths of a second
 
 _GREYS, _SHADES = 24, 8  # of 256 colours: for lines and obstacles, and for control points
+
+# The viewer takes the element of class "content"; without one it would empty the whole page.
+_LEGEND = """<div class="content"></div>
+<div style="position: fixed; z-index: 1; left: 16px; top: 16px; display: flex; gap: 32px;
+ font: 14px sans-serif">{bars}<div>{caption}</div></div>
+</body>"""
+_BAR = """<div>{title}<div
+ style="width: 200px; height: 14px; background: linear-gradient(to right, {colours})"></div><div
+ style="display: flex; justify-content: space-between"><span>{low:g}</span><span>{high:g}</span></div>
+</div>"""
+_EVERY = 8  # every 8th colour of a table makes the gradient
+_WASM = "trame.widgets.vtklocal"
 
 
 def view3d(
@@ -80,7 +99,7 @@ def view3d(
     height = number_between("isosurface", isosurface, FLOOR, 0.0, "dB")
     name, shown = ("volume", in_domain) if on_plane is None else ("field", on_plane)
     zero = zero_level(reference, name, np.ones(1) if shown is None else shown)
-    path = None if save is None else export_path("save", save)
+    path = None if save is None else _export_path("save", save)
     require_rendering()
     plotter = meshes.new_plotter(scene, off_screen, (drive is not None, shown is not None))
     meshes.add_transducers(plotter, scene, phases)
@@ -93,7 +112,7 @@ def view3d(
         caption.append(f"surface: {height:g} dB")
     meshes.add_caption(plotter, *caption)
     if path is not None:
-        write(plotter, path, scene, caption)
+        _write(plotter, path, scene, caption)
     return plotter
 
 
@@ -159,3 +178,85 @@ def _colours(plotter: pyvista.Plotter) -> NDArray[np.uint8]:
     each = (256 - _GREYS - _SHADES) // len(tables)
     maps = [table[np.linspace(0, len(table) - 1, each).astype(int)] for table in tables]
     return np.concatenate([greys, shades, *maps]).astype(np.uint8)
+
+
+def _export_path(name: str, value: str | Path) -> Path:
+    """Return the path of a file that can be written."""
+    path = path_of(name, value, suffixes=(".png", ".html", ".gltf"))
+    if path.suffix.lower() == ".html" and importlib.util.find_spec("trame_pyvista") is None:
+        raise RuntimeError(f"{name}: {str(path)!r} needs trame-pyvista: {with_extra('notebook')}")
+    return path
+
+
+def _write(plotter: pyvista.Plotter, path: Path, scene: Scene, caption: Sequence[str]) -> None:
+    """Write the view in the format of the path's suffix."""
+    in_folder(path)
+    if path.suffix.lower() == ".png":
+        Image.fromarray(plotter.screenshot(return_img=True)).save(path)
+        return
+    still = [actor for name, actor in plotter.actors.items() if name.startswith(STILL_AXES)]
+    for actor in still:  # axes of a picture, in which the view does not turn
+        actor.SetVisibility(False)
+    if path.suffix.lower() == ".gltf":
+        _write_gltf(plotter, path)
+    else:
+        meshes.add_axes(plotter, scene.domain)
+        _write_html(plotter, path, caption)
+        plotter.remove_bounds_axes()
+    for actor in still:
+        actor.SetVisibility(True)
+
+
+def _write_gltf(plotter: pyvista.Plotter, path: Path) -> None:
+    """Write glTF in metres, without the camera, which PyVista does not turn with the scene.
+
+    The materials are corrected: VTK tints textures and makes translucent surfaces opaque.
+    """
+    plotter.export_gltf(str(path))
+    content = json.loads(path.read_text(encoding="utf-8"))
+    del content["cameras"]
+    for node in content["nodes"]:
+        node.pop("camera", None)
+        if "children" in node:
+            node["scale"] = [1 / MM] * 3
+    for material in content["materials"]:
+        surface = material["pbrMetallicRoughness"]
+        if "baseColorTexture" in surface:
+            surface["baseColorFactor"][:3] = 1.0, 1.0, 1.0
+        if surface["baseColorFactor"][3] < 1:
+            material["alphaMode"] = "BLEND"
+        material["doubleSided"] = True
+    path.write_text(json.dumps(content), encoding="utf-8")
+
+
+def _write_html(plotter: pyvista.Plotter, path: Path, caption: Sequence[str]) -> None:
+    """Write HTML with separate colour bars: the viewer in the page would draw all of them in one place."""
+    bars = plotter.scalar_bars
+    drawn = "".join(_html_bar(title.strip(), bar.lookup_table) for title, bar in bars.items())
+    for bar in bars.values():
+        bar.SetVisibility(False)
+    with signals_restored(), _without_wasm():  # trame starts a server for the page, which ignores Ctrl-C
+        page: str = plotter.trame.export_html(None).getvalue()
+    for bar in bars.values():
+        bar.SetVisibility(True)
+    legend = _LEGEND.format(bars=drawn, caption="<br>".join(caption))
+    path.write_text(page.replace("</body>", legend), encoding="utf-8")
+
+
+@contextlib.contextmanager
+def _without_wasm() -> Iterator[None]:
+    """Hide a package from trame that would download VTK for browsers, which the page does not need."""
+    if _WASM in sys.modules:
+        yield
+        return
+    sys.modules[_WASM] = None  # type: ignore[assignment] # stands for a missing module
+    try:
+        yield
+    finally:
+        del sys.modules[_WASM]
+
+
+def _html_bar(title: str, table: pyvista.LookupTable) -> str:
+    low, high = table.scalar_range
+    colours = ", ".join("rgb({}, {}, {})".format(*rgba[:3]) for rgba in table.values[::_EVERY])
+    return _BAR.format(title=title, colours=colours, low=low, high=high)

@@ -1,23 +1,39 @@
-"""Axes of a picture: their labels are upright, and do not turn with the view as VTK's do."""
+"""Texts of 3D views: their font, and upright axes of still pictures."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import ImageFont
 
 from autdtorch.plot.data import MM
-from autdtorch.plot.view3d.font import font_file, use_font
 from autdtorch.utils.validation import Vector
 
 if TYPE_CHECKING:
     import pyvista
+    from vtkmodules.vtkRenderingCore import vtkTextProperty
 
-STILL_AXES = "still axes"  # begins the names of the actors
+STILL_AXES = "still axes"  # prefix of the names of the actors
 _LETTERS, _BESIDE_BARS = 30, 23  # pixels; pictures without colour bars are shown smaller, as in reports
 _MARGIN = 12  # pixels
 _GREY = "#909090"
+_FROM_FILE = 4  # VTK_FONT_FILE
+
+
+def font_file() -> str:
+    """Return the path of the font of 3D views, Matplotlib's: the fonts of VTK have no π."""
+    from matplotlib import get_data_path
+
+    return str(Path(get_data_path()) / "fonts/ttf/DejaVuSans.ttf")
+
+
+def use_font(*properties: vtkTextProperty) -> None:
+    """Use the font for texts."""
+    for text in properties:
+        text.SetFontFamily(_FROM_FILE)
+        text.SetFontFile(font_file())
 
 
 def add_still_axes(
@@ -26,9 +42,9 @@ def add_still_axes(
     towards_camera: Vector,
     margins: tuple[float, float],
 ) -> None:
-    """Draw axes around a domain [m], and fit the camera to them, between the margins of the window.
+    """Draw axes around a domain [m] whose labels do not turn with the view, and fit the camera to them.
 
-    `margins` are those on the left and on the right [pixels].
+    `margins` of the window are on the left and on the right [pixels].
     """
     import pyvista
     from vtkmodules.vtkRenderingCore import vtkBillboardTextActor3D
