@@ -1,7 +1,7 @@
-"""Live views that tests in a browser share."""
+"""One live view that all tests in a browser share; each begins with the first scene and drive."""
 
 import pytest
-from live_view import SPACING, opened
+from live_view import SPACING, in_session, opened
 
 import autdtorch as at
 from autdtorch.plot.view3d import rendering_problem
@@ -9,34 +9,57 @@ from autdtorch.plot.view3d import rendering_problem
 
 @pytest.fixture(scope="session")
 def scene():
-    """Two cubes that are not alike, so that a mirrored picture is another."""
+    """Two obstacles that are not alike, so that a mirrored picture is another."""
     array = at.TransducerArray.grid((4, 4), 10e-3, (1e-3, 50e-3, 50e-3))
     foci = at.circle_points((80e-3, 50e-3, 50e-3), 25e-3, 3, (1, 0, 0))
-    cubes = (
+    obstacles = (
         at.Box((40e-3, 45e-3, 50e-3), (14e-3,) * 3, density=100.0, sound_speed=340.0),
         at.Sphere((30e-3, 70e-3, 60e-3), 4e-3, rigid=True),
     )
     plane = at.Plane((80e-3, 50e-3, 50e-3), (1, 0, 0), (100e-3, 100e-3))
     domain = [[0, 0, 0], [0.1, 0.1, 0.1]]
-    return at.Scene(array, at.Medium.air(), 40e3, foci, cubes, plane, domain, name="cube and sphere")
-
-
-@pytest.fixture
-def live(scene, browser):
-    """A live view of the scene, and its page in a browser, when the first drive is found."""
-    if problem := rendering_problem():
-        pytest.skip(problem)
-    explorer = at.explore(scene, spacing=SPACING)
-    with opened(browser, explorer) as page:
-        yield explorer, page
-    explorer.close()
+    return at.Scene(array, at.Medium.air(), 40e3, foci, obstacles, plane, domain, name="cube and sphere")
 
 
 @pytest.fixture(scope="session")
-def unchanged(scene):
-    """A live view that tests share, since they leave scene and drive as they are."""
+def shared(scene):
+    """A live view and the first drive that it finds."""
+    pytest.importorskip("trame_rca", reason="trame: install autdtorch[explore]")
     if problem := rendering_problem():
         pytest.skip(problem)
     explorer = at.explore(scene, spacing=SPACING)
-    yield explorer
+    explorer.ready()
+    yield explorer, explorer.drive
     explorer.close()
+
+
+@pytest.fixture
+def view(shared, scene):
+    """The shared live view, begun again with the first scene and drive."""
+    from autdtorch.plot.explore.display import first_state
+    from autdtorch.plot.explore.situation import History, Situation
+
+    explorer, drive = shared
+    first = Situation.of(scene, drive)
+
+    def begin_again(session):
+        session.cancel()
+        session.grip, session._history = None, History(first)
+        state = first_state(first, session.methods)
+        session._state.update({name: state[name] for name in state.keys() - {"shown", "wanted"}})
+        session.display.surface = state["surface"]
+        session.display.silent.clear()
+        session.display.picture.move_camera(0, 0, 0)
+        session.place()
+        session.look()
+
+    in_session(explorer, begin_again)
+    explorer.ready()
+    return explorer
+
+
+@pytest.fixture
+def live(view, browser):
+    """The shared live view and its page."""
+    with opened(browser, view) as page:
+        yield view, page

@@ -1,33 +1,23 @@
 """The live view as a program uses it: scene and drive are read and set, and results waited for."""
 
+import gc
+import signal
 import threading
+import weakref
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from live_view import SPACING, opened, pressures, settled, share_of_bound, simulated, wait_for
+from live_view import PATIENCE, SPACING, in_session, share_of_bound
 
 import autdtorch as at
 from autdtorch.plot.explore import calculation
 from autdtorch.plot.explore.picture import Grip
-from autdtorch.plot.view3d import rendering_problem
-
-pytest.importorskip("trame_rca", reason="trame: install autdtorch[explore]")
-
-
-@pytest.fixture
-def view(scene):
-    """A live view that no browser shows."""
-    if problem := rendering_problem():
-        pytest.skip(problem)
-    explorer = at.explore(scene, spacing=SPACING)
-    yield explorer
-    explorer.close()
 
 
 def test_a_notebook_that_runs_all_cells_has_the_drive(view, scene):
-    view.ready()
     assert share_of_bound(view) > 0.97
     drive = view.drive
     view.scene = replace(scene, obstacles=scene.obstacles[1:])
@@ -42,64 +32,64 @@ def test_a_notebook_that_runs_all_cells_has_the_drive(view, scene):
 
 def test_a_drive_that_is_set_ends_the_search(view):
     mine = torch.exp(1j * torch.linspace(0, 3, 16, dtype=torch.float64))
+    in_session(view, lambda session: session.find())
     view.drive = mine
     view.ready()
     assert torch.equal(view.drive, mine)
 
 
-def test_the_page_shows_what_is_set_and_undoes_it(view, scene, browser):
-    other = at.Cylinder((35e-3, 20e-3, 50e-3), 5e-3, 30e-3, rigid=True)
-    with opened(browser, view) as page:
-        before = page.locator("#body option").all_text_contents()
-        with settled(page):
-            view.scene = replace(scene, obstacles=(*scene.obstacles, other), name="three")
-        assert page.locator("#body option").all_text_contents() == [*before, "2: cylinder"]
-        assert "three" in page.title()
-        with settled(page):
-            view.drive = torch.ones(16, dtype=torch.complex128)
-        np.testing.assert_allclose(pressures(page), simulated(view), rtol=1e-2)
-        page.click("#undo")
-        with settled(page):
-            page.click("#undo")
-        assert view.scene is scene
-        wait_for(lambda: page.locator("#body option").all_text_contents() == before)
-
-
 def test_what_cannot_be_set_changes_nothing(view, scene):
-    view.ready()
     drive = view.drive
     with pytest.raises(ValueError, match="scene"):
         view.scene = "two_cubes"
     too_coarse = replace(scene, medium=at.Medium.air(frequency=90e3), frequency=90e3)
     with pytest.raises(ValueError, match="spacing"):
         view.scene = too_coarse
+    with pytest.raises(ValueError, match="spacing"):
+        at.explore(scene, spacing=6e-3)
     for wrong in (drive[:3], 2 * drive, float("nan") * drive):
         with pytest.raises(ValueError, match="drive"):
             view.drive = wrong
     assert view.scene is scene
     assert torch.equal(view.drive, drive)
-    view.close()
+
+
+@pytest.mark.usefixtures("shared")  # which skips where nothing can be shown
+def test_views_may_be_opened_by_several_threads_and_say_that_they_are_closed(scene, monkeypatch):
+    with ThreadPoolExecutor(2) as threads:
+        futures = [threads.submit(at.explore, scene, spacing=SPACING) for _ in range(2)]
+    one, other = (future.result() for future in futures)
+    assert one.address != other.address
+    one.close()
     with pytest.raises(RuntimeError, match="closed"):
-        view.drive = drive
+        one.drive = torch.ones(16, dtype=torch.complex128)
     with pytest.raises(RuntimeError, match="closed"):
-        view.ready()
-
-
-def test_a_view_that_closes_before_it_comes_to_a_call_says_so(view, scene, monkeypatch):
-    view.ready()
-    server = view._server
-    monkeypatch.setattr(server, "_call", lambda *_: view.close())  # after the check that it runs
+        one.ready()
+    monkeypatch.setattr(other._server, "_call", lambda *_: other.close())  # after the check that it runs
     with pytest.raises(RuntimeError, match="closed"):
-        view.scene = scene
+        other.scene = scene
 
 
-def in_session(view, act):
-    """Call a function of the session in its thread."""
-    view._server.call(lambda: act(view._application.session))
+@pytest.mark.usefixtures("shared")
+def test_ctrl_c_in_a_wait_leaves_a_view_and_it_ends_with_its_last_reference(scene):
+    """A calculation that runs on while Python ends aborts the program."""
+    live = at.explore(scene, spacing=SPACING)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores it
+    try:
+        with pytest.raises(KeyboardInterrupt):  # noqa: PT012 - the signal may come before the wait
+            threading.Timer(0.5, signal.raise_signal, [signal.SIGINT]).start()
+            live.wait()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    live.scene = live.scene  # the server answers
+    server, reference = live._server, weakref.ref(live)
+    del live
+    gc.collect()
+    assert reference() is None
+    assert not server.running
 
 
 def test_the_view_follows_though_the_search_before_failed(view, monkeypatch):
-    view.ready()
     begun, may_fail = threading.Event(), threading.Event()
 
     def fail(*_):
@@ -109,7 +99,7 @@ def test_the_view_follows_though_the_search_before_failed(view, monkeypatch):
 
     monkeypatch.setattr(calculation.Calculator, "_steps", fail)
     in_session(view, lambda session: session.find())
-    assert begun.wait(10)
+    assert begun.wait(PATIENCE)
 
     def look_elsewhere(session):
         session.attempt(lambda: session.now.with_plane("z"), moving=False)
@@ -119,8 +109,7 @@ def test_the_view_follows_though_the_search_before_failed(view, monkeypatch):
     may_fail.set()
     with pytest.raises(RuntimeError, match="no drive today"):
         view.ready()
-    session = view._application.session
-    assert session.display.result.request.situation.plane == "z"
+    assert view._application.session.display.result.request.situation.plane == "z"
 
 
 def test_the_mouse_lets_go_of_what_another_scene_has_no_more(view, scene):
@@ -154,8 +143,6 @@ def test_the_camera_stays_where_the_domain_does(view, scene):
 
 
 def test_who_waits_is_told_why_there_is_no_result(view, monkeypatch):
-    view.ready()
-
     def fail(*_):
         raise RuntimeError("no field today")
 
