@@ -33,11 +33,11 @@ _TAKEN = re.compile(r"[A-Za-z0-9_./\\:@%+ -]*|.*=.*|['\"].*|.*\$\{.*|.*,.*", re.
 
 def quoted(argument: str) -> str:
     """Return an argument with the path in it in quotes where Hydra would not take it, and ~ replaced."""
-    found = _PATH.fullmatch(argument)
-    if found is None or _TAKEN.fullmatch(found["path"]):
+    setting = _PATH.fullmatch(argument)
+    if setting is None or _TAKEN.fullmatch(setting["path"]):
         return argument
-    path = re.sub(r"(\\*)'", r"\1\1\\'", os.path.expanduser(found["path"]))
-    return f"{found[1]}='{path}'"
+    path = re.sub(r"(\\*)'", r"\1\1\\'", os.path.expanduser(setting["path"]))
+    return f"{setting[1]}='{path}'"
 
 
 def command_of(arguments: list[str]) -> str | None:
@@ -69,11 +69,11 @@ def is_sweep(arguments: Sequence[str]) -> bool:
         return False
     sweep = bool(parser.parse_args(arguments).multirun) or any(map(_SWEEP.fullmatch, arguments))
     for word in arguments:
-        if found := _LAUNCHER.fullmatch(word):
-            plugin = "joblib" if found[1] == "joblib" else "submitit"
+        if launcher := _LAUNCHER.fullmatch(word):
+            plugin = "joblib" if launcher[1] == "joblib" else "submitit"
             if not _has_plugin(f"hydra_{plugin}_launcher"):
                 needs = f"needs the extra cluster: {with_extra('cluster')}"
-                raise ValueError(f"hydra/launcher: {found[1]!r}; {needs}")
+                raise ValueError(f"hydra/launcher: {launcher[1]!r}; {needs}")
         if sweep and re.match(r"\+*output=", word):
             accepted = "a sweep has a folder for each job in hydra.sweep.dir"
             raise ValueError(f"{word}: {accepted}, as hydra.sweep.dir={word.partition('=')[2]}")

@@ -1,6 +1,6 @@
 """The YAML files that Hydra composes a run from: ours, those of a trusted folder, and those from others.
 
-Hydra runs what its own settings name: launchers, callbacks, handlers of the log. A config from others
+Hydra runs what its settings name: launchers, callbacks, handlers of the log. A config from others
 therefore cannot change them, neither by a key nor by its package or its defaults list.
 """
 

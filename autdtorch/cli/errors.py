@@ -28,7 +28,7 @@ AGAIN = "the same command repeats what is not finished"
 _REFUSALS = (ValueError, OSError, ImportError, HydraException, OmegaConfBaseException)
 
 _NO_SLURM = 'Could not detect "srun"'  # submitit, on a machine without Slurm
-# Names of submitit's errors, since it may be missing; and a job that ended without reporting its own.
+# Names of submitit's errors, since it may be missing; and a job that ended without a report of its error.
 _SUBMITIT_ERRORS = ("FailedJobError", "UncompletedJobError")
 _LOST_JOB = re.compile(r" (/.*/(\d[\d_]*))/\2_\d+_(?:result\.pkl|log\.err)$", re.MULTILINE)
 
@@ -42,7 +42,7 @@ def stop(error: BaseException) -> NoReturn:
 
     The status is 2 where a setting is refused or a file cannot be written, and 3 where a limit of a hardware
     trial is reached. After a signal it is 128 and its number, and 1 after any other error, such as one in a
-    user's own method.
+    user's method.
     """
     print(f"autdtorch: {in_one_line(error)}", file=sys.stderr)
     if isinstance(error, KeyboardInterrupt):
@@ -83,13 +83,13 @@ def _of_missing(group: str, name: str, options: Sequence[str]) -> str:
     if path.suffix in (".yaml", ".yml") or len(path.parts) > 1:
         stem, folder = path.stem, path.parent.parent if path.parent.name == group else Path("FOLDER")
         ours = f"{group}={stem}"
-        # Hydra's own groups may hold shell commands and are not read from --config-dir.
-        given = "hydra.searchpath=[{}]" if group.startswith("hydra/") else "--config-dir {}"
+        # Hydra's groups may hold shell commands and are not read from --config-dir.
+        option = "hydra.searchpath=[{}]" if group.startswith("hydra/") else "--config-dir {}"
         mine = (
-            f"a file of your own is FOLDER/{group}/NAME.yaml, given as {given.format('FOLDER')} {group}=NAME"
+            f"a file of your own is FOLDER/{group}/NAME.yaml, given as {option.format('FOLDER')} {group}=NAME"
         )
         if stem not in options:
-            ours = f"{given.format(folder)} {group}={stem}"
+            ours = f"{option.format(folder)} {group}={stem}"
         return f"{group}: {name!r}; must be a name, not a path: {ours}; {mine}"
     more = f"; the extra cluster brings more ({with_extra('cluster')}), hydra.searchpath=[FOLDER] your own"
     more = more if group == "hydra/launcher" else ""
@@ -105,8 +105,8 @@ def _siblings(error: BaseException | None) -> list[str]:
 def _of_hydra(error: BaseException, text: str) -> str:
     """Return a message of Hydra in our words; others as they are, in one line."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
-        found = re.search(r"Available options in '(.+)'", text)
-        group = found[1] if found else error.missing_cfg_file.rpartition("/")[0]
+        available = re.search(r"Available options in '(.+)'", text)
+        group = available[1] if available else error.missing_cfg_file.rpartition("/")[0]
         return _of_missing(group, error.missing_cfg_file.removeprefix(f"{group}/"), error.options)
     if unknown := re.match(r"Could not override '(.+)'", text):
         key = str(getattr(error.__cause__, "full_key", None) or unknown[1])
@@ -118,8 +118,8 @@ def _of_hydra(error: BaseException, text: str) -> str:
             listed += f"; keys that are set: {', '.join(keys)}" if keys else ""
             listed += f"; a key that the file leaves out is added as {added[1]}" if added else ""
         return f"{key}: unknown key{hint}{listed}; autdtorch --cfg job lists the settings"
-    if found := re.match(r"(Error merging override [^,\n]+)", text):
-        text = f"{found[1]}: {error.__cause__}"
+    if merging := re.match(r"(Error merging override [^,\n]+)", text):
+        text = f"{merging[1]}: {error.__cause__}"
     if missing := re.match(r"Missing mandatory value: (\S+)", text):
         return f"{missing[1]}: none; must be given, as {missing[1]}=VALUE"
     if "missing EQUAL" in text and (word := re.search(r"'(.*?)'", text)):

@@ -105,17 +105,17 @@ class _Trial:
             return
         folder = self._folder
         folder.mkdir(parents=True, exist_ok=True)
-        found, again, preflight, log = self._measure(folder / _LOG_FILE)
-        save_drive(folder / "drive.npz", found.drive[0], self._scene.array)
+        solution, again, preflight, log = self._measure(folder / _LOG_FILE)
+        save_drive(folder / "drive.npz", solution.drive[0], self._scene.array)
         command = shlex.join(["autdtorch", *sys.argv[1:]])
         report = write_hardware_report(
-            folder, log, found, again, self._simulated, self._expected, preflight, self._goal, command
+            folder, log, solution, again, self._simulated, self._expected, preflight, self._goal, command
         )
         score = _shown(self._goal, again.mean(dim=0))
         print(f"{score}, measured once more; the report is {report}")
 
     def _measure(self, log: Path) -> _Measured:
-        """Check the transducers, run the method on the device, and read the drive it found again (R, P)."""
+        """Check the transducers, run the method on the device, and read its drive again (R, P) [Pa]."""
         bench, points = self._bench, len(self._scene.control_points)
         readings = 1 if bench.by_hand else 4
         with (
@@ -143,9 +143,9 @@ class _Trial:
             progress.begin("checking the transducers, one by one")
             preflight = self._preflight(limited, sensor, readings, progress)
             progress.begin(f"running {name_of(self._method)} on {bench.device.name}")
-            found = solve(self._method, objective, [0], self._seed, self._goal)
-            progress.begin("the drive that was found, once more")
-            limited.play(found.drive[0])
+            solution = solve(self._method, objective, [0], self._seed, self._goal)
+            progress.begin("the drive of the method, once more")
+            limited.play(solution.drive[0])
             again = torch.stack([limited.reading(sensor, points) for _ in range(readings)])
             limited.off()
             progress.begin("silence, outputs off, once more")
@@ -153,7 +153,7 @@ class _Trial:
                 silent = hardware.hears_silence(sensor, preflight, points, readings)
             if not silent:
                 logger.warning("the sensor reads more than before the trial: are the outputs off?")
-        return found, again, preflight, objective.log
+        return solution, again, preflight, objective.log
 
     def _preflight(
         self, limited: hardware.LimitedLink, sensor: hardware.Sensor, readings: int, progress: Progress

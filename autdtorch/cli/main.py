@@ -36,7 +36,7 @@ _LONGEST_NAME = 150  # of a job's folder; file systems allow 255 bytes
 
 
 class _Carrier(BaseException):
-    """Carries its cause past Hydra, which would print a line of its own about any `Exception`."""
+    """Carries its cause past Hydra, which would print another line about any `Exception`."""
 
 
 class SweepCallback(Callback):
@@ -63,7 +63,7 @@ def main() -> None:
     prepare_streams()
     sys.argv[1:] = map(quoted, sys.argv[1:])
     wanted = os.environ.get(FULL_ERROR)
-    os.environ[FULL_ERROR] = "1"  # makes Hydra pass exceptions on, which it would print in its own way
+    os.environ[FULL_ERROR] = "1"  # makes Hydra pass exceptions on, which it would otherwise print itself
     error: BaseException
     try:
         arguments = sys.argv[1:]

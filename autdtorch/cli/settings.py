@@ -62,7 +62,7 @@ def section_of(settings: Mapping[str, Any], key: str) -> dict[str, Any]:
 
 
 def scene_of(where: str, section: Mapping[str, Any], modules: list[Any]) -> Scene:
-    """Build the scene of a section named `where`; `modules` may define obstacles of one's own."""
+    """Build the scene of a section named `where`; `modules` may define further obstacles."""
     try:
         return load_scene(section, modules)
     except ValueError as error:
@@ -83,9 +83,9 @@ def load_method(where: str, section: Mapping[str, Any], modules: Collection[Any]
     if not isinstance(target, type):
         method = functools.partial(target, **settings)
         signature = inspect.signature(method)
-        given = [key for key in ("trials", "seed", "goal", "score") if key in signature.parameters]
+        passed = [key for key in ("trials", "seed", "goal", "score") if key in signature.parameters]
         try:
-            signature.bind("objective", **dict.fromkeys(given))
+            signature.bind("objective", **dict.fromkeys(passed))
         except TypeError as error:
             accepted = "must take an objective, its settings, and trials and seed if it has random choices"
             raise ValueError(f"{where}: {section[TARGET]!r}; {error}; {accepted}") from error
@@ -98,15 +98,15 @@ def load_method(where: str, section: Mapping[str, Any], modules: Collection[Any]
 
 
 def _target(where: str, target: object, modules: Collection[Any]) -> Callable[..., Any]:
-    """Return the class of a method, or a function of one's own."""
+    """Return the class of a method, or a user's function."""
     module, _, name = str(target).rpartition(".")
     ours = METHODS | {method.__name__: method for method in METHODS.values()}
     if module == "autdtorch" and name in ours:
         return ours[name]
-    found = load_trusted(where, target, modules, ", ".join(f"autdtorch.{method}" for method in METHODS))
-    if isinstance(found, type) and not issubclass(found, Method):
+    loaded = load_trusted(where, target, modules, ", ".join(f"autdtorch.{method}" for method in METHODS))
+    if isinstance(loaded, type) and not issubclass(loaded, Method):
         raise ValueError(f"{where}: {target!r}; must be a function or a subclass of autdtorch.Method")
-    return found
+    return loaded
 
 
 def _parameters(function: Callable[..., Any], but: tuple[str, ...]) -> list[str]:

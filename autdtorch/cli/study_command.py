@@ -1,4 +1,4 @@
-"""Studies: one run or an experiment, with a table on stdout, and `collect`, which merges several."""
+"""Studies: a run, an experiment or a path of poses, with a table on stdout; `collect` merges several."""
 
 from __future__ import annotations
 
@@ -10,29 +10,43 @@ import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
-from autdtorch.cli.poses import Poses, along_path
 from autdtorch.cli.settings import folder_of, is_given, load_method, scene_of, section_of, solver_of
 from autdtorch.hardware import DEVICES
 from autdtorch.io.drive_file import save_drive
 from autdtorch.io.goal_section import load_goal
 from autdtorch.propagators import CACHE_VARIABLE
+from autdtorch.scene.geometry import rotation_matrix
+from autdtorch.scene.obstacles.moving import angles_of
 from autdtorch.scene.scene import Scene
 from autdtorch.study.results import StudyResult, summary_rows
 from autdtorch.study.run import StudyMethod, name_of, run_study
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.display import counted
-from autdtorch.utils.validation import require_one_of
+from autdtorch.utils.units import angles
+from autdtorch.utils.validation import (
+    finite_vector,
+    integer_at_least,
+    invalid,
+    require_known,
+    require_one_of,
+    within,
+)
 
 _HELP = """autdtorch collect FOLDER [modules=NAME]
 
 Merges the finished studies in a folder and below it, such as those of a sweep in multirun, into one table
 (summary.csv) and one report (report.md, report.html), which are written there. modules=NAME allows obstacles
 of one's own, which the module NAME defines."""
+
+_POSE_KEYS = ("offset", "rotation", "rotation_degrees", "count")
+_MOST_POSES = 10_000
 
 
 def study(
@@ -54,7 +68,7 @@ def study(
         usual = folder if is_given("output") or len(folder.parts) == 1 else folder.parent
         solver["cache"] = (sweep or usual) / "matrices"
     settings["solver"] = {key: value for key, value in solver.items() if key != "cache"}  # changes no result
-    poses = None if settings.get("poses") is None else along_path(settings)
+    poses = None if settings.get("poses") is None else _along_path(settings)
     scenes, methods = _parts(settings, modules)
     goal = load_goal("goal", settings.get("goal"))
     device = _device_of(drive, scenes)
@@ -157,8 +171,8 @@ def _save_drives(results: StudyResult, scenes: Mapping[str, Scene], folder: Path
     """Write the drive of the best trial of each method in each scene."""
     single = len(scenes) == 1 and all(len(scene.methods) == 1 for scene in results.scenes.values())
     for name, result in results.scenes.items():
-        for method, own in result.methods.items():
-            best = own.solution.drive[int(own.solution.score.argmax())]
+        for method, outcome in result.methods.items():
+            best = outcome.solution.drive[int(outcome.solution.score.argmax())]
             path = folder / ("drive.csv" if single else f"drive_{name}_{method}.csv")
             save_drive(path, best, scenes[name].array, device)
 
@@ -179,13 +193,15 @@ def _draw_poses(results: StudyResult, poses: Poses, folder: Path) -> None:
     """Draw the scores along the path of the obstacles."""
     from autdtorch.plot.trials import plot_poses
 
-    found = list(results.scenes.values())
+    outcomes = list(results.scenes.values())
     scores = {
-        name: torch.stack([scene.methods[name].solution.score for scene in found])
-        for name in found[0].methods
+        name: torch.stack([scene.methods[name].solution.score for scene in outcomes])
+        for name in outcomes[0].methods
     }
-    bounds = [scene.bound for scene in found]
-    plot_poses(scores, poses.places, poses.label, found[0].score_label, bounds).savefig(folder / "poses.png")
+    bounds = [scene.bound for scene in outcomes]
+    plot_poses(scores, poses.places, poses.label, outcomes[0].score_label, bounds).savefig(
+        folder / "poses.png"
+    )
 
 
 def _quoted(path: Path) -> str:
@@ -201,3 +217,64 @@ def _print_table(results: StudyResult, end: str) -> None:
     # At once, so that lines of other jobs of a sweep do not come between.
     sys.stdout.write("".join(f"{line}\n" for line in (*lines, end)))
     sys.stdout.flush()
+
+
+class Poses(NamedTuple):
+    """Places along a path, in mm, or in degrees where the obstacles only turn."""
+
+    places: Array
+    label: str
+
+
+def _along_path(settings: dict[str, Any]) -> Poses:
+    """Replace scene and method in the settings by an experiment with a scene for each pose.
+
+    The path begins at the pose of the scene. The last pose is moved by `offset` and turned by `rotation` from
+    there. Shifts and angles between are evenly spaced.
+
+    Raises:
+        ValueError: a setting of `poses` that is unknown or out of range, or an experiment beside it.
+    """
+    poses = section_of(settings, "poses")
+    require_known("poses", poses, _POSE_KEYS)
+    if "scenes" in settings:
+        raise invalid("poses", poses, "must not be given beside an experiment")
+    with within("poses"):
+        offset = np.array(finite_vector("offset", poses.get("offset", (0, 0, 0))))
+        rotation = _turn("", poses)
+        count = integer_at_least("count", poses.get("count"), 2)
+        if count > _MOST_POSES:
+            raise invalid("count", count, f"must be at most {_MOST_POSES}")
+        if not (offset.any() or rotation.any()):
+            raise invalid(
+                "offset", offset.tolist(), "must move the obstacles, or rotation must turn them", "m"
+            )
+    scene, chosen = section_of(settings, "scene"), HydraConfig.get().runtime.choices
+    first = section_of(scene, "pose") if scene.get("pose") else {}
+    require_known("scene.pose", first, _POSE_KEYS[:3])
+    start = [np.array(finite_vector("scene.pose.offset", first.get("offset", (0, 0, 0))))]
+    start.append(_turn("scene.pose.", first))
+    shares, digits = np.linspace(0, 1, count), len(str(count - 1))
+    turns = [rotation_matrix(tuple((share * rotation).tolist())) for share in shares]
+    settings["scenes"] = {
+        f"{chosen['scene']}_{number:0{digits}d}": {
+            **scene,
+            "pose": {
+                "offset": (start[0] + share * offset).tolist(),
+                "rotation": angles_of(turn @ rotation_matrix(tuple(start[1].tolist()))).tolist(),
+            },
+        }
+        for number, (share, turn) in enumerate(zip(shares, turns, strict=True))
+    }
+    settings["methods"] = {chosen["method"]: section_of(settings, "method")}
+    del settings["scene"], settings["method"]
+    if offset.any():
+        return Poses(1e3 * float(np.linalg.norm(offset)) * shares, "path of the obstacles [mm]")
+    cosines = [(float(torch.trace(turn)) - 1) / 2 for turn in turns]
+    return Poses(np.degrees(np.arccos(np.clip(cosines, -1, 1))), "turn of the obstacles [degrees]")
+
+
+def _turn(where: str, section: dict[str, Any]) -> Array:
+    """Return the angles (3,) [rad] of a section, which may give them in degrees."""
+    turn = angles(f"{where}rotation", section.get("rotation", (0, 0, 0)), section.get("rotation_degrees"))
+    return np.array(turn)

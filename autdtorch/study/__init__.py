@@ -1,1 +1,1 @@
-"""Trials of methods in scenes: run, kept on disk, compared, reported."""
+"""Trials of methods in scenes: run, saved, compared, reported."""

@@ -1,4 +1,4 @@
-"""The folder of a study: what it holds of the same study is used again, all else is kept aside."""
+"""The folder of a study: its files are used again by the same study, and moved aside for another."""
 
 from __future__ import annotations
 
@@ -58,12 +58,12 @@ class StudyFolder:
         aside = {name: reason for name, reason in self._not_used.items() if (self.path / name).exists()}
         if aside:
             places = (self.path / f"{PREVIOUS}{number}" for number in itertools.count(1))
-            kept = next(place for place in places if not place.exists())
-            kept.mkdir()
+            aside_folder = next(place for place in places if not place.exists())
+            aside_folder.mkdir()
             for name in aside:
-                (self.path / name).replace(kept / name)
+                (self.path / name).replace(aside_folder / name)
             why = "; ".join(dict.fromkeys(aside.values()))
-            logger.warning("%s of %s kept in %s: %s", ", ".join(aside), self.path, kept, why)
+            logger.warning("%s of %s kept in %s: %s", ", ".join(aside), self.path, aside_folder, why)
         save_provenance(self.provenance, self.path)
         if TRIALS_FILE in self._not_used:
             self.trials = self._trial_file()

@@ -149,7 +149,7 @@ class StudyResult:
 
 
 def stored_solution(fields: Mapping[str, Any], transducers: int, points: int) -> Solution:
-    """Return the solution of stored trials, given its `fields` by name, if a method can have found it.
+    """Return the solution of stored trials, given its `fields` by name, if it can be that of a method.
 
     Raises:
         ValueError: another shape or type, or numbers out of range; the message names the field.
@@ -218,11 +218,11 @@ def column_decimals(
     results: StudyResult, quantity: Callable[[MethodResult], torch.Tensor | None], digits: int = 3
 ) -> int:
     """Return decimals for a column of a table: the largest value of each scene has some digits or more."""
-    found = [0]
+    decimals = [0]
     for scene in results.scenes.values():
         values = [value for method in scene.methods.values() if (value := quantity(method)) is not None]
-        found.append(decimals_of((float(value.abs().max()) for value in values), digits))
-    return max(found)
+        decimals.append(decimals_of((float(value.abs().max()) for value in values), digits))
+    return max(decimals)
 
 
 def _share_of_bound(scene: SceneResult, score: float) -> str:

@@ -112,7 +112,7 @@ def _read_provenance(attributes: Any) -> Provenance:
 
 
 def _write_scene(group: Any, scene: SceneResult) -> None:
-    # A goal of one's own may have settings that JSON cannot hold.
+    # A user's goal may have settings that JSON cannot hold.
     attributes: dict[str, Any] = {"goal": json.dumps(scene.goal, default=str), "unit": scene.unit}
     attributes |= {"obstacles": scene.obstacles, "bound": scene.bound}
     attributes |= {key: getattr(scene.simulation, key) for key in _SIMULATION}

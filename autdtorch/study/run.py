@@ -1,4 +1,4 @@
-"""Trials x scenes x methods; what is finished is kept on disk, trial by trial, and not computed again."""
+"""Trials x scenes x methods; finished trials are saved one by one, and not computed again."""
 
 from __future__ import annotations
 
@@ -54,14 +54,14 @@ logger = logging.getLogger(__name__)
 
 StudyMethod: TypeAlias = Method | Callable[..., Solution]
 """A `Method`, or a function of an objective with its settings bound. A function that has parameters `trials`
-and `seed` is given the numbers of the trials to run, as many as it is to return, and the study's seed. One
-that has a parameter `goal` is given the goal."""
+and `seed` gets the numbers of the trials to run, as many as it must return, and the study's seed. One
+that has a parameter `goal` gets the goal."""
 
 BLOCK = Method.block
 """Trials that are run and saved together. The end of the process costs the block in work at most."""
 
 _COUNTED_SPACING = 2e-3  # [m], of the grid on which the runs of poses are counted, at most
-_MOST_BODIES = 4  # Bodies whose operators are kept in memory
+_MOST_BODIES = 4  # bodies whose operators stay in memory
 
 _MOST_SAMPLES = 10**6  # of an observation plane: 16 complex columns of them are 256 MB
 
@@ -82,7 +82,7 @@ def run_study(
     """Run every method in every scene; return the results of all scenes.
 
     A scene is simulated twice, whatever the number of methods and trials: its transfer matrix, on which the
-    methods work, and then the observation plane under the drives they found. All settings are checked before.
+    methods work, and then the observation plane under their drives. All settings are checked before.
 
     Args:
         scenes: by name.
@@ -95,8 +95,8 @@ def run_study(
         goal: what the methods maximise.
         config: all of the above as text. What the folder holds for the same text, made with the same source
             and packages, is taken from there. Without text, or with methods, obstacles or a goal that are not
-            autdtorch's own, everything is computed.
-        poses: whether the scenes are poses of the obstacles, in order. Methods start at the drives found in
+            autdtorch's, everything is computed.
+        poses: whether the scenes are poses of the obstacles, in order. Methods start at the drives of
             the scene before, and the method "auto" of the solver takes scattering operators where these are
             fewer simulations in all.
 
@@ -123,35 +123,31 @@ def run_study(
                 with within(f"method {name}"):
                     method.require_fit(problem, min(counts[name], method.block))
     planes = {name: _plane_points(scene, plane_spacing) for name, scene in scenes.items()}
-    # The digest of our source does not cover methods, obstacles and goals of the user's own.
+    # The digest of our source does not cover methods, obstacles and goals of users.
     code = [*map(_code_of, methods.values()), *map(type, _goals_of(goal))]
     code += [type(obstacle) for scene in scenes.values() for obstacle in scene.obstacles]
     ours = all(one.__module__.partition(".")[0] == "autdtorch" for one in code)
     provenance = provenance_now(config, seed)
-    with open_folder(folder, provenance, scenes, reuse=bool(config) and ours) as kept:
-        missing = {name: scene for name, scene in scenes.items() if name not in kept.scenes}
+    with open_folder(folder, provenance, scenes, reuse=bool(config) and ours) as stored:
+        missing = {name: scene for name, scene in scenes.items() if name not in stored.scenes}
         with within("solver"):
             settings = _for_poses(scenes, solver or {}) if poses else solver or {}
             propagators = {name: make_propagator(scene, **settings) for name, scene in missing.items()}
-        kept.begin()
+        stored.begin()
+        names = list(scenes)
         with show_progress(len(missing) * (sum(counts.values()) + 2)) as progress:
             for name in missing:
                 propagator = propagators.pop(name)
-                before = kept.scenes.get(_before(name, scenes)) if poses else None
+                first = not poses or name == names[0]
+                before = None if first else stored.scenes[names[names.index(name) - 1]]
                 place = name, propagator, planes[name]
-                finished = _run_scene(*place, methods, counts, seed, goal, kept.trials, progress, before)
-                kept.save(name, finished)
+                finished = _run_scene(*place, methods, counts, seed, goal, stored.trials, progress, before)
+                stored.save(name, finished)
                 level = logging.DEBUG if poses else logging.INFO
                 logger.log(level, "%s: %s", name, _in_short(propagator, finished))
         if poses and missing:
             logger.info("%s, the last: %s", counted(len(missing), "pose"), _in_short(propagator, finished))
-        return StudyResult(kept.provenance, {name: kept.scenes[name] for name in scenes})
-
-
-def _before(name: str, scenes: Mapping[str, Scene]) -> str:
-    """Return the name of the scene before, or "" for the first."""
-    names = ["", *scenes]
-    return names[names.index(name) - 1]
+        return StudyResult(stored.provenance, {name: stored.scenes[name] for name in scenes})
 
 
 def _for_poses(scenes: Mapping[str, Scene], solver: Mapping[str, Any]) -> dict[str, Any]:
@@ -205,16 +201,10 @@ def check_goal(goal: Goal, scenes: Mapping[str, Scene], methods: Mapping[str, St
         with within("goal"):
             goal.check(len(scene.control_points))
     for name, method in methods.items():
-        _require_goal_taken(name, method, goal)
-
-
-def _require_goal_taken(name: str, method: StudyMethod, goal: Goal) -> None:
-    """Refuse a function that maximises the weakest focus, whatever the goal."""
-    if goal == WEAKEST_FOCUS or isinstance(method, Method):
-        return
-    if goal_keyword(method) is None:
-        accepted = f"must have a parameter `goal`, for the goal {goal.name}"
-        raise invalid(f"method {name}", name_of(method), accepted)
+        takes_goal = isinstance(method, Method) or goal_keyword(method) is not None
+        if goal != WEAKEST_FOCUS and not takes_goal:
+            accepted = f"must have a parameter `goal`, for the goal {goal.name}"
+            raise invalid(f"method {name}", name_of(method), accepted)
 
 
 def goal_keyword(method: Callable[..., Solution]) -> str | None:
@@ -259,8 +249,8 @@ def solve(
     if isinstance(method, Method):
         return run(method, objective, trials, seed, goal=goal, start=start)
     taken = inspect.signature(method).parameters
-    known = {"trials": trials, "seed": seed, goal_keyword(method) or "goal": goal}
-    return method(objective, **{key: value for key, value in known.items() if key in taken})
+    arguments = {"trials": trials, "seed": seed, goal_keyword(method) or "goal": goal}
+    return method(objective, **{key: value for key, value in arguments.items() if key in taken})
 
 
 def _run_scene(
@@ -291,20 +281,22 @@ def _run_scene(
         def solved(
             trials: range, method: StudyMethod = method, start: torch.Tensor | None = start
         ) -> Solution:
-            own = None if start is None else start[list(trials)]
-            return solve(method, objective, trials, seed, goal, own)
+            first_drives = None if start is None else start[list(trials)]
+            return solve(method, objective, trials, seed, goal, first_drives)
 
         _run_trials(where, size, solved, trials, progress)
-    found = {method_name: trials.found(name, method_name, count) for method_name, count in counts.items()}
+    solutions = {
+        method_name: trials.solution(name, method_name, count) for method_name, count in counts.items()
+    }
     progress.describe(f"{name}: observation plane")
     begin = time.perf_counter()
     planes, cell_area = _plane_pressures(
-        propagator, [solution.drive for solution, _ in found.values()], plane
+        propagator, [solution.drive for solution, _ in solutions.values()], plane
     )
     plane_seconds = time.perf_counter() - begin
     progress.advance(1)
     results = {}
-    for (method_name, (solution, seconds)), pressure in zip(found.items(), planes, strict=True):
+    for (method_name, (solution, seconds)), pressure in zip(solutions.items(), planes, strict=True):
         metrics = focus_metrics(solution.pressure, None if pressure is None else pressure.abs(), cell_area)
         shown = median_trial(solution.score)
         shown_plane = None if pressure is None else pressure[shown].clone()

@@ -72,14 +72,16 @@ def bootstrap(
     expanded = 1 - 2 * stats.norm.sf(math.sqrt(trials / (trials - 1)) * student)
     settings: Any = {"n_resamples": _RESAMPLES, "vectorized": True, "method": "percentile"}
     rng = np.random.default_rng(_SEED)
-    found = stats.bootstrap(drawn, statistic, confidence_level=expanded, rng=rng, **settings)
-    return Interval(value, *map(float, found.confidence_interval))
+    interval = stats.bootstrap(drawn, statistic, confidence_level=expanded, rng=rng, **settings)
+    return Interval(value, *map(float, interval.confidence_interval))
 
 
 def share_interval(successes: torch.Tensor) -> Interval:
     """Return the share of successful trials (T,) with Wilson's interval: a bootstrap is certain of 0 or 1."""
-    found = stats.binomtest(int(successes.sum()), len(successes)).proportion_ci(CONFIDENCE, method="wilson")
-    return Interval(float(successes.double().mean()), float(found.low), float(found.high))
+    interval = stats.binomtest(int(successes.sum()), len(successes)).proportion_ci(
+        CONFIDENCE, method="wilson"
+    )
+    return Interval(float(successes.double().mean()), float(interval.low), float(interval.high))
 
 
 @dataclass(frozen=True, eq=False)

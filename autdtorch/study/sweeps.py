@@ -67,11 +67,11 @@ class _Part:
     scene_settings: Settings
     method_settings: Settings
     seed: int
-    found: SceneResult
+    in_scene: SceneResult
 
     @property
     def result(self) -> MethodResult:
-        return self.found.methods[self.method]
+        return self.in_scene.methods[self.method]
 
 
 def collect_results(folder: str | os.PathLike[str], modules: Collection[str] = ()) -> Sweep:
@@ -105,8 +105,8 @@ def collect_results(folder: str | os.PathLike[str], modules: Collection[str] = (
             logger.warning("%s: a copy of the study in %s, counted once", path, other)
     parts: list[_Part] = []
     for path, study in studies.items():
-        own, missing = _parts(path, study)
-        parts += own
+        finished, missing = _parts(path, study)
+        parts += finished
         unfinished += [f"{path}: {scene}" for scene in missing]
     groups, swept = _groups(parts)
     results = {scene: _merged_scene(methods) for scene, methods in groups.items()}
@@ -133,15 +133,16 @@ def _parts(path: Path, study: StudyResult) -> tuple[list[_Part], list[str]]:
             logger.warning("%s: unfinished scenes are left out: %s", path, ", ".join(missing))
         common = {key: settings[key] for key in ("solver", "plane_spacing") if key in settings}
         parts = []
-        for name, found in study.scenes.items():
+        for name, result in study.scenes.items():
             section = settings["scenes"][name] if "scenes" in settings else settings["scene"]
             files = settings.get(_FILES, {}).get(name)
-            of_scene = dict(_flat({"scene": section, _FILES: files, **common})) | dict(_flat_goal(found.goal))
-            for method in found.methods:
+            of_scene = dict(_flat({"scene": section, _FILES: files, **common}))
+            of_scene |= dict(_flat_goal(result.goal))
+            for method in result.methods:
                 chosen = settings["methods"][method] if "methods" in settings else settings["method"]
                 of_method = dict(_flat({"method": chosen}))
                 seed = study.provenance.seed
-                parts.append(_Part(name, method, section, of_scene, of_method, seed, found))
+                parts.append(_Part(name, method, section, of_scene, of_method, seed, result))
         return parts, missing
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{file}: no settings of a study; must come from the command line") from error
@@ -211,16 +212,16 @@ def _swept(named: Sequence[tuple[str, Settings]]) -> list[tuple[str, Settings]]:
         other = first.setdefault(name, settings)
         keys = settings.keys() | other.keys()
         varying.setdefault(name, set()).update(key for key in keys if settings.get(key) != other.get(key))
-    return [(name, {key: own[key] for key in own if key in varying[name]}) for name, own in named]
+    return [(name, {key: values[key] for key in values if key in varying[name]}) for name, values in named]
 
 
 def _names(named: Sequence[tuple[str, Settings]]) -> list[str]:
     """Return names with the swept settings, distinct for distinct settings, fit for file names."""
-    found = [(_name(name, swept), digest_of(sorted(swept.items()))[:8]) for name, swept in named]
-    bearers = Counter(name for name, _ in set(found))
+    digested = [(_name(name, swept), digest_of(sorted(swept.items()))[:8]) for name, swept in named]
+    bearers = Counter(name for name, _ in set(digested))
     return [
         f"{name[:_LONGEST_NAME]}-{digest}" if len(name) > _LONGEST_NAME or bearers[name] > 1 else name
-        for name, digest in found
+        for name, digest in digested
     ]
 
 
@@ -240,31 +241,31 @@ def _word(text: object) -> str:
 
 
 def _merged_scene(methods: Mapping[str, Sequence[_Part]]) -> SceneResult:
-    found = [part.found for same in methods.values() for part in same]
-    simulated = max((scene.simulation for scene in found), key=lambda simulation: len(simulation.runs))
+    scenes = [part.in_scene for same in methods.values() for part in same]
+    simulated = max((scene.simulation for scene in scenes), key=lambda simulation: len(simulation.runs))
     results = {name: _merged_trials(same) for name, same in methods.items()}
-    return replace(found[0], simulation=simulated, methods=results)
+    return replace(scenes[0], simulation=simulated, methods=results)
 
 
 def _merged_trials(parts: Sequence[_Part]) -> MethodResult:
     """Join the trials of all seeds, for each seed those of its longest study."""
     longest = sorted(parts, key=lambda part: (part.seed, part.result.trials))
-    kept = list({part.seed: part.result for part in longest}.values())
-    one = kept[0].solution
-    others = [result.solution for result in kept]
+    by_seed = list({part.seed: part.result for part in longest}.values())
+    one = by_seed[0].solution
+    others = [result.solution for result in by_seed]
     if all(torch.equal(one.drive, it.drive) and torch.equal(one.history, it.history) for it in others):
-        kept = kept[:1]  # the method makes no random choices
-    solution = joined([result.solution for result in kept])
+        by_seed = by_seed[:1]  # the method makes no random choices
+    solution = joined([result.solution for result in by_seed])
     # A study keeps the observation plane of one trial. The one nearest to the joint median is shown.
     median = float(solution.score[median_trial(solution.score)])
-    shown = [float(result.solution.score[result.shown_trial]) for result in kept]
-    nearest = min(range(len(kept)), key=lambda place: abs(shown[place] - median))
+    shown = [float(result.solution.score[result.shown_trial]) for result in by_seed]
+    nearest = min(range(len(by_seed)), key=lambda place: abs(shown[place] - median))
     return MethodResult(
         solution,
-        _joined_metrics([result.metrics for result in kept]),
-        torch.cat([result.seconds for result in kept]),
-        sum(result.trials for result in kept[:nearest]) + kept[nearest].shown_trial,
-        kept[nearest].plane_pressure,
+        _joined_metrics([result.metrics for result in by_seed]),
+        torch.cat([result.seconds for result in by_seed]),
+        sum(result.trials for result in by_seed[:nearest]) + by_seed[nearest].shown_trial,
+        by_seed[nearest].plane_pressure,
     )
 
 

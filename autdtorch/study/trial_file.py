@@ -1,4 +1,4 @@
-"""The finished trials of a study, appended to a file as they end: a line of JSON with all that a trial found.
+"""The finished trials of a study, appended to a file as they end: a line of JSON for each.
 
 Lines survive the end of the process at any moment, and a study that is begun again goes on after them.
 """
@@ -47,18 +47,20 @@ class TrialFile:
         """Return which of the first `trials` trials are not there."""
         return [trial for trial in range(trials) if (scene, method, trial) not in self._trials]
 
-    def append(self, scene: str, method: str, trials: Sequence[int], found: Solution, seconds: float) -> None:
+    def append(
+        self, scene: str, method: str, trials: Sequence[int], solution: Solution, seconds: float
+    ) -> None:
         """Add the trials of a block; those that the file holds already stay as they are.
 
-        Each trial is given an equal share of the wall time `seconds` [s] of the block.
+        Each trial gets an equal share of the wall time `seconds` [s] of the block.
         """
         share = seconds / len(trials)
         added = [trial for trial in trials if (scene, method, trial) not in self._trials]
         for trial in added:
-            self._trials[scene, method, trial] = _alone(found, trials.index(trial)), share
+            self._trials[scene, method, trial] = _alone(solution, trials.index(trial)), share
         self._lines.append(*(self._row(scene, method, trial) for trial in added))
 
-    def found(self, scene: str, method: str, trials: int) -> tuple[Solution, torch.Tensor]:
+    def solution(self, scene: str, method: str, trials: int) -> tuple[Solution, torch.Tensor]:
         """Return the joined solution of the first `trials` trials, and seconds (T,) of each."""
         each = [self._trials[scene, method, trial] for trial in range(trials)]
         seconds = torch.tensor([share for _, share in each], **REAL)
@@ -101,9 +103,9 @@ class TrialFile:
         self._trials[where] = solution, not_negative("seconds", row["seconds"], "s")
 
 
-def _alone(found: Solution, place: int) -> Solution:
+def _alone(solution: Solution, place: int) -> Solution:
     """One of the trials (T,), its history as long as its evaluations."""
     row = slice(place, place + 1)
-    evaluations = found.evaluations[row]
-    history = found.history[row, : int(evaluations)]
-    return Solution(found.drive[row], found.pressure[row], found.score[row], evaluations, history)
+    evaluations = solution.evaluations[row]
+    history = solution.history[row, : int(evaluations)]
+    return Solution(solution.drive[row], solution.pressure[row], solution.score[row], evaluations, history)

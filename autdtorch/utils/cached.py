@@ -23,7 +23,7 @@ class cached_property(functools.cached_property[T_co]):  # noqa: TID251
     def __get__(self, instance: object, owner: type[Any] | None = None) -> T_co: ...
 
     def __get__(self, instance: object, owner: type[Any] | None = None) -> Self | T_co:
-        """Compute and keep the value; once it is kept, Python finds it without this call."""
+        """Compute and store the value, which Python then reads without this call."""
         if instance is None:
             return self
         assert self.attrname is not None  # Python sets it when the class is made

@@ -23,7 +23,7 @@ def digest_of(*parts: object) -> str:
     """Return the SHA-256 of values: numbers, text, arrays, tensors, and containers and dataclasses of these.
 
     Two values have the same digest only if they agree to the last bit. Of a dataclass, compared fields and
-    arrays count, and the source code where the class is not autdtorch's own.
+    arrays count, and the source code where the class is not autdtorch's.
     """
     digest = hashlib.sha256()
     for part in parts:
@@ -61,8 +61,10 @@ def _add(digest: Any, part: Any) -> None:
         digest.update(f"array {array.dtype.str} {array.shape}\n".encode() + array.tobytes())
     elif dataclasses.is_dataclass(part):
         named = [(field, getattr(part, field.name)) for field in dataclasses.fields(part)]
-        kept = {field.name: own for field, own in named if field.compare or hasattr(own, "__array__")}
-        _add(digest, (type(part).__name__, _source_of(type(part)), kept))
+        compared = {
+            field.name: value for field, value in named if field.compare or hasattr(value, "__array__")
+        }
+        _add(digest, (type(part).__name__, _source_of(type(part)), compared))
     elif isinstance(part, Mapping):
         _add(digest, tuple(part.items()))
     elif isinstance(part, tuple | list):

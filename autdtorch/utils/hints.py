@@ -20,24 +20,24 @@ _UNEXPECTED = re.compile(r"got an unexpected keyword argument '(\w+)'")
 _SUGGESTS = "_suggests"  # attribute of functions that are decorated by `suggesting`
 
 
-def nearest_name(given: object, accepted: Collection[str]) -> str | None:
-    """Return the accepted name most like `given`; None if none is alike."""
-    if not isinstance(given, str):
+def nearest_name(wrong: object, accepted: Collection[str]) -> str | None:
+    """Return the accepted name most like `wrong`; None if none is alike."""
+    if not isinstance(wrong, str):
         return None
-    nearest = difflib.get_close_matches(given.casefold(), {name.casefold() for name in accepted})
+    nearest = difflib.get_close_matches(wrong.casefold(), {name.casefold() for name in accepted})
     alike = [name for name in accepted if name.casefold() in nearest]  # some differ in capitals alone
-    return max(alike, key=partial(_likeness, given), default=None)
+    return max(alike, key=partial(_likeness, wrong), default=None)
 
 
-def did_you_mean(given: object, accepted: Collection[str]) -> str:
-    """Return a question for messages with the accepted name most like `given`; empty if none is alike."""
-    name = nearest_name(given, accepted)
+def did_you_mean(wrong: object, accepted: Collection[str]) -> str:
+    """Return a question for messages with the accepted name most like `wrong`; empty if none is alike."""
+    name = nearest_name(wrong, accepted)
     return f" (did you mean {name!r}?)" if name else ""
 
 
-def _likeness(given: str, name: str) -> float:
+def _likeness(wrong: str, name: str) -> float:
     """Return how alike two names are, first without and then with regard to capitals, 0 to 2."""
-    pairs = (given.casefold(), name.casefold()), (given, name)
+    pairs = (wrong.casefold(), name.casefold()), (wrong, name)
     return sum(difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs)
 
 

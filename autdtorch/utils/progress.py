@@ -24,15 +24,15 @@ from autdtorch.utils.threads import in_forked
 logger = logging.getLogger(__name__)
 
 _PATIENCE = 3.0  # time after which the bar or the first forecast in the log appears [s]
-_MOST_POINTS = 1000  # times that are kept
-# without tqdm's own forecast, which is of means
+_MOST_POINTS = 1000  # times of earlier steps
+# without tqdm's forecast, which is of means
 _BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
-_UNSURE = 1.5  # ratio of two forecasts, from which both are told
+_UNSURE = 1.5  # ratio of two forecasts, from which both are shown
 _asked: ContextVar[Callable[[], bool]] = ContextVar("asked to stop", default=lambda: False)
 
 
 def _renew_lock() -> None:
-    """Replace tqdm's own lock, which a thread that drew a bar may have held, but not one that a user set."""
+    """Replace tqdm's lock, which a thread that drew a bar may have held, but not one that a user set."""
     if isinstance(tqdm.get_lock(), TqdmDefaultWriteLock):
         tqdm.set_lock(threading.RLock())  # all of the default ones share theirs
 
@@ -106,7 +106,7 @@ class Progress:
         """Return the time left as text; nothing before it is known.
 
         The remaining steps take as long as those of the later half so far, or become slower along the line
-        through both halves; where these differ much, both are told.
+        through both halves; where the two differ much, both are shown.
         """
         left = self._steps - self._done
         if left < 0:

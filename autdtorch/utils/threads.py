@@ -101,7 +101,7 @@ if hasattr(os, "register_at_fork"):
 T = TypeVar("T")
 R = TypeVar("R")
 
-_given: ContextVar[int | None] = ContextVar("threads", default=None)
+_count: ContextVar[int | None] = ContextVar("threads", default=None)
 
 
 class _Outside:
@@ -160,8 +160,8 @@ def thread_count() -> int:
 
     It is PyTorch's, set by `torch.set_num_threads` or OMP_NUM_THREADS, and at most the processors available.
     """
-    given = _given.get()
-    return min(_outside.threads(), _processors()) if given is None else given
+    count = _count.get()
+    return min(_outside.threads(), _processors()) if count is None else count
 
 
 @contextlib.contextmanager
@@ -171,13 +171,13 @@ def one_library_thread() -> Iterator[None]:
     Their threads spin while they wait, also after their work is done. They take the processor from ours, and
     on a busy machine slow thousands of small operations down many times (docs/decisions/threads.md).
     """
-    token = _given.set(thread_count())
+    token = _count.set(thread_count())
     before = _outside.enter()
     try:
         yield
     finally:
         _outside.leave(before)
-        _given.reset(token)
+        _count.reset(token)
 
 
 def spread(function: Callable[[T], R], items: Iterable[T], most: int | None = None) -> list[R]:
@@ -192,7 +192,7 @@ def spread(function: Callable[[T], R], items: Iterable[T], most: int | None = No
         return [function(item) for item in items]
 
     def alone(item: T) -> R:
-        _given.set(1)
+        _count.set(1)
         return function(item)
 
     with ThreadPoolExecutor(threads) as pool:

@@ -1,4 +1,4 @@
-"""Quantities that are given in another unit than the one that is meant: angles in degrees."""
+"""Angles, and warnings of quantities that seem to be in another unit."""
 
 from __future__ import annotations
 
@@ -57,8 +57,9 @@ def angles(name: str, value: object, degrees: object = None) -> Vector:
         return turn
     if any(turn):
         raise invalid(f"{name}_degrees", degrees, f"must not be given beside {name}, {turn} rad", "degrees")
-    given = finite_vector(f"{name}_degrees", degrees, "degrees")
-    x, y, z = (math.radians(math.remainder(one, 360)) for one in given)
+    x, y, z = (
+        math.radians(math.remainder(one, 360)) for one in finite_vector(f"{name}_degrees", degrees, "degrees")
+    )
     return x, y, z
 
 

@@ -53,7 +53,7 @@ def require_name(field: str, name: object) -> None:
 
 
 def path_of(name: str, value: object, what: str = "a file", suffixes: Collection[str] = ()) -> Path:
-    """Return `value` as the path of `what`, with one of the `suffixes` if given; it need not exist."""
+    """Return `value` as the path of `what`, which ends in one of the `suffixes`, if any."""
     text = os.fspath(value) if isinstance(value, str | os.PathLike) else None
     if not isinstance(text, str) or not text or "\0" in text:
         raise invalid(name, value, f"must be the path of {what}")
@@ -69,12 +69,12 @@ def require_one_of(name: str, value: object, accepted: Collection[str]) -> None:
         raise invalid(name, value, f"must be one of {', '.join(accepted)}{did_you_mean(value, accepted)}")
 
 
-def require_known(where: str, given: Iterable[Any], allowed: Collection[str], what: str = "key") -> None:
+def require_known(where: str, keys: Iterable[Any], allowed: Collection[str], what: str = "key") -> None:
     """Refuse keys that are not allowed."""
-    for key in given:
+    for key in keys:
         if key not in allowed:
-            found = f"unknown {what} {key!r}{did_you_mean(key, allowed)}"
-            raise ValueError(f"{where}: {found}; allowed {what}s: {', '.join(allowed)}")
+            unknown = f"unknown {what} {key!r}{did_you_mean(key, allowed)}"
+            raise ValueError(f"{where}: {unknown}; allowed {what}s: {', '.join(allowed)}")
 
 
 def require_kind(name: str, value: object, kind: type) -> None:
@@ -94,7 +94,7 @@ def members(name: str, value: object, kind: type) -> tuple[Any, ...]:
 
 
 def _listed(name: str, value: object, accepted: str) -> list[Any]:
-    """Return the entries of an iterable other than text; a class of the user's own may raise anything."""
+    """Return the entries of an iterable other than text; a user's class may raise anything."""
     try:
         if not isinstance(value, str | bytes):
             return list(value)  # type: ignore[call-overload, no-any-return]
@@ -104,7 +104,7 @@ def _listed(name: str, value: object, accepted: str) -> list[Any]:
 
 
 def device_type(name: str, value: object) -> str | None:
-    """Return "cpu" or "cuda", the type of a device given as text or `torch.device`, or None for None."""
+    """Return "cpu" or "cuda", the type of a device as text or `torch.device`, or None for None."""
     if value is None:
         return None
     device = None
@@ -148,7 +148,7 @@ def finite_number(name: str, value: object, unit: str = "") -> float:
         number = float(value)
     except OverflowError:  # an integer or a fraction, too large for a float
         number = math.inf
-    except Exception as error:  # of a class of the user's own
+    except Exception as error:  # of a user's class
         raise invalid(name, value, f"must be a real number{_in_unit(unit)}") from error
     if not math.isfinite(number):
         raise invalid(name, value, "must be finite", unit)
@@ -334,7 +334,7 @@ def _tensor(name: str, value: object, accepted: str) -> torch.Tensor:
         if numeric and isinstance(value, torch.Tensor):
             return value.as_subclass(torch.Tensor)  # a subclass may override functions
         array = np.asarray(value if numeric else None)
-    except Exception as error:  # a class of the user's own may raise anything
+    except Exception as error:  # a user's class may raise anything
         raise invalid(name, value, accepted) from error
     if array.dtype.kind not in "iufc":
         raise invalid(name, value, accepted)

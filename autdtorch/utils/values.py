@@ -79,7 +79,7 @@ class _Short(reprlib.Repr):
         return repr(value) if bits <= _SHOWN_BITS else f"integer of {bits} bits"
 
     def repr_instance(self, value: Any, level: int) -> str:
-        with contextlib.suppress(Exception):  # of a class of the user's own
+        with contextlib.suppress(Exception):  # of a user's class
             if isinstance(value, Sequence) and not isinstance(value, memoryview):
                 return self.repr_list(value, level)  # type: ignore[arg-type]
         return super().repr_instance(value, level)

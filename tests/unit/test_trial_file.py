@@ -50,7 +50,7 @@ def test_trials_come_back_bit_for_bit_in_their_order(path):
     for read in (file, opened(path, 7)):
         assert read.missing("a", "gabs", 6) == [4, 5]
         assert read.missing("a", "lssg", 1) == [0]
-        back, seconds = read.found("a", "gabs", 4)
+        back, seconds = read.solution("a", "gabs", 4)
         assert_equal(back, solution)
         assert seconds.dtype == torch.float64
         assert seconds.tolist() == [2.0, 6.0, 2.0, 2.0]
@@ -60,7 +60,7 @@ def test_trials_that_ended_early_go_on_with_their_last_value(path):
     file = opened(path)
     file.append("a", "gabs", [0], found(1, 3), 1.0)
     file.append("a", "gabs", [1], found(1, 5, seed=1), 1.0)
-    back, _ = opened(path).found("a", "gabs", 2)
+    back, _ = opened(path).solution("a", "gabs", 2)
     assert back.evaluations.tolist() == [3, 5]
     assert back.history.shape == (2, 5)
     assert back.history[0, 3:].tolist() == [back.score[0].item()] * 2
@@ -161,4 +161,4 @@ def test_a_last_drive_that_scored_below_the_best_or_near_it_comes_back(path, sco
     solution = found(1, 4)
     solution.score[0] = score * solution.history[0, -1]
     opened(path).append("a", "identify", [0], solution, 1.0)
-    assert_equal(opened(path).found("a", "identify", 1)[0], solution)
+    assert_equal(opened(path).solution("a", "identify", 1)[0], solution)

@@ -51,14 +51,14 @@ def of_trials(quantities: Mapping[str, Spread]) -> str:
             for scene, by_method in values.items()
         }
         panels.append(f"({letter}) {label}: {_by_scene(medians)}")
-    return f"Values of the trials by scene and method, medians given here. {'. '.join(panels)}"
+    return f"Values of the trials by scene and method, medians here. {'. '.join(panels)}"
 
 
 def of_convergence(scenes: Mapping[str, SceneResult]) -> str:
     """Return the text of the convergence: the scores at the end, the evaluations used, and the bound."""
     ends = {}
     for name, scene in scenes.items():
-        solutions = {method: found.solution for method, found in competitors(scene).items()}
+        solutions = {method: result.solution for method, result in competitors(scene).items()}
         scores = {method: _median(one.history[:, -1]) for method, one in solutions.items()}
         used = int(solutions[max(scores, key=lambda method: scores[method])].evaluations.max())
         bound = f", bound {scene.bound:.3g}" if math.isfinite(scene.bound) else ""
@@ -71,7 +71,7 @@ def of_convergence(scenes: Mapping[str, SceneResult]) -> str:
 
 def of_costs(scenes: Mapping[str, SceneResult]) -> str:
     """Return the text of scores against times: the fastest and the best method."""
-    found = {}
+    texts = {}
     for name, scene in scenes.items():
         methods = competitors(scene)
         seconds = {method: _median(one.seconds) for method, one in methods.items()}
@@ -82,13 +82,13 @@ def of_costs(scenes: Mapping[str, SceneResult]) -> str:
             f"in {seconds[method]:.2g} s"
             for text, method in (("fastest", fastest), ("best", best))
         )
-        found[name] = ", ".join(places)
-    return f"Median score against median time of the search. {_by_scene(found)}"
+        texts[name] = ", ".join(places)
+    return f"Median score against median time of the search. {_by_scene(texts)}"
 
 
-def of_bench(found: Solution, scale: float, expected: Solution, unit: str) -> str:
+def of_bench(solution: Solution, scale: float, expected: Solution, unit: str) -> str:
     """Return the text of the convergence on the bench and in the simulation, times the factor `scale`."""
-    ends = float(found.history[0, -1]), scale * float(expected.history[0, -1])
+    ends = float(solution.history[0, -1]), scale * float(expected.history[0, -1])
     bench, simulation = (f"{end:.4g} {unit}".rstrip() for end in ends)
     return f"Best score so far against evaluations: the bench ends at {bench}, the simulation at {simulation}"
 

@@ -29,7 +29,7 @@ Compare: TypeAlias = Callable[[SceneResult, SceneResult], Comparison]
 
 LSSG, BO, GABS = "lssg", "bayes_opt", "gabs"
 
-MUCH_WEAKER = 1 / math.sqrt(2)  # half the intensity; a pressure above this share of another one is kept
+MUCH_WEAKER = 1 / math.sqrt(2)  # half the intensity; a pressure above this share of another is kept
 SAME_LEVEL = 0.1  # areas are at the same level if they differ by less than this share of the larger one
 LAST_PART = 0.1  # last share of the evaluations
 CONVERGED = 0.01  # a trial has converged if its last part raises the score by at most this share
@@ -54,7 +54,7 @@ class Claim:
 
     text: str
     reading: str  # the comparison, with the threshold where the paper's words are vague
-    compare: Compare  # compares in one scene, given the result of the first scene without obstacles
+    compare: Compare  # compares in one scene, with the result of the first scene without obstacles
     methods: tuple[str, ...] = (BO, GABS)  # scenes without them are left out
     obstacles: bool | None = None  # about scenes with or without obstacles; None for both
     scene: str = ""  # name of the only scene it is about
@@ -70,19 +70,21 @@ class Claim:
             if set(self.methods) <= scene.methods.keys() and scene.goal == PAPERS_GOAL
         }
         empty = [scene for scene in usable.values() if scene.obstacles == 0]
-        found = {
+        comparisons = {
             name: self.compare(scene, (empty or [scene])[0])
             for name, scene in usable.items()
             if self._is_about(name, scene) and (empty or not self.needs_empty)
         }
-        if not found:
+        if not comparisons:
             return None
-        margins = [margin for _, one in found.values() for margin in one]
+        margins = [margin for _, one in comparisons.values() for margin in one]
         holds = all(margin.value > 0 for margin in margins)
         surely_holds = all(margin.low > 0 for margin in margins)
         clear = surely_holds if holds else any(margin.high <= 0 for margin in margins)
         heading = [self.heading] if self.heading else []
-        return Verdict(holds, clear, (*heading, *(f"{name}: {text}" for name, (text, _) in found.items())))
+        return Verdict(
+            holds, clear, (*heading, *(f"{name}: {text}" for name, (text, _) in comparisons.items()))
+        )
 
     def _is_about(self, name: str, scene: SceneResult) -> bool:
         with_area = all(method.metrics.area is not None for method in scene.methods.values())
@@ -112,8 +114,8 @@ def _means(scene: SceneResult, methods: Iterable[str], quantity: str) -> tuple[s
     """Return the means of methods as text, and the form of their numbers."""
     means = {}
     for method in methods:
-        own = _values(scene, method, quantity)
-        means[label_of(method)] = own if isinstance(own, float) else float(own.mean())
+        values = _values(scene, method, quantity)
+        means[label_of(method)] = values if isinstance(values, float) else float(values.mean())
     form = ".0f" if quantity == "evaluations" else f".{decimals_of(means.values())}f"
     texts = ", ".join(f"{label} {mean:{form}}" for label, mean in means.items())
     return f"{texts} {_UNITS[quantity][0]}".rstrip(), form

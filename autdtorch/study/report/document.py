@@ -119,12 +119,12 @@ def _embed_images(tokens: Sequence[Token], folder: Path) -> None:
 
 def _mark_sections(tokens: Sequence[Token]) -> list[tuple[str, str]]:
     """Give each section an anchor; return anchors and headings."""
-    found: list[tuple[str, str]] = []
+    sections: list[tuple[str, str]] = []
     for token, content in itertools.pairwise(tokens):
         if token.type == "heading_open" and token.tag == "h2":
-            found.append((f"section-{len(found) + 1}", content.content))
-            token.attrSet("id", found[-1][0])
-    return found
+            sections.append((f"section-{len(sections) + 1}", content.content))
+            token.attrSet("id", sections[-1][0])
+    return sections
 
 
 def _mark_tables(tokens: Sequence[Token]) -> list[Token]:
@@ -138,16 +138,16 @@ def _mark_tables(tokens: Sequence[Token]) -> list[Token]:
         elif token.type == "table_open":
             start = len(marked) - 1
         elif token.type == "table_close":
-            own = marked[start:]
-            if pictures := _pictures(own):
+            table = marked[start:]
+            if pictures := _pictures(table):
                 marked[start:] = [Token("figures", "", 0, meta={"pictures": pictures})]
                 continue
             count += 1
-            own[0].meta["label"] = f"{section}, table {count}" if count > 1 else f"{section}, table"
-            if max(len(cell.content) for cell in own if cell.type == "inline") <= _SHORT:
-                own[0].attrSet("class", "short")
-            _mark_headers(own)
-            _mark_numbers(own)
+            table[0].meta["label"] = f"{section}, table {count}" if count > 1 else f"{section}, table"
+            if max(len(cell.content) for cell in table if cell.type == "inline") <= _SHORT:
+                table[0].attrSet("class", "short")
+            _mark_headers(table)
+            _mark_numbers(table)
     return marked
 
 
@@ -177,8 +177,8 @@ def _pictures(table: Sequence[Token]) -> list[tuple[Token, Token]]:
 
 
 def _table_open(renderer: RendererHTML, tokens: Sequence[Token], index: int, *_: object) -> str:
-    label, own = html.escape(tokens[index].meta["label"]), renderer.renderAttrs(tokens[index])
-    return f'<div class="table" role="group" aria-label="{label}" tabindex="0"><table{own}>\n'
+    label, attributes = html.escape(tokens[index].meta["label"]), renderer.renderAttrs(tokens[index])
+    return f'<div class="table" role="group" aria-label="{label}" tabindex="0"><table{attributes}>\n'
 
 
 def _table_close(*_: object) -> str:

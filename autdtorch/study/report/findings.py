@@ -70,8 +70,8 @@ def _winners(results: StudyResult, best: Mapping[str, _Best]) -> str:
     median = any(method.trials > 1 for scene in scenes.values() for method in scene.methods.values())
     every = {label_of(method) for scene in scenes.values() for method in competitors(scene)}
     groups: dict[tuple[str, ...], list[str]] = {}
-    for name, found in best.items():
-        groups.setdefault(found.labels, []).append(name)
+    for name, top in best.items():
+        groups.setdefault(top.labels, []).append(name)
     largest_first = sorted(groups, key=lambda labels: -len(groups[labels]))
     parts = [
         f"{_scores(groups[labels], scenes, best)}, by {listed(labels)}{_level(labels)}"

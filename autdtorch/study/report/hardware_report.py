@@ -46,7 +46,7 @@ def compare(measured: torch.Tensor, simulated: torch.Tensor) -> Comparison:
 def write_hardware_report(
     folder: Path,
     log: EvaluationLog,
-    found: Solution,
+    solution: Solution,
     again: torch.Tensor,
     simulated: Objective,
     expected: Solution,
@@ -56,7 +56,7 @@ def write_hardware_report(
 ) -> Path:
     """Write `report.md` and its figure into a folder; return its path.
 
-    The search on the bench `found` a drive, which was read `again` (R, P) [Pa]. `expected` is the solution of
+    The drive of the `solution` on the bench was read `again` (R, P) [Pa]. `expected` is the solution of
     the same method on the `simulated` objective, without noise and with the phase levels of the device. Both
     maximised the `goal`.
     """
@@ -68,12 +68,12 @@ def write_hardware_report(
     fit = compare(measured, predicted)
     # A pressure scales with the transducers; a score without unit does not.
     scale = fit.scale if goal.unit else 1.0
-    histories = {"bench": found.history, "simulation": scale * expected.history}
+    histories = {"bench": solution.history, "simulation": scale * expected.history}
     label = score_label(f"{goal.name}, best so far", goal.unit)
     with naming(folder / _FIGURE):
         plot_convergence({scene.name: histories}, label=label).savefig(folder / _FIGURE)
     again_mean = again.mean(dim=0)
-    pressures = found.pressure[0], again_mean, fit.scale * simulated(working * found.drive)[0]
+    pressures = solution.pressure[0], again_mean, fit.scale * simulated(working * solution.drive)[0]
     times = [datetime.fromisoformat(one.time) for one in evaluations]
     gaps = [(later - earlier).total_seconds() for earlier, later in itertools.pairwise(times)]
     text = rendered(
@@ -85,20 +85,23 @@ def write_hardware_report(
         version=autdtorch.__version__,
         times=times,
         interval=statistics.median_low(gaps) if gaps else 0.0,  # an interruption does not change it
-        found=found,
-        convergence=picture(_FIGURE, alt_texts.of_bench(found, scale, expected, goal.unit)),
+        found=solution,
+        convergence=picture(_FIGURE, alt_texts.of_bench(solution, scale, expected, goal.unit)),
         goal=score_label(goal.name),
         unit=goal.unit and f" {goal.unit}",
         score_again=float(goal(again_mean)),
         readings=len(again),
-        same=int(torch.isclose(found.drive, expected.drive, rtol=0, atol=1e-9).sum()),
+        same=int(torch.isclose(solution.drive, expected.drive, rtol=0, atol=1e-9).sum()),
         points=_points(scene.control_points, *pressures),
         fits=_fits(scene.control_points, measured, predicted),
         scale=fit.scale,
         misfit=_percent(fit.misfit),
         alone=preflight.pressure[preflight.pressure > preflight.threshold],
         preflight=preflight,
-        settings=[["setting", "value"], *([name, code(_value(own))] for name, own in log.origin.items())],
+        settings=[
+            ["setting", "value"],
+            *([name, code(_as_text(value))] for name, value in log.origin.items()),
+        ],
     )
     path = folder / REPORT_FILE
     replace_file(path, text.encode())
@@ -109,12 +112,12 @@ def _percent(share: float) -> str:
     return in_digits(round(100 * share, 6), 2)  # smaller digits are rounding
 
 
-def _value(own: Any) -> str:
+def _as_text(value: Any) -> str:
     """Return a setting as JSON, consecutive integers as a range."""
-    integers = isinstance(own, list) and len(own) > 2 and all(isinstance(one, int) for one in own)
-    if integers and own == list(range(own[0], own[-1] + 1)):
-        return f"{own[0]} to {own[-1]}"
-    return json.dumps(own, ensure_ascii=False)
+    integers = isinstance(value, list) and len(value) > 2 and all(isinstance(one, int) for one in value)
+    if integers and value == list(range(value[0], value[-1] + 1)):
+        return f"{value[0]} to {value[-1]}"
+    return json.dumps(value, ensure_ascii=False)
 
 
 def _points(places: torch.Tensor, *pressures: torch.Tensor) -> list[list[str]]:

@@ -143,8 +143,8 @@ def _draw_scenes(scenes: Mapping[str, Scene], folder: Path) -> str | None:
 def _trim(file: Path) -> None:
     """Cut the white margin of a picture, which would make its labels small on a page."""
     with Image.open(file) as picture:
-        kept = ImageOps.invert(picture.convert("RGB")).getbbox()
-        picture.crop(kept).save(file)
+        box = ImageOps.invert(picture.convert("RGB")).getbbox()
+        picture.crop(box).save(file)
 
 
 def _without_alike(results: StudyResult, methods: Iterable[str]) -> list[str]:
@@ -209,12 +209,12 @@ def _by_method(
     results: StudyResult, quantity: Callable[[MethodResult], torch.Tensor | None]
 ) -> dict[str, dict[str, torch.Tensor]]:
     """Return a quantity by scene and method, without methods and scenes that lack it."""
-    found: dict[str, dict[str, torch.Tensor]] = {}
+    values: dict[str, dict[str, torch.Tensor]] = {}
     for scene, result in results.scenes.items():
         for name, method in result.methods.items():
             if (value := quantity(method)) is not None:
-                found.setdefault(scene, {})[name] = value
-    return found
+                values.setdefault(scene, {})[name] = value
+    return values
 
 
 def _numbered(name: str, before: Sequence[str]) -> str:
@@ -229,10 +229,10 @@ def _draw_convergence(results: StudyResult, folder: Path) -> list[str]:
         history, levels = {}, {}
         for name, scene in scenes.items():
             competitors = tables.competitors(scene)
-            history[name] = {method: found.solution.history for method, found in competitors.items()}
+            history[name] = {method: result.solution.history for method, result in competitors.items()}
             levels[name] = _bounds(scene.bound) | {
-                label_of(method): float(found.solution.score.median())
-                for method, found in scene.methods.items()
+                label_of(method): float(result.solution.score.median())
+                for method, result in scene.methods.items()
                 if method not in competitors
             }
         file, label = _numbered("fig3d", pictures), score_label(f"{goal}, best so far", unit)
@@ -260,8 +260,8 @@ def _draw_costs(results: StudyResult, folder: Path) -> list[str]:
     for label, scenes in groups.items():
         points = {
             name: {
-                method: [(float(found.seconds.median()), _shown_score(found, scene.bound))]
-                for method, found in tables.competitors(scene).items()
+                method: [(float(result.seconds.median()), _shown_score(result, scene.bound))]
+                for method, result in tables.competitors(scene).items()
             }
             for name, scene in scenes.items()
         }
@@ -279,7 +279,7 @@ def _shown_score(method: MethodResult, bound: float) -> float:
 
 def _grouped(results: StudyResult, key: Callable[[SceneResult], _Key]) -> dict[_Key, dict[str, SceneResult]]:
     """Return the scenes by a key, and by name."""
-    found: dict[_Key, dict[str, SceneResult]] = {}
+    groups: dict[_Key, dict[str, SceneResult]] = {}
     for name, scene in results.scenes.items():
-        found.setdefault(key(scene), {})[name] = scene
-    return found
+        groups.setdefault(key(scene), {})[name] = scene
+    return groups

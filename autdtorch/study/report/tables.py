@@ -69,8 +69,8 @@ def focus_rows(results: StudyResult) -> list[list[str]]:
     rows = [["scene", "method", *(f"point {number} [Pa]" for number in range(1, most + 1))]]
     decimals = column_decimals(results, lambda method: method.solution.pressure)
     for name, scene in results.scenes.items():
-        for method, found in scene.methods.items():
-            pressures = found.solution.pressure[found.shown_trial].tolist()
+        for method, result in scene.methods.items():
+            pressures = result.solution.pressure[result.shown_trial].tolist()
             cells = [f"{pressure:.{decimals}f}" for pressure in pressures]
             rows.append([name, label_of(method), *cells, *["-"] * (most - len(cells))])
     return rows
@@ -85,10 +85,10 @@ def gap_rows(results: StudyResult) -> list[list[str]]:
         bound = scene.in_unit(f"{scene.bound:{form}}") if math.isfinite(scene.bound) else "no bound"
         rows.append([scene_name, "*bound*", bound, "-", "-", "-", "-"])
         for name, method in scene.methods.items():
-            found = bound_gap(method, scene.bound)
-            scores = [scene.in_unit(f"{found.score:{form}}"), _gap(found.gap, scene, form)]
+            gap = bound_gap(method, scene.bound)
+            scores = [scene.in_unit(f"{gap.score:{form}}"), _gap(gap.gap, scene, form)]
             evaluations = f"{method.solution.evaluations.double().mean():.0f}"
-            near = _median_of_reached(found.evaluations) if has_shares(scene.bound) else "-"
+            near = _median_of_reached(gap.evaluations) if has_shares(scene.bound) else "-"
             counts = ["-", "-"] if is_baseline(name) else [evaluations, near]
             seconds = in_digits(float(method.seconds.median()), 2)
             rows.append([scene_name, label_of(name), *scores, *counts, seconds])
@@ -161,15 +161,15 @@ def save_summary(sweep: Sweep, path: Path) -> None:
 
 
 def _numbers(method: MethodResult, scene: SceneResult) -> dict[str, object]:
-    found, metrics = bound_gap(method, scene.bound), method.metrics
+    gap, metrics = bound_gap(method, scene.bound), method.metrics
     return {
         "goal": scene.goal["name"],
         "unit": scene.unit,
         "trials": method.trials,
-        "median score": found.score.value,
+        "median score": gap.score.value,
         "best score": float(method.solution.score.max()),
         "bound": scene.bound if math.isfinite(scene.bound) else None,
-        "gap to the bound": found.gap.value if has_shares(scene.bound) else None,
+        "gap to the bound": gap.gap.value if has_shares(scene.bound) else None,
         "mean of the foci [Pa]": float(metrics.mean.mean()),
         "std among the foci [Pa]": float(metrics.std.mean()),
         "area a focus [m^2]": None if metrics.area is None else float(metrics.area.mean()),
