@@ -14,6 +14,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
+from PIL import Image
 from small_scenes import AIR, CUBE, small_scene
 
 import autdtorch.study.report.study_report
@@ -44,10 +46,18 @@ def scene(plane=PLANE, obstacles=()):
     return Scene(plain.array, AIR, 40e3, plain.control_points, obstacles, plane, plain.domain)
 
 
+@pytest.fixture
+def pictures():
+    """Have a test draw the figures."""
+
+
 @pytest.fixture(autouse=True)
-def without_renderer(monkeypatch):
-    """Skip 3D pictures, which take seconds and have tests of their own."""
+def quick(request, monkeypatch):
+    """Skip 3D pictures, which have tests elsewhere, and in most tests leave the figures blank."""
     monkeypatch.setattr(autdtorch.study.report.study_report, "rendering_problem", lambda: "no driver")
+    if "pictures" not in request.fixturenames:
+        blank = Image.new("RGB", (2, 1))
+        monkeypatch.setattr(Figure, "savefig", lambda _, path: blank.save(path))
 
 
 def studied(scenes, **settings):
@@ -80,7 +90,7 @@ def of_seven_trials():
 BOTH = {"homogeneous": scene(), "three_cubes": scene(obstacles=(CUBE,))}
 
 
-def test_all_figures_and_tables_are_there_and_no_number_is_missing(tmp_path):
+def test_all_figures_and_tables_are_there_and_no_number_is_missing(tmp_path, pictures):
     results, report = reported(BOTH, tmp_path / "new", trials=3, config="trials: 3\n")
     shown = figures(report)
     scenes = ["fig1_homogeneous.png", "fig1_three_cubes.png"]
@@ -175,7 +185,7 @@ def test_every_method_has_a_gap_to_the_bound():
     assert lssg_row[5] == "-"
 
 
-def test_a_report_of_target_pressures_has_differences_to_the_bound_and_no_verdict(tmp_path):
+def test_a_report_of_target_pressures_has_differences_to_the_bound_and_no_verdict(tmp_path, pictures):
     results, report = reported(BOTH, tmp_path, trials=3, goal=TargetPressures([9, 6, 9]))
     _, _, lssg_row, *_ = gap_rows(results)
     result = results.scenes["homogeneous"]
@@ -261,7 +271,7 @@ def test_the_page_holds_the_same_and_needs_no_other_file(tmp_path):
 def test_methods_may_differ_between_scenes_and_claims_without_data_are_no_table(tmp_path):
     scenes = {"lab": scene(obstacles=(CUBE,)), "other": scene(None), "third": scene()}
     results = studied(scenes, trials=2)
-    lab, other, _ = (found.methods for found in results.scenes.values())
+    lab, other, _ = (result.methods for result in results.scenes.values())
     lab["my_method,levels=4"] = lab.pop("gabs")
     lab["gradient_ascent"] = lab.pop("lssg")
     for name in ("lssg", "gabs"):
@@ -287,7 +297,7 @@ def test_matrices_that_were_kept_are_no_runs_and_not_exact(tmp_path):
 def scored(results, scores, bound=10.0):
     """Give each method in each scene the score of its name, in every trial."""
     scenes = {}
-    for name, found in results.scenes.items():
+    for name, result in results.scenes.items():
         methods = {
             method: replace(
                 one,
@@ -295,10 +305,10 @@ def scored(results, scores, bound=10.0):
                     one.solution, score=torch.full_like(one.solution.score, scores[name][method])
                 ),
             )
-            for method, one in found.methods.items()
+            for method, one in result.methods.items()
             if method in scores[name]
         }
-        scenes[name] = replace(found, methods=methods, bound=bound)
+        scenes[name] = replace(result, methods=methods, bound=bound)
     return replace(results, scenes=scenes)
 
 
@@ -331,9 +341,9 @@ def test_findings_of_many_scenes_count_them():
     results = studied({"a": scene()})
     scenes = {f"scene_{number}": results.scenes["a"] for number in range(20)}
     scores = {name: {"gabs": 4.0} for name in scenes}
-    found = findings(scored(replace(results, scenes=scenes), scores), [])
-    assert "20 of 20 scenes" in found[0]
-    assert max(map(len, found)) < 200  # characters
+    sentences = findings(scored(replace(results, scenes=scenes), scores), [])
+    assert "20 of 20 scenes" in sentences[0]
+    assert max(map(len, sentences)) < 200  # characters
 
 
 @pytest.mark.parametrize(("bound", "text"), [(math.inf, "No upper bound"), (-1.0, "3 Pa below")])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import contextlib
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
 from pathlib import Path
 from unittest import mock
 
@@ -36,31 +35,31 @@ def threads(count: int) -> Iterator[None]:
         yield
 
 
+#: Pairs of settings, as each run takes seconds.
 STATES = {
-    "float16": lambda: setting("default_dtype", torch.float16),
-    "float64": lambda: setting("default_dtype", torch.float64),
-    "meta device": lambda: torch.device("meta"),
-    "inference mode": torch.inference_mode,
-    "no gradients": torch.no_grad,
-    "one thread": lambda: threads(1),
-    "three threads": lambda: threads(3),
-    "coarse products": lambda: setting("float32_matmul_precision", "medium"),
+    "float16, three threads": lambda: (setting("default_dtype", torch.float16), threads(3)),
+    "float64, one thread": lambda: (setting("default_dtype", torch.float64), threads(1)),
+    "meta device, no gradients": lambda: (torch.device("meta"), torch.no_grad()),
+    "inference mode, coarse products": lambda: (
+        torch.inference_mode(),
+        setting("float32_matmul_precision", "medium"),
+    ),
 }
 
 
 def numbers(folder: Path) -> dict[str, torch.Tensor]:
     """Return the numbers of a study, from the scene to files and metrics."""
-    found: dict[str, torch.Tensor] = {}
+    values: dict[str, torch.Tensor] = {}
     ball = at.Sphere((12e-3, 20e-3, 5e-3), 3e-3, density=0.2, sound_speed=900.0)
     scene = small_scene((CUBE, ball), radius=1e-3, absorption=2.0)
     propagators = {}
     for method in ("box", "full", "free_space"):
         propagators[method] = propagator = at.make_propagator(scene, method, 2e-3, 0.1, cache=False)
-        found[method] = propagator.transfer_matrix()
+        values[method] = propagator.transfer_matrix()
         drive = at.drive_from_phases(torch.arange(4, dtype=torch.float64, device="cpu"))
-        found[f"{method} field"] = propagator.field(drive, scene.control_points + 1e-4)
+        values[f"{method} field"] = propagator.field(drive, scene.control_points + 1e-4)
     _, error = propagators["box"].transfer_matrix(return_error=True)
-    found["error"] = torch.tensor(error, dtype=torch.float64, device="cpu")
+    values["error"] = torch.tensor(error, dtype=torch.float64, device="cpu")
     objective = at.SimulatedObjective(scene, propagators["box"])
     noisy = at.Noise(at.Quantised(at.Drift(at.FailedTransducers(objective, [1]), 0.1, 5), 16), 30.0)
     for name, solution in {
@@ -73,18 +72,18 @@ def numbers(folder: Path) -> dict[str, torch.Tensor]:
         "gradient": at.gradient_ascent(objective, starts=3, steps=20),
         "noisy": at.gabs(noisy, trials=2),
     }.items():
-        found |= {f"{name} {key}": getattr(solution, key) for key in ("drive", "pressure", "history")}
+        values |= {f"{name} {key}": getattr(solution, key) for key in ("drive", "pressure", "history")}
     metrics = at.focus_metrics(
-        found["gabs pressure"][0], found["gabs pressure"][:1].repeat(7, 1), cell_area=1e-6 / 3
+        values["gabs pressure"][0], values["gabs pressure"][:1].repeat(7, 1), cell_area=1e-6 / 3
     )
     assert metrics.area is not None
-    found |= {"mean": metrics.mean, "uniformity": metrics.uniformity, "area": metrics.area}
-    found["bound"] = torch.tensor(at.focus_bound(found["box"]), dtype=torch.float64, device="cpu")
-    at.save_drive(folder / "drive.csv", found["gabs drive"][0], scene.array)
-    found["saved"] = at.load_drive(folder / "drive.csv")
-    found["gradient of the drive"] = at.differentiable_field(scene, drive, spacing=2e-3)
-    found["volume"] = at.volume_field(propagators["free_space"], drive).nan_to_num()
-    return found
+    values |= {"mean": metrics.mean, "uniformity": metrics.uniformity, "area": metrics.area}
+    values["bound"] = torch.tensor(at.focus_bound(values["box"]), dtype=torch.float64, device="cpu")
+    at.save_drive(folder / "drive.csv", values["gabs drive"][0], scene.array)
+    values["saved"] = at.load_drive(folder / "drive.csv")
+    values["gradient of the drive"] = at.differentiable_field(scene, drive, spacing=2e-3)
+    values["volume"] = at.volume_field(propagators["free_space"], drive).nan_to_num()
+    return values
 
 
 @pytest.fixture(scope="module")
@@ -94,13 +93,14 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, torch.Tensor
 
 @pytest.mark.parametrize("state", STATES)
 def test_no_bit_changes(state: str, expected: dict[str, torch.Tensor], tmp_path: Path) -> None:
-    made: AbstractContextManager[object] = STATES[state]()
-    with made:
-        found = numbers(tmp_path)
+    with contextlib.ExitStack() as settings:
+        for one in STATES[state]():
+            settings.enter_context(one)
+        computed = numbers(tmp_path)
     for name, value in expected.items():
-        assert found[name].device.type == "cpu", name
-        assert found[name].dtype == value.dtype, name
-        assert torch.equal(found[name].detach(), value.detach()), name
+        assert computed[name].device.type == "cpu", name
+        assert computed[name].dtype == value.dtype, name
+        assert torch.equal(computed[name].detach(), value.detach()), name
 
 
 def test_what_inference_mode_has_made_serves_gradients_later() -> None:
@@ -120,16 +120,16 @@ MAKERS |= {"ones", "rand", "randn", "tensor", "zeros"}
 
 
 def test_every_tensor_is_made_with_its_dtype_and_device() -> None:
-    found = 0
+    count = 0
     for path in PACKAGE.rglob("*.py"):
         for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             match call:
                 case ast.Call(func=ast.Attribute(value=ast.Name("torch"), attr=name)) if name in MAKERS:
-                    given = {keyword.arg for keyword in call.keywords}
+                    keywords = {keyword.arg for keyword in call.keywords}
                     if {ast.unparse(each.value) for each in call.keywords if each.arg is None} & BOTH:
-                        given |= {"device", "dtype"}
+                        keywords |= {"device", "dtype"}
                     # integers have one dtype, and what is there keeps its own
                     required = {"device"} if name in ("arange", "as_tensor") else {"device", "dtype"}
-                    assert required <= given, f"{path}:{call.lineno}: {ast.unparse(call)}"
-                    found += 1
-    assert found > 100
+                    assert required <= keywords, f"{path}:{call.lineno}: {ast.unparse(call)}"
+                    count += 1
+    assert count > 100
