@@ -20,13 +20,13 @@ from autdtorch.methods.lssg import LSSG
 from autdtorch.methods.prior import Prior
 from autdtorch.objectives.goals import Goal, MeanPressure, TargetPressures
 from autdtorch.objectives.quiet import Contrast, QuietPoints
-from autdtorch.propagators import FreeSpacePropagator, Run, SteadyStateWarning, make_propagator
+from autdtorch.propagators import FreeSpacePropagator, Run, SteadyStateWarning
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Box
 from autdtorch.scene.scene import Scene
 from autdtorch.study.results_file import load_results
-from autdtorch.study.run import run_study
+from autdtorch.study.run import _for_poses, run_study
 from autdtorch.study.trial_file import TRIALS_FILE
 
 PLANE = Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 16e-3))
@@ -265,19 +265,9 @@ def test_poses_start_at_the_drives_of_the_scene_before(tmp_path):
         assert float(after.history[0, 0]) == pytest.approx(float(observed))
 
 
-def test_poses_are_simulated_by_operators_where_these_are_fewer_runs(tmp_path, monkeypatch):
-    chosen = []
-
-    def made(scene, method="auto", spacing=1e-3, **settings):
-        chosen.append(method)
-        return make_propagator(scene, method, spacing, **settings)
-
-    monkeypatch.setattr(autdtorch.study.run, "make_propagator", made)
+def test_poses_are_simulated_by_operators_where_these_are_fewer_runs():
     cube = Box((12e-3,) * 3, (3e-3,) * 3, rigid=True)
+    scenes = {f"{step}": scene(None, (cube,)).moved((0, 1e-5 * step, 0)) for step in range(60)}
     solver = {"spacing": 2e-3, "tolerance": 0.1}
-    for count, method in ((1, "auto"), (60, "operator")):
-        scenes = {f"{step}": scene(None, (cube,)).moved((0, 1e-5 * step, 0)) for step in range(count)}
-        chosen.clear()
-        folder = tmp_path / str(count)
-        run_study(scenes, {"lssg": LSSG(levels=2)}, folder, solver=solver, poses=True)
-        assert chosen[-count:] == [method] * count
+    assert _for_poses(scenes, solver) == solver | {"method": "operator"}
+    assert _for_poses({"0": scenes["0"]}, solver) == solver

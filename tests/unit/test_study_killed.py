@@ -7,7 +7,7 @@ from unittest.mock import Mock
 import pytest
 import slow_study
 import torch
-from checks.kills import SUBJECTS, finish, wait
+from checks.kills import SUBJECTS, wait
 from filelock import FileLock
 from small_scenes import small_scene
 
@@ -22,12 +22,16 @@ def test_killed_again_and_again_a_study_ends_with_the_same_numbers(tmp_path, mon
     folders = calm, killed = tmp_path / "calm", tmp_path / "killed"
     for folder in folders:
         folder.mkdir()
-    # The undisturbed study runs in this process, which has imported PyTorch, and need not be slow.
-    with monkeypatch.context() as patched:
-        patched.setattr("sys.argv", ["slow_study.py", str(calm / "out")])
-        patched.setattr("autdtorch.study.run.BLOCK", 1)  # the study sets it, too
-        patched.setattr("slow_study.time", Mock())
-        slow_study.main()
+
+    def finish(folder):
+        """Run the study in this process, which has imported PyTorch; it need not be slow."""
+        with monkeypatch.context() as patched:
+            patched.setattr("sys.argv", ["slow_study.py", str(folder / "out")])
+            patched.setattr("autdtorch.study.run.BLOCK", 1)  # the study sets it, too
+            patched.setattr("slow_study.time", Mock())
+            slow_study.main()
+
+    finish(calm)
     undisturbed = STUDY.numbers(calm)
     for trials in (2, 8):  # in the midst of either scene
         process = STUDY.start(killed)
@@ -35,10 +39,10 @@ def test_killed_again_and_again_a_study_ends_with_the_same_numbers(tmp_path, mon
         process.kill()
         assert process.wait() == -signal.SIGKILL
     assert STUDY.lines(killed) < 12
-    finish(STUDY.start(killed), killed)
-    found = STUDY.numbers(killed)
-    assert len(found) == len(undisturbed) > 0
-    assert all(map(torch.equal, found, undisturbed))
+    finish(killed)
+    resumed = STUDY.numbers(killed)
+    assert len(resumed) == len(undisturbed) > 0
+    assert all(map(torch.equal, resumed, undisturbed))
     # Nothing is done twice: a line a trial.
     assert STUDY.lines(killed) == STUDY.lines(calm) == 12
 
