@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 import os
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
-from xml.parsers import expat
+from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
 
 import numpy as np
 
@@ -70,8 +70,10 @@ def read_ultraino(path: str | os.PathLike[str]) -> UltrainoFile:
     """Read a simulation of Ultraino; `ValueError` names the file and what is wrong."""
     reader = _Reader()
     try:
-        reader.feed(_unpacked(Path(path)))
-    except (expat.ExpatError, zlib.error, EOFError) as error:
+        parser = XMLParser(target=_Tree())
+        parser.feed(_unpacked(Path(path)))
+        reader.value(parser.close())
+    except (ParseError, zlib.error, EOFError) as error:
         raise ValueError(f"{path}: {error}; must be a simulation saved by Ultraino, XML in gzip") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
@@ -139,43 +141,73 @@ def _unpacked(path: Path) -> bytes:
     return text
 
 
-class _Call:
-    """An element that is being read: a call on a `target`, whose arguments and result are collected."""
+class _Tree(TreeBuilder):
+    """A tree of limited depth and size, without a document type, which alone could define entities."""
 
-    def __init__(self, reader: _Reader, tag: str, attributes: dict[str, str], target: Any) -> None:
-        self._reader, self.tag, self.attributes, self._target = reader, tag, attributes, target
-        self.text, self.arguments = "", []  # type: str, list[Any]
-        self._result: Any = None
-        self._known = False
-        if "method" not in attributes and "property" not in attributes and tag in ("object", "void"):
-            self._keep(self._made())  # at once, as what follows in it may name it
+    depth = count = 0
 
-    def _made(self) -> Any:
-        if "idref" in self.attributes:
-            return self._reader.record(self.attributes["idref"])
-        return _Record(self.attributes.get("class", ""))
+    def start(self, tag: Any, attrs: Any) -> Any:
+        self.depth, self.count = self.depth + 1, self.count + 1
+        if self.depth > _DEEPEST:
+            raise ValueError(f"elements in more than {_DEEPEST} levels; Ultraino writes 13")
+        if self.count > _MOST:
+            raise ValueError(f"more than {_MOST} elements; Ultraino writes far fewer")
+        return super().start(tag, attrs)
 
-    def _keep(self, result: Any) -> None:
-        self._result, self._known = result, True
-        if "id" in self.attributes:
-            self._reader.records[self.attributes["id"]] = result
-        if "class" in self.attributes and isinstance(result, _Record) and result.kind.endswith(".Simulation"):
-            self._reader.simulations.append(result)
+    def end(self, tag: Any) -> Any:
+        self.depth -= 1
+        return super().end(tag)
 
-    @property
-    def result(self) -> Any:
-        """The value of the call, made with the arguments that have been read."""
-        if not self._known:
-            self._keep(self._called())
-        return self._result
+    def doctype(self, *_: object) -> None:
+        raise ValueError("it has a document type; must be a simulation saved by Ultraino")
 
-    def _called(self) -> Any:
-        target, arguments = self._target, self.arguments
-        if self.tag in _NUMBERS:
-            return float(self.text)
-        if self.tag in ("string", "boolean", "char", "class"):
-            return self.text
-        method, name = self.attributes.get("method"), self.attributes.get("property")
+
+class _Reader:
+    """Follows the calls of a file."""
+
+    def __init__(self) -> None:
+        self.simulations: list[_Record] = []
+        self._named: dict[str, Callable[[], Any]] = {}
+
+    def value(self, element: Element, target: Any = None) -> Any:
+        """Return the value of an element: a call on a target, whose arguments are the elements in it.
+
+        The call is made with the arguments read so far where an element within calls on its value.
+        """
+        arguments: list[Any] = []
+        results: list[Any] = []
+
+        def result() -> Any:
+            if not results:
+                results.append(None)  # of an element that names itself
+                results[0] = self._called(element, target, arguments)
+            return results[0]
+
+        if "id" in element.attrib:
+            self._named[element.attrib["id"]] = result
+        if _is_object(element):
+            result()
+        for child in element:
+            calls_on = child.tag == "void" and not child.attrib.keys() & {"class", "idref"}
+            value = self.value(child, result() if calls_on else None)
+            if child.tag != "void":
+                arguments.append(value)
+        return result()
+
+    def _called(self, element: Element, target: Any, arguments: list[Any]) -> Any:
+        attributes = element.attrib
+        if _is_object(element):
+            if "idref" in attributes:
+                return self._named.get(attributes["idref"], lambda: None)()
+            record = _Record(attributes.get("class", ""))
+            if record.kind.endswith(".Simulation"):
+                self.simulations.append(record)
+            return record
+        if element.tag in _NUMBERS:
+            return float(element.text or "")
+        if element.tag in ("string", "boolean", "char", "class"):
+            return element.text or ""
+        method, name = attributes.get("method"), attributes.get("property")
         if method == "getField" and arguments and isinstance(arguments[0], str):
             return _Field(arguments[0])
         if isinstance(target, _Field) and arguments and isinstance(arguments[0], _Record):
@@ -191,49 +223,5 @@ class _Call:
         return _Record()
 
 
-class _Reader:
-    """Follows the calls of a file."""
-
-    def __init__(self) -> None:
-        self.records: dict[str, Any] = {}
-        self.simulations: list[_Record] = []
-        self._open: list[_Call] = []
-        self._count = 0
-
-    def record(self, name: str) -> Any:
-        """Return the value of a name, made now if its element is still being read."""
-        waiting = next((call for call in self._open if call.attributes.get("id") == name), None)
-        return self.records.get(name) if waiting is None else waiting.result
-
-    def feed(self, text: bytes) -> None:
-        """Read a text without a document type, which alone could define entities."""
-        parser = expat.ParserCreate()
-        parser.buffer_text = True
-        parser.StartDoctypeDeclHandler = self._refuse
-        parser.StartElementHandler = self._begin
-        parser.EndElementHandler = self._end
-        parser.CharacterDataHandler = self._add
-        parser.Parse(text, True)
-
-    def _refuse(self, *_: object) -> None:
-        raise ValueError("it has a document type; must be a simulation saved by Ultraino")
-
-    def _begin(self, tag: str, attributes: dict[str, str]) -> None:
-        if len(self._open) >= _DEEPEST:
-            raise ValueError(f"elements in more than {_DEEPEST} levels; Ultraino writes 13")
-        self._count += 1
-        if self._count > _MOST:
-            raise ValueError(f"more than {_MOST} elements; Ultraino writes far fewer")
-        calls_on = self._open and tag == "void" and not attributes.keys() & {"class", "idref"}
-        target = self._open[-1].result if calls_on else None
-        self._open.append(_Call(self, tag, attributes, target))
-
-    def _end(self, tag: str) -> None:
-        call = self._open.pop()
-        result = call.result
-        if tag != "void" and self._open:
-            self._open[-1].arguments.append(result)
-
-    def _add(self, text: str) -> None:
-        if self._open:
-            self._open[-1].text += text
+def _is_object(element: Element) -> bool:
+    return element.tag in ("object", "void") and not element.attrib.keys() & {"method", "property"}
