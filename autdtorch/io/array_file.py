@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from autdtorch.utils.validation import ArrayLike, path_of, within
 PLACE_COLUMNS = {"x": "m", "y": "m", "z": "m"}
 NORMAL_COLUMNS = {"nx": "", "ny": "", "nz": ""}
 SIZE_COLUMNS = {"source_strength": "Pa m", "radius": "m"}
+_PARTS = ("positions", "normals", "source_strength", "radius")
 _IGNORED = {"frame": "", "transducer": "", "phase": "rad", "amplitude": ""}
 _PITCHES = {"m": (3e-3, 0.1), "mm": (3.0, 100.0)}  # of arrays for airborne ultrasound, in each unit
 _UNIT_ROUNDING = 1e-3  # by which the length of a normal may differ from 1, in a file of few digits
@@ -75,11 +76,7 @@ def load_array(
 
 def _from_pat(path: str | os.PathLike[str]) -> dict[str, Any]:
     board = OpenMPDBoard.load(path).array()
-    return {name: getattr(board, name) for name in ("positions", "normals", "source_strength", "radius")}
-
-
-def _from_ultraino(path: str | os.PathLike[str]) -> dict[str, Any]:
-    return read_ultraino(path).parts
+    return {name: getattr(board, name) for name in _PARTS}
 
 
 def _from_csv(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -139,14 +136,13 @@ def _from_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
     for name in ("positions", "normals"):
         if name not in arrays:
             raise ValueError(f"{path}: no array {name!r}; must have positions and normals")
-    names = ("positions", "normals", "source_strength", "radius")
-    return {name: arrays[name] for name in names if name in arrays}
+    return {name: arrays[name] for name in _PARTS if name in arrays}
 
 
-_READERS = {
+_READERS: dict[str, Callable[[str | os.PathLike[str]], dict[str, Any]]] = {
     ".csv": _from_csv,
     ".npz": _from_npz,
     ".pat": _from_pat,
-    SUFFIX: _from_ultraino,
-    ".xml": _from_ultraino,
+    SUFFIX: lambda path: read_ultraino(path).parts,
+    ".xml": lambda path: read_ultraino(path).parts,
 }

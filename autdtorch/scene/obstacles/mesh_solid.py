@@ -48,11 +48,6 @@ class _Part(NamedTuple):
     volume: float  # negative if it is inside out
     area: float
 
-    @property
-    def bounds(self) -> Array:
-        """Lower and upper corner of the bounding box (2, 3)."""
-        return _bounds(self.vertices)
-
 
 def solid_of(corners: Array, triangles: Index) -> Triangles:
     """Return the distinct vertices and the outward faces of the solid that triangles enclose.
@@ -61,10 +56,12 @@ def solid_of(corners: Array, triangles: Index) -> Triangles:
         ValueError: the triangles are not closed, or a part crosses itself, is inside out or encloses nothing.
             The message names the place, in the coordinates of `corners`.
     """
+    import igl
+
     _require_triangles(corners, triangles)
     vertices, faces = joined(corners, triangles)
     if not len(faces):
-        raise ValueError(f"{_box(_bounds(vertices))} has no volume; must enclose a volume")
+        raise ValueError(f"{_box(vertices)} has no volume; must enclose a volume")
     label = _labels(vertices, faces)
     if _part(vertices, faces).volume < 0:
         faces = faces[:, ::-1]
@@ -74,9 +71,10 @@ def solid_of(corners: Array, triangles: Index) -> Triangles:
         _require_simple(part)
     solids = [part for part in parts if abs(part.volume) > _EMPTY * part.area * _extent(part.vertices)]
     if not solids:
-        raise ValueError(f"{_box(whole.bounds)} has no volume; must enclose a volume")
+        raise ValueError(f"{_box(whole.vertices)} has no volume; must enclose a volume")
     _require_unfolded(vertices, faces)
-    if any(map(_touches_itself, parts)):  # manifold3d may join other sheets at an edge than the parts do
+    if not all(igl.is_edge_manifold(part.faces)[0] for part in parts):
+        # manifold3d may join other sheets at an edge than the parts do
         _require_simple(whole)
         _require_air_beside(whole)
         return whole.vertices, whole.faces
@@ -155,7 +153,7 @@ def winding_number(vertices: Array, faces: Index, points: Array) -> Array:
     """Return how often a closed surface winds around points (N,), to 1 % (Barill et al. 2018)."""
     import igl
 
-    lower, upper = _bounds(vertices)
+    lower, upper = vertices.min(axis=0), vertices.max(axis=0)
     within = ((points >= lower) & (points <= upper)).all(axis=1)
     winding = np.zeros(len(points))
     if within.any():
@@ -274,7 +272,9 @@ def _require_few_crossings(whole: _Part) -> None:
         crossings += sum(hit[1] < 1 for ray in rays for hit in ray)
         if crossings > most:
             number = f"more than {_MOST_CROSSINGS:.0e} edges through triangles"
-            raise ValueError(f"{_box(whole.bounds)} has {number}; must be parts that overlap in fewer places")
+            raise ValueError(
+                f"{_box(whole.vertices)} has {number}; must be parts that overlap in fewer places"
+            )
 
 
 def _edges(part: _Part) -> tuple[Any, Array, Array]:
@@ -305,13 +305,6 @@ def _refuse_crossing(places: Array) -> None:
         raise ValueError(
             f"the surface crosses itself at {place_of(places[0])}; parts may overlap, but each must be simple"
         )
-
-
-def _touches_itself(part: _Part) -> bool:
-    """Return whether more than two triangles meet at an edge."""
-    import igl
-
-    return not igl.is_edge_manifold(part.faces)[0]
 
 
 def _has_sliver(part: _Part) -> bool:
@@ -362,7 +355,7 @@ def _owners(bodies: Sequence[_Part], cavities: Sequence[_Part]) -> Index:
         winding = winding_number(body.vertices, body.faces, points)
         owner[np.bincount(of_cavity, winding) > 0.25 * np.bincount(of_cavity)] = number
     if len(alone := np.flatnonzero(owner < 0)):
-        where = _box(cavities[alone[0]].bounds)
+        where = _box(cavities[alone[0]].vertices)
         raise ValueError(f"{where} is a part that is inside out, but in no other; must face outwards")
     return owner
 
@@ -374,7 +367,7 @@ def _manifold(part: _Part) -> Any:
     faces = part.faces if part.volume > 0 else part.faces[:, ::-1]
     body = Manifold(Mesh64(part.vertices, np.ascontiguousarray(faces, np.uint64)))
     if body.status() != Error.NoError or abs(body.volume() - abs(part.volume)) > _INTACT * abs(part.volume):
-        raise ValueError(f"{_box(part.bounds)} has a part that is too thin; must enclose a volume")
+        raise ValueError(f"{_box(part.vertices)} has a part that is too thin; must enclose a volume")
     return body
 
 
@@ -387,10 +380,6 @@ def _agree(union: _Part, parts: Sequence[_Part]) -> bool:
     )
 
 
-def _bounds(vertices: Array) -> Array:
-    return np.stack([vertices.min(axis=0), vertices.max(axis=0)])
-
-
 def _extent(vertices: Array) -> float:
     return float(np.ptp(vertices, axis=0).max())
 
@@ -400,5 +389,6 @@ def place_of(point: Array) -> str:
     return f"({', '.join(f'{entry:.6g}' for entry in point)})"
 
 
-def _box(bounds: Array) -> str:
-    return f"the space from {' to '.join(map(place_of, bounds))}"
+def _box(points: Array) -> str:
+    """Return the bounding box of points (N, 3) as messages show it."""
+    return f"the space from {place_of(points.min(axis=0))} to {place_of(points.max(axis=0))}"
