@@ -331,31 +331,21 @@ BOMB = (
 )
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        pytest.param(gzip.compress(BOMB.encode()), "document type", id="doctype and entities"),
-        pytest.param(
-            gzip.compress(b'<!DOCTYPE java SYSTEM "file:///etc/passwd"><java/>'),
-            "document type",
-            id="doctype of a file",
-        ),
-        pytest.param(
-            gzip.compress(b"<java>" + b" " * 2**26 + b"</java>"), "more than 67108864 bytes", id="long text"
-        ),
-        pytest.param(gzip.compress(b"<void>" * 300 + b"</void>" * 300), "more than 200 levels", id="deep"),
-        pytest.param(
-            gzip.compress(HEAD.encode() + b"</java>" + bytes(1000))[:40], "breaks off", id="cut short"
-        ),
-        pytest.param(gzip.compress(b"<html><body>Not found</body></html>"), "no transducers", id="HTML"),
-        pytest.param(
-            b"version https://git-lfs.github.com/spec/v1\n",
-            "must be a simulation saved by Ultraino",
-            id="pointer",
-        ),
-        pytest.param(b"", "must be a simulation saved by Ultraino", id="empty"),
-    ],
-)
+ATTACKS = {
+    "doctype and entities": (gzip.compress(BOMB.encode()), "document type"),
+    "doctype of a file": (
+        gzip.compress(b'<!DOCTYPE java SYSTEM "file:///etc/passwd"><java/>'), "document type",
+    ),
+    "long text": (gzip.compress(b"<java>" + b" " * 2**26 + b"</java>"), "more than 67108864 bytes"),
+    "deep": (gzip.compress(b"<void>" * 300 + b"</void>" * 300), "more than 200 levels"),
+    "cut short": (gzip.compress(HEAD.encode() + b"</java>" + bytes(1000))[:40], "breaks off"),
+    "HTML": (gzip.compress(b"<html><body>Not found</body></html>"), "no transducers"),
+    "pointer": (b"version https://git-lfs.github.com/spec/v1\n", "must be a simulation saved by Ultraino"),
+    "empty": (b"", "must be a simulation saved by Ultraino"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("content", "message"), ATTACKS.values(), ids=ATTACKS)
 def test_files_that_are_none_or_attack_are_refused(tmp_path, content, message):
     path = tmp_path / "board.xml.gz"
     path.write_bytes(content)
