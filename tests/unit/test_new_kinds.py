@@ -121,5 +121,5 @@ def test_the_shape_scatters_as_its_mesh_does(scene):
         for bodies in ([cone], [mesh], [])
     )
     assert (cones - nothing).abs().max() > 0.2 * nothing.abs().max()
-    # 5.7 cells to a wavelength: surfaces are told apart by 1 %
+    # 5.7 cells to a wavelength, where the surfaces of a shape and of its mesh differ by 1 %
     assert (cones - meshes).abs().max() < 0.03 * cones.abs().max()

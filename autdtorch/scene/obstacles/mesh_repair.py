@@ -15,7 +15,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
-from autdtorch.scene.obstacles.mesh_polygons import Polygons, triangulated
+from autdtorch.scene.obstacles.mesh_file import Polygons, triangulated
 from autdtorch.scene.obstacles.mesh_solid import (
     Triangles,
     joined,

@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from autdtorch.scene.obstacles.mesh_polygons import FARTHEST
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.spatial import areas_of, doubled_normals, paired_sides, sides_of
 
 Triangles: TypeAlias = tuple[Array, Index]
 """Vertices (V, 3) and the indices of each triangle's vertices (F, 3)."""
+
+FARTHEST = 1e50
+"""Largest coordinate of a vertex, in units of the file; volumes do not overflow."""
 
 _EMPTY = 1e-12  # volumes below this share of area times extent are rounding errors
 _SLIVER = 1e-9  # height, relative to the extent of the mesh, below which a triangle has no certain normal
