@@ -41,12 +41,10 @@ def warn_of_implausible(scene: Scene) -> None:
     for name, hint in _too_large(scene):
         warn_user(f"Scene.{name}{hint}")
     _warn_of_foci_behind(scene)
-    known = scene.medium.absorption_frequency
-    if known is not None and abs(known / scene.frequency - 1) > _SAME_FREQUENCY:
-        fix = f"take Medium.air(..., frequency={scene.frequency:g})"
-        warn_user(
-            f"Scene.medium: its absorption is for {known:g} Hz, the scene has {scene.frequency:g} Hz; {fix}"
-        )
+    expected, frequency = scene.medium.absorption_frequency, scene.frequency
+    if expected is not None and abs(expected / frequency - 1) > _SAME_FREQUENCY:
+        fix = f"take Medium.air(..., frequency={frequency:g})"
+        warn_user(f"Scene.medium: absorption is for {expected:g} Hz, the scene has {frequency:g} Hz; {fix}")
 
 
 def unit_hint(scene: Scene, obstacle: Obstacle) -> str:
@@ -64,9 +62,9 @@ def extent_of(obstacle: Obstacle) -> str:
 
 
 def _too_large(scene: Scene) -> Iterator[tuple[str, str]]:
-    """Yield names and descriptions of the parts that are far larger than what they should fit.
+    """Yield names and descriptions of parts far larger than array and control points.
 
-    These are array and control points; for the domain, all that is in it.
+    The domain is compared with everything in it.
     """
     points = _observed(scene)
     everything = [points]
@@ -74,8 +72,8 @@ def _too_large(scene: Scene) -> Iterator[tuple[str, str]]:
         corners = points.new_tensor([obstacle.lower, obstacle.upper])
         everything.append(corners)
         if _is_too_large(scene, points, _without_slabs(corners, points)):
-            told = f"{type(obstacle).__name__} of {extent_of(obstacle)}; {obstacle.unit_question}"
-            yield f"obstacles[{index}]", f": {told}"
+            kind = type(obstacle).__name__
+            yield f"obstacles[{index}]", f": {kind} of {extent_of(obstacle)}; {obstacle.unit_question}"
     ask = "is it in m, 100 mm as 100e-3?"
     if (plane := scene.observation_plane) is not None:
         everything.append(plane.corners)
@@ -86,7 +84,7 @@ def _too_large(scene: Scene) -> Iterator[tuple[str, str]]:
 
 
 def _is_too_large(scene: Scene, points: torch.Tensor, part: torch.Tensor) -> bool:
-    """Return whether a part (N, 3) reaches so far beyond points (N, 3) [m] that it can hardly be meant."""
+    """Return whether a part (N, 3) reaches implausibly far beyond points (N, 3) [m]."""
     return _diagonal(torch.cat([points, part])) > max(_usual_reach(scene, points), _FAR)
 
 
@@ -95,9 +93,9 @@ def _usual_reach(scene: Scene, points: torch.Tensor) -> float:
 
 
 def _without_slabs(corners: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-    """Return corners (2, 3) cut to the points (N, 3) on each axis where they pass these at both ends.
+    """Return corners (2, 3) cut to the points (N, 3) on each axis along which they exceed them at both ends.
 
-    So a wall across the scene may be as wide as one likes, since it is meant to have no end.
+    A wall across the scene may have any width.
     """
     lower, upper = points.amin(dim=0), points.amax(dim=0)
     passes = (corners[0] < lower) & (corners[1] > upper)
@@ -114,9 +112,9 @@ def _diagonal(points: torch.Tensor) -> float:
 
 
 def _warn_of_foci_behind(scene: Scene) -> None:
-    """Warn where all lies behind every transducer; some points may, and an obstacle ahead may reflect.
+    """Warn if all control points and obstacles lie behind every transducer; a few point sources face nowhere.
 
-    A few point sources are no array that faces somewhere.
+    Some of them may lie behind, since an obstacle ahead may reflect.
     """
     array, points = scene.array, scene.control_points
     if len(array) < _FEWEST and not radii_of(array).any():

@@ -125,7 +125,7 @@ def _cleaned(faces: Index) -> Index:
 
 
 def _near(vertices: Array, some: Index, distance: float) -> Index:
-    """Return for each vertex the one that stands for it: of `some` up to a distance apart, the first."""
+    """Return the representative of each vertex: the first of `some` that are up to a distance apart."""
     from scipy.spatial import KDTree
 
     pairs = KDTree(vertices[some]).query_pairs(distance, output_type="ndarray")
