@@ -10,7 +10,7 @@ g = 1 / (1 + sigma / (alpha - i w)). In time this takes two memory variables (CP
 
 E_a u is the term that the layer adds to d2 u. In the 27-point sum, T_a + E_a replaces every sum T_a of the
 two neighbours along axis a, in products too. This is the exact complex stretching of the *discrete* equation,
-edges and corners of the grid included (`docs/decisions/boundary-layer.md`).
+edges and corners of the grid included (`docs/numerics.md`).
 
 A layer repeats the cells that it touches, so the stencil row of a cell is constant along the layer's normal.
 The kernels stretch rows as in air, scaled to the sum of the cell's weights: exact inside an obstacle. At an

@@ -1,7 +1,7 @@
 """Walls thinner than a cell and oblique to the grid: rigid sheets are thickened, and a warning is logged.
 
 Elements measure bodies on a lattice of points a quarter of a cell apart, so that they would miss a rigid
-sheet between these (`docs/decisions/surfaces.md` has figures). Errors at such walls are larger than
+sheet between these (`docs/numerics.md` has figures). Errors at such walls are larger than
 estimated.
 """
 

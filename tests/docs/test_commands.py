@@ -2,7 +2,7 @@
 
 The commands of a page run in their order in one folder, a copy of what a clone holds, and so do its blocks of
 Python. Bash reads the commands; `autdtorch` and Python then run in this process, which has imported PyTorch.
-Cells of notebooks are executed by the build of the documentation (test_docs.py).
+Cells of notebooks run in test_pages.py.
 """
 
 import contextlib
@@ -76,14 +76,12 @@ def mentioned(page):
             yield Command(page, text)
 
 
-LISTED = {page: found for page in PAGES if (found := list(listed(page)))}
-IN_BLOCKS = {command.text for found in LISTED.values() for command in found}
+LISTED = {page: list(listed(page)) for page in PAGES}
+IN_BLOCKS = {command.text for commands in LISTED.values() for command in commands}
 MENTIONED = sorted(
     {command for page in PAGES for command in mentioned(page) if command.text not in IN_BLOCKS}
 )
-PYTHON = {
-    page: "".join(f"{block}\n" for block in found) for page in PAGES if (found := blocks(page, "python"))
-}
+PYTHON = {page: "\n".join(blocks(page, "python")) for page in PAGES}
 
 
 # --- a folder like a clone
@@ -131,8 +129,8 @@ def environment(folder):
 
 
 def run(command, folder):
-    given = environment(folder)
-    return subprocess.run(command, cwd=folder, env=given, capture_output=True, text=True, input="\n")
+    settings = {"cwd": folder, "env": environment(folder), "capture_output": True, "text": True}
+    return subprocess.run(command, **settings, input="\n")
 
 
 # --- rules
@@ -189,10 +187,10 @@ def here(folder):
             del sys.modules[name]
 
 
-def ending(function, *given, **named):
+def ending(function, *arguments, **keywords):
     """Return the status with which a program ends."""
     try:
-        function(*given, **named)
+        function(*arguments, **keywords)
     except SystemExit as end:
         return end.code or 0
     return 0
@@ -289,12 +287,14 @@ def lives(command, folder):
     if problem := rendering_problem():
         pytest.skip(problem)
     words = [*shlex.split(command.text), "explore.browser=false"]
-    with subprocess.Popen(
-        words, cwd=folder, env=environment(folder), stdout=subprocess.PIPE, text=True
-    ) as live:
-        assert live.stdout.readline().startswith("The live view is at http://127.0.0.1:")
-        live.terminate()
-        assert live.wait(timeout=60) == 0
+    pipe = {"stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(words, cwd=folder, env=environment(folder), **pipe) as live:
+        try:
+            assert live.stdout.readline().startswith("The live view is at http://127.0.0.1:")
+            live.terminate()
+            assert live.wait(timeout=120) == 0
+        finally:
+            live.kill()  # no effect once it has ended
 
 
 def left_out(reason):
@@ -316,11 +316,12 @@ RULES = [
     (r"sudo cp ", substituted),
     (r"sudo udevadm ", left_out("needs root, and a device")),
     (r"jupyter lab ", left_out("waits for a browser")),
-    (r"jupytext ", covered_by("tests/docs/test_notebooks.py", "test_jupytext_executes_a_page")),
+    (r"jupytext ", covered_by("tests/docs/test_pages.py", "test_jupytext_executes_a_page")),
     (r"autdtorch explore\b", lives),
     (r"ssh ", left_out("needs another machine")),
     (r"autdtorch .*hydra/launcher=mine", launches),
-    (r"python scripts/hardware_trial.py \$bench", runs("hardware.emulated=true")),
+    (r"python scripts/hardware_trial.py \$bench method=identify", runs("hardware.emulated=true")),
+    (r"python scripts/hardware_trial.py \$bench", runs("hardware.emulated=true method=gabs method.levels=4")),
     (r"autdtorch hardware=emulated|python scripts/hardware_trial.py ", runs()),
     (r"autdtorch .*poses=", runs("solver.spacing=2e-3 poses.count=3")),
     (r"autdtorch --help", starts),
@@ -337,30 +338,7 @@ def follow(command, folder):
     pytest.fail(f"{command.page}: no rule says how to test {command.text!r}")
 
 
-# --- tests
-
-
-@pytest.mark.parametrize("page", LISTED)
-def test_commands_of_a_page_run(page, tmp_path):
-    furnish(tmp_path)
-    for command in LISTED[page]:
-        assert "..." not in command.text, "is no command"
-        follow(command, tmp_path)
-
-
-@pytest.mark.parametrize("command", MENTIONED, ids=lambda command: f"{command.page}: {command.text}")
-def test_commands_in_the_text_are_accepted(command, tmp_path):
-    furnish(tmp_path)
-    follow(command, tmp_path)
-
-
-def test_every_rule_is_needed():
-    texts = [*IN_BLOCKS, *(command.text for command in MENTIONED)]
-    for pattern, _ in RULES:
-        assert any(re.match(pattern, text) for text in texts), pattern
-
-
-# These pages open devices and an oscilloscope: emulated ones take their places.
+# The page opens devices and an oscilloscope: emulated ones take their places.
 EMULATED = """
 from pathlib import Path
 
@@ -372,11 +350,11 @@ from autdtorch import hardware
 benches, open_link, open_scope = [], hardware.open_link, hardware.open_scope
 
 
-def emulated_link(device, transducers=None, **given):
+def emulated_link(device, transducers=None, **options):
     count = device.transducers if transducers is None else len(transducers)
     matrix = torch.polar(1 + torch.rand(4, count), 6 * torch.rand(4, count)).to(torch.complex128)
     benches.append(hardware.EmulatedBench(device, matrix, transducers))
-    return open_link(device, transducers, backend=benches[-1].bus, **given)
+    return open_link(device, transducers, backend=benches[-1].bus, **options)
 
 
 def emulated_scope(chip, dialect=hardware.KEYSIGHT, backend=None):
@@ -401,11 +379,10 @@ for name in ("left", "right"):
     places, pins = "(0, 0, 0) " * 256, " ".join(map(str, range(256)))
     Path(f"{name}.pat").write_text("\\n".join([name, "256", "128", places, pins, zeros, gains]))
 """
-STAND_INS = {"docs/hardware.md": EMULATED, "docs/devices.md": EMULATED}
 
 
-@pytest.mark.parametrize("page", PYTHON)
-def test_python_of_a_page_runs(page, tmp_path):
+def program(page, folder):
+    """Run the Python of a page, in this process unless it has loops and threads that end with the process."""
     code = PYTHON[page]
     if "view3d" in code or "explore" in code:
         from autdtorch.plot.view3d import rendering_problem
@@ -414,19 +391,46 @@ def test_python_of_a_page_runs(page, tmp_path):
             pytest.skip(problem)
     if "playwright" in code and shutil.which("chromium") is None:
         pytest.skip("no Chromium")
-    furnish(tmp_path)
-    code = STAND_INS.get(page, "") + code
-    if "explore" in code or "playwright" in code:  # has loops and threads that end with the process
-        (tmp_path / "page.py").write_text(code, "utf-8")
-        done = run([sys.executable, "page.py"], tmp_path)
+    if "explore" in code:
+        (folder / "page.py").write_text(code, "utf-8")
+        done = run([sys.executable, "page.py"], folder)
         assert done.returncode == 0, done.stderr
         return
-    with here(tmp_path) as patch, matplotlib.rc_context({"backend": "Agg"}):
+    if page == "docs/hardware.md":
+        code = EMULATED + code
+    with here(folder) as patch, matplotlib.rc_context({"backend": "Agg"}):
         for name in ("open_link", "open_scope", "FileSensor"):  # to be undone
             patch.setattr(hardware, name, getattr(hardware, name))
         exec(compile(code, f"{page} as Python", "exec"), {"__name__": "__main__"})
 
 
-def test_the_gallery_shows_every_picture():
-    shown = set(re.findall(r"\]\((\w+\.png)\)", text_of("docs/gallery.md")))
-    assert shown == {path.name for path in ROOT.glob("docs/**/*.png")}
+# --- tests
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if LISTED[page] or PYTHON[page]])
+def test_a_page_runs(page, tmp_path):
+    furnish(tmp_path)
+    for command in LISTED[page]:
+        assert "..." not in command.text, "is no command"
+        follow(command, tmp_path)
+    if PYTHON[page]:
+        program(page, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def clone(tmp_path_factory):
+    """A folder for commands that write nothing."""
+    folder = tmp_path_factory.mktemp("clone")
+    furnish(folder)
+    return folder
+
+
+@pytest.mark.parametrize("command", MENTIONED, ids=lambda command: f"{command.page}: {command.text}")
+def test_commands_in_the_text_are_accepted(command, clone):
+    follow(command, clone)
+
+
+def test_every_rule_is_needed():
+    texts = [*IN_BLOCKS, *(command.text for command in MENTIONED)]
+    for pattern, _ in RULES:
+        assert any(re.match(pattern, text) for text in texts), pattern

@@ -14,7 +14,7 @@ field beyond the surface. A pressure that varies linearly along the surface then
 vertex, wherever the surface falls between the cells. The difference of the tuned stencil from finite elements
 is added in proportion to the volume.
 
-`docs/decisions/surfaces.md` compares this treatment with others.
+`docs/numerics.md` compares this treatment with others.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ class Blocks(NamedTuple):
 
 
 def blocks_of(shape: tables.Cells) -> Blocks:
-    """Return the blocks for a grid, by timings on an H100; `docs/decisions/cuda.md` has them."""
+    """Return the blocks for a grid, by timings on an H100; `docs/decisions/kernels.md` has them."""
     nx, ny, nz = shape
     if nx * ny * nz > _MOST_CACHED:
         return Blocks(32, 1, 256)
