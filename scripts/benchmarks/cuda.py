@@ -27,7 +27,6 @@ COPIED = 2**28
 """Numbers of the copy, 1 GiB."""
 SIDES = (112, 256)
 REPEATS = 2
-SETS, POINTS, TRANSDUCERS, ITERATIONS = 4096, 8, 256, 100
 PHONE = at.Box((40e-3, 50e-3, 50e-3), (8e-3, 70e-3, 140e-3), rotation=(0.1, 0.2, 0.3), rigid=True)
 
 
@@ -41,8 +40,6 @@ def main(page: Page, seconds: float) -> None:
         table(["grid", "time", "Gcell/s", "of the bandwidth"], printed(rates(copied, seconds))),
         "Transfer matrices, preparing on the CPU included, and the difference of the two:",
         table(["scene", "CPU", "GPU", "ratio", "difference"], printed(matrices())),
-        f"Holograms a second, {TRANSDUCERS} transducers, {POINTS} points, {ITERATIONS} iterations:",
-        table(["algorithm", "a second"], printed(holograms())),
     )
 
 
@@ -98,17 +95,3 @@ def matrices() -> Iterator[list[str]]:
         )
         difference = f"{relative_error(on_gpu.cpu(), on_cpu):.1e}"
         yield [name, f"{slow:.2f} s", f"{fast:.2f} s", f"{slow / fast:.1f}", difference]
-
-
-def holograms() -> Iterator[list[str]]:
-    """Measure the holograms a second of each algorithm."""
-    generator = torch.Generator().manual_seed(0)
-    sets = torch.randn(SETS, POINTS, TRANSDUCERS, dtype=torch.complex64, generator=generator).cuda()
-    for algorithm in ("naive", "gs", "wgs", "gs_pat"):
-
-        def solve(times: int, algorithm: str = algorithm) -> None:
-            for _ in range(times):
-                at.holography(sets, None, algorithm, ITERATIONS)
-            torch.cuda.synchronize()
-
-        yield [algorithm, f"{fastest(solve, SETS, 0.1):,.0f}"]

@@ -1,4 +1,4 @@
-"""Hardware trials on emulated devices: results, and evaluations per second.
+"""Hardware trials on emulated devices: drives, with noise and without.
 
 Fills in a block of the documentation.
 
@@ -10,12 +10,10 @@ import tempfile
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from shared.document import Page, table
 from shared.scenes import paper_objectives
-from shared.timing import timed
 
 import autdtorch as at
 from autdtorch import hardware
@@ -31,16 +29,6 @@ METHODS = {
     "GABS": at.gabs,
     "GABS, 3 passes": partial(at.gabs, passes=3),
     "identify": at.identify,
-}
-TARGETS = at.TargetPressures([6.0, 4.0, 6.0, 4.0])
-FOCI = {"initial": 4, "model": "foci", "kernel": "phasor", "noise": "inferred"}
-FOR_TARGETS = {
-    "GABS": partial(at.gabs, goal=TARGETS),
-    "GABS, 3 passes": partial(at.gabs, passes=3, goal=TARGETS),
-    "GABS, 5 passes": partial(at.gabs, passes=5, goal=TARGETS),
-    "BO": partial(at.bayes_opt, evaluations=150, goal=TARGETS),
-    "BO, circle": partial(at.bayes_opt, evaluations=150, kernel="circle", goal=TARGETS),
-    "BO, foci": partial(at.bayes_opt, evaluations=80, **FOCI, goal=TARGETS),
 }
 SNR = 30.0  # dB
 
@@ -73,23 +61,7 @@ def main(page: Page, seeds: int) -> None:
         "sample of an oscilloscope: true weakest focus against the simulated trial of the same seed, on\n"
         f"{DEVICES[0].name}.",
         table(["noise in", "method", "mean (95 % interval) [%]", "range [%]", "within 5 %"], noisy),
-        f"Targets of {TARGETS.targets} Pa with this noise in every reading: true rms\n"
-        "deviation from the targets.",
-        table(
-            ["method", "evaluations", "median [%]", "largest [%]", "within 5 %"],
-            with_targets(simulated, DEVICES[0], seeds),
-        ),
-        "Evaluations per second of GABS, on the emulated device and with the waits of a bench (frames on\n"
-        f"the line, off frames, 5 ms of settling): {'; '.join(rates(simulated, d, seeds) for d in DEVICES)}.",
     )
-
-
-class Trial(NamedTuple):
-    """A trial on an emulated device: its solution, its run time [s], and the waits of a real one [s]."""
-
-    solution: at.Solution
-    seconds: float
-    waits: float
 
 
 @contextlib.contextmanager
@@ -126,7 +98,7 @@ noiseless = partial(readings, snr=None)
 
 def measure(
     simulated: at.SimulatedObjective, device: hardware.Device, sensor: Sensor, method: Method, seed: int
-) -> Trial:
+) -> at.Solution:
     """Run the whole loop, with its log on disk."""
     transducers = range(len(simulated.scene.array))
     bench = hardware.EmulatedBench(device, simulated.transfer_matrix, transducers)
@@ -138,9 +110,7 @@ def measure(
         limited = hardware.LimitedLink(link, hardware.Limits(amplitude=1.0))
         log = Path(folder) / "trial.jsonl"
         objective = hardware.HardwareObjective(simulated.scene, limited, opened, log)
-        slept = bench.bus.slept
-        solution, seconds = timed(lambda: method(objective, seed=seed))
-        return Trial(solution, seconds, bench.bus.slept - slept)
+        return method(objective, seed=seed)
 
 
 def on_levels(simulated: at.SimulatedObjective, device: hardware.Device) -> at.Objective:
@@ -151,7 +121,7 @@ def on_levels(simulated: at.SimulatedObjective, device: hardware.Device) -> at.O
 def same_drive(simulated: at.SimulatedObjective, device: hardware.Device, method: Method, seed: int) -> bool:
     """Return whether a trial without noise finds the drive of the simulation."""
     expected = method(on_levels(simulated, device), seed=seed)
-    solution = measure(simulated, device, noiseless, method, seed).solution
+    solution = measure(simulated, device, noiseless, method, seed)
     return torch.allclose(solution.drive, expected.drive, rtol=0, atol=1e-9)
 
 
@@ -161,7 +131,7 @@ def with_noise(
     """Return the cells of a method in the table of noise."""
     played, deviations = on_levels(simulated, device), []
     for seed in seeds:
-        drive = measure(simulated, device, sensor, method, seed).solution.drive
+        drive = measure(simulated, device, sensor, method, seed).drive
         true = at.weakest_focus(at.true_pressure(played, drive))
         deviations.append(float(true / at.weakest_focus(method(played, seed=seed).pressure)) - 1)
     mean = bootstrap(torch.tensor(deviations))
@@ -172,23 +142,3 @@ def with_noise(
         f"{100 * min(deviations):+.1f} to {100 * max(deviations):+.1f}",
         f"{within} of {len(seeds)}",
     ]
-
-
-def with_targets(simulated: at.SimulatedObjective, device: hardware.Device, seeds: range) -> list[list[str]]:
-    """Return the rows of the table of targets: true rms deviations from the targets."""
-    played, rows = on_levels(simulated, device), []
-    for name, method in FOR_TARGETS.items():
-        solutions = [measure(simulated, device, readings, method, seed).solution for seed in seeds]
-        true = torch.cat([-TARGETS(at.true_pressure(played, solution.drive)) for solution in solutions])
-        cells = [f"{100 * float(value):.1f}" for value in (true.median(), true.max())]
-        within = f"{int((true <= 0.05).sum())} of {len(seeds)}"
-        rows.append([name, str(int(solutions[0].evaluations)), *cells, within])
-    return rows
-
-
-def rates(simulated: at.SimulatedObjective, device: hardware.Device, seeds: range) -> str:
-    """Return the evaluations per second of GABS, the median of its trials, without and with waits."""
-    trials = [measure(simulated, device, noiseless, METHODS["GABS"], seed) for seed in seeds]
-    count = int(trials[0].solution.evaluations)
-    seconds = float(torch.tensor([trial.seconds for trial in trials]).median())
-    return f"{device.name}: {count / seconds:.0f} and {count / (seconds + trials[0].waits):.0f}"

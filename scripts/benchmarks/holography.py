@@ -29,7 +29,7 @@ import autdtorch as at
 DOCUMENT = "performance.md"
 
 SETS, TRANSDUCERS, ITERATIONS, REPEATS = 2048, 249, 50, 5
-POINTS = (1, 2, 8, 32)
+POINTS = (1, 32)
 SETTLED = 0.3  # [s]
 ALGORITHMS = ("naive", "gs", "wgs", "gs_pat")
 FRAMES, PHASE_STEP = 200, math.pi / 4

@@ -1,20 +1,18 @@
 """T-matrices of the paper's cubes: time to build, accuracy after moves, and transfer matrices a second.
 
 Fills in a block of the documentation. Shifts and turns are random, and compared with the box solver at the
-same spacing and at a fine one. Then drives for every pose of a cube on a path, simulated spheres against
-their closed form, and a hand that is too large for a T-matrix: its box keeps outgoing fields.
+same spacing and at a fine one. Then drives for every pose of a cube on a path.
 
-    python scripts/benchmark.py operator        about twelve minutes on 2 idle cores
+    python scripts/benchmark.py operator        about ten minutes on 2 idle cores
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import torch
-from benchmarks.meshes import DOMAIN, FOCI, UP, hand
 from shared.document import Page, percent, printed, table
-from shared.scenes import paper_scene, relative_error, uncached, weakest
+from shared.scenes import paper_scene, relative_error, weakest
 from shared.timing import shortest, timed
 
 import autdtorch as at
@@ -45,10 +43,6 @@ def main(page: Page, shifts: int, turns: int) -> None:
         "plane of 10,000, are for 256 transducers.",
         table(head, printed(row(name, shifts, turns) for name in SCENES)),
         on_path(),
-        f"Spheres simulated at {1e3 * SPACING:g} mm, against their closed form:",
-        table(["sphere", "built [s]", "transfer matrix", "entries of T"], printed(spheres())),
-        f"A hand in front of an AUTD3 at {1e3 * SPACING:g} mm, by `box`, whose outgoing fields are kept:",
-        table(["what", "runs", "time [s]"], printed(outgoing_fields())),
     )
 
 
@@ -118,41 +112,3 @@ def on_path() -> str:
         f"{percent(float(share.min()))} of the optimum of its pose (32 gradient ascents), in the median\n"
         f"{percent(float(share.median()))}."
     )
-
-
-def spheres() -> Iterator[list[str]]:
-    """Yield the errors of spheres that are simulated, against their closed form."""
-    scene = paper_scene("two_cubes")
-    fluid = {"density": 77 * AIR.density, "sound_speed": 340.0}
-    for name, material in (("rigid", {"rigid": True}), ("density ratio 77", fluid)):
-        for radius in (5e-3, 8e-3):
-            sphere = at.Sphere((41e-3, 50e-3, 50e-3), radius, **material)
-            exact, _ = build(sphere)
-            simulated, seconds = build((sphere, sphere))  # two in one place are simulated
-            pair = (one.transfer_matrix(scene.array, scene.control_points) for one in (simulated, exact))
-            count = min(len(simulated.matrix), len(exact.matrix))
-            entries = relative_error(simulated.matrix[:count, :count], exact.matrix[:count, :count])
-            errors = percent(relative_error(*pair)), percent(entries)
-            yield [f"{name}, {1e3 * radius:g} mm", f"{seconds:.1f}", *errors]
-
-
-def outgoing_fields() -> Iterator[list[str]]:
-    """Yield the times of sets of four points behind a hand, for an AUTD3."""
-    array, points = at.TransducerArray.autd3((0.0, 0.0, 0.0), UP), torch.tensor(FOCI, dtype=torch.float64)
-    scene = at.Scene(array, AIR, 40e3, FOCI, [hand()], domain=DOMAIN)
-    uncached(scene, "box", 2.0, 2e-3).transfer_matrix()  # compiles the kernel
-    propagator = uncached(scene, "box", 1e3 * SPACING, 2e-3)
-
-    def row_of(what: str, work: Callable[[], object]) -> list[str]:
-        before = len(propagator.runs)
-        _, seconds = timed(work)
-        return [what, f"{len(propagator.runs) - before}", f"{seconds:.2f}"]
-
-    plane = at.Plane((0, 0, 0.16), UP, (20e-3, 20e-3)).points(1.2e-3).reshape(-1, 3)  # as many as transducers
-    picture = at.Plane((0, 0, 0.16), UP, (0.1, 0.1)).points(1e-3)
-    drive = torch.ones(len(array), dtype=torch.complex128)
-    yield row_of("first four points, with assembling", propagator.transfer_matrix)
-    yield row_of("second four points", lambda: propagator.transfer_matrix(points + 4e-3))
-    yield row_of(f"{len(plane)} points", lambda: propagator.transfer_matrix(plane))
-    yield row_of("four points after them", lambda: propagator.transfer_matrix(points + 2e-3))
-    yield row_of("field of a drive on 10,000 points", lambda: propagator.field(drive, picture))

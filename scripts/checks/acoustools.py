@@ -30,7 +30,7 @@ from shared.timing import timed
 
 import autdtorch as at
 
-DOCUMENT = "crosschecks.md"
+DOCUMENT = "benchmarks.md"
 PACKAGES = ("acoustools", "vedo")
 
 SPHERE_SUBDIVISIONS, CUBE_SUBDIVISIONS = (2, 3, 4), (3, 4)

@@ -30,7 +30,7 @@ from autdtorch.analytic.green import free_space_matrix
 from autdtorch.hardware import AUTD3
 from autdtorch.scene.arrays import TRANSDUCER_RADIUS
 
-DOCUMENT = "crosschecks.md"
+DOCUMENT = "benchmarks.md"
 PACKAGES = ("autd3-emulator", "autd3-pattern")
 
 FREQUENCY, SOUND_SPEED = 40e3, 340.0

@@ -21,7 +21,7 @@ from shared.scenes import PAPER, paper_scene, weakest
 import autdtorch as at
 from autdtorch.plot.style import TICK_SIZE, add_legend, looks_of, new_figure, readable, styled
 
-DOCUMENT = "pose_errors.md"
+DOCUMENT = "conditions.md"
 SCENES = ("two_cubes", "three_cubes", "shadow of two_cubes")
 SHADOW = 10e-3
 """Radius of the circle of the foci that are in the shadow of the larger cube [m]; the paper's is 30 mm."""
@@ -30,7 +30,7 @@ SHIFTS = (0.2, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
 """Distances [mm]."""
 TURNS = (1.0, 2.0, 5.0, 7.0, 10.0, 15.0, 20.0)
 """Angles [degrees]."""
-SHOWN = {"mm": (0.5, 1.0, 2.0, 5.0), "degrees": (2.0, 5.0, 10.0, 20.0)}
+SHOWN = {"mm": (1.0, 2.0, 5.0), "degrees": (5.0, 20.0)}
 """Pose errors in the table."""
 STARTS = 8
 """First guesses of the drives that follow the pose."""
