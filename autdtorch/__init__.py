@@ -17,7 +17,12 @@ __version__ = "0.1.0"
 _load, __dir__, __all__ = lazy_names(__name__, __file__)
 
 #: Names of version 0.1 that were renamed since, and their names now.
-_RENAMED = {"Dead": "FailedTransducers", "reference": "analytic"}
+_RENAMED = {
+    "Dead": "FailedTransducers",
+    "ScatteringBodies": "TMatrixCluster",
+    "ScatteringOperator": "TMatrix",
+    "reference": "analytic",
+}
 
 
 def __getattr__(name: str) -> object:

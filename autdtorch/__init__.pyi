@@ -36,9 +36,8 @@ from .plot.scene_figure import plot_scene
 from .plot.trials import plot_convergence, plot_poses, plot_trials
 from .plot.view3d import animate3d, view3d
 from .propagators import SteadyStateWarning, cell_centers, differentiable_field, make_propagator, volume_field
-from .propagators.bodies import ScatteringBodies
 from .propagators.estimate import Estimate, estimate
-from .propagators.operator import ScatteringOperator
+from .propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
 from .scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
 from .scene.drive import amplitudes_of, drive_from_phases, focus_phases, phases_of
 from .scene.geometry import Plane, circle_points, sphere_points
@@ -83,8 +82,6 @@ __all__ = [
     "QuietPoints",
     "RandomSearch",
     "ScaleWarning",
-    "ScatteringBodies",
-    "ScatteringOperator",
     "Scene",
     "SimulatedObjective",
     "Solution",
@@ -92,6 +89,8 @@ __all__ = [
     "State",
     "SteadyStateWarning",
     "Sweep",
+    "TMatrix",
+    "TMatrixCluster",
     "TargetPressures",
     "TransducerArray",
     "VoxelMask",

@@ -43,7 +43,7 @@ METHODS = ("BayesOpt", "GABS", "GradientAscent", "Holography", "Identify", "LSS"
 NOT_CALLED_BY_USERS = {
     *("Estimate", "Evaluation", "EvaluationLog", "FocusMetrics", "Preflight", "Run", "Solution", "Sweep"),
     *("Adapter", "Device", "Dialect", "Obstacle", "OpenMPDBoard"),
-    *("OperatorPropagator", "ScatteringOperator", "SimulatedPropagator"),
+    *("TMatrixPropagator", "TMatrix", "SimulatedPropagator"),
     "UsbtmcPort",
     *("EmulatedBench.receive", "EmulatedScope.execute", "Goal", "Method", "State", "Waveform"),
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
@@ -100,8 +100,8 @@ def board_file(folder: Path) -> Path:
 
 
 @cache
-def operator() -> at.ScatteringOperator:
-    return at.ScatteringOperator.of(at.Sphere((40e-3, 12e-3, 12e-3), radius=4e-3, rigid=True), AIR, 40e3)
+def operator() -> at.TMatrix:
+    return at.TMatrix.of(at.Sphere((40e-3, 12e-3, 12e-3), radius=4e-3, rigid=True), AIR, 40e3)
 
 
 def objective() -> at.SimulatedObjective:
@@ -312,7 +312,7 @@ OTHERS: dict[str, Any] = {
     "plot_poses.scores": {"gabs": [[1.0, 2.0], [2.0, 3.0]]},
     "plot_poses.places": [0.0, 1.0],
     "plot_poses.bounds": [3.0, 3.0],
-    "ScatteringBodies.operators": Made(lambda _: [operator()]),
+    "TMatrixCluster.bodies": Made(lambda _: [operator()]),
     "save_field.points": GRID,
     "save_field.pressure": torch.ones(2, 3, 4, dtype=torch.complex128),
     "weakest_focus.pressure": torch.ones(2, 3),
@@ -329,9 +329,9 @@ OTHERS: dict[str, Any] = {
 #: Of classes that users do not make themselves.
 INSTANCES = {
     "SimulatedPropagator": Made(lambda _: at.make_propagator(SCENE, "box", 2e-3, 0.5, max_periods=6)),
-    "OperatorPropagator": Made(lambda _: at.make_propagator(BALL, "operator")),
-    "ScatteringOperator": Made(lambda _: operator()),
-    "ScatteringBodies": Made(lambda _: at.ScatteringBodies([operator()])),
+    "TMatrixPropagator": Made(lambda _: at.make_propagator(BALL, "tmatrix")),
+    "TMatrix": Made(lambda _: operator()),
+    "TMatrixCluster": Made(lambda _: at.TMatrixCluster([operator()])),
     "OpenMPDBoard": Made(lambda folder: at.OpenMPDBoard.load(board_file(folder))),
 }
 

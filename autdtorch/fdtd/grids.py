@@ -118,7 +118,7 @@ def choose_grids(
     region: Region, method: str, spacing: float, tolerance: float, runs: int
 ) -> tuple[str, Grouping]:
     """Return the method and its grids; for "auto" the cheapest of "box" and "full" that is accurate."""
-    if method in ("box", "operator"):
+    if method in ("box", "tmatrix"):
         return method, cheapest_boxes(region, spacing, tolerance, runs)
     axes, extent = np.eye(3), domain_extent(region, spacing)
     aligned = bool(region.bodies) and all(flat_faces(shape).all_aligned(axes) for shape in region.shapes)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -60,19 +60,19 @@ def run_to_steady_state(
     cells: Index,
     tolerance: float,
     max_periods: int,
-    observe: Callable[[Tensor], Tensor],
+    observe: Callable[[Tensor], Sequence[Tensor]],
     stepped: Callable[[int], None],
-    floor: float = 0.0,
+    floors: Sequence[float] = (0.0,),
 ) -> SteadyState:
     """Step until the relative residual is within `tolerance`, or `max_periods` have passed.
 
-    `observe` maps the phasors of `cells` (k,) to the quantity that must converge, once sound has arrived
-    everywhere; the residual is relative to its norm, or to `floor` if that is more. `stepped` is called with
-    the number of periods after each block.
+    `observe` maps the phasors of `cells` (k,) to the quantities that must all converge, once sound has
+    arrived everywhere. The residual of each is relative to its norm, or to its entry of `floors` if that is
+    more. `stepped` is called with the number of periods after each block.
     """
     earliest, block = fewest_periods(assembly.grid.arrival), block_of(assembly.steps_per_period)[1]
     sequence = Extrapolation(phasors_kept(len(cells)))
-    values: deque[Tensor] = deque(maxlen=_JUDGED)
+    values: deque[Sequence[Tensor]] = deque(maxlen=_JUDGED)
     first_judged = min(earliest, max_periods) - (_JUDGED - 1) * block
     ramp = math.ceil(RAMP_PERIODS * assembly.steps_per_period)
     for count, windows in windows_of_run(assembly, kernel, sources, cells):
@@ -84,7 +84,7 @@ def run_to_steady_state(
             continue
         limit = torch.from_numpy(sequence.limit() if len(sequence) else windows[-1][1])
         values.append(observe(limit))
-        residual = _residual(values, floor)
+        residual = max(map(_residual, zip(*values, strict=True), floors))
         converged = count >= earliest and residual <= tolerance
         if converged or count >= max_periods:
             break
@@ -182,7 +182,7 @@ def _is_needed(time: int, steps: int, shift: int) -> bool:
     return time % shift == 0 or (time + steps) % shift == 0
 
 
-def _residual(values: deque[Tensor], floor: float) -> float:
+def _residual(values: Sequence[Tensor], floor: float) -> float:
     """Return the residual of the last value, estimated from its changes over the last blocks."""
     last, size = values[-1], max(float(values[-1].norm()), floor)
     if len(values) < 3 or not size:

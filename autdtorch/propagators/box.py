@@ -1,69 +1,114 @@
 """FDTD of the scattered field in boxes around the obstacles; the field elsewhere is exact.
 
-Several boxes are coupled by a multiple-scattering iteration. In each pass every box is simulated, driven by
-the field that the others radiated in the pass before. A pass adds one scattering order. The sums follow
-x_(n+1) = T x_n + b like the phasors of a run, and are extrapolated in the same way; weakly coupled boxes need
-three or four passes. Later passes contribute little, and are simulated to looser tolerances.
+Outside the boxes, the amplitudes of their Huygens surfaces radiate the whole scattered field: a linear map
+from drives. Those of all transducers, or of some drives, are simulated once for any points. A few points take
+fewer runs, which begin at them (reciprocity).
 """
 
 from __future__ import annotations
 
+import functools
+import itertools
 import logging
 import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
+from scipy.spatial import KDTree
 
-from autdtorch.fdtd.grids import MOST_PASSES, one_box
+from autdtorch.fdtd.grid import Grid, make_box
+from autdtorch.fdtd.grids import one_box
+from autdtorch.fdtd.region import Body, Region
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
-from autdtorch.fdtd.steady_state import Extrapolation, SteadyState, run_to_steady_state
-from autdtorch.fdtd.stepping import Assembly
-from autdtorch.fdtd.turning import is_turned
-from autdtorch.propagators.moved_boxes import assembled_box
+from autdtorch.fdtd.steady_state import SteadyState, run_to_steady_state
+from autdtorch.fdtd.stepping import Assembly, assemble_on
+from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_array
+from autdtorch.fdtd.turning import is_turned, turned
+from autdtorch.propagators.multiple_scattering import Observe, iterated
 from autdtorch.propagators.plan import MOST_JUDGED
-from autdtorch.propagators.simulation import Run, Simulation, Stepped
+from autdtorch.propagators.simulation import PressureMap, Run, Simulation, Stepped
+from autdtorch.propagators.store import BODIES, MOST_BYTES
+from autdtorch.scene.arrays import apertures_of, strengths_of
+from autdtorch.scene.geometry import sphere_points
+from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.obstacles.moving import circumscribed, is_movable, shifted
 from autdtorch.scene.scene import require_clear
 from autdtorch.utils.apertures import Apertures
-from autdtorch.utils.array_types import COMPLEX, REAL
+from autdtorch.utils.array_types import COMPLEX, REAL, Array, Index
 from autdtorch.utils.cached import cached_property
+from autdtorch.utils.digest import digest_of
 from autdtorch.utils.threads import one_library_thread, spread
 
 logger = logging.getLogger(__name__)
 
-_LOOSEST = 0.1
-"""Largest tolerance of a run, relative to its pass."""
+_CELL_BYTES = 20
+"""Memory of an assembled cell [bytes]."""
 
-_CAUTION = 2.0
-"""Safety factor: neglected scattering orders are estimated as this many times the next one."""
-
-Observe = Callable[[torch.Tensor], torch.Tensor]
-"""Computes the quantity that must converge from phasors of cells."""
-
-Simulate = Callable[[int, torch.Tensor, float, Observe], SteadyState]
-"""Simulates a box, given its index, the incident field (n,), the tolerance and the observed quantity."""
+_ENTRY_BYTES = torch.complex128.itemsize
 
 
-class Solved(NamedTuple):
-    """The steady states of R runs in boxes.
+class Judged(NamedTuple):
+    """Receivers that decide when a run has converged: each `every`-th of some, in groups that all must."""
 
-    With the transform of each box to P receivers, the incident field (P, R) there, which receivers (P,) are
-    silent, and the phasors (k, R) of the cells of each box.
+    receivers: Apertures
+    every: int
+    groups: tuple[slice, ...]
+
+    @classmethod
+    def of(cls, receivers: Apertures) -> Judged:
+        """Return at most `MOST_JUDGED` of the receivers, in one group."""
+        return cls(receivers, math.ceil(len(receivers.positions) / MOST_JUDGED), (slice(None),))
+
+
+@dataclass(frozen=True)
+class Radiation:
+    """A linear map from K drives to the scattered field outside of boxes.
+
+    Attributes:
+        boxes: the boxes.
+        amplitudes: of each box's Huygens surface (n, K) [Pa m].
+        runs: the simulations behind it.
     """
 
     boxes: Sequence[ScatteredField]
+    amplitudes: tuple[torch.Tensor, ...]
+    runs: tuple[Run, ...]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory [bytes]."""
+        return sum(part.nbytes for part in self.amplitudes)
+
+    def reaches(self, points: torch.Tensor) -> bool:
+        """Return whether no point (P, 3) [m] is in a box, where its cells are read."""
+        return not any(box.inside(points).any() for box in self.boxes)
+
+    def pressure(self, receivers: Apertures) -> torch.Tensor:
+        """Return the scattered field (P, K) [Pa] at P receivers that it reaches."""
+        parts = zip(self.boxes, self.amplitudes, strict=True)
+        return torch.stack([box.near_to_far(receivers).radiated(part) for box, part in parts]).sum(dim=0)
+
+
+class Solved(NamedTuple):
+    """The steady states of R runs in boxes: the phasors (k, R) of the cells that each transform reads."""
+
     transforms: Sequence[NearToFar]
-    incident: torch.Tensor
-    silent: torch.Tensor
     phasors: Sequence[torch.Tensor]
     runs: list[Run]
 
     @property
+    def pressure(self) -> torch.Tensor:
+        """The scattered field (P, R) [Pa] at the receivers."""
+        parts = zip(self.transforms, self.phasors, strict=True)
+        return torch.stack([transform.field(part) for transform, part in parts]).sum(dim=0)
+
+    @property
     def amplitudes(self) -> list[torch.Tensor]:
-        """Amplitudes (n, R) [Pa m] of the Huygens surface of each box."""
+        """The amplitudes (n, R) [Pa m] of each box's Huygens surface."""
         pairs = zip(self.transforms, self.phasors, strict=True)
         return [transform.amplitudes(part) for transform, part in pairs]
 
@@ -83,7 +128,7 @@ class BoxSimulation(Simulation):
         plan.require_feasible()
         boxes = []
         for group, axes in zip(plan.grouping.groups, plan.grouping.axes, strict=True):
-            part = replace(plan.region, bodies=tuple(plan.region.bodies[one] for one in group))
+            part = replace(plan.region, bodies=tuple(plan.region.bodies[index] for index in group))
             if is_turned(axes):
                 logger.debug("the grid around obstacles %s is turned along their faces", list(group))
             assembly = assembled_box(part, axes, plan.spacing, plan.dtype, plan.time_step)
@@ -95,11 +140,6 @@ class BoxSimulation(Simulation):
         """The assembled grids of the boxes."""
         return [box.assembly for box in self.boxes]
 
-    @cached_property
-    def _in_one_box(self) -> BoxSimulation:
-        plan = self.plan
-        return BoxSimulation(replace(plan, grouping=one_box(plan.region, plan.spacing)))
-
     def near_obstacle(self, points: torch.Tensor) -> bool:
         """Return whether the interpolation kernel of any point (N, 3) has heterogeneous cells."""
         return any(box.near_obstacle(points) for box in self.boxes)
@@ -107,152 +147,250 @@ class BoxSimulation(Simulation):
     def _check(self, points: torch.Tensor) -> None:
         require_clear(self.plan.scene.array, "points", points)
 
+    def _in_enclosed_cells(self, points: torch.Tensor) -> torch.Tensor:
+        enclosed = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu")
+        for box in self.boxes:
+            enclosed |= box.enclosed(points, self.plan.region.walls)
+        return enclosed
+
+    def _orbits_of_transducers(self, points: torch.Tensor) -> Orbits:
+        if not self._radiates(points):
+            return super()._orbits_of_transducers(points)
+        return Orbits(False, *orbits_of_array(self.symmetries), np.zeros((0, 0), np.int64))
+
+    def _matrix(self, points: torch.Tensor) -> PressureMap:
+        if self._radiates(points) and not self.orbits(points).from_points:
+            radiation = self._store.get(
+                digest_of(self.plan.key, "transducers"), self._radiation_of_transducers
+            )
+            if radiation.reaches(points):
+                array = self.plan.scene.array
+                alone = [apertures_of(array).chosen(slice(index, index + 1)) for index in range(len(array))]
+                strength = strengths_of(array)[:, None].to(torch.complex128)
+                return self._total(radiation, alone, strength, points)
+        return super()._matrix(points)
+
+    def _fields(self, drive: torch.Tensor, points: torch.Tensor) -> PressureMap:
+        if self._radiates(points):
+            array, key = self.plan.scene.array, digest_of(self.plan.key, "drives", drive)
+            sources, strength = [apertures_of(array)] * len(drive), strengths_of(array) * drive
+            radiation = self._store.get(key, lambda: self._radiation(sources, strength))
+            if radiation.reaches(points):
+                return self._total(radiation, sources, strength, points)
+        return super()._fields(drive, points)
+
+    def _radiates(self, points: torch.Tensor) -> bool:
+        """Return whether the field at points (P, 3) is that of the Huygens surfaces, and these are kept.
+
+        For sources next to an obstacle, runs that begin at points are more accurate.
+        """
+        return self._keeps_surfaces and not any(box.inside(points).any() for box in self.boxes)
+
+    @cached_property
+    def _keeps_surfaces(self) -> bool:
+        array = self.plan.scene.array
+        size = _ENTRY_BYTES * len(array) * sum(len(box.surface[0]) for box in self.boxes)
+        return size <= MOST_BYTES and not self.near_obstacle(array.nodes.positions.reshape(-1, 3))
+
+    def _radiation_of_transducers(self) -> Radiation:
+        """Simulate the radiation of unit drives of all transducers.
+
+        Under a symmetry that maps a transducer to its representative, cells of the surface map to cells.
+        """
+        representative, symmetry = orbits_of_array(self.symmetries)
+        first, place = np.unique(representative, return_inverse=True)
+        array = self.plan.scene.array
+        alone = [apertures_of(array).chosen(slice(index, index + 1)) for index in first]
+        radiation = self._radiation(alone, torch.ones((len(alone), 1), **COMPLEX))
+        amplitudes = []
+        for box, part in zip(radiation.boxes, radiation.amplitudes, strict=True):
+            images = np.stack([_images(box, each) for each in self.symmetries])
+            unit = part[torch.from_numpy(images[symmetry].T), torch.from_numpy(place)]
+            amplitudes.append(strengths_of(array) * unit)
+        return replace(radiation, amplitudes=tuple(amplitudes))
+
+    def _radiation(self, sources: Sequence[Apertures], strength: torch.Tensor) -> Radiation:
+        """Simulate the radiation of runs; see `_run`."""
+        solved, runs = self._recorded(
+            len(sources), lambda stepped: self._solved(sources, strength, self._judged, stepped)
+        )
+        boxes = [transform.box for transform in solved.transforms]
+        return Radiation(boxes, tuple(solved.amplitudes), tuple(runs))
+
+    @cached_property
+    def _judged(self) -> Judged:
+        """Receivers that judge a radiation: control points, and a sphere around the obstacles.
+
+        The former may be in a shadow, the latter see all that is scattered.
+        """
+        scene = self.plan.scene
+        places = scene.control_points
+        places = places[:: math.ceil(len(places) / MOST_JUDGED)]
+        center, radius = circumscribed(scene.obstacles)
+        around = sphere_points(center, radius, MOST_JUDGED)
+        apart = torch.cdist(around, scene.array.nodes.positions.reshape(-1, 3)).amin(dim=1)
+        around = around[apart > self.plan.spacing]  # their own 1/r would hide the rest
+        groups = [part[~self.silent(part[:, None])] for part in (places, around)]
+        ends = np.cumsum([0, *map(len, groups)])
+        slices = tuple(slice(*pair) for pair in itertools.pairwise(ends) if pair[0] < pair[1])
+        return Judged(Apertures.of_points(torch.cat(groups)), 1, slices)
+
+    def _total(
+        self, radiation: Radiation, sources: Sequence[Apertures], strength: torch.Tensor, points: torch.Tensor
+    ) -> PressureMap:
+        """Return the pressure of K drives at points (P, 3) that their radiation reaches."""
+        receivers = Apertures.of_points(points)
+        pressure = self._incident(sources, strength, receivers) + radiation.pressure(receivers)
+        return PressureMap.of_runs(pressure, radiation.runs, from_points=False)
+
+    def _incident(
+        self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures
+    ) -> torch.Tensor:
+        """Return the incident field (P, R) [Pa] at P receivers in R runs; see `_run`."""
+        points, weights = receivers.positions, receivers.weights.to(torch.complex128)
+        drives = zip(sources, strength, strict=True)
+        fields = [self.boxes[0].incident(points.reshape(-1, 3), *drive) for drive in drives]
+        return torch.stack([field.reshape(points.shape[:-1]) @ weights for field in fields], dim=1)
+
     def _simulate(
         self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures, stepped: Stepped
     ) -> tuple[torch.Tensor, list[Run]]:
-        solved = self.solved(sources, strength, receivers, stepped)
-        return self.total(solved), solved.runs
+        solved, runs = self._solved(sources, strength, Judged.of(receivers), stepped)
+        total = self._incident(sources, strength, receivers) + solved.pressure
+        return total.mT.masked_fill(self.silent(receivers.positions), 0), runs
 
-    def total(self, solved: Solved) -> torch.Tensor:
-        """Return the pressure (R, P) [Pa] at the receivers of runs."""
-        parts = zip(solved.transforms, solved.phasors, strict=True)
-        total = solved.incident + sum(transform.field(part) for transform, part in parts)
-        return total.mT.masked_fill(solved.silent, 0)  # kept fields have them too
-
-    def incident(
-        self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures
-    ) -> torch.Tensor:
-        """Return the incident field (P, R) [Pa] at P receivers in R runs; see `run`."""
-        points, weights = receivers.positions, receivers.weights.to(torch.complex128)
-        drives = zip(sources, strength, strict=True)
-        fields = [self.boxes[0].incident(points.reshape(-1, 3), nodes, own) for nodes, own in drives]
-        return torch.stack([field.reshape(points.shape[:-1]) @ weights for field in fields], dim=1)
-
-    @torch.no_grad()
-    def solved(
-        self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures, stepped: Stepped
-    ) -> Solved:
-        """Simulate R runs, until the pressure at the receivers has converged; see `run`."""
-        boxes, plan = self.boxes, self.plan
-        drives = list(zip(sources, strength, strict=True))
-        incident = self.incident(sources, strength, receivers)
-        transforms = [box.near_to_far(receivers) for box in boxes]
-        every = math.ceil(len(receivers.positions) / MOST_JUDGED)
+    def _solved(
+        self, sources: Sequence[Apertures], strength: torch.Tensor, judged: Judged, stepped: Stepped
+    ) -> tuple[Solved, list[Run]]:
+        """Simulate R runs until the pressure at the judged receivers has converged; see `_run`."""
+        receivers, every, groups = judged
+        drives, some = list(zip(sources, strength, strict=True)), receivers.chosen(slice(None, None, every))
+        transforms = [box.near_to_far(receivers) for box in self.boxes]
         readings = [transform.matrices(every) for transform in transforms]
         sizes = [len(transform.cells) for transform in transforms]
-        silent = self.silent(receivers.positions)
-        heard = (~silent[::every]).to(incident.dtype)[:, None]
-        judged = receivers.positions[::every]
-        floors = [self.silence(judged, *drive) for drive in drives]
+        incident = self._incident(sources, strength, some)
+        audible = (~self.silent(some.positions)).to(incident.dtype)[:, None]
+        floors = [[self._silence(some.positions[group], *drive) for group in groups] for drive in drives]
 
-        def pressure(phasors: torch.Tensor) -> torch.Tensor:
+        def observed(phasors: torch.Tensor, runs: slice) -> list[torch.Tensor]:
             parts = zip(readings, torch.split(phasors, sizes), strict=True)
-            return heard * (incident[::every] + sum(reading.field(part) for reading, part in parts))
+            pressure = audible * (incident[:, runs] + sum(reading.field(part) for reading, part in parts))
+            return [pressure[group] for group in groups]
 
-        def simulate(
-            index: int, field: torch.Tensor, tolerance: float, observe: Observe, floor: float = 0.0
-        ) -> SteadyState:
-            box, cells = boxes[index], transforms[index].cells
-            forces = box.sources(field)
-            if not forces.force.any():  # obstacles of air, or drives that cancel
-                nothing = torch.zeros(len(cells), **COMPLEX)
-                return SteadyState(nothing, 0, 0.0, True)
-            settings = tolerance, plan.max_periods, observe, stepped, floor
-            return run_to_steady_state(box.assembly, self._kernel, forces, cells, *settings)
+        bodies = [_Body(self, transform, stepped) for transform in transforms]
+        if len(bodies) == 1:
 
-        @torch.no_grad()  # holds in one thread only
-        def alone(run: int) -> tuple[SteadyState, float]:
-            begin, (nodes, own), direct = time.perf_counter(), drives[run], incident[::every, run]
-            field = boxes[0].driving(nodes, own)
+            @torch.no_grad()  # holds in one thread only
+            def alone(run: int) -> tuple[SteadyState, float]:
+                begin, field = time.perf_counter(), self.boxes[0].driving(*drives[run])
 
-            def total(phasors: torch.Tensor) -> torch.Tensor:
-                return heard[:, 0] * (direct + readings[0].field(phasors[:, None])[:, 0])
+                def observe(phasors: torch.Tensor) -> list[torch.Tensor]:
+                    return [value[:, 0] for value in observed(phasors[:, None], slice(run, run + 1))]
 
-            steady = simulate(0, field, plan.tolerance, total, floors[run])
-            return steady, time.perf_counter() - begin
+                steady = bodies[0].answer(field, self.plan.tolerance, observe, floors[run])
+                return steady, time.perf_counter() - begin
 
-        if len(boxes) == 1:
-            found = spread(alone, range(len(drives)), self._kernel.at_once(boxes[0].assembly.grid.shape))
+            states = spread(alone, range(len(drives)), self._kernel.at_once(self.assemblies[0].grid.shape))
         else:
-            pairs = [[box.driving(nodes, own) for nodes, own in drives] for box in boxes]
-            driving = [torch.stack(fields, dim=1) for fields in pairs]
-            found = _coupled(boxes, transforms, driving, pressure, floors, simulate, plan.tolerance)
-            if not found:
-                logger.debug("the iteration between %d boxes does not converge: one box instead", len(boxes))
-                return self._in_one_box.solved(sources, strength, receivers, stepped)
-        steady, seconds = zip(*found, strict=True)
+            driving = [torch.stack([box.driving(*drive) for drive in drives], dim=1) for box in self.boxes]
+            least = torch.tensor(floors, **REAL).mT.clamp(min=torch.finfo(torch.float64).tiny)
+            observe_all = functools.partial(observed, runs=slice(None))
+            states = iterated(bodies, driving, observe_all, least, self.plan.tolerance)
+            if not states:
+                logger.debug("the iteration between %d boxes does not converge: one box instead", len(bodies))
+                return self._in_one_box._solved(sources, strength, judged, stepped)
+        steady, seconds = zip(*states, strict=True)
         phasors = torch.stack([each.pressure for each in steady], dim=1)
         runs = list(map(Run.of, steady, seconds))
-        return Solved(boxes, transforms, incident, silent, torch.split(phasors, sizes), runs)
+        return Solved(transforms, torch.split(phasors, sizes), runs), runs
 
-    def _in_enclosed_cells(self, points: torch.Tensor) -> torch.Tensor:
-        found = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu")
-        for box in self.boxes:
-            found |= box.enclosed(points, self.plan.region.walls)
-        return found
+    @cached_property
+    def _in_one_box(self) -> BoxSimulation:
+        grouping = one_box(self.plan.region, self.plan.spacing)
+        return BoxSimulation(replace(self.plan, grouping=grouping), self._store)
 
 
-def _coupled(
-    boxes: Sequence[ScatteredField],
-    transforms: Sequence[NearToFar],
-    driving: Sequence[torch.Tensor],
-    pressure: Observe,
-    floors: Sequence[float],
-    simulate: Simulate,
-    tolerance: float,
-) -> list[tuple[SteadyState, float]]:
-    """Iterate until the pressure (P, R) of R runs has converged; return nothing without convergence.
+@dataclass(frozen=True, eq=False)
+class _Body:
+    """The obstacles of a box, whose answers to incident fields are simulated."""
 
-    The incident field `driving` is (n, R) on each box. Half of the relative tolerance is for the runs, half
-    for the iteration. `pressure` maps the phasors (k, R) of all boxes' cells to the receivers; changes are
-    relative to its norms, or to `floors` (R,) if those are more. The result is the phasors of these cells and
-    the seconds of each run.
+    simulation: BoxSimulation
+    transform: NearToFar
+    stepped: Stepped
+
+    def answer(
+        self, field: torch.Tensor, tolerance: float, observe: Observe, floors: Sequence[float] = (0.0,)
+    ) -> SteadyState:
+        """Simulate the answer to an incident field (n,) until all that is observed has converged."""
+        box, cells, plan = self.transform.box, self.transform.cells, self.simulation.plan
+        forces = box.sources(field)
+        if not forces.force.any():  # obstacles of air, or drives that cancel
+            return SteadyState(torch.zeros(len(cells), **COMPLEX), 0, 0.0, True)
+        settings = tolerance, plan.max_periods, observe, self.stepped, floors
+        return run_to_steady_state(box.assembly, self.simulation._kernel, forces, cells, *settings)
+
+    def answers(self, incoming: torch.Tensor, tolerances: Sequence[float]) -> list[SteadyState]:
+        """Simulate the answers to incident fields (n, R) until their amplitudes have converged."""
+
+        def observe(phasors: torch.Tensor) -> list[torch.Tensor]:
+            return [self.outgoing(phasors)]
+
+        return [self.answer(*run, observe) for run in zip(incoming.mT, tolerances, strict=True)]
+
+    def outgoing(self, phasors: torch.Tensor) -> torch.Tensor:
+        """Return the amplitudes of the Huygens surface."""
+        return self.transform.amplitudes(phasors)
+
+    def incoming(self, other: _Body, outgoing: torch.Tensor) -> torch.Tensor:
+        """Return the field (n, R) that the Huygens surface of another box radiates to this one."""
+        return other.transform.box.radiated(outgoing, self.transform.box.driven)
+
+
+@dataclass(frozen=True)
+class _AssembledBox:
+    """An assembled box with its first cell at the origin."""
+
+    assembly: Assembly
+
+    @property
+    def nbytes(self) -> int:
+        """Memory [bytes], about."""
+        return _CELL_BYTES * math.prod(self.assembly.grid.shape)
+
+
+def assembled_box(
+    region: Region, axes: Array, spacing: float, dtype: torch.dtype, time_step: float | None
+) -> Assembly:
+    """Assemble the box of a region on a grid along `axes`, one a row (3, 3); see `stepping.assemble_on`.
+
+    It is assembled with its first cell at the origin: for a body that moves it is the same, to the last bit.
     """
-    begin = time.perf_counter()
-    runs = driving[0].shape[1]
-    largest = torch.stack([field.norm(dim=0) for field in driving]).amax(dim=0)
-    sums = torch.zeros((), **COMPLEX)
-    sequences = [Extrapolation(MOST_PASSES) for _ in range(runs)]
-    periods, reached = np.zeros(runs, np.int64), np.ones(runs, bool)
-    cells = sum(len(transform.cells) for transform in transforms)
-    value, size = pressure(driving[0].new_zeros((cells, runs))), None
-    left = torch.zeros(runs, **REAL)
-    least = torch.tensor(floors, **REAL).clamp(min=torch.finfo(torch.float64).tiny)
-    for number in range(1, MOST_PASSES + 1):
-        parts = []
-        own = tolerance / 2 ** (number + 1)  # half the tolerance in all passes
-        unsettled = torch.zeros((len(boxes), runs), **REAL)
-        for index, field in enumerate(driving):
-            share = field.norm(dim=0) / largest
-            loose = (own / share).clamp(max=_LOOSEST).tolist()
-            observe = transforms[index].amplitudes
-            steady = [simulate(index, *each, observe) for each in zip(field.mT, loose, strict=True)]
-            parts.append(torch.stack([each.pressure for each in steady], dim=1))
-            periods += [each.periods for each in steady]
-            reached &= [each.converged for each in steady]
-            residuals = torch.tensor([each.residual for each in steady], **REAL)
-            unsettled[index] = share * residuals
-        left += unsettled.amax(dim=0)
-        sums = sums + torch.cat(parts)
-        for sequence, column in zip(sequences, sums.mT.numpy(), strict=True):
-            sequence.append(column)
-        phasors = torch.from_numpy(np.stack([sequence.limit() for sequence in sequences], axis=1))
-        amplitudes = [transform.amplitudes(part) for transform, part in zip(transforms, parts, strict=True)]
-        before, value = value, pressure(phasors)
-        smaller, size = size, torch.cat(amplitudes).norm(dim=0)
-        change = (value - before).norm(dim=0) / torch.maximum(value.norm(dim=0), least)
-        if smaller is not None:
-            remaining = _CAUTION * change * (size / smaller).clamp(max=1)
-            if (remaining <= tolerance / 2).all():
-                seconds = (time.perf_counter() - begin) / runs
-                logger.debug("%d boxes, %d passes of multiple scattering", len(boxes), number)
-                found = zip(phasors.mT, periods.tolist(), (left + remaining).tolist(), reached, strict=True)
-                return [(SteadyState(*each[:3], bool(each[3])), seconds) for each in found]
-        radiating = list(zip(boxes, amplitudes, strict=True))
-        driving = [
-            torch.stack([box.radiated(part, own.driven) for box, part in radiating if box is not own]).sum(
-                dim=0
-            )
-            for own in boxes
-        ]
-    return []
+    part = turned(region, axes)
+    grid = make_box(part, spacing)
+    if not all(map(is_movable, region.shapes)):
+        return assemble_on(grid, part, dtype, time_step)
+    bodies = tuple(_shifted(body, grid, axes) for body in region.bodies)
+    here = replace(grid, origin=(0.0, 0.0, 0.0))
+
+    def assembled() -> _AssembledBox:
+        everywhere, nowhere = ((-math.inf,) * 3, (math.inf,) * 3), np.zeros((0, 3))
+        still = Region(region.fluid, region.attenuation, region.frequency, bodies, everywhere, nowhere)
+        return _AssembledBox(assemble_on(here, turned(still, axes), dtype, time_step))
+
+    medium = region.fluid, region.attenuation, region.frequency
+    key = digest_of("box", bodies, axes, here, *medium, str(dtype), time_step)
+    return replace(BODIES.get(key, assembled).assembly, grid=grid)
+
+
+def _shifted(body: Body, grid: Grid, axes: Array) -> Body:
+    """Return a body as seen from the first cell of a grid along `axes`."""
+    offset = torch.from_numpy(-np.array(grid.origin) @ axes)
+    return replace(body, shape=shifted(cast(Obstacle, body.shape), offset))
+
+
+def _images(box: ScatteredField, symmetry: Symmetry) -> Index:
+    """Return for each cell of the Huygens surface the place of its image among them."""
+    places = box.surface[0].numpy() - symmetry.center
+    if (symmetry.matrix == np.eye(3)).all():
+        return np.arange(len(places))
+    return np.asarray(KDTree(places).query(places @ symmetry.matrix.T)[1], np.int64)

@@ -14,9 +14,9 @@ from autdtorch.fdtd.grids import grid_cost
 from autdtorch.fdtd.kernels.choice import make_kernel
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stepping import assemble, drive_signal
-from autdtorch.propagators.operator_propagator import OperatorPropagator
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.simulated import SimulatedPropagator
+from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.display import counted
@@ -39,7 +39,7 @@ class Estimate:
     """The cost of the transfer matrix of a scene's control points.
 
     Attributes:
-        method: "free_space", "box", "full" or "operator".
+        method: "free_space", "box", "full" or "tmatrix".
         spacing: edge of a cell [m]; None where nothing is simulated.
         cells: cells of all grids, boundary layers included.
         runs: number of simulations, with symmetries.
@@ -97,7 +97,7 @@ def estimate(
     # a multiple of the spacing: a scene that is symmetric on one grid mostly is on the other
     factor = max(1, math.floor(planned.region.wavelength / _PILOT_CELLS / spacing))
     pilot = planned.at(spacing * factor, planned.tolerance)
-    kind = OperatorPropagator if planned.method == "operator" else SimulatedPropagator
+    kind = TMatrixPropagator if planned.method == "tmatrix" else SimulatedPropagator
     if pilot.memory < available_memory():
         planned = replace(planned, runs=kind(pilot).planned_runs)
     small, large = _MEASURED_CELLS

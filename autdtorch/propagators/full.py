@@ -35,30 +35,30 @@ class DomainSimulation(Simulation):
         return self.assemblies[0].touches_heterogeneous(points)
 
     def _in_enclosed_cells(self, points: torch.Tensor) -> torch.Tensor:
-        found = self.assemblies[0].is_enclosed(points.reshape(-1, 3), self.plan.region.walls)
-        return torch.from_numpy(found).reshape(points.shape[:-1])
+        enclosed = self.assemblies[0].is_enclosed(points.reshape(-1, 3), self.plan.region.walls)
+        return torch.from_numpy(enclosed).reshape(points.shape[:-1])
 
     def _check(self, points: torch.Tensor) -> None:
         require_inside(self.plan.scene.domain, "points", points)
 
-    @torch.no_grad()
     def _simulate(
         self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures, stepped: Stepped
     ) -> tuple[torch.Tensor, list[Run]]:
         (assembly,), plan = self.assemblies, self.plan
         points = assembly.interpolation(receivers.positions, receivers.weights)
         cells = np.unique(points.index)
-        read = points.matrix(cells)
+        reading = points.matrix(cells)
         every = math.ceil(len(receivers.positions) / MOST_JUDGED)
-        some = read[::every]
+        judged = reading[::every]
         rows, runs = [], []
-        for nodes, own in zip(sources, strength, strict=True):
-            begin, forces = time.perf_counter(), assembly.sources(nodes.positions, own, nodes.weights)
-            floor = self.silence(receivers.positions[::every], nodes, own)
+        for source, amplitude in zip(sources, strength, strict=True):
+            begin = time.perf_counter()
+            forces = assembly.sources(source.positions, amplitude, source.weights)
             steady = run_to_steady_state(
                 assembly, self._kernel, forces, cells, plan.tolerance, plan.max_periods,
-                lambda phasor: torch.from_numpy(some @ phasor.numpy()), stepped, floor,
+                lambda phasor: [torch.from_numpy(judged @ phasor.numpy())], stepped,
+                [self._silence(receivers.positions[::every], source, amplitude)],
             )  # fmt: skip
             runs.append(Run.of(steady, time.perf_counter() - begin))
-            rows.append(torch.from_numpy(read @ steady.pressure.numpy()))
+            rows.append(torch.from_numpy(reading @ steady.pressure.numpy()))
         return torch.stack(rows).masked_fill(self.silent(receivers.positions), 0), runs

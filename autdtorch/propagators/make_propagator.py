@@ -10,13 +10,13 @@ from typing import Literal
 import torch
 
 from autdtorch.fdtd.grid import warn_if_coarse
-from autdtorch.propagators.cache import disk_cache
 from autdtorch.propagators.free_space import FreeSpacePropagator
-from autdtorch.propagators.operator_propagator import OperatorPropagator
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.refinement import Budget, refined
 from autdtorch.propagators.scene_region import warn_of_ending_walls, warn_of_near_points
 from autdtorch.propagators.simulated import SimulatedPropagator
+from autdtorch.propagators.store import store_in
+from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import invalid, positive
 
@@ -37,7 +37,7 @@ def make_propagator(
     seconds: float | None = None,
     memory: float | None = None,
     cache: str | os.PathLike[str] | Literal[False] | None = None,
-) -> FreeSpacePropagator | OperatorPropagator | SimulatedPropagator:
+) -> FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator:
     """Make the propagator of a scene. Nothing is simulated before its first use.
 
     Args:
@@ -46,9 +46,9 @@ def make_propagator(
             scattered field in a box around the obstacles, exact elsewhere, also outside the domain. Distant
             obstacles get boxes of their own, coupled by a multiple-scattering iteration, where that is
             cheaper. Obstacles are simulated as a whole, including parts outside the domain. The grid of a
-            box turns with tilted flat faces. "operator": scattering operators of the obstacles, each
+            box turns with tilted flat faces. "tmatrix": T-matrices of the obstacles, each
             simulated once for all poses, arrays and points, and known for spheres; see
-            `ScatteringOperator`. "auto": free space without obstacles; full where a wall continues through
+            `TMatrix`. "auto": free space without obstacles; full where a wall continues through
             the boundary layer; operator where it takes fewer simulations (up to three spheres take none); box
             where other obstacles leave the domain or are tilted; otherwise the cheaper of box and full. The
             propagator's `method` is the one chosen; the reason is logged at level DEBUG.
@@ -86,23 +86,23 @@ def make_propagator(
     memory = None if memory is None else positive("memory", memory, "bytes")
     if spacing is not None and (seconds, memory) != (None, None):
         raise invalid("spacing", spacing, "must be None where seconds or memory limit its choice", "m")
-    kept = disk_cache(cache)
+    store = store_in(cache)
     if planned.method == "free_space":
         return FreeSpacePropagator(scene)
-    propagator: OperatorPropagator | SimulatedPropagator
-    if planned.method == "operator":
+    propagator: TMatrixPropagator | SimulatedPropagator
+    if planned.method == "tmatrix":
         make_box = None
         if spacing is None:
-            make_box = functools.cache(lambda: refined(planned.by_box, Budget(seconds, memory), kept))
+            make_box = functools.cache(lambda: refined(planned.by_box, Budget(seconds, memory), store))
             planned = planned.at(make_box().spacing, tolerance, time_step) if planned.runs else planned
-        propagator = OperatorPropagator(planned, kept, make_box)
+        propagator = TMatrixPropagator(planned, store, make_box)
         if not planned.runs:
             return propagator
     elif spacing is None:
-        propagator = refined(planned, Budget(seconds, memory), kept)
+        propagator = refined(planned, Budget(seconds, memory), store)
     else:
         planned.require_feasible()
-        propagator = SimulatedPropagator(planned, kept)
+        propagator = SimulatedPropagator(planned, store)
     if time_step is not None:
         logger.debug("time step %.4g us", 1e6 * propagator.time_step)  # refuses one that is not stable
     warn_if_coarse(planned.region.sound_speeds, scene.frequency, propagator.spacing)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -24,14 +24,15 @@ from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels.choice import available_kernel, make_kernel, precision_of
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import phasors_kept
-from autdtorch.propagators.scene_bodies import (
+from autdtorch.propagators.scene_region import region_of, with_rigid
+from autdtorch.propagators.store import key_of
+from autdtorch.propagators.tmatrix.bodies import (
     are_outside,
     bodies_of,
     fewest_waves,
     waves_of,
     waves_to_simulate,
 )
-from autdtorch.propagators.scene_region import hardened, region_of
 from autdtorch.scene.arrays import apertures_of
 from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.scene import Scene
@@ -39,6 +40,7 @@ from autdtorch.utils.cached import cached_property
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.spatial import doubled_normals
 from autdtorch.utils.threads import thread_count
+from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import (
     integer_at_least,
     invalid,
@@ -50,7 +52,7 @@ from autdtorch.utils.validation import (
 logger = logging.getLogger(__name__)
 
 MOST_JUDGED = 64
-"""Receivers whose pressure decides when a run has converged."""
+"""Receivers of a kind whose pressure decides when a run has converged."""
 
 # Fitted to transfer matrices of boxes and domains at 0.6 to 2 mm: `scripts/check.py estimate` reports errors.
 
@@ -91,7 +93,11 @@ _HARDENED = 0.25
 """Share of the error asked for up to which bodies are taken as rigid, where the spacing is chosen by it."""
 
 _MOST_BODIES, _MOST_WAVES = 3, 2000
-"""Bodies, and waves around all, up to which "auto" takes scattering operators: more are slower than a box."""
+"""Bodies, and waves around all, up to which "auto" takes T-matrices: more are slower than a box."""
+
+
+_NO_EFFECT = ("observation_plane", "name")
+"""Scene fields that do not affect the pressure; left out of keys."""
 
 
 class Heterogeneity(NamedTuple):
@@ -112,7 +118,7 @@ class Plan:
         spacing: edge of a cell [m]; of no effect in free space.
         time_step: upper limit of the time step [s]; None for the largest stable one.
         grouping: the grids, and the obstacles on each; no grids in free space.
-        runs: number of simulations of the control points' transfer matrix, or of the scattering operators;
+        runs: number of simulations of the control points' transfer matrix, or of the T-matrices;
             `plan` neglects symmetries.
     """
 
@@ -135,13 +141,23 @@ class Plan:
 
     @property
     def with_materials(self) -> Self:
-        """The plan without bodies that are taken as rigid; see `hardened`."""
-        return replace(self, region=hardened(region_of(self.scene), 0.0)).at(self.spacing, self.tolerance)
+        """The plan without bodies that are taken as rigid; see `with_rigid`."""
+        return replace(self, region=with_rigid(region_of(self.scene), 0.0)).at(self.spacing, self.tolerance)
 
     @property
     def second(self) -> Self:
         """The plan on a second grid, for an estimate of the grid's error."""
         return self.at(second_spacing(self.region, self.spacing), self.tolerance)
+
+    @cached_property
+    def key(self) -> str:
+        """A digest of everything that affects the plan's results."""
+        scene = {entry.name: getattr(self.scene, entry.name) for entry in fields(self.scene)}
+        settings = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        settings |= {"scene": None, "region": None, "runs": None, "dtype": str(self.dtype)}
+        rigid = [body.fluid is None for body in self.region.bodies]
+        affecting = {name: part for name, part in scene.items() if name not in _NO_EFFECT}
+        return key_of(settings, rigid, affecting)
 
     @property
     def law(self) -> Law:
@@ -150,7 +166,7 @@ class Plan:
 
     @property
     def by_box(self) -> Self:
-        """The plan of the box that serves where scattering operators do not."""
+        """The plan of the box that serves where T-matrices do not."""
         return replace(self, method="box", runs=min(len(self.scene.control_points), len(self.scene.array)))
 
     @property
@@ -293,11 +309,14 @@ def plan(
         raise invalid("tolerance", tolerance, "must be in (0, 1)")
     most = _HARDENED * tolerance if spacing is None else tolerance
     spacing = coarsest_spacing(region) if spacing is None else positive("spacing", spacing, "m")
-    region = hardened(region, most)
+    region = with_rigid(region, most)
     max_periods = integer_at_least("max_periods", max_periods, 1)
     time_step = None if time_step is None else positive("time_step", time_step, "s")
-    require_one_of("method", method, ("auto", "free_space", "box", "full", "operator"))
-    if method in ("box", "operator") and not scene.obstacles:
+    if method == "operator":
+        warn_user('method "operator" is now "tmatrix"', DeprecationWarning)
+        method = "tmatrix"
+    require_one_of("method", method, ("auto", "free_space", "box", "full", "tmatrix"))
+    if method in ("box", "tmatrix") and not scene.obstacles:
         raise invalid("method", method, "needs a scene with obstacles; take free_space")
     runs, grouping = min(len(scene.control_points), len(scene.array)), Grouping((), (), (), 0, aligned=False)
     if method == "auto" and not scene.obstacles:
@@ -306,17 +325,17 @@ def plan(
     if method != "free_space":
         require_spacing(region, spacing)
         chosen, grouping = choose_grids(region, method, spacing, tolerance, runs)
-        method, runs = _by_operator(scene, region, method, chosen, tolerance, runs)
+        method, runs = _by_tmatrix(scene, region, method, chosen, tolerance, runs)
     return Plan(
         scene, region, method, spacing, tolerance, kernel, precision, max_periods, time_step, grouping, runs
     )
 
 
-def _by_operator(
+def _by_tmatrix(
     scene: Scene, region: Region, method: str, chosen: str, tolerance: float, runs: int
 ) -> tuple[str, int]:
-    """Return "operator" and its runs where it is asked for, or has fewer runs; otherwise what was chosen."""
-    if method not in ("auto", "operator"):
+    """Return "tmatrix" and its runs where it is asked for, or has fewer runs; otherwise what was chosen."""
+    if method not in ("auto", "tmatrix"):
         return chosen, runs
     if method == "auto" and fewest_waves(scene, tolerance) > runs:
         return chosen, runs
@@ -328,5 +347,5 @@ def _by_operator(
         many = len(bodies) > _MOST_BODIES or waves_of(scene, bodies, tolerance) > _MOST_WAVES
         if walls or many or waves > runs or not are_outside(places, bodies).all():
             return chosen, runs
-        logger.debug("method auto: operator; %d waves, where %s takes %d runs", waves, chosen, runs)
-    return "operator", waves
+        logger.debug("method auto: tmatrix; %d waves, where %s takes %d runs", waves, chosen, runs)
+    return "tmatrix", waves

@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 
 from autdtorch.fdtd.grid import coarsest_spacing
 from autdtorch.fdtd.region import Region
-from autdtorch.propagators.cache import DiskCache
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulated import SimulatedPropagator
+from autdtorch.propagators.simulation import Simulation
+from autdtorch.propagators.store import Store
 from autdtorch.utils.validation import invalid
 
 logger = logging.getLogger(__name__)
@@ -68,21 +69,21 @@ class Budget:
         return in_time and (self.memory is None or plan.memory <= self.memory) and plan.is_feasible()
 
 
-def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPropagator:
+def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
     """Return a propagator whose estimated error is within the tolerance of a plan.
 
     Where the budget does not suffice, it is the finest that fits, and where the surface of an obstacle is not
     known well enough, it is one that does not add to that. A warning says which error it has, and one that
     obstacles resonate.
     """
-    found = _refined(pilot, budget, cache)
-    found.warn_of_ringing()
-    return found
+    propagator = _refined(pilot, budget, store)
+    propagator.warn_of_ringing()
+    return propagator
 
 
-def _refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPropagator:
+def _refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
     tolerance, region, law = pilot.tolerance, pilot.region, pilot.law
-    others: list[SimulatedPropagator] = []
+    others: list[Simulation] = []
     spacing = coarsest_spacing(region)
     if budget.is_unlimited:
         spacing /= min(region.wavelength / region.shortest_wavelength, _FINER_IF_SLOW)
@@ -90,22 +91,22 @@ def _refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedP
     plan = pilot.at(spacing, _SETTLED * tolerance, pilot.time_step)
     while True:
         plan.require_feasible("tolerance", tolerance)
-        begin, found = time.perf_counter(), SimulatedPropagator(plan, cache, others)
-        error, shape, hardening = found.known_errors()
+        begin, propagator = time.perf_counter(), SimulatedPropagator(plan, store, others)
+        error, shape, rigid_error = propagator.known_errors()
         taken = time.perf_counter() - begin
         logger.debug("spacing %.3g mm: estimated error %.2g", 1e3 * plan.spacing, error)
-        if hardening > _HARDENING * tolerance:
+        if rigid_error > _HARDENING * tolerance:
             logger.debug(
-                "obstacles taken as rigid would leave an error of %.2g: their materials count", hardening
+                "obstacles taken as rigid would leave an error of %.2g: their materials count", rigid_error
             )
-            return _refined(pilot.with_materials, budget, cache)
+            return _refined(pilot.with_materials, budget, store)
         step = _LARGEST_STEP
         if others:
             accepted = tolerance * (_BY_TWO_GRIDS if len(others) == 1 else _BY_THREE_GRIDS)
-            known = shape + hardening
+            known = shape + rigid_error
             if error - known <= max(accepted - known, shape / _SHAPE):
                 _warn_of_shape(region, shape, error, tolerance)
-                return found
+                return propagator
             if not math.isfinite(error):
                 reason = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
                 raise invalid("max_periods", pilot.max_periods, reason)
@@ -119,8 +120,8 @@ def _refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedP
         else:
             shown = 1e3 * plan.spacing, error, tolerance
             logger.warning("time or memory end at %.3g mm: estimated error %.2g, tolerance %g", *shown)
-            return found
-        plan, others = finer, [*others, found]
+            return propagator
+        plan, others = finer, [*others, propagator.simulation]
 
 
 def _warn_of_shape(region: Region, shape: float, error: float, tolerance: float) -> None:

@@ -36,7 +36,7 @@ def region_of(scene: Scene) -> Region:
     return Region(air, scene.attenuation, scene.frequency, tuple(bodies), scene.domain, positions)
 
 
-def hardened(region: Region, tolerance: float) -> Region:
+def with_rigid(region: Region, tolerance: float) -> Region:
     """Return the region with its hard bodies rigid, where that changes the field by less than a tolerance.
 
     That is relative to the field in free space: errors count it (`rigid_errors`). A body that a later one

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import math
-import warnings
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal, Protocol, overload, runtime_checkable
 
@@ -16,13 +13,11 @@ from autdtorch.analytic.green import PAIR_BYTES, free_space_matrix
 from autdtorch.fdtd.grid_errors import errors_by_grids, grid_errors, rigid_errors, shape_errors, sizes
 from autdtorch.fdtd.thin_walls import warn_of_thin_walls
 from autdtorch.propagators.box import BoxSimulation
-from autdtorch.propagators.cache import DiskCache, cache_key
 from autdtorch.propagators.full import DomainSimulation
-from autdtorch.propagators.kept_fields import KeepingSimulation
-from autdtorch.propagators.kept_matrices import KeptMatrices
+from autdtorch.propagators.notices import Notices, warn_of_unsettled
 from autdtorch.propagators.plan import Plan
-from autdtorch.propagators.scene_region import warn_of_near_points
-from autdtorch.propagators.simulation import Run, TransferMatrix
+from autdtorch.propagators.simulation import PressureMap, Run, Simulation
+from autdtorch.propagators.store import Store
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX
@@ -32,20 +27,8 @@ from autdtorch.utils.memory import require_memory
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import ArrayLike, boolean, points_grid
 
-logger = logging.getLogger(__name__)
-
-# Periods from which a run tells of a resonance. Runs of bodies without any take 15 to 60; a quality factor is
-# about half the periods, and a grid of 1.3 mm shifts frequencies by 0.2 %
-_RINGING = 100
-
-_FAINT = 1e-7  # Pressure relative to that in free space, -140 dB, which is rounding in single precision
-
-# Ratio of periods from which another grid is next to a resonance that this one is not: it tells of that alone
 _LONGER = 1.5
-
-
-class SteadyStateWarning(UserWarning):
-    """A simulation ended before its steady state was reached."""
+"""Ratio of periods from which another grid is next to a resonance that this one is not, and is left out."""
 
 
 @runtime_checkable
@@ -70,14 +53,9 @@ class Propagator(Protocol):
 class SimulatedPropagator:
     """A propagator that simulates the steady state of the drive by FDTD.
 
-    By method "box" and without a cache, the outgoing fields of the last drives are kept. Those of all
-    transducers are simulated and kept once they pay: after as many runs from points. More points outside the
-    boxes, and more drives, then take sums and no runs.
-
-    The last transfer matrices are kept, up to 250 MB in all; a larger one is simulated whenever it is needed.
-    Points that are given as a grid (Nu, Nv, 3), such as a plane, are likely to be looked at again. Without a
-    cache, their matrix is simulated once drives there have taken as many runs as the matrix takes, if it can
-    be kept; more drives then take no runs.
+    A result depends on the scene, the settings and the arguments of its call alone. The last ones are kept,
+    up to 1 GB: transfer matrices, and by method "box" the outgoing fields of drives, from which other points
+    outside the boxes take sums and no runs.
 
     Attributes:
         scene: the scene it was made for.
@@ -85,31 +63,19 @@ class SimulatedPropagator:
         spacing: edge of a cell [m].
         tolerance: relative distance to the steady state at which a run ends.
         max_periods: periods after which a run ends in any case, with a `SteadyStateWarning`.
-        runs: all simulations in order. A run in several boxes counts as one; symmetry images and loaded
-            matrices take none.
-        loaded_from: folder of the cache that a matrix came from, or None.
+        simulation: the grids and the runs on them.
     """
 
-    def __init__(
-        self, plan: Plan, cache: DiskCache | None = None, others: Sequence[SimulatedPropagator] = ()
-    ) -> None:
+    def __init__(self, plan: Plan, store: Store | None = None, others: Sequence[Simulation] = ()) -> None:
         """Use `make_propagator`, which checks its arguments. Nothing is computed here.
 
-        `others` are propagators of the scene on other grids, for error estimates; by default one is made.
+        `others` are simulations of the scene on other grids, for error estimates; by default one is made.
         """
         self.scene, self.method, self.spacing = plan.scene, plan.method, plan.spacing
         self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
-        self.runs: list[Run] = []
-        self.loaded_from: Path | None = None
-        self._reported = 0
-        self._plan, self._cache, self._given = plan, cache, tuple(others)
-        # What a folder holds must not decide how later fields are computed: nothing is kept beside a cache.
-        boxes = KeepingSimulation if cache is None else BoxSimulation
-        self._simulation = DomainSimulation(plan) if plan.method == "full" else boxes(plan)
-        self._kept = KeptMatrices(len(plan.scene.array))
-        self._transducers_ran = self._near_logged = False
-        self._near_points_logged = self._enclosed_logged = False
-        self._ringing_logged = self._faint_logged = False
+        self._plan, self._store, self._coarser = plan, store or Store(), tuple(others)
+        self.simulation = simulation_of(plan, self._store)
+        self._notices = Notices(self.simulation)
 
     def __repr__(self) -> str:
         """Scene, settings and number of runs."""
@@ -117,33 +83,41 @@ class SimulatedPropagator:
         return f"SimulatedPropagator(scene {self.scene.name!r}, {settings}, {counted(len(self.runs), 'run')})"
 
     @property
+    def runs(self) -> list[Run]:
+        """All simulations in order.
+
+        A run in several boxes counts as one; symmetry images and loaded matrices take none.
+        """
+        return self.simulation.runs
+
+    @property
+    def loaded_from(self) -> Path | None:
+        """Folder of the cache that a matrix came from, or None."""
+        return self.simulation.loaded_from
+
+    @property
     def time_step(self) -> float:
         """The time step [s], of several boxes the shortest."""
-        return self._simulation.time_step
+        return self.simulation.time_step
 
     @property
     def cells(self) -> int:
         """Number of cells of all grids."""
         return self._plan.cells
 
-    def warn_of_thin_walls(self) -> None:
-        """Log which obstacles have walls thinner than a cell, oblique to their grid."""
-        grids = zip(self._plan.grouping.groups, self._plan.grouping.axes, strict=True)
-        warn_of_thin_walls(self._plan.region, self.spacing, grids)
-
     def warn_of_ringing(self) -> None:
         """Log if the control points' sound rings, where grids may agree and be wrong together."""
-        self._report_ringing(self._with_error(None).periods)
+        self._error(self.scene.control_points)
 
     @property
     def planned_runs(self) -> int:
         """Number of simulations of the control points' transfer matrix."""
-        return self._simulation.matrix_runs(self.scene.control_points)
+        return self.simulation.matrix_runs(self.scene.control_points)
 
-    @cached_property
-    def _others(self) -> tuple[SimulatedPropagator, ...]:
-        """Simulations on other grids, for the error estimate."""
-        return self._given or (SimulatedPropagator(self._plan.second, self._cache),)
+    def warn_of_thin_walls(self) -> None:
+        """Log which obstacles have walls thinner than a cell, oblique to their grid."""
+        grids = zip(self._plan.grouping.groups, self._plan.grouping.axes, strict=True)
+        warn_of_thin_walls(self._plan.region, self.spacing, grids)
 
     @overload
     def transfer_matrix(
@@ -160,7 +134,7 @@ class SimulatedPropagator:
         """Return the transfer matrix G, from one simulation for each transducer or each point (reciprocity).
 
         Simulations start at the transducers if a point is next to an obstacle. Points or transducers in one
-        symmetry orbit of the scene on its grid share a simulation. The last matrices are kept, up to 250 MB.
+        symmetry orbit of the scene on its grid share a simulation.
 
         Args:
             points: (P, 3) [m]; by default the scene's control points.
@@ -176,19 +150,17 @@ class SimulatedPropagator:
                 or on a transducer (method "box").
         """
         with_error = boolean("return_error", return_error)
-        places = None if points is None else self._simulation.checked(points)
-        if places is not None:
-            require_memory("points", (len(places), 3), PAIR_BYTES * len(self.scene.array) * len(places))
-        result = self._with_error(places) if with_error else self._result(places)
-        if places is not None:
-            self._report_near(places)
-        self._report_enclosed(self.scene.control_points if places is None else places, result.matrix.mT)
-        if places is None:
-            self._report_faint(result.matrix)
-        if with_error:
-            self._report_ringing(result.periods)
-        self._report()
-        return (result.matrix, result.error) if with_error else result.matrix
+        places = self._places(points)
+        result = self.simulation.transfer_matrix(places)
+        self._notices.of_sources(result)
+        self._notices.of_cavities(places, result.matrix)
+        if points is None:
+            self._notices.of_faint_points(result.matrix, self._free(places))
+        judged = [self.simulation, *self._others] if with_error and not self._coarser else [self.simulation]
+        warn_of_unsettled(
+            [run for each in judged for run in each.transfer_matrix(places).runs], self.tolerance
+        )
+        return (result.matrix.clone(), self._error(places)) if with_error else result.matrix.clone()
 
     @one_library_thread()
     def point_errors(self, points: ArrayLike | None = None) -> torch.Tensor:
@@ -196,39 +168,37 @@ class SimulatedPropagator:
 
         Points and errors are those of `transfer_matrix`.
         """
-        places = None if points is None else self._simulation.checked(points)
-        result = self._result(places)
-        others = [(other._result(places), other.spacing) for other in self._others]
-        free = self._free(places)
-        settling = result.error * result.matrix.norm() / sizes(result.matrix, free)
+        places = self._places(points)
+        result, free = self.simulation.transfer_matrix(places), self._free(places)
+        others = [other.transfer_matrix(places) for other in self._others]
+        self._notices.of_ringing(max(each.periods for each in (result, *others)))
+        settling = result.residual * result.matrix.norm() / sizes(result.matrix, free)
         settling = torch.where(result.matrix.any(dim=1), settling, 0.0)
-        self._report_ringing(max(one.periods for one in (result, *(other for other, _ in others))))
-        return self._errors(result, others, free) + settling
+        matrices = [each.matrix for each in (result, *others)]
+        return self._errors(matrices, [each.periods for each in (result, *others)], free) + settling
 
-    def _errors(
-        self, result: TransferMatrix, others: Sequence[tuple[TransferMatrix, float]], free: torch.Tensor
-    ) -> torch.Tensor:
-        """Return the errors (P,) of the rows of a matrix by grid, shape and bodies taken as rigid.
+    @one_library_thread()
+    def known_errors(self) -> tuple[float, float, float]:
+        """Simulate the control points; return their error, and its parts by shapes and rigid bodies.
 
-        Rows of the matrices on `others`, grids and their spacings [m], and in free space belong to them.
+        The error is that by the grids given, infinite without any. For the last part see `rigid_errors`.
         """
-        calm = [other for other in others if other[0].periods <= _LONGER * result.periods] or others[-1:]
-        matrix, grids = result.matrix, [(other.matrix, spacing) for other, spacing in calm]
-        # only boxes know the incident field
-        of_grids = errors_by_grids if self.method == "full" else grid_errors
-        errors = of_grids(matrix, free, self.spacing, grids, self._plan.law)
-        errors = torch.where(matrix.any(dim=1), errors, 0.0)  # silence is exact
-        region = self._plan.region
-        return errors + shape_errors(matrix, free, region) + rigid_errors(matrix, free, region)
-
-    def _free(self, points: torch.Tensor | None) -> torch.Tensor:
-        """Return the matrix of points in free space, by default of the control points."""
-        points = self.scene.control_points if points is None else points
-        return free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
+        points = self.scene.control_points
+        matrix, free = (
+            part.reshape(1, -1)
+            for part in (self.simulation.transfer_matrix(points).matrix, self._free(points))
+        )
+        shape, rigid_error = (
+            float(errors(matrix, free, self._plan.region)) for errors in (shape_errors, rigid_errors)
+        )
+        return self._error(points) if self._coarser else math.inf, shape, rigid_error
 
     @one_library_thread()
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
         """Return the pressure of drives at points, from a simulation for each drive or the transfer matrix.
+
+        The latter takes fewer runs for many drives: for still more in later calls, multiply by
+        `transfer_matrix`.
 
         Args:
             drive: (..., M) complex, |q| <= 1, on any device.
@@ -242,150 +212,74 @@ class SimulatedPropagator:
         """
         drive = validate_drive(drive, len(self.scene.array)).cpu()
         points, grid = points_grid("points", points)
-        points = self._simulation.checked(points)
-        if len(grid) == 1:  # others are pictures, which may cross obstacles
-            self._report_near(points)
+        points = self.simulation.checked(points)
+        is_picture = len(grid) > 1  # which may cross obstacles
+        if not is_picture:
+            self._notices.of_points(points)
         flat = drive.reshape(-1, drive.shape[-1])
-        # Planes are looked at again, with other drives. Beside a cache, earlier calls decide nothing.
-        revisited = len(grid) > 1 and self._cache is None
-        drives = len(flat) + (self._kept.runs(points) if revisited else 0)
-        known = revisited and self._kept.get(points) is not None
-        by_matrix = known or drive.requires_grad or self._simulation.matrix_pays(drives, points)
+        loud = flat.detach().any(dim=1)
+        by_matrix = drive.requires_grad or int(loud.sum()) > self.simulation.matrix_runs(points)
         rows = len(self.scene.array) if by_matrix else len(flat)
         require_memory("points", (*grid, 3), PAIR_BYTES * rows * len(points))
-        if by_matrix:
-            result = self._executed(points)
-            self._report()
-            if len(grid) == 1:
-                self._report_enclosed(points, result.matrix.mT)
-            return (drive @ result.matrix.mT).reshape(*drive.shape[:-1], *grid)
         field = torch.zeros((len(flat), len(points)), **COMPLEX)
-        if (loud := flat.any(dim=1)).any():
-            field[loud], runs = self._simulation.fields(flat[loud], points)
-            self.runs += runs
-            if revisited:
-                self._kept.count(points, len(runs))
-            self._transducers_ran |= bool(runs)
-            self._report()
-            if len(grid) == 1:
-                self._report_enclosed(points, field[loud])
+        if by_matrix:
+            result = self.simulation.transfer_matrix(points)
+            field = flat @ result.matrix.mT
+        elif loud.any():
+            result = self.simulation.fields(flat[loud], points)
+            field[loud] = result.matrix.mT
+        else:
+            result = PressureMap(field.mT)
+        warn_of_unsettled(result.runs, self.tolerance)
+        self._notices.of_sources(result)
+        if not is_picture:
+            self._notices.of_cavities(points, result.matrix)
         return field.reshape(*drive.shape[:-1], *grid)
 
-    def _result(self, points: torch.Tensor | None) -> TransferMatrix:
-        """Return the matrix of points, by default of the control points; it may be changed."""
-        points = self.scene.control_points if points is None else points
-        result = self._executed(points)
-        own = self._kept.get(points) is not result
-        return result if own else replace(result, matrix=result.matrix.clone())
+    def _places(self, points: ArrayLike | None) -> torch.Tensor:
+        """Return points (P, 3) after checking them, by default the control points."""
+        if points is None:
+            return self.scene.control_points
+        places = self.simulation.checked(points)
+        require_memory("points", (len(places), 3), PAIR_BYTES * len(self.scene.array) * len(places))
+        self._notices.of_points(places)
+        return places
 
-    def _executed(self, points: torch.Tensor) -> TransferMatrix:
-        """Return the matrix of points: kept, from the cache or simulated. The cache gets those converged.
+    @cached_property
+    def _others(self) -> tuple[Simulation, ...]:
+        """Simulations on other grids, for the error estimate."""
+        return self._coarser or (simulation_of(self._plan.second, self._store),)
 
-        It is not to be changed if it is kept.
+    def _error(self, points: torch.Tensor) -> float:
+        """Return the relative error of the matrix of points, estimated from other grids."""
+        result, *others = (each.transfer_matrix(points) for each in (self.simulation, *self._others))
+        periods = [each.periods for each in (result, *others)]
+        self._notices.of_ringing(max(periods))
+        flat = [each.matrix.reshape(1, -1) for each in (result, *others)]
+        return result.residual + float(self._errors(flat, periods, self._free(points).reshape(1, -1)))
+
+    def _errors(
+        self, matrices: Sequence[torch.Tensor], periods: Sequence[int], free: torch.Tensor
+    ) -> torch.Tensor:
+        """Return the errors (P,) of the rows of the first matrix by grid, shape and bodies taken as rigid.
+
+        The others are those of `_others`; `free` is the matrix in free space.
         """
-        if (kept := self._kept.get(points)) is not None:
-            return kept
-        result = self._loaded(points)
-        if result is None:
-            result = self._simulation.transfer_matrix(points)
-            self.runs += result.runs
-            self._transducers_ran |= bool(result.runs) and not result.from_points
-            if self._cache is not None and all(run.reached for run in result.runs):
-                numbers = result.error, result.periods
-                self._cache.save(cache_key(self._plan, points), result.matrix.numpy(), *numbers)
-        return self._kept.add(points, result) or result
+        matrix, others = matrices[0], list(zip(matrices[1:], self._others, periods[1:], strict=True))
+        calm = [other for other in others if other[2] <= _LONGER * periods[0]] or others[-1:]
+        grids = [(other, simulation.plan.spacing) for other, simulation, _ in calm]
+        # only boxes know the incident field
+        of_grids = errors_by_grids if self.method == "full" else grid_errors
+        errors = of_grids(matrix, free, self.spacing, grids, self._plan.law)
+        errors = torch.where(matrix.any(dim=1), errors, 0.0)  # silence is exact
+        region = self._plan.region
+        return errors + shape_errors(matrix, free, region) + rigid_errors(matrix, free, region)
 
-    def _loaded(self, points: torch.Tensor) -> TransferMatrix | None:
-        """Return the matrix of points from the cache, if it is there."""
-        if self._cache is None:
-            return None
-        shape = len(points), len(self.scene.array)
-        if (found := self._cache.load(cache_key(self._plan, points), shape, 2)) is None:
-            return None
-        self.loaded_from = self._cache.folder
-        logger.debug("transfer matrix of %s loaded from %s", self.scene.name, self.loaded_from)
-        matrix, (error, periods) = found
-        return TransferMatrix(torch.from_numpy(matrix), error, int(periods), (), from_points=True)
+    def _free(self, points: torch.Tensor) -> torch.Tensor:
+        """Return the matrix of points in free space."""
+        return free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
 
-    @one_library_thread()
-    def _with_error(self, points: torch.Tensor | None) -> TransferMatrix:
-        """Return the matrix of points with its error, estimated from other grids."""
-        result, others = self._result(points), [other._result(points) for other in self._others]
-        flat, *rest = (replace(one, matrix=one.matrix.reshape(1, -1)) for one in (result, *others))
-        grids = [(one, other.spacing) for one, other in zip(rest, self._others, strict=True)]
-        whole = self._errors(flat, grids, self._free(points).reshape(1, -1))
-        periods = max(one.periods for one in (result, *others))
-        return replace(result, error=result.error + float(whole), periods=periods)
 
-    @one_library_thread()
-    def known_errors(self) -> tuple[float, float, float]:
-        """Simulate the control points; return their error, and its parts by uncertain surfaces and hardening.
-
-        The error is that by the grids given, infinite without any. For the last part see `rigid_errors`.
-        """
-        result = self._with_error(None) if self._given else self._result(None)
-        matrix, free = (part.reshape(1, -1) for part in (result.matrix, self._free(None)))
-        shape, hardening = (float(of(matrix, free, self._plan.region)) for of in (shape_errors, rigid_errors))
-        return result.error if self._given else math.inf, shape, hardening
-
-    def _report_near(self, points: torch.Tensor) -> None:
-        """Log once, of the points of any call, which are next to a surface."""
-        if not self._near_points_logged:
-            self._near_points_logged = warn_of_near_points(self.scene, "points", points, self.spacing)
-
-    def _report_enclosed(self, points: torch.Tensor, pressure: torch.Tensor) -> None:
-        """Log once that points (P, 3) of pressure (R, P) are in a cavity of rigid obstacles."""
-        silent = points[(pressure == 0).all(dim=0)]
-        if not self._enclosed_logged and len(silent) and (found := self._simulation.enclosed(silent)).any():
-            self._enclosed_logged, count = True, int(found.sum())
-            place = tuple(round(1e3 * entry, 3) for entry in silent[found][0].tolist())
-            more = f", and of {count - 1} more," if count > 1 else ""
-            logger.warning("rigid obstacles enclose the point at %s mm: its pressure%s is 0", place, more)
-
-    def _report_faint(self, matrix: torch.Tensor) -> None:
-        """Log once that what control points get is rounding: methods would make foci of it."""
-        size, free = matrix.norm(dim=1), self._free(None).norm(dim=1)
-        faint = self.scene.control_points[(size > 0) & (size < _FAINT * free)]
-        if len(faint) and not self._faint_logged:
-            self._faint_logged = True
-            place = tuple(round(1e3 * entry, 3) for entry in faint[0].tolist())
-            more = f", nor {len(faint) - 1} more" if len(faint) > 1 else ""
-            logger.warning("no sound reaches the point at %s mm%s: its pressure is rounding", place, more)
-
-    def _report_ringing(self, periods: int) -> None:
-        """Log once that obstacles resonate; see `warn_of_ringing`."""
-        if periods > _RINGING and not self._ringing_logged:
-            self._ringing_logged = True
-            logger.warning(
-                "sound rings for %d periods in or between obstacles: next to a resonance a small shift of its"
-                " frequency changes the field, and the error may be larger than estimated", periods,
-            )  # fmt: skip
-
-    def _unreported(self) -> list[Run]:
-        """Return the runs since the last call."""
-        runs, self._reported = self.runs[self._reported :], len(self.runs)
-        return runs
-
-    def _report(self) -> None:
-        """Warn of new runs that did not converge; log once if a source is next to an obstacle.
-
-        Coarse grids on the way to a tolerance do not matter.
-        """
-        runs = self._unreported()
-        if not self._given and "_others" in vars(self):
-            runs += [run for other in self._others for run in other._unreported()]
-        if self._transducers_ran and not self._near_logged:
-            self._near_logged = True
-            if any(map(self._simulation.near_obstacle, self.scene.array.nodes.positions)):
-                logger.warning(
-                    "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g"
-                    " mm", 1e3 * self._plan.source_clearance, 1e3 * self.spacing,
-                )  # fmt: skip
-        if unsettled := [run for run in runs if not run.reached]:
-            periods, error = max(run.periods for run in unsettled), max(run.remaining for run in unsettled)
-            warnings.warn(
-                f"no steady state after {periods} periods in {len(unsettled)} of {counted(len(runs), 'run')}"
-                f": estimated relative error up to {error:.1e}, tolerance {self.tolerance:g}; raise "
-                "max_periods or tolerance", SteadyStateWarning,
-                stacklevel=4,  # the caller of the public, decorated method
-            )  # fmt: skip
+def simulation_of(plan: Plan, store: Store) -> Simulation:
+    """Make the simulation of a plan of method "box" or "full"."""
+    return (DomainSimulation if plan.method == "full" else BoxSimulation)(plan, store)

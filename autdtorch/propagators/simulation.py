@@ -1,4 +1,4 @@
-"""A plan's grids and the runs on them."""
+"""A plan's grids and the runs on them: every result is a linear map, decided by the plan and the points."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import logging
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import cast
+from pathlib import Path
+from typing import TypeVar, cast
 
 import torch
 
@@ -16,24 +16,21 @@ from autdtorch.fdtd.grids import USUAL_PERIODS
 from autdtorch.fdtd.kernels.choice import make_kernel
 from autdtorch.fdtd.steady_state import SILENCE, SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly
-from autdtorch.fdtd.symmetry import (
-    Orbits,
-    Symmetry,
-    orbits_of_points,
-    orbits_of_transducers,
-    symmetries,
-)
+from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_points, orbits_of_transducers, symmetries
 from autdtorch.propagators.plan import Plan
+from autdtorch.propagators.store import Store
 from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.cached import cached_property
+from autdtorch.utils.digest import digest_of
 from autdtorch.utils.display import counted
-from autdtorch.utils.progress import Progress, show_progress
+from autdtorch.utils.progress import show_progress
 from autdtorch.utils.validation import ArrayLike, invalid, points_tensor
 
 logger = logging.getLogger(__name__)
+ResultT = TypeVar("ResultT")
 
 Stepped = Callable[[int], None]
 
@@ -62,30 +59,49 @@ class Run:
 
 
 @dataclass(frozen=True)
-class TransferMatrix:
-    """A simulated transfer matrix.
+class PressureMap:
+    """A linear map from drives to pressures at points: a transfer matrix, or the fields of some drives.
 
     Attributes:
-        matrix: complex128 (P, M) [Pa].
-        error: estimated relative error; from a single grid the distance to the steady state alone.
-        periods: most periods of a run, also if it was kept or loaded.
-        runs: the simulations it took; none if it was loaded.
+        matrix: complex128 (P, M) [Pa], or (P, R) for R drives.
+        residual: estimated relative distance to the steady state.
+        periods: most periods of a run.
+        runs: the simulations behind it; none if it was loaded.
         from_points: whether they began at the points (reciprocity), not at the transducers.
     """
 
     matrix: torch.Tensor
-    error: float
-    periods: int
-    runs: tuple[Run, ...]
-    from_points: bool
+    residual: float = 0.0
+    periods: int = 0
+    runs: tuple[Run, ...] = ()
+    from_points: bool = True
+
+    @property
+    def nbytes(self) -> int:
+        """Memory [bytes]."""
+        return self.matrix.nbytes
+
+    @classmethod
+    def of_runs(cls, matrix: torch.Tensor, runs: Sequence[Run], from_points: bool) -> PressureMap:
+        """Return the map that runs gave."""
+        residual, periods = max(run.remaining for run in runs), max(run.periods for run in runs)
+        return cls(matrix, residual, periods, tuple(runs), from_points)
 
 
 class Simulation(ABC):
-    """A plan's grids, which are assembled at first use, and the runs on them."""
+    """A plan's grids, which are assembled at first use, and the runs on them.
 
-    def __init__(self, plan: Plan) -> None:
-        """Make the simulation of a plan; nothing is computed yet."""
-        self.plan = plan
+    Attributes:
+        plan: the plan.
+        runs: all simulations in order.
+        loaded_from: folder that a matrix was loaded from, or None.
+    """
+
+    def __init__(self, plan: Plan, store: Store) -> None:
+        """Make the simulation of a plan, whose results are in a store; nothing is computed yet."""
+        self.plan, self._store = plan, store
+        self.runs: list[Run] = []
+        self.loaded_from: Path | None = None
         self._kernel = make_kernel(plan.kernel)
 
     @property
@@ -109,7 +125,7 @@ class Simulation(ABC):
     def _simulate(
         self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures, stepped: Stepped
     ) -> tuple[torch.Tensor, list[Run]]:
-        """Do the work of `run`; `stepped` is called with numbers of periods."""
+        """Do the work of `_run`; `stepped` is called with numbers of periods."""
 
     def checked(self, points: ArrayLike) -> torch.Tensor:
         """Return points (P, 3) after checking them; a `ValueError` names one that cannot be computed."""
@@ -117,37 +133,28 @@ class Simulation(ABC):
         self._check(points)
         return points
 
-    def enclosed(self, points: torch.Tensor) -> torch.Tensor:
-        """Return which points (..., 3) are in air that rigid obstacles enclose."""
-        found = self._in_enclosed_cells(points)
-        for obstacle, body in zip(self.plan.scene.obstacles, self.plan.region.bodies, strict=True):
-            if body.shape is not obstacle:  # its cavities are filled
-                found = found | (cast(Obstacle, body.shape).contains(points) & ~obstacle.contains(points))
-        return found
+    def transfer_matrix(self, points: torch.Tensor) -> PressureMap:
+        """Return the transfer matrix of points (P, 3), from the store or simulated; not to be changed."""
+        key = digest_of(self.plan.key, points)
+        return self._store.get(key, lambda: self._loaded(key, points) or self._saved(key, points))
 
-    def silent(self, nodes: torch.Tensor) -> torch.Tensor:
-        """Return which receivers (P,), with nodes (P, n, 3) [m], are in a rigid obstacle or enclosed by some.
+    def fields(self, drive: torch.Tensor, points: torch.Tensor) -> PressureMap:
+        """Return the pressure (P, R) of drives (R, M), none of them silent, at points (P, 3)."""
+        key = digest_of(self.plan.key, points, drive)
+        return self._store.get(key, lambda: self._fields(drive, points))
 
-        Of overlapping obstacles the later counts.
-        """
-        silent = torch.zeros(len(nodes), dtype=torch.bool, device="cpu")
-        for body in self.plan.region.bodies:
-            inside = cast(Obstacle, body.shape).contains(nodes).any(dim=1)
-            silent = torch.where(inside, body.fluid is None, silent)
-        return silent | self.enclosed(nodes).any(dim=1)
+    def matrix_runs(self, points: torch.Tensor) -> int:
+        """Return the number of runs that the transfer matrix of points (P, 3) takes."""
+        return self.orbits(points).runs
 
-    @cached_property
-    def _enclosed_transducers(self) -> torch.Tensor:
-        """Numbers (n,) of the transducers that rigid obstacles enclose."""
-        return self.enclosed(self.plan.scene.array.nodes.positions).any(dim=1).nonzero()[:, 0]
-
-    def _refuse_enclosed_transducers(self) -> None:
-        """Refuse transducers that rigid obstacles enclose: no sound leaves, and there is no steady state."""
-        if len(self._enclosed_transducers):
-            number = int(self._enclosed_transducers[0])
-            place = tuple(self.plan.scene.array.positions[number].tolist())
-            accepted = "is enclosed by rigid obstacles, which no sound leaves; must be outside"
-            raise invalid(f"array.positions[{number}]", place, accepted, "m")
+    def orbits(self, points: torch.Tensor) -> Orbits:
+        """Return the fewest runs for a transfer matrix: from transducers or, by reciprocity, from points."""
+        forward = self._orbits_of_transducers(points)
+        if self.near_obstacle(points):
+            return forward  # only these are accurate there
+        backward = orbits_of_points(points, self.symmetries)
+        fewer = (backward.runs, len(points)) < (forward.runs, len(self.plan.scene.array))
+        return backward if fewer else forward
 
     @cached_property
     def symmetries(self) -> list[Symmetry]:
@@ -160,26 +167,54 @@ class Simulation(ABC):
         most = max(assembly.steps_per_period for assembly in self.assemblies)
         return 1 / (self.plan.scene.frequency * float(most))
 
-    def orbits(self, points: torch.Tensor) -> Orbits:
-        """Return the fewest runs for a transfer matrix: from transducers or, by reciprocity, from points."""
-        forward = orbits_of_transducers(points, self.symmetries)
-        if self.near_obstacle(points):
-            return forward  # only these are accurate there
-        backward = orbits_of_points(points, self.symmetries)
-        fewer = (backward.runs, len(points)) < (forward.runs, len(self.plan.scene.array))
-        return backward if fewer else forward
+    def silent(self, nodes: torch.Tensor) -> torch.Tensor:
+        """Return which receivers (P,), with nodes (P, n, 3) [m], are in a rigid obstacle or enclosed by some.
 
-    def transfer_matrix(self, points: torch.Tensor) -> TransferMatrix:
-        """Simulate the transfer matrix of points (P, 3); no run begins at one that no sound reaches."""
-        heard = ~self.silent(points[:, None])
+        Of overlapping obstacles the later counts.
+        """
+        silent = torch.zeros(len(nodes), dtype=torch.bool, device="cpu")
+        for body in self.plan.region.bodies:
+            inside = cast(Obstacle, body.shape).contains(nodes).any(dim=1)
+            silent = torch.where(inside, body.fluid is None, silent)
+        return silent | self.enclosed(nodes).any(dim=1)
+
+    def enclosed(self, points: torch.Tensor) -> torch.Tensor:
+        """Return which points (..., 3) are in air that rigid obstacles enclose."""
+        enclosed = self._in_enclosed_cells(points)
+        for obstacle, body in zip(self.plan.scene.obstacles, self.plan.region.bodies, strict=True):
+            if body.shape is not obstacle:  # its cavities are filled
+                filled = cast(Obstacle, body.shape).contains(points)
+                enclosed = enclosed | (filled & ~obstacle.contains(points))
+        return enclosed
+
+    def _loaded(self, key: str, points: torch.Tensor) -> PressureMap | None:
+        """Return the transfer matrix of points that an earlier process saved, if it is there."""
+        saved = self._store.load(key, (len(points), len(self.plan.scene.array)), 2)
+        if saved is None:
+            return None
+        self.loaded_from = self._store.folder
+        logger.debug("transfer matrix of %s loaded from %s", self.plan.scene.name, self.loaded_from)
+        matrix, (residual, periods) = saved
+        return PressureMap(torch.from_numpy(matrix), residual, int(periods))
+
+    def _saved(self, key: str, points: torch.Tensor) -> PressureMap:
+        """Simulate the transfer matrix of points, and save it if all runs converged."""
+        result = self._audible(points)
+        if all(run.reached for run in result.runs):
+            self._store.save(key, result.matrix.numpy(), result.residual, result.periods)
+        return result
+
+    def _audible(self, points: torch.Tensor) -> PressureMap:
+        """Simulate the transfer matrix of points; no run begins at one that no sound reaches."""
+        audible = ~self.silent(points[:, None])
         matrix = torch.zeros((len(points), len(self.plan.scene.array)), **COMPLEX)
-        if not heard.any():
-            return TransferMatrix(matrix, 0.0, 0, (), from_points=True)
-        found = self._matrix_of(points[heard])
-        matrix[heard] = found.matrix
-        return replace(found, matrix=matrix)
+        if not audible.any():
+            return PressureMap(matrix)
+        result = self._matrix(points[audible])
+        matrix[audible] = result.matrix
+        return replace(result, matrix=matrix)
 
-    def _matrix_of(self, points: torch.Tensor) -> TransferMatrix:
+    def _matrix(self, points: torch.Tensor) -> PressureMap:
         """Simulate the transfer matrix of points (P, 3), none of them silent."""
         array, orbits = self.plan.scene.array, self.orbits(points)
         targets, transducers = Apertures.of_points(points), apertures_of(array)
@@ -187,39 +222,50 @@ class Simulation(ABC):
         begins = "points" if orbits.from_points else "transducers"
         logger.debug("transfer matrix: %d runs serve %d %s", orbits.runs, len(orbits.representative), begins)
         strength = torch.ones((orbits.runs, 1), **COMPLEX)
-        alone = [sources.chosen(slice(own, own + 1)) for own in orbits.representatives]
-        found, runs = self.run(alone, strength, receivers)
-        rows, remaining = orbits.expand(found), max(run.remaining for run in runs)
-        periods = max(run.periods for run in runs)
+        alone = [sources.chosen(slice(index, index + 1)) for index in orbits.representatives]
+        pressure, runs = self._run(alone, strength, receivers)
+        rows = orbits.expand(pressure)
         matrix = strengths_of(array) * (rows if orbits.from_points else rows.mT.contiguous())
-        return TransferMatrix(matrix, remaining, periods, tuple(runs), orbits.from_points)
+        return PressureMap.of_runs(matrix, runs, orbits.from_points)
 
-    def matrix_runs(self, points: torch.Tensor) -> int:
-        """Return the number of runs that the transfer matrix of points (P, 3) takes."""
-        return self.orbits(points).runs
-
-    def matrix_pays(self, drives: int, points: torch.Tensor) -> bool:
-        """Return whether so many drives take longer than the transfer matrix of points (P, 3)."""
-        return drives > self.matrix_runs(points)
-
-    def fields(self, drive: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, list[Run]]:
-        """Return the pressure (R, P) [Pa] of drives (R, M), none of them silent, and the runs it took."""
+    def _fields(self, drive: torch.Tensor, points: torch.Tensor) -> PressureMap:
+        """Simulate the pressure of drives at points; see `fields`."""
         array = self.plan.scene.array
         sources, strength = [apertures_of(array)] * len(drive), strengths_of(array) * drive
-        return self.run(sources, strength, Apertures.of_points(points))
+        pressure, runs = self._run(sources, strength, Apertures.of_points(points))
+        return PressureMap.of_runs(pressure.mT, runs, from_points=False)
 
-    def run(
+    def _run(
         self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures
     ) -> tuple[torch.Tensor, list[Run]]:
         """Return the pressure (R, P) [Pa] at P receivers of R runs with N sources each, and the runs.
 
         The strengths (R, N) [Pa m] of a run are not all zero; receivers take the mean over their nodes.
         """
-        self._refuse_enclosed_transducers()
-        with self._progress(len(sources)) as progress:
-            return self._simulate(sources, strength, receivers, progress.advance)
+        return self._recorded(
+            len(sources), lambda stepped: self._simulate(sources, strength, receivers, stepped)
+        )
 
-    def silence(self, points: torch.Tensor, sources: Apertures, strength: torch.Tensor) -> float:
+    def _recorded(
+        self, count: int, simulate: Callable[[Stepped], tuple[ResultT, list[Run]]]
+    ) -> tuple[ResultT, list[Run]]:
+        """Simulate so many runs, show their progress and record them."""
+        self._refuse_enclosed_transducers()
+        plan, grids = self.plan, [assembly.grid for assembly in self.assemblies]
+        what = f"simulating {plan.scene.name}"
+        settings = plan.method, 1e3 * plan.spacing, counted(count, "run")
+        logger.debug("%s: %s, cells of %.3g mm, %s", what, *settings)
+        arrival = max(grid.arrival for grid in grids)
+        with show_progress(math.ceil(count * USUAL_PERIODS * fewest_periods(arrival)), what) as progress:
+            result, runs = simulate(progress.advance)
+        self.runs += runs
+        return result, runs
+
+    def _orbits_of_transducers(self, points: torch.Tensor) -> Orbits:
+        """Return the orbits of runs from the transducers that serve points (P, 3)."""
+        return orbits_of_transducers(points, self.symmetries)
+
+    def _silence(self, points: torch.Tensor, sources: Apertures, strength: torch.Tensor) -> float:
         """Return the norm of the pressure [Pa] at points (P, n, 3) below which a run may end: -80 dB.
 
         It is relative to free space, as if the sources of strength (N,) [Pa m] did not cancel each other.
@@ -227,11 +273,14 @@ class Simulation(ABC):
         distance = torch.cdist(points.mean(dim=1), sources.positions.mean(dim=1))
         return SILENCE * float((strength.abs() / distance.clamp(min=self.plan.spacing / 2)).norm())
 
-    def _progress(self, runs: int) -> AbstractContextManager[Progress]:
-        """Show the progress of so many runs."""
-        plan, grids = self.plan, [assembly.grid for assembly in self.assemblies]
-        what = f"simulating {plan.scene.name}"
-        count = counted(runs, "run")
-        logger.debug("%s: %s, cells of %.3g mm, %s", what, plan.method, 1e3 * plan.spacing, count)
-        arrival = max(grid.arrival for grid in grids)
-        return show_progress(math.ceil(runs * USUAL_PERIODS * fewest_periods(arrival)), what)
+    def _refuse_enclosed_transducers(self) -> None:
+        if len(self._enclosed_transducers):
+            number = int(self._enclosed_transducers[0])
+            place = tuple(self.plan.scene.array.positions[number].tolist())
+            accepted = "is enclosed by rigid obstacles, which no sound leaves; must be outside"
+            raise invalid(f"array.positions[{number}]", place, accepted, "m")
+
+    @cached_property
+    def _enclosed_transducers(self) -> torch.Tensor:
+        """Numbers (n,) of the transducers that rigid obstacles enclose."""
+        return self.enclosed(self.plan.scene.array.nodes.positions).any(dim=1).nonzero()[:, 0]

@@ -144,7 +144,7 @@ class Scene:
     ) -> Scene:
         """Return the scene with all obstacles shifted, and turned as one body.
 
-        They turn about the centre of the sphere around them, as those of a `ScatteringOperator`.
+        They turn about the centre of the sphere around them, as those of a `TMatrix`.
 
         Args:
             offset: (3,) [m].

@@ -27,7 +27,7 @@ class Simulation:
     """The simulation of the field of one scene.
 
     Attributes:
-        method: "free_space" (exact), "box" or "full" (FDTD), or "operator".
+        method: "free_space" (exact), "box" or "full" (FDTD), or "tmatrix".
         wavelength: in the medium [m].
         spacing: edge of a cell [m]; None in free space.
         tolerance: relative distance from the steady state at which a run ends; None in free space.

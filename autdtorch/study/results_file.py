@@ -156,9 +156,10 @@ def _read_goal(attributes: Any) -> tuple[dict[str, Any], str]:
 def _read_simulation(group: Any) -> Simulation:
     attributes, runs = group.attrs, _entry(group, "runs")
     columns = [_array(runs, key).tolist() for key in _RUN]
-    require_one_of("method", attributes["method"], ("free_space", "box", "full", "operator"))
+    method = attributes["method"].replace("operator", "tmatrix")  # a name of version 0.1
+    require_one_of("method", method, ("free_space", "box", "full", "tmatrix"))
     return Simulation(
-        attributes["method"],
+        method,
         positive("wavelength", attributes["wavelength"], "m"),
         positive("spacing", attributes["spacing"], "m") if "spacing" in attributes else None,
         positive("tolerance", attributes["tolerance"]) if "tolerance" in attributes else None,

@@ -25,9 +25,9 @@ from autdtorch.objectives.metrics import focus_metrics
 from autdtorch.objectives.objective import Objective
 from autdtorch.objectives.quiet import QuietPoints
 from autdtorch.objectives.simulated import SimulatedObjective
-from autdtorch.propagators import OperatorPropagator, Propagator, SimulatedPropagator, make_propagator
-from autdtorch.propagators.operator_propagator import placed_bodies
+from autdtorch.propagators import Propagator, SimulatedPropagator, TMatrixPropagator, make_propagator
 from autdtorch.propagators.plan import plan
+from autdtorch.propagators.tmatrix.propagator import placed_bodies
 from autdtorch.scene.obstacles.moving import is_movable
 from autdtorch.scene.scene import Scene
 from autdtorch.study.folder import open_folder
@@ -165,8 +165,8 @@ def _for_poses(scenes: Mapping[str, Scene], solver: Mapping[str, Any]) -> dict[s
         return dict(solver)
     bodies = {}
     for scene in scenes.values():
-        once = plan(scene, "operator", spacing, **settings)
-        if not OperatorPropagator(once).serves(scene.control_points).all():
+        once = plan(scene, "tmatrix", spacing, **settings)
+        if not TMatrixPropagator(once).serves(scene.control_points).all():
             return dict(solver)
         bodies.update({one.body: one for one in placed_bodies(once)})
         if len(bodies) > _MOST_BODIES:
@@ -175,7 +175,7 @@ def _for_poses(scenes: Mapping[str, Scene], solver: Mapping[str, Any]) -> dict[s
     if runs > len(scenes) * each.planned_runs:
         return dict(solver)
     logger.debug("scattering operators: %d runs for all poses", runs)
-    return {**solver, "method": "operator"}
+    return {**solver, "method": "tmatrix"}
 
 
 def _counts(methods: Mapping[str, StudyMethod], trials: int | Mapping[str, int], seed: int) -> dict[str, int]:
@@ -302,7 +302,7 @@ def _run_scene(
         shown_plane = None if pressure is None else pressure[shown].clone()
         results[method_name] = MethodResult(solution, metrics, seconds, shown, shown_plane)
     simulation = Simulation("free_space", scene.wavelength, None, None, (), matrix_seconds, plane_seconds)
-    if isinstance(propagator, SimulatedPropagator | OperatorPropagator):
+    if isinstance(propagator, SimulatedPropagator | TMatrixPropagator):
         grid = {"spacing": propagator.spacing, "tolerance": propagator.tolerance}
         simulation = replace(simulation, method=propagator.method, **grid, runs=tuple(propagator.runs))
     known = transfer_matrix, float(goal.bound(transfer_matrix)), simulation, results
@@ -341,7 +341,7 @@ def _in_short(propagator: Propagator, result: SceneResult) -> str:
     """Return the work of a scene in a line: how it was simulated, the error that is known, and the trials."""
     simulation = result.simulation
     work = "free space" if simulation.method == "free_space" else f"{simulation.method}, "
-    if isinstance(propagator, SimulatedPropagator | OperatorPropagator):
+    if isinstance(propagator, SimulatedPropagator | TMatrixPropagator):
         work += _accuracy(propagator, simulation)
         if propagator.cells:
             work += f", {propagator.cells:,} cells of {1e3 * propagator.spacing:.3g} mm"
@@ -354,9 +354,9 @@ def _in_short(propagator: Propagator, result: SceneResult) -> str:
     return "; ".join(parts)
 
 
-def _accuracy(propagator: SimulatedPropagator | OperatorPropagator, simulation: Simulation) -> str:
+def _accuracy(propagator: SimulatedPropagator | TMatrixPropagator, simulation: Simulation) -> str:
     """Return the number of simulations, and the relative error as far as it is known."""
-    if isinstance(propagator, OperatorPropagator):
+    if isinstance(propagator, TMatrixPropagator):
         waves = f"{propagator.planned_runs} waves" if propagator.cells else "exact waves"
         return f"{waves}, error {propagator.tolerance:g}"
     count, error = len(simulation.runs), propagator.known_errors()[0]

@@ -16,7 +16,7 @@ from shared.scenes import paper_scene, relative_error, weakest
 from shared.timing import shortest, timed
 
 import autdtorch as at
-from autdtorch.propagators.moved_boxes import forget_assemblies
+from autdtorch.propagators.store import BODIES
 
 DOCUMENT = "performance.md"
 
@@ -51,10 +51,10 @@ def by_box(scene: at.Scene, spacing: float) -> torch.Tensor:
     return at.make_propagator(scene, "box", spacing, cache=False).transfer_matrix()
 
 
-def build(obstacles: at.Obstacle | tuple[at.Obstacle, ...]) -> tuple[at.ScatteringOperator, float]:
+def build(obstacles: at.Obstacle | tuple[at.Obstacle, ...]) -> tuple[at.TMatrix, float]:
     """Return the T-matrix of obstacles in air, and the time it took [s]."""
-    forget_assemblies()
-    return timed(lambda: at.ScatteringOperator.of(obstacles, AIR, 40e3, SPACING, cache=False))
+    BODIES.forget()
+    return timed(lambda: at.TMatrix.of(obstacles, AIR, 40e3, SPACING, cache=False))
 
 
 def row(name: str, shifts: int, turns: int) -> list[str]:

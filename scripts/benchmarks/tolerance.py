@@ -22,7 +22,7 @@ from shared.scenes import relative_error, uncached
 from shared.timing import timed
 
 import autdtorch as at
-from autdtorch.propagators import OperatorPropagator, SimulatedPropagator
+from autdtorch.propagators import TMatrixPropagator, SimulatedPropagator
 
 DOCUMENT = "benchmarks.md"
 
@@ -195,7 +195,7 @@ def on_grids(case: Case) -> tuple[list[Result], torch.Tensor]:
 
 def simulating(scene: at.Scene) -> str:
     """Return the method that simulates a scene; "auto" would take the closed form of a sphere."""
-    known = isinstance(at.make_propagator(scene, cache=False), OperatorPropagator)
+    known = isinstance(at.make_propagator(scene, cache=False), TMatrixPropagator)
     return "box" if known else "auto"
 
 

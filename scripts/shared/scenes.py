@@ -8,7 +8,7 @@ import torch
 
 import autdtorch as at
 from autdtorch.propagators import SimulatedPropagator
-from autdtorch.propagators.moved_boxes import forget_assemblies
+from autdtorch.propagators.store import BODIES
 
 ROOT = Path(__file__).parents[2]
 SCENES = ROOT / "configs" / "scene"
@@ -52,7 +52,7 @@ def uncached(
     scene: at.Scene, method: str, spacing: float | None, tolerance: float = 1e-3, **settings: Any
 ) -> SimulatedPropagator:
     """Return a propagator at `spacing` [mm] that reads nothing from disk and reuses no assembly."""
-    forget_assemblies()
+    BODIES.forget()
     spacing = None if spacing is None else 1e-3 * spacing
     propagator = at.make_propagator(scene, method, spacing, tolerance=tolerance, cache=False, **settings)
     assert isinstance(propagator, SimulatedPropagator)

@@ -87,8 +87,8 @@ def scene_of(name: str) -> at.Scene:
 def losses(name: str, count: int, spacing: float) -> Iterator[Losses]:
     """Yield the losses of one of the scenes, for `count` directions, on cells of `spacing` [m]."""
     scene = scene_of(name)
-    body = at.ScatteringOperator.of(scene.obstacles, scene.medium, scene.frequency, spacing)
-    objective = at.SimulatedObjective(scene, at.make_propagator(scene, "operator", spacing, 1e-3))
+    body = at.TMatrix.of(scene.obstacles, scene.medium, scene.frequency, spacing)
+    objective = at.SimulatedObjective(scene, at.make_propagator(scene, "tmatrix", spacing, 1e-3))
     best = at.gradient_ascent(objective)
     drive, full = best.drive[0], float(best.score[0])
     generator = torch.Generator().manual_seed(0)

@@ -39,7 +39,7 @@ def main(spacing: float, seed: int) -> None:
     """Simulate the measurement, recover the pose, and print the fit from each start."""
     scene, true, spacing = bench(), pose_of(TRUE_OFFSET, TRUE_ROTATION), 1e-3 * spacing
     observed = measured(scene, true, spacing / 2, seed)
-    body = at.ScatteringOperator.of(scene.obstacles, scene.medium, scene.frequency, spacing, error=1e-2)
+    body = at.TMatrix.of(scene.obstacles, scene.medium, scene.frequency, spacing, error=1e-2)
     starts = [pose_of(0.0, (0.0, *tilt)) for tilt in TILTS]
     results: list[Fit] = []
     for number, fit in enumerate(fits(body, scene, observed, starts), 1):
@@ -104,7 +104,7 @@ def measured(
 
 
 def fits(
-    body: at.ScatteringOperator, scene: at.Scene, observed: torch.Tensor, starts: Iterable[torch.Tensor]
+    body: at.TMatrix, scene: at.Scene, observed: torch.Tensor, starts: Iterable[torch.Tensor]
 ) -> Iterator[Fit]:
     """Fit the pose of a body to magnitudes (P, M) [Pa] of each transducer alone, from several poses (6,)."""
     rms = observed.square().mean().sqrt()

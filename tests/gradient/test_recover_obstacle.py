@@ -17,8 +17,8 @@ TRUE = pose_of((0.6e-3, -0.6e-3, 0.5e-3), (3.5, -2.5, 2.5))  # 1 mm and 5 degree
 
 
 @pytest.fixture(scope="module")
-def body() -> at.ScatteringOperator:
-    return at.ScatteringOperator.of(BLOCK, AIR, 40e3, spacing=1.5e-3, error=1e-2)
+def body() -> at.TMatrix:
+    return at.TMatrix.of(BLOCK, AIR, 40e3, spacing=1.5e-3, error=1e-2)
 
 
 def test_operator_and_scene_agree_in_a_pose(body):

@@ -36,7 +36,7 @@ def together(scene, spacing=SPACING):
 
 
 def cells(propagator):
-    return [math.prod(assembly.grid.shape) for assembly in propagator._simulation.assemblies]
+    return [math.prod(assembly.grid.shape) for assembly in propagator.simulation.assemblies]
 
 
 def far_apart(*obstacles):
@@ -91,7 +91,7 @@ def test_points_in_a_box_read_its_grid_and_receive_the_other():
 
 
 def test_boxes_whose_iteration_does_not_converge_are_joined(monkeypatch):
-    monkeypatch.setattr("autdtorch.propagators.box.MOST_PASSES", 1)
+    monkeypatch.setattr("autdtorch.propagators.multiple_scattering.MOST_PASSES", 1)
     apart, one = boxes(spheres()), together(spheres())
     assert torch.equal(apart.transfer_matrix(), one.transfer_matrix())
     assert [run.periods for run in apart.runs] == [run.periods for run in one.runs]

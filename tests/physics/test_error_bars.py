@@ -179,7 +179,7 @@ def test_rows_where_nothing_arrives_have_an_error_relative_to_free_space():
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-5])
 def test_exact_spheres_claim_the_waves_left_out(tolerance):
     """By scattering operators in closed form: measured 1e-7, claimed once the whole tolerance."""
-    propagator = make_propagator(small_scene((RIGID,)), "operator", None, tolerance)
+    propagator = make_propagator(small_scene((RIGID,)), "tmatrix", None, tolerance)
     matrix, error = propagator.transfer_matrix(return_error=True)
     true = relative_error(matrix, exact(RIGID))
     assert true < max(3 * error, 1e-10)

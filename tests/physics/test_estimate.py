@@ -22,7 +22,7 @@ BALL = at.Sphere((12e-3, 20e-3, 5e-3), 3e-3, density=0.2, sound_speed=900.0)
         (at.Box((11e-3, 12e-3, 12e-3), (15e-3, 23.8e-3, 23.8e-3), rigid=True), "box"),
         (at.Box((12e-3,) * 3, (2e-3, 30e-3, 30e-3), rigid=True), "full"),
         (at.Box((12e-3,) * 3, (2e-3, 8e-3, 30e-3), rigid=True), "box"),
-        (at.Sphere((14e-3, 12e-3, 2e-3), 4e-3, rigid=True), "operator"),
+        (at.Sphere((14e-3, 12e-3, 2e-3), 4e-3, rigid=True), "tmatrix"),
         (at.VoxelMask(np.ones((4, 4, 4), bool), 1e-3, (14e-3, 12e-3, 0.0), rigid=True), "box"),
     ],
     ids=["small", "filling the domain", "wall", "post", "sphere", "at the rim"],
@@ -57,7 +57,7 @@ def test_cells_and_runs_are_those_of_the_simulation(method, spacing):
     cost = at.estimate(scene, spacing, method=method)
     propagator = at.make_propagator(scene, method, spacing)
     propagator.transfer_matrix()
-    (assembly,) = propagator._simulation.assemblies
+    (assembly,) = propagator.simulation.assemblies
     assert cost.method == method
     # a grid may be placed so that an axis has a cell more
     shape = assembly.grid.shape

@@ -41,7 +41,7 @@ def simulated(scene, method="box", spacing=1.3e-3, tolerance=1e-3):
 
 
 def count(scene, method="box"):
-    return len(simulated(scene, method)._simulation.symmetries)
+    return len(simulated(scene, method).simulation.symmetries)
 
 
 @pytest.mark.parametrize("name", ["two_cubes", "three_cubes", "sphere"])
@@ -120,7 +120,7 @@ def test_a_wall_that_goes_on_is_symmetric_too():
     wall = Box((30e-3, 12e-3, 12e-3), (20e-3, 60e-3, 60e-3), rigid=True)
     points = FOCI - torch.tensor([4e-3, 0, 0])
     propagator = simulated(scene(wall, points=points), "full", tolerance=SETTLED)
-    assert len(propagator._simulation.symmetries) == 8
+    assert len(propagator.simulation.symmetries) == 8
     matrix = propagator.transfer_matrix()
     direct = propagator.transfer_matrix(points[3:])
     assert relative_error(matrix[3:], direct) < SETTLED
@@ -175,7 +175,7 @@ def test_random_symmetric_scenes(obstacle, spacing):
     symmetric = scene(*copies)
     assume(lies_symmetrically(symmetric, spacing))  # with many faces, another place may be clearly better
     propagator = simulated(symmetric, "box", spacing, tolerance=SETTLED)
-    assert len(propagator._simulation.symmetries) == 8
+    assert len(propagator.simulation.symmetries) == 8
     matrix = propagator.transfer_matrix()  # of as many points as transducers: from the transducers
     assert len(propagator.runs) == 1
     direct = simulated(symmetric, "box", spacing, tolerance=SETTLED).field(

@@ -39,9 +39,9 @@ def of_two_speeds(extent):
 @pytest.mark.parametrize(("method", "extent"), [("box", 200e-3), ("full", 48e-3)])
 def test_a_coarse_spacing_is_logged_once_for_all_obstacles(method, extent, caplog):
     propagator = simulated(of_two_speeds(extent), method, 2.5e-3)
-    assert len(propagator._simulation.assemblies) == (2 if method == "box" else 1)
-    assert propagator._others[0].spacing < propagator.spacing
-    assert propagator._others[0].planned_runs
+    assert len(propagator.simulation.assemblies) == (2 if method == "box" else 1)
+    assert propagator._others[0].plan.spacing < propagator.spacing
+    assert propagator._others[0].matrix_runs(propagator.scene.control_points)
     (message,) = messages(caplog, "coarse")
     assert "2.5 mm" in message
     assert all(where in message for where in ("the medium", "obstacle 1", "obstacle 2"))

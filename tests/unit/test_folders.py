@@ -19,7 +19,7 @@ def save_state(path):
 
 def save_operator(path):
     matrix = torch.diag(torch.ones(4, dtype=torch.complex128))
-    at.ScatteringOperator(matrix, 700.0 + 0j, 1e-3, torch.zeros(3).double(), torch.eye(3).double()).save(path)
+    at.TMatrix(matrix, 700.0 + 0j, 1e-3, torch.zeros(3).double(), torch.eye(3).double()).save(path)
 
 
 def log(path):

@@ -100,7 +100,7 @@ def propagator_and_matrix(method):
 
 
 @settings(max_examples=15)
-@given(st.integers(0, 30), st.sampled_from(["full", "box", "operator"]))
+@given(st.integers(0, 30), st.sampled_from(["full", "box", "tmatrix"]))
 def test_work_that_was_stopped_at_any_step_begins_again_as_if_it_had_not(step, method):
     make, expected = propagator_and_matrix(method)
     propagator, steps = make(), itertools.count()

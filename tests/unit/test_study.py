@@ -269,5 +269,5 @@ def test_poses_are_simulated_by_operators_where_these_are_fewer_runs():
     cube = Box((12e-3,) * 3, (3e-3,) * 3, rigid=True)
     scenes = {f"{step}": scene(None, (cube,)).moved((0, 1e-5 * step, 0)) for step in range(60)}
     solver = {"spacing": 2e-3, "tolerance": 0.1}
-    assert _for_poses(scenes, solver) == solver | {"method": "operator"}
+    assert _for_poses(scenes, solver) == solver | {"method": "tmatrix"}
     assert _for_poses({"0": scenes["0"]}, solver) == solver

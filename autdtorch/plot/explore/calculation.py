@@ -24,8 +24,8 @@ from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.plot.explore.situation import Situation
 from autdtorch.propagators import (
     FreeSpacePropagator,
-    OperatorPropagator,
     SimulatedPropagator,
+    TMatrixPropagator,
     make_propagator,
     volume_field,
 )
@@ -34,7 +34,7 @@ from autdtorch.scene.geometry import Plane
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.progress import Stopped, stopping_when
 
-Propagator: TypeAlias = FreeSpacePropagator | OperatorPropagator | SimulatedPropagator
+Propagator: TypeAlias = FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator
 
 logger = logging.getLogger(__name__)
 

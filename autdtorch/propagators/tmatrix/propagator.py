@@ -1,4 +1,4 @@
-"""The propagator of scattering operators: each body of a scene is simulated once, wherever it is."""
+"""The propagator of T-matrices: each body of a scene is simulated once, wherever it is."""
 
 from __future__ import annotations
 
@@ -15,14 +15,13 @@ from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.grid_errors import grid_errors, rigid_errors, shape_errors, sizes
 from autdtorch.fdtd.thin_walls import warn_of_thin_walls
 from autdtorch.fdtd.turning import axes_along, flat_faces
-from autdtorch.propagators.bodies import ScatteringBodies, bodies_at, scattered_waves
-from autdtorch.propagators.body_matrix import Placed, Solver, placed
-from autdtorch.propagators.cache import DiskCache
-from autdtorch.propagators.operator import ScatteringOperator
 from autdtorch.propagators.plan import Plan
-from autdtorch.propagators.scene_bodies import Body, are_outside, bodies_of
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.propagators.simulation import Run
+from autdtorch.propagators.store import Store
+from autdtorch.propagators.tmatrix.bodies import Body, are_outside, bodies_of
+from autdtorch.propagators.tmatrix.body import Placed, Solver, placed
+from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import require_clear
 from autdtorch.utils.array_types import COMPLEX, REAL
@@ -41,15 +40,15 @@ _ROUNDING = 1e-12  # Error of sums of all waves
 _TINY = torch.finfo(torch.float64).tiny
 
 
-class OperatorPropagator:
-    """A propagator by the scattering operators of a scene's bodies, simulated once or in closed form.
+class TMatrixPropagator:
+    """A propagator by the T-matrices of a scene's bodies, simulated once or in closed form.
 
     Obstacles whose circumscribed spheres overlap make one body. Points inside a sphere, or so near that the
     waves have not converged to the tolerance, are served by a propagator of method "box", which is logged.
 
     Attributes:
         scene: the scene it was made for.
-        method: "operator".
+        method: "tmatrix".
         spacing: edge of a cell [m].
         tolerance: relative error at which waves are left out, and at which runs end.
         max_periods: periods after which a run ends in any case.
@@ -58,7 +57,7 @@ class OperatorPropagator:
     def __init__(
         self,
         plan: Plan,
-        cache: DiskCache | None = None,
+        store: Store | None = None,
         make_box: Callable[[], SimulatedPropagator] | None = None,
     ) -> None:
         """Use `make_propagator`, which checks its arguments. Nothing is computed here.
@@ -67,14 +66,13 @@ class OperatorPropagator:
         """
         self.scene, self.method, self.spacing = plan.scene, plan.method, plan.spacing
         self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
-        self._plan, self._cache = plan, cache
-        self._make_box = make_box or functools.partial(SimulatedPropagator, plan.by_box, cache)
-        self._logged = False
+        self._plan, self._store = plan, store or Store()
+        self._make_box = make_box or functools.partial(SimulatedPropagator, plan.by_box, self._store)
 
     def __repr__(self) -> str:
         """Scene, settings and number of bodies."""
-        settings = f"operator, spacing {1e3 * self.spacing:.4g} mm, tolerance {self.tolerance:g}"
-        return f"OperatorPropagator(scene {self.scene.name!r}, {settings})"
+        settings = f"tmatrix, spacing {1e3 * self.spacing:.4g} mm, tolerance {self.tolerance:g}"
+        return f"TMatrixPropagator(scene {self.scene.name!r}, {settings})"
 
     @property
     def runs(self) -> list[Run]:
@@ -88,15 +86,13 @@ class OperatorPropagator:
 
     @property
     def cells(self) -> int:
-        """Number of cells of all grids; 0 where the operators are known."""
+        """Number of cells of all grids; 0 where T-matrices have a closed form."""
         return self._plan.cells if self._plan.runs else 0
 
     @cached_property
-    def bodies(self) -> ScatteringBodies:
+    def bodies(self) -> TMatrixCluster:
         """The bodies of the scene."""
-        return ScatteringBodies(
-            [ScatteringOperator(*body.matrix(self._cache)) for body in placed_bodies(self._plan)]
-        )
+        return TMatrixCluster(TMatrix(*body.matrix(self._store)) for body in placed_bodies(self._plan))
 
     def warn_of_thin_walls(self) -> None:
         """Log which obstacles have walls thinner than a cell, oblique to a grid along their own faces."""
@@ -106,7 +102,7 @@ class OperatorPropagator:
 
     @property
     def planned_runs(self) -> int:
-        """Number of simulations of all operators, if none is there."""
+        """Number of simulations of all T-matrices, if none is there."""
         return sum(body.runs for body in placed_bodies(self._plan))
 
     def serves(self, points: ArrayLike) -> torch.Tensor:
@@ -134,7 +130,7 @@ class OperatorPropagator:
         """Return the transfer matrix G; see `SimulatedPropagator.transfer_matrix`.
 
         Differentiable by the points that are not served by the box. The error is that of the waves left out,
-        and, where operators are simulated, the tolerance and that of the grid, from a second grid. For rows
+        and, where T-matrices are simulated, the tolerance and that of the grid, from a second grid. For rows
         from the box, the box estimates it.
         """
         with_error = boolean("return_error", return_error)
@@ -170,11 +166,11 @@ class OperatorPropagator:
         region = self._plan.region
         if not self._plan.runs:  # exact but for the waves left out
             more = self._plan.at(self.spacing, _MORE_WAVES * self.tolerance)
-            other, served = OperatorPropagator(more, self._cache)._by_waves(points)
+            other, served = TMatrixPropagator(more, self._store)._by_waves(points)
             left_out = (matrix - other).norm(dim=1) / sizes(matrix, free)
             errors = torch.full((len(points),), self.tolerance, **REAL)
             return torch.where(served, left_out + _ROUNDING, errors)
-        second = OperatorPropagator(self._plan.second, self._cache)
+        second = TMatrixPropagator(self._plan.second, self._store)
         other = second.transfer_matrix(points)
         others = [(other, second.spacing)]
         errors = grid_errors(matrix, free, self.spacing, others, self._plan.law)
@@ -196,8 +192,7 @@ class OperatorPropagator:
         if not served.all():
             field = field.clone()
             near = places[~served].detach()
-            # Of a plane they stay a grid, for which the box may keep its matrix.
-            near = near if len(grid) == 1 else near[None]
+            near = near if len(grid) == 1 else near[None]  # those of a picture may be in obstacles
             field[..., ~served] = self._box.field(drive, near).reshape(*drive.shape[:-1], -1)
         return field.reshape(*drive.shape[:-1], *grid)
 
@@ -218,25 +213,25 @@ class OperatorPropagator:
         if served.any():
             outside = points[served]
             parts = [self._converged(part) for part in torch.split(outside, _AT_ONCE)]
-            found, converged = torch.cat([part for part, _ in parts]), torch.cat([own for _, own in parts])
+            rows, converged = (torch.cat(part) for part in zip(*parts, strict=True))
             served = served.index_put((served.clone(),), converged)
-            matrix = matrix.index_put((served,), found[converged])
-        if not served.all() and not self._logged:
-            self._logged = True
+            matrix = matrix.index_put((served,), rows[converged])
+        if not served.all():
             logger.debug("%d points are too near an obstacle for its waves: by box", int((~served).sum()))
         return matrix, served
 
     def _converged(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return G (P, M) at points (P, 3), and where (P,) the waves have converged to the tolerance."""
-        waves, (scattered, *fewer) = bodies_at(self.bodies, points), self._scattered
-        found = waves @ scattered + free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
-        left_out = self._left_out(waves.detach(), [scattered, *fewer])
-        return found, left_out <= self.tolerance * found.detach().norm(dim=1)
+        waves, scattered = self.bodies.outgoing_waves(points), self._scattered
+        direct = free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
+        matrix = waves @ scattered[0] + direct
+        left_out = self._left_out(waves.detach(), scattered)
+        return matrix, left_out <= self.tolerance * matrix.detach().norm(dim=1)
 
     @cached_property
     def _scattered(self) -> list[torch.Tensor]:
         """Outgoing waves (N, M) of all bodies, by all degrees and with the highest ones left out."""
-        return scattered_waves(self.bodies, self.scene.array, (0, _FEWER, 2 * _FEWER))
+        return self.bodies.scattered_waves(self.scene.array, (0, _FEWER, 2 * _FEWER))
 
     @staticmethod
     def _left_out(waves: torch.Tensor, scattered: Sequence[torch.Tensor]) -> torch.Tensor:

@@ -9,11 +9,12 @@ import pytest
 import torch
 from small_scenes import AIR, relative_error, small_scene
 
-from autdtorch.propagators import OperatorPropagator, SteadyStateWarning, make_propagator
-from autdtorch.propagators.body_matrix import _simulated
+from autdtorch.propagators import SteadyStateWarning, TMatrixPropagator, make_propagator
 from autdtorch.propagators.estimate import estimate
 from autdtorch.propagators.plan import plan
-from autdtorch.propagators.scene_bodies import bodies_of
+from autdtorch.propagators.store import BODIES
+from autdtorch.propagators.tmatrix import body
+from autdtorch.propagators.tmatrix.bodies import bodies_of
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.obstacles import Box, Sphere, VoxelMask
 from autdtorch.scene.obstacles.moving import shifted, turned
@@ -30,21 +31,21 @@ def scene_of(*obstacles: object, points: torch.Tensor = POINTS) -> Scene:
     return Scene(ARRAY, AIR, 40e3, points, obstacles)
 
 
-def operator(scene: Scene, **settings: object) -> OperatorPropagator:
-    propagator = make_propagator(scene, "operator", **{**COARSE, **settings})
-    assert isinstance(propagator, OperatorPropagator)
+def by_tmatrix(scene: Scene, **settings: object) -> TMatrixPropagator:
+    propagator = make_propagator(scene, "tmatrix", **{**COARSE, **settings})
+    assert isinstance(propagator, TMatrixPropagator)
     return propagator
 
 
 def test_it_is_the_box():
     scene = scene_of(SMALL)
     box = make_propagator(scene, "box", **COARSE)
-    matrix = operator(scene).transfer_matrix()
+    matrix = by_tmatrix(scene).transfer_matrix()
     # two digits of waves were asked for
     assert relative_error(matrix, box.transfer_matrix()) < 0.02
     drive = torch.polar(torch.ones(2, 4).double(), torch.arange(8).double().reshape(2, 4))
     plane = POINTS[0] + torch.cartesian_prod(*(1e-3 * torch.arange(n).double() for n in (1, 3, 4)))
-    field = operator(scene).field(drive, plane.reshape(3, 4, 3))
+    field = by_tmatrix(scene).field(drive, plane.reshape(3, 4, 3))
     assert field.shape == (2, 3, 4)
     assert relative_error(field, box.field(drive, plane.reshape(3, 4, 3))) < 0.02
 
@@ -52,21 +53,21 @@ def test_it_is_the_box():
 def test_auto_takes_what_is_known_of_a_sphere():
     scene = scene_of(BALL)
     found, box = make_propagator(scene, cache=False), make_propagator(scene, "box", 0.6e-3, cache=False)
-    assert found.method == "operator"
+    assert found.method == "tmatrix"
     assert (estimate(scene).runs, estimate(scene).spacing) == (0, None)
     # of the box, as in test_sphere.py
     assert relative_error(box.transfer_matrix(), found.transfer_matrix()) < 0.01
     assert found.transfer_matrix(return_error=True)[1] <= 2e-3
     assert make_propagator(scene_of(SMALL), cache=False).method == "box"
     at_surface = scene_of(BALL, points=torch.tensor([[18.1e-3, 12e-3, 12e-3]]).double())
-    assert make_propagator(at_surface, cache=False).method == "operator"
+    assert make_propagator(at_surface, cache=False).method == "tmatrix"
 
 
-def test_auto_takes_operators_where_they_are_fewer_runs():
+def test_auto_takes_t_matrices_where_they_are_fewer_runs():
     many = POINTS[0] + torch.cartesian_prod(*(1e-3 * torch.arange(n).double() for n in (2, 8, 8)))
     array = type(ARRAY).grid((12, 12), 2e-3, (0, 12e-3, 12e-3), (1, 0, 0), radius=0)
     scene = Scene(array, AIR, 40e3, many, [SMALL])
-    assert make_propagator(scene, spacing=2e-3, tolerance=0.02, cache=False).method == "operator"
+    assert make_propagator(scene, spacing=2e-3, tolerance=0.02, cache=False).method == "tmatrix"
     assert make_propagator(replace(scene, array=ARRAY), spacing=2e-3, tolerance=0.02).method == "box"
 
 
@@ -74,7 +75,7 @@ def test_points_near_a_body_are_served_by_the_box(caplog):
     caplog.set_level(logging.DEBUG)
     near = torch.tensor([[12e-3, 12e-3, 14.2e-3], [14.6e-3, 12e-3, 12e-3]]).double()
     scene = scene_of(SMALL, points=torch.cat((POINTS, near)))
-    matrix = operator(scene).transfer_matrix()
+    matrix = by_tmatrix(scene).transfer_matrix()
     assert "2 points are too near an obstacle" in caplog.text
     box = make_propagator(scene, "box", **COARSE).transfer_matrix()
     assert torch.equal(matrix[3:], make_propagator(scene, "box", **COARSE).transfer_matrix(near))
@@ -84,7 +85,7 @@ def test_points_near_a_body_are_served_by_the_box(caplog):
 def test_transducers_within_a_sphere_are_served_by_the_box():
     array = type(ARRAY).grid((2, 2), 2.6e-3, (9e-3, 12e-3, 12e-3), (1, 0, 0), radius=0)  # 3.5 mm away
     scene = Scene(array, AIR, 40e3, POINTS, [SMALL])
-    found = operator(scene).transfer_matrix()
+    found = by_tmatrix(scene).transfer_matrix()
     assert torch.equal(found, make_propagator(scene, "box", **COARSE).transfer_matrix())
 
 
@@ -92,8 +93,8 @@ def test_waves_near_a_sphere_are_checked():
     """Degrees that suffice far from a sphere do not suffice at its surface."""
     places = torch.tensor([[18.05e-3, 12e-3, 12e-3], [30e-3, 12e-3, 12e-3]]).double()
     scene = scene_of(replace(BALL, radius=4e-3), points=places)
-    rough = operator(scene, spacing=0.5e-3, tolerance=0.01).transfer_matrix()
-    exact = operator(scene, tolerance=1e-7).transfer_matrix()
+    rough = by_tmatrix(scene, spacing=0.5e-3, tolerance=0.01).transfer_matrix()
+    exact = by_tmatrix(scene, tolerance=1e-7).transfer_matrix()
     errors = (rough - exact).norm(dim=1) / exact.norm(dim=1)
     assert float(errors[1]) < 0.01
     assert float(errors[0]) < 0.05  # of the box, a tenth of a cell from the surface
@@ -106,38 +107,40 @@ def moved(obstacles: tuple[Box, ...], angles: tuple[float, ...], offset: tuple[f
     return [shifted(turned(one, rotation_matrix(angles), pivot), shift) for one in obstacles]
 
 
-def test_a_body_is_simulated_once_wherever_it_is():
+def test_a_body_is_simulated_once_wherever_it_is(monkeypatch):
     pair = (SMALL, replace(SMALL, center=(15e-3, 13e-3, 12e-3), size=(2e-3, 2e-3, 2e-3)))
-    _simulated.cache_clear()
-    operator(scene_of(*pair)).transfer_matrix()
+    simulate, simulated = body._simulated, []
+    monkeypatch.setattr(body, "_simulated", lambda still: simulated.append(still) or simulate(still))
+    BODIES.forget()
+    by_tmatrix(scene_of(*pair)).transfer_matrix()
     for angles, offset in (
         ((0, 0, 0), (1e-3, 0, 1e-3)),
         ((0.3, -0.5, 0.2), (5e-4, 1e-3, 0)),
         ((0, 0, 0.1), (0, 0, 0)),
     ):
         scene = scene_of(*moved(pair, angles, offset))
-        found = operator(scene).transfer_matrix()
+        found = by_tmatrix(scene).transfer_matrix()
         # of the tilted box at 2 mm: 1.5 to 4 % from one grid to another
         assert relative_error(found, make_propagator(scene, "box", **COARSE).transfer_matrix()) < 0.1
-    assert _simulated.cache_info().misses == 1
+    assert len(simulated) == 1
 
 
-def test_operators_are_kept_on_disk(tmp_path):
+def test_t_matrices_are_kept_on_disk(tmp_path):
     scene = scene_of(SMALL)
-    _simulated.cache_clear()
-    first = operator(scene, cache=tmp_path).transfer_matrix()
+    BODIES.forget()
+    first = by_tmatrix(scene, cache=tmp_path).transfer_matrix()
     (kept,) = tmp_path.glob("*.matrix")
-    _simulated.cache_clear()
+    BODIES.forget()
     before = kept.stat().st_mtime_ns
-    assert torch.equal(operator(scene, cache=tmp_path).transfer_matrix(), first)
+    assert torch.equal(by_tmatrix(scene, cache=tmp_path).transfer_matrix(), first)
     assert torch.equal(
-        operator(scene_of(shifted(SMALL, torch.zeros(3).double())), cache=tmp_path).transfer_matrix(), first
+        by_tmatrix(scene_of(shifted(SMALL, torch.zeros(3).double())), cache=tmp_path).transfer_matrix(), first
     )
     assert [path.stat().st_mtime_ns for path in tmp_path.glob("*.matrix")] == [before]
 
 
 def test_gradients_by_the_points_are_those_of_finite_differences():
-    propagator, drive = operator(scene_of(BALL)), torch.ones(4, dtype=torch.complex128)
+    propagator, drive = by_tmatrix(scene_of(BALL)), torch.ones(4, dtype=torch.complex128)
 
     def loudness(points: torch.Tensor) -> torch.Tensor:
         return propagator.field(drive, points).abs().sum()
@@ -158,18 +161,18 @@ def test_obstacles_whose_spheres_overlap_make_one_body():
     near = replace(SMALL, center=(12e-3, 12e-3, 17e-3))
     groups = [body.obstacles for body in bodies_of([SMALL, apart, near])]
     assert groups == [(0, 2), (1,)]
-    assert len(operator(scene_of(BALL, replace(BALL, center=(14e-3, 12e-3, 30e-3)))).bodies.operators) == 2
+    assert len(by_tmatrix(scene_of(BALL, replace(BALL, center=(14e-3, 12e-3, 30e-3)))).bodies.bodies) == 2
 
 
 def test_the_error_is_that_of_the_grid():
     scene = scene_of(SMALL)
-    matrix, error = operator(scene, spacing=1.4e-3).transfer_matrix(return_error=True)
+    matrix, error = by_tmatrix(scene, spacing=1.4e-3).transfer_matrix(return_error=True)
     fine = make_propagator(scene, "box", 0.7e-3, cache=False).transfer_matrix()
     assert relative_error(matrix, fine) < error < 0.2
 
 
 def test_a_spacing_is_chosen_by_the_tolerance():
-    found = operator(scene_of(SMALL), spacing=None, tolerance=0.05)
+    found = by_tmatrix(scene_of(SMALL), spacing=None, tolerance=0.05)
     assert 0.5e-3 < found.spacing < 3e-3
     assert math.isfinite(float(found.transfer_matrix().abs().sum()))
 
@@ -177,13 +180,13 @@ def test_a_spacing_is_chosen_by_the_tolerance():
 def test_obstacles_that_cannot_be_turned_are_simulated_where_they_are():
     mask = VoxelMask(np.ones((3, 3, 3), bool), 1e-3, (11e-3, 11e-3, 11e-3), rigid=True)
     same = Box((12.5e-3, 12.5e-3, 12.5e-3), (3e-3,) * 3, rigid=True)
-    found, wanted = (operator(scene_of(each), spacing=1.4e-3).transfer_matrix() for each in (mask, same))
+    found, wanted = (by_tmatrix(scene_of(each), spacing=1.4e-3).transfer_matrix() for each in (mask, same))
     assert relative_error(found, wanted) < 0.1  # corners of voxels
 
 
-def test_a_scene_without_obstacles_has_no_operator():
-    with pytest.raises(ValueError, match="method: 'operator'; needs a scene with obstacles"):
-        make_propagator(small_scene(()), "operator")
+def test_a_scene_without_obstacles_has_no_t_matrix():
+    with pytest.raises(ValueError, match="method: 'tmatrix'; needs a scene with obstacles"):
+        make_propagator(small_scene(()), "tmatrix")
 
 
 def test_points_just_outside_a_turned_body_are_served():
@@ -193,9 +196,9 @@ def test_points_just_outside_a_turned_body_are_served():
         scene = scene_of(*pair).moved(rotation=(0, 0.2, angle))
         (body,) = bodies_of(scene.obstacles)
         points = sphere_points(body.center, body.radius + 1e-6, 20)
-        propagator = operator(replace(scene, control_points=points))
+        propagator = by_tmatrix(replace(scene, control_points=points))
         assert propagator.serves(points).all()
-        own = propagator.bodies.operators[0]
+        own = propagator.bodies.bodies[0]
         assert torch.allclose(own.center, body.center, atol=1e-8)
         assert own.radius == pytest.approx(body.radius, abs=1e-8)
         assert torch.isfinite(propagator.transfer_matrix().abs()).all()
@@ -208,14 +211,14 @@ def test_touching_spheres_make_one_body():
     apart = replace(pair[1], center=(14e-3, 16e-3 + 1e-6, 12e-3))
     near = make_propagator(scene_of(pair[0], apart), tolerance=1e-4, cache=False)
     box = make_propagator(scene_of(*pair), "box", 0.7e-3, cache=False).transfer_matrix()
-    assert near.method == "operator"
+    assert near.method == "tmatrix"
     # of the box at two surfaces that touch
     assert relative_error(near.transfer_matrix(), box) < 0.02
     assert make_propagator(scene_of(*pair), cache=False).method == "box"
 
 
 def test_a_picture_through_a_sphere_is_one_run():
-    propagator = make_propagator(scene_of(BALL), "operator", 1.4e-3, cache=False)
+    propagator = make_propagator(scene_of(BALL), "tmatrix", 1.4e-3, cache=False)
     plane = torch.tensor([14e-3, 0, 0]).double() + torch.cartesian_prod(
         torch.zeros(1).double(), *(0.5e-3 * torch.arange(48).double() for _ in range(2))
     )
@@ -233,7 +236,7 @@ def test_a_picture_through_a_sphere_is_one_run():
 def test_errors_of_points_within_a_body_are_those_of_the_box():
     inside = torch.cat((POINTS, torch.tensor([[14e-3, 12e-3, 12.5e-3]]).double()))
     scene = scene_of(BALL)
-    propagator = make_propagator(scene, "operator", 1e-3, cache=False)
+    propagator = make_propagator(scene, "tmatrix", 1e-3, cache=False)
     matrix, error = propagator.transfer_matrix(inside, return_error=True)
     errors = propagator.point_errors(inside)
     assert (errors[:3] < 2e-3).all()  # of the waves left out
@@ -241,16 +244,14 @@ def test_errors_of_points_within_a_body_are_those_of_the_box():
     assert float(errors[3]) == pytest.approx(float(box.point_errors(inside[3:])), rel=0.1)
     whole = (errors * matrix.norm(dim=1)).norm() / matrix.norm()
     assert error == pytest.approx(float(whole))
-    assert (
-        make_propagator(scene, "operator", None, 0.02, cache=False).transfer_matrix(inside).isfinite().all()
-    )
+    assert make_propagator(scene, "tmatrix", None, 0.02, cache=False).transfer_matrix(inside).isfinite().all()
 
 
 def test_an_obstacle_of_air_scatters_nothing():
     air = replace(SMALL, rigid=False, density=AIR.density, sound_speed=AIR.sound_speed)
-    found = operator(scene_of(air))
-    assert not found.bodies.operators[0].matrix.any()
-    assert found.bodies.operators[0].reciprocity == 0
+    found = by_tmatrix(scene_of(air))
+    assert not found.bodies.bodies[0].matrix.any()
+    assert found.bodies.bodies[0].reciprocity == 0
     free = make_propagator(scene_of(), cache=False).transfer_matrix()
     assert torch.allclose(found.transfer_matrix(), free)
 
@@ -259,12 +260,12 @@ def test_many_or_large_spheres_are_simulated():
     grid = [replace(BALL, center=(x, y, 12e-3), radius=2e-3) for x in (9e-3, 15e-3) for y in (9e-3, 15e-3)]
     assert make_propagator(scene_of(*grid), cache=False).method == "box"
     large = replace(BALL, center=(0.0, 12e-3, -0.2), radius=0.15)
-    assert plan(scene_of(large)).method != "operator"
+    assert plan(scene_of(large)).method != "tmatrix"
 
 
 def test_runs_that_do_not_settle_are_warned_of_each_time(tmp_path):
     scene = scene_of(SMALL)
     for _ in range(2):
         with pytest.warns(SteadyStateWarning, match="waves of a body after 3 periods"):
-            operator(scene, max_periods=3, cache=tmp_path, tolerance=1e-3).transfer_matrix()
+            by_tmatrix(scene, max_periods=3, cache=tmp_path, tolerance=1e-3).transfer_matrix()
     assert not list(tmp_path.glob("*.matrix"))

@@ -1,4 +1,4 @@
-"""The runs of the box solver that make the scattering operator of a body.
+"""The runs of the box solver that make the T-matrix of a body.
 
 Each column of T is the answer to one regular wave. Where mirrors of the grid's axes map the body onto itself,
 waves of different parities scatter into waves of different parities: they share a run, and are separated
@@ -22,6 +22,7 @@ from autdtorch.fdtd.steady_state import SteadyState, run_to_steady_state
 from autdtorch.fdtd.symmetry import symmetries
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.plan import MOST_JUDGED, Plan
+from autdtorch.propagators.store import Store
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX
@@ -51,7 +52,7 @@ class BodyWaves:
     def runs(self) -> list[list[int]]:
         """The real waves of each run, at most one of each kind; those of similar degree together."""
         kinds = self._kinds
-        of_kind = [torch.nonzero(kinds == own)[:, 0].tolist() for own in range(int(kinds.max()) + 1)]
+        of_kind = [torch.nonzero(kinds == kind)[:, 0].tolist() for kind in range(int(kinds.max()) + 1)]
         return [[wave for wave in waves if wave is not None] for waves in zip_longest(*of_kind)]
 
     @one_library_thread()
@@ -75,20 +76,20 @@ class BodyWaves:
                 settings = (
                     plan.tolerance,
                     plan.max_periods,
-                    lambda phasors: observed @ phasors,
+                    lambda phasors: [observed @ phasors],
                     lambda _: None,
                 )
                 steady = run_to_steady_state(box.assembly, kernel, forces, box.surface[1], *settings)
                 progress.advance(1)
                 return steady
 
-            found = spread(run, self.runs, kernel.at_once(box.assembly.grid.shape))
-        answers = outgoing @ torch.stack([steady.pressure for steady in found], dim=1)
+            states = spread(run, self.runs, kernel.at_once(box.assembly.grid.shape))
+        answers = outgoing @ torch.stack([steady.pressure for steady in states], dim=1)
         matrix, kinds = torch.zeros_like(mixing), self._kinds
         for waves, answer in zip(self.runs, answers.mT, strict=True):
             for wave in waves:
                 matrix[:, wave] = torch.where(kinds == kinds[wave], answer * size[wave], 0)
-        return mixing @ matrix @ mixing.mH, max(steady.residual for steady in found)
+        return mixing @ matrix @ mixing.mH, max(steady.residual for steady in states)
 
     @cached_property
     def _grouping(self) -> Grouping:
@@ -96,14 +97,14 @@ class BodyWaves:
 
     @cached_property
     def _box(self) -> ScatteredField:
-        return BoxSimulation(replace(self.plan, grouping=self._grouping)).boxes[0]
+        return BoxSimulation(replace(self.plan, grouping=self._grouping), Store()).boxes[0]
 
     @cached_property
     def _kinds(self) -> torch.Tensor:
         """The kind (N,) of each real wave; waves of different kinds do not scatter into one another."""
         box, odd = self._box, parities(self.degree).numpy()
-        found = symmetries([box.assembly], box.axes, Apertures.of_points(self.center[None]))
-        turns = [box.axes @ symmetry.matrix @ box.axes.T for symmetry in found]
+        mirrors = symmetries([box.assembly], box.axes, Apertures.of_points(self.center[None]))
+        turns = [box.axes @ symmetry.matrix @ box.axes.T for symmetry in mirrors]
         flips = np.stack([np.diag(turn) < 0 for turn in turns if np.allclose(np.abs(turn), np.eye(3))])
         odd = odd @ flips.T.astype(np.int64) % 2  # by wave and symmetry
         return torch.from_numpy(np.unique(odd, axis=0, return_inverse=True)[1].reshape(-1))

@@ -6,8 +6,8 @@ import pytest
 import torch
 from small_scenes import AIR, relative_error, scene_of_all_kinds
 
-from autdtorch.propagators import make_propagator, moved_boxes
-from autdtorch.propagators.moved_boxes import forget_assemblies
+from autdtorch.propagators import box, make_propagator
+from autdtorch.propagators.store import BODIES
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
 from autdtorch.scene.scene import Scene
@@ -20,10 +20,12 @@ SPHERE = Sphere((40e-3, 50e-3, 50e-3), 4e-3, rigid=True)
 @pytest.fixture
 def assembled(monkeypatch):
     """A list with an entry for every box that is assembled; none is kept before."""
-    found, assemble_on = [], moved_boxes.assemble_on
-    forget_assemblies()
-    monkeypatch.setattr(moved_boxes, "assemble_on", lambda *given: found.append(0) or assemble_on(*given))
-    return found
+    boxes, assemble_on = [], box.assemble_on
+    BODIES.forget()
+    monkeypatch.setattr(
+        box, "assemble_on", lambda grid, *more: boxes.append(grid) or assemble_on(grid, *more)
+    )
+    return boxes
 
 
 def by(move, place):
@@ -53,7 +55,7 @@ def test_a_kept_assembly_changes_no_bit(assembled):
     there = replace(SPHERE, center=by(MOVE, SPHERE.center))
     warm = matrix(there)
     assert len(assembled) == 1
-    forget_assemblies()
+    BODIES.forget()
     assert torch.equal(matrix(there), warm)
     assert len(assembled) == 2
 
@@ -73,6 +75,6 @@ def test_other_bodies_have_boxes_of_their_own(other, assembled):
 
 
 def test_large_boxes_are_not_kept(assembled, monkeypatch):
-    monkeypatch.setattr(moved_boxes, "_MOST_CELLS", 100)
+    monkeypatch.setattr(BODIES, "_most_bytes", 1000)
     assert torch.equal(matrix(SPHERE), matrix(SPHERE))
     assert len(assembled) == 2

@@ -19,8 +19,7 @@ from autdtorch.analytic.spherical_waves import (
     sphere_coefficients,
 )
 from autdtorch.propagators import make_propagator
-from autdtorch.propagators.bodies import ScatteringBodies
-from autdtorch.propagators.operator import ScatteringOperator
+from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.medium import Medium
@@ -46,8 +45,8 @@ def relative(value: torch.Tensor, exact: torch.Tensor) -> float:
 
 
 @pytest.fixture(scope="module")
-def cube() -> ScatteringOperator:
-    return ScatteringOperator.of(CUBE, AIR, FREQUENCY, spacing=1.5e-3, error=1e-2)
+def cube() -> TMatrix:
+    return TMatrix.of(CUBE, AIR, FREQUENCY, spacing=1.5e-3, error=1e-2)
 
 
 def test_harmonics_are_those_of_scipy():
@@ -81,7 +80,7 @@ def test_waves_add_up_to_a_point_source(wavenumber):
 @pytest.mark.parametrize("material", [{"rigid": True}, {"density": 5.0, "sound_speed": 600.0}])
 def test_a_sphere_in_closed_form_is_the_series(material):
     sphere = Sphere(center=CENTER, radius=8e-3, **material)
-    operator = ScatteringOperator.of(sphere, AIR, FREQUENCY, error=1e-8)
+    operator = TMatrix.of(sphere, AIR, FREQUENCY, error=1e-8)
     given = (POINTS, ARRAY.positions, WAVENUMBER, CENTER, 8e-3)
     exact = rigid_sphere(*given) if sphere.rigid else fluid_sphere(*given, 5.0 / 1.2, 600.0 / 340.0)
     # eight digits were asked for at the surface, and all points are outside
@@ -95,8 +94,8 @@ def test_a_sphere_in_closed_form_is_the_series(material):
 @pytest.mark.filterwarnings("ignore::autdtorch.OverlapWarning")
 def test_a_simulated_sphere_is_near_the_exact_one():
     sphere = Sphere(center=CENTER, radius=5e-3, rigid=True)
-    exact = ScatteringOperator.of(sphere, AIR, FREQUENCY, error=1e-2)
-    twice = ScatteringOperator.of([sphere, sphere], AIR, FREQUENCY, spacing=1e-3, error=1e-2)  # is simulated
+    exact = TMatrix.of(sphere, AIR, FREQUENCY, error=1e-2)
+    twice = TMatrix.of([sphere, sphere], AIR, FREQUENCY, spacing=1e-3, error=1e-2)  # is simulated
     assert twice.degree >= exact.degree
     found, wanted = (one.transfer_matrix(ARRAY, POINTS) for one in (twice, exact))
     # 0.7 % was measured at 5 cells a radius
@@ -155,13 +154,13 @@ def test_gradients_by_the_pose_are_those_of_finite_differences(cube):
 def test_an_operator_comes_back_from_its_file(cube, tmp_path):
     moved = cube.moved((1e-3, 0, 0), (0, 0.1, 0))
     moved.save(tmp_path / "cube.npz")
-    again = ScatteringOperator.load(tmp_path / "cube.npz")
+    again = TMatrix.load(tmp_path / "cube.npz")
     assert torch.equal(again.transfer_matrix(ARRAY, POINTS), moved.transfer_matrix(ARRAY, POINTS))
     cube.moved(torch.zeros(3, dtype=torch.float64, requires_grad=True)).save(tmp_path / "varied.npz")
-    assert torch.equal(ScatteringOperator.load(tmp_path / "varied.npz").center, cube.center)
+    assert torch.equal(TMatrix.load(tmp_path / "varied.npz").center, cube.center)
     np.savez(tmp_path / "other.npz", matrix=np.ones((2, 2)))
     with pytest.raises(ValueError, match=r"other.npz: no array center, axes"):
-        ScatteringOperator.load(tmp_path / "other.npz")
+        TMatrix.load(tmp_path / "other.npz")
 
 
 def test_bad_input_is_named(cube):
@@ -172,9 +171,9 @@ def test_bad_input_is_named(cube):
     with pytest.raises(ValueError, match=r"offset: shape \(2,\)"):
         cube.moved((0.0, 0.0))
     with pytest.raises(ValueError, match="obstacles"):
-        ScatteringOperator.of([], AIR, FREQUENCY)
+        TMatrix.of([], AIR, FREQUENCY)
     with pytest.raises(ValueError, match=r"error: 0; must be in 1e-08 to 0\.1"):
-        ScatteringOperator.of(CUBE, AIR, FREQUENCY, error=0)
+        TMatrix.of(CUBE, AIR, FREQUENCY, error=0)
 
 
 def test_coefficients_conserve_energy_and_degrees_suffice():
@@ -224,8 +223,8 @@ def collocated(spheres: tuple[Sphere, ...]) -> torch.Tensor:
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_spheres_scatter_one_another(count):
     spheres = SPHERES[:count]
-    bodies = [ScatteringOperator.of(sphere, AIR, FREQUENCY, error=1e-5) for sphere in spheres]
-    coupled = ScatteringBodies(bodies).transfer_matrix(ARRAY, OUTSIDE)
+    bodies = [TMatrix.of(sphere, AIR, FREQUENCY, error=1e-5) for sphere in spheres]
+    coupled = TMatrixCluster(bodies).transfer_matrix(ARRAY, OUTSIDE)
     # 3e-8 to 2e-7 were measured
     assert relative(coupled, collocated(spheres)) < 1e-5
     if count > 1:  # each as if alone
@@ -235,10 +234,10 @@ def test_spheres_scatter_one_another(count):
 
 
 def test_gradients_by_the_place_of_one_of_several_bodies():
-    first, second = (ScatteringOperator.of(sphere, AIR, FREQUENCY, error=1e-2) for sphere in SPHERES[:2])
+    first, second = (TMatrix.of(sphere, AIR, FREQUENCY, error=1e-2) for sphere in SPHERES[:2])
 
     def loudness(offset: torch.Tensor) -> torch.Tensor:
-        return ScatteringBodies([first, second.moved(offset)]).transfer_matrix(ARRAY, OUTSIDE).abs().sum()
+        return TMatrixCluster([first, second.moved(offset)]).transfer_matrix(ARRAY, OUTSIDE).abs().sum()
 
     offset = torch.tensor([2e-3, -1e-3, 1e-3], dtype=torch.float64, requires_grad=True)
     (gradient,) = torch.autograd.grad(loudness(offset), offset)
@@ -252,9 +251,9 @@ def test_gradients_by_the_place_of_one_of_several_bodies():
 
 
 def test_bodies_that_do_not_fit_are_named(cube):
-    with pytest.raises(ValueError, match=r"operators\[1\].center: .* apart.*; must be at least 0.01039 m"):
-        ScatteringBodies([cube, cube.moved((5e-3, 0, 0))])
-    with pytest.raises(ValueError, match=r"operators\[1\].wavenumber"):
-        ScatteringBodies([cube, ScatteringOperator.of(SPHERES[2], AIR, 41e3)])
-    with pytest.raises(ValueError, match=r"operators: .*; must have at least one"):
-        ScatteringBodies([])
+    with pytest.raises(ValueError, match=r"bodies\[1\].center: .* apart.*; must be at least 0.01039 m"):
+        TMatrixCluster([cube, cube.moved((5e-3, 0, 0))])
+    with pytest.raises(ValueError, match=r"bodies\[1\].wavenumber"):
+        TMatrixCluster([cube, TMatrix.of(SPHERES[2], AIR, 41e3)])
+    with pytest.raises(ValueError, match=r"bodies: .*; must have at least one"):
+        TMatrixCluster([])

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
 
 from autdtorch.analytic.spherical_waves import degrees, enough_degrees, sphere_coefficients
-from autdtorch.propagators.body_waves import BodyWaves
-from autdtorch.propagators.cache import DiskCache
+from autdtorch.propagators.notices import SteadyStateWarning
 from autdtorch.propagators.plan import plan
-from autdtorch.propagators.scene_bodies import has_closed_form
-from autdtorch.propagators.simulated import SteadyStateWarning
+from autdtorch.propagators.store import BODIES, Store, key_of
+from autdtorch.propagators.tmatrix.bodies import has_closed_form
+from autdtorch.propagators.tmatrix.waves import BodyWaves
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle, Sphere
@@ -26,24 +24,35 @@ from autdtorch.scene.obstacles.moving import at_rest, circumscribed, is_movable,
 from autdtorch.scene.scene import OverlapWarning, ScaleWarning, Scene
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.cached import cached_property
-from autdtorch.utils.digest import digest_of, package_versions, source_digest
 from autdtorch.utils.memory import require_memory
 
 logger = logging.getLogger(__name__)
 
 _ENTRY_BYTES = 48.0  # of T and what makes it
-_KEPT = 4  # Matrices kept: 8 MB each for the paper's cubes
 _DIGITS = 10  # Decimals of the places [m] of obstacles in their body, so that poses are the same body
 
 
 class BodyMatrix(NamedTuple):
-    """The attributes of a `ScatteringOperator`."""
+    """The attributes of a `TMatrix`."""
 
     matrix: torch.Tensor
     wavenumber: complex
     radius: float
     center: torch.Tensor
     axes: torch.Tensor
+
+
+class SimulatedT(NamedTuple):
+    """A simulated T (N, N), the axes of its grid (3, 3) and the largest residual of its runs."""
+
+    matrix: torch.Tensor
+    axes: torch.Tensor
+    residual: float
+
+    @property
+    def nbytes(self) -> int:
+        """Memory [bytes]."""
+        return self.matrix.nbytes
 
 
 class Solver(NamedTuple):
@@ -107,24 +116,23 @@ class Placed(NamedTuple):
         body = self.body
         return 0 if has_closed_form(body.obstacles, body.medium) else len(body.waves.runs)
 
-    def matrix(self, cache: DiskCache | None) -> BodyMatrix:
-        """Return T, from memory or disk if it is there."""
+    def matrix(self, store: Store) -> BodyMatrix:
+        """Return T and its place, from memory or the store's folder if it is there."""
         body, scene = self.body, self.body.scene
         center, radius = body.sphere
         count = (body.degree + 1) ** 2
         require_memory("obstacles", f"{count} waves", _ENTRY_BYTES * count**2)
         if has_closed_form(body.obstacles, body.medium):
-            matrix, axes = (
-                _of_sphere(body.obstacles[0], scene, body.degree),
-                torch.eye(3, **REAL),
-            )
+            matrix, axes = _of_sphere(body.obstacles[0], scene, body.degree), torch.eye(3, **REAL)
         else:
-            comparable = all(map(is_movable, body.obstacles))  # others may have no hash
-            simulate = _simulated if comparable else _simulated.__wrapped__
-            kept, axes, residual = simulate(body, cache and cache.folder)
-            matrix = kept.clone()
-            if residual > body.solver.error:
-                _warn_of_unsettled(body.solver, residual)
+            settings = tuple(str(entry) if isinstance(entry, torch.dtype) else entry for entry in body.solver)
+            key = key_of(body.obstacles, body.medium, body.frequency, settings)
+            simulated = BODIES.get(key, lambda: _loaded(body, key, store) or _simulated(body))
+            matrix, axes = simulated.matrix.clone(), simulated.axes
+            if simulated.residual > body.solver.error:
+                _warn_of_unsettled(body.solver, simulated.residual)
+            elif not store.has(key):
+                store.save(key, matrix.numpy(), simulated.residual)
         place = self.turn @ center + self.shift
         return BodyMatrix(matrix, scene.complex_wavenumber, radius, place, self.turn @ axes)
 
@@ -150,24 +158,21 @@ def _of_sphere(sphere: Obstacle, scene: Scene, degree: int) -> torch.Tensor:
     return torch.diag(each[degrees(degree)])
 
 
-@functools.lru_cache(_KEPT)
-def _simulated(body: StillBody, folder: Path | None) -> tuple[torch.Tensor, torch.Tensor, float]:
-    """Return T of a body from the cache in a folder, or simulate it.
+def _loaded(body: StillBody, key: str, store: Store) -> SimulatedT | None:
+    """Return T that an earlier process saved, if it is there."""
+    saved = store.load(key, 2 * ((body.degree + 1) ** 2,), 1)
+    if saved is None:
+        return None
+    logger.info("T-matrix of an earlier run, kept in %s", store.folder)
+    return SimulatedT(torch.from_numpy(saved[0]), body.waves.axes, saved[1][0])
 
-    With the axes of its grid and the largest residual of its runs; the last ones are kept in memory.
-    """
-    waves, shape = body.waves, 2 * ((body.degree + 1) ** 2,)
-    cache = None if folder is None else DiskCache(folder)
-    digest = digest_of(source_digest(), package_versions(), _described(body))
-    if cache is not None and (found := cache.load(digest, shape, 1)) is not None:
-        logger.info("scattering operator of an earlier run, kept in %s", folder)
-        return torch.from_numpy(found[0]), waves.axes, found[1][0]
+
+def _simulated(body: StillBody) -> SimulatedT:
     spacing = 1e3 * body.solver.spacing
-    logger.debug("simulating a scattering operator: %d waves, cells of %.3g mm", shape[0], spacing)
+    logger.debug("simulating a T-matrix: %d waves, cells of %.3g mm", (body.degree + 1) ** 2, spacing)
+    waves = body.waves
     matrix, residual = waves.matrix()
-    if cache is not None and residual <= body.solver.error:
-        cache.save(digest, matrix.numpy(), residual)
-    return matrix, waves.axes, residual
+    return SimulatedT(matrix, waves.axes, residual)
 
 
 def _warn_of_unsettled(solver: Solver, residual: float) -> None:
@@ -175,10 +180,5 @@ def _warn_of_unsettled(solver: Solver, residual: float) -> None:
         f"no steady state of the waves of a body after {solver.max_periods} periods: estimated relative "
         f"error up to {residual:.1e}, tolerance {solver.error:g}; raise max_periods or tolerance",
         SteadyStateWarning,
-        stacklevel=4,  # about where the operator is made
+        stacklevel=4,  # about where the T-matrix is made
     )
-
-
-def _described(body: StillBody) -> tuple[object, ...]:
-    settings = tuple(str(each) if isinstance(each, torch.dtype) else each for each in body.solver)
-    return body.obstacles, body.medium, body.frequency, settings

@@ -1,0 +1,99 @@
+"""Notices on results: points that are less accurate, silence, resonances, runs without a steady state."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Sequence
+
+import torch
+
+from autdtorch.propagators.scene_region import warn_of_near_points
+from autdtorch.propagators.simulation import PressureMap, Run, Simulation
+from autdtorch.utils.display import counted
+
+logger = logging.getLogger(__name__)
+
+_RINGING = 100
+"""Periods from which a run indicates a resonance. Runs of bodies without any take 15 to 60; a quality factor
+is about half the periods, and a grid of 1.3 mm shifts frequencies by 0.2 %."""
+
+_FAINT = 1e-7
+"""Pressure relative to that in free space, -140 dB, which is rounding in single precision."""
+
+
+class SteadyStateWarning(UserWarning):
+    """A simulation ended before its steady state was reached."""
+
+
+class Notices:
+    """Log entries on the results of a simulation, each kind once."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        """Log nothing yet."""
+        self._simulation, self._plan = simulation, simulation.plan
+        self._logged: set[str] = set()
+
+    def of_points(self, points: torch.Tensor) -> None:
+        """Log which points (P, 3) are next to a surface."""
+        if "surface" not in self._logged:
+            near = warn_of_near_points(self._plan.scene, "points", points, self._plan.spacing)
+            self._logged |= {"surface"} if near else set()
+
+    def of_cavities(self, points: torch.Tensor, pressure: torch.Tensor) -> None:
+        """Log that points (P, 3), with the pressure (P, K) of drives, are in a cavity of rigid obstacles."""
+        silent = points[(pressure == 0).all(dim=1)]
+        if len(silent) and "cavity" not in self._logged:
+            enclosed = silent[self._simulation.enclosed(silent)]
+            if len(enclosed):
+                more = f", and of {len(enclosed) - 1} more," if len(enclosed) > 1 else ""
+                text = "rigid obstacles enclose the point at %s mm: its pressure%s is 0"
+                self._once("cavity", text, _in_mm(enclosed[0]), more)
+
+    def of_sources(self, result: PressureMap) -> None:
+        """Log that a source is next to an obstacle, where runs began at the transducers."""
+        if result.runs and not result.from_points and "source" not in self._logged:
+            nodes = self._plan.scene.array.nodes.positions
+            if any(map(self._simulation.near_obstacle, nodes)):
+                text = "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than"
+                self._once(
+                    "source", f"{text} %.2g mm", 1e3 * self._plan.source_clearance, 1e3 * self._plan.spacing
+                )
+
+    def of_faint_points(self, matrix: torch.Tensor, free: torch.Tensor) -> None:
+        """Log that the matrix at control points is rounding, relative to free space: methods would use it."""
+        size = matrix.norm(dim=1)
+        faint = self._plan.scene.control_points[(size > 0) & (size < _FAINT * free.norm(dim=1))]
+        if len(faint):
+            more = f", nor {len(faint) - 1} more" if len(faint) > 1 else ""
+            text = "no sound reaches the point at %s mm%s: its pressure is rounding"
+            self._once("faint", text, _in_mm(faint[0]), more)
+
+    def of_ringing(self, periods: int) -> None:
+        """Log that obstacles resonate, where grids may agree and be wrong together."""
+        if periods > _RINGING:
+            text = (
+                "sound rings for %d periods in or between obstacles: next to a resonance a small shift of its"
+            )
+            text += " frequency changes the field, and the error may be larger than estimated"
+            self._once("ringing", text, periods)
+
+    def _once(self, kind: str, text: str, *values: object) -> None:
+        if kind not in self._logged:
+            self._logged.add(kind)
+            logger.warning(text, *values)
+
+
+def warn_of_unsettled(runs: Sequence[Run], tolerance: float) -> None:
+    """Warn the caller of a public, decorated method of runs that did not converge."""
+    if unsettled := [run for run in runs if not run.reached]:
+        periods, residual = max(run.periods for run in unsettled), max(run.remaining for run in unsettled)
+        warnings.warn(
+            f"no steady state after {periods} periods in {len(unsettled)} of {counted(len(runs), 'run')}"
+            f": estimated relative error up to {residual:.1e}, tolerance {tolerance:g}; raise "
+            "max_periods or tolerance", SteadyStateWarning, stacklevel=4,
+        )  # fmt: skip
+
+
+def _in_mm(point: torch.Tensor) -> tuple[float, ...]:
+    return tuple(round(1e3 * entry, 3) for entry in point.tolist())

@@ -1,0 +1,150 @@
+"""Results that are kept in memory, up to a limit, and in a folder if there is one.
+
+A store makes a call quicker, never different: the key of a result is a digest of everything that affects it.
+The first line of a file is a checksum of its name, its shape and its content.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, Protocol, TypeVar
+
+import numpy as np
+import torch
+
+from autdtorch.utils.array_types import AnyArray, ComplexArray
+from autdtorch.utils.digest import digest_of, package_versions, source_digest
+from autdtorch.utils.files import replace_file
+from autdtorch.utils.validation import invalid, path_of
+
+logger = logging.getLogger(__name__)
+
+SUFFIX = ".matrix"
+CACHE_VARIABLE = "AUTDTORCH_CACHE_DIR"
+MOST_BYTES = 1_000_000_000
+"""Limit of a store's memory [bytes]: the Huygens amplitudes of 256 transducers take 300 MB."""
+
+
+class Result(Protocol):
+    """A result of a known size."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory [bytes]."""
+        ...
+
+
+ResultT = TypeVar("ResultT", bound=Result)
+
+
+class Store:
+    """Results by key. Those used last stay in memory; matrices with a few numbers are also saved in a folder.
+
+    Attributes:
+        folder: made with the first matrix; None for memory alone.
+    """
+
+    def __init__(self, folder: Path | None = None, most_bytes: int = MOST_BYTES) -> None:
+        """Start with none; nothing is read or made here. A result of more than `most_bytes` is not kept."""
+        self.folder, self._most_bytes = folder, most_bytes
+        self._results: dict[str, Any] = {}
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all results [bytes]."""
+        return sum(result.nbytes for result in self._results.values())
+
+    def get(self, key: str, make: Callable[[], ResultT]) -> ResultT:
+        """Return the result of a key, which is not to be changed; `make` it if it is not in memory."""
+        result: ResultT | None = self._results.pop(key, None)
+        if result is None:
+            with torch.inference_mode(False), torch.no_grad():  # later calls may need gradients
+                result = make()
+        if result.nbytes <= self._most_bytes:
+            self._results[key] = result
+        for oldest in list(self._results):
+            if self.nbytes <= self._most_bytes:
+                break
+            self._results.pop(oldest, None)
+        return result
+
+    def forget(self) -> None:
+        """Keep no result in memory, such as before a measurement of time."""
+        self._results.clear()
+
+    def has(self, key: str) -> bool:
+        """Return whether the folder, if there is one, has a file of a key."""
+        return self.folder is None or self._path(self.folder, key).exists()
+
+    def load(self, key: str, shape: tuple[int, ...], count: int) -> tuple[ComplexArray, list[float]] | None:
+        """Return a saved matrix and its `count` numbers; None if there is none, or a damaged or other one."""
+        if self.folder is None:
+            return None
+        path = self._path(self.folder, key)
+        try:
+            content = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            logger.warning("%s cannot be read (%s): computing again", path, error.strerror)
+            return None
+        body = content.partition(b"\n")[2]
+        if content != _with_checksum(key, shape, body):
+            logger.warning("%s is damaged (its checksum is wrong): computing again", path)
+            return None
+        whole = len(body) == np.dtype(np.complex128).itemsize * (np.prod(shape, dtype=int) + count)
+        values = np.frombuffer(body, np.complex128) if whole else np.array([np.nan])
+        if not np.isfinite(values).all():
+            logger.warning("%s holds no finite matrix of shape %s: computing again", path, shape)
+            return None
+        return values[:-count].reshape(shape).copy(), values[-count:].real.tolist()
+
+    def save(self, key: str, matrix: AnyArray, *numbers: float) -> None:
+        """Save a matrix and its numbers; a file that cannot be written is logged and left out."""
+        if self.folder is None:
+            return
+        body = np.append(matrix, numbers).astype(np.complex128).tobytes()
+        path = self._path(self.folder, key)
+        try:
+            replace_file(path, _with_checksum(key, matrix.shape, body))
+        except OSError as error:
+            logger.warning("%s cannot be written (%s): not kept", path, error.strerror)
+
+    @staticmethod
+    def _path(folder: Path, key: str) -> Path:
+        return folder / f"{key}{SUFFIX}"
+
+
+BODIES = Store(most_bytes=MOST_BYTES // 4)
+"""BODIES: assembled boxes and T-matrices, which a body has in any scene and at any place."""
+
+
+def key_of(*parts: object) -> str:
+    """Return a digest of parts, of this package's source and of the versions of others."""
+    return digest_of(source_digest(), package_versions(), *parts)
+
+
+def store_in(folder: str | os.PathLike[str] | Literal[False] | None) -> Store:
+    """Return a store in a folder, by default the one that `CACHE_VARIABLE` names; in memory for False."""
+    name = "cache"
+    if folder is None:
+        name, folder = CACHE_VARIABLE, os.environ.get(CACHE_VARIABLE) or False
+    if folder is False:
+        return Store()
+    path = path_of(name, folder, "a folder, or False")
+    there = next(
+        part for part in (path, *path.absolute().parents) if os.path.lexists(part) or part.parent == part
+    )
+    if not os.path.isdir(there) or (there != path and not os.access(there, os.W_OK | os.X_OK)):
+        accepted = f"must be a folder, or one that can be made, but {there} is no folder to write in"
+        raise invalid(name, str(path), accepted)
+    return Store(path)
+
+
+def _with_checksum(key: str, shape: tuple[int, ...], body: bytes) -> bytes:
+    named = f"{key} {shape}\n".encode()
+    return hashlib.sha256(named + body).hexdigest().encode() + b"\n" + body

@@ -1,0 +1,1 @@
+"""T-matrices of bodies, and the propagator of scenes by them."""
