@@ -22,7 +22,7 @@ from shared.scenes import relative_error, uncached
 from shared.timing import timed
 
 import autdtorch as at
-from autdtorch.propagators import TMatrixPropagator, SimulatedPropagator
+from autdtorch.propagators import SimulatedPropagator, TMatrixPropagator
 
 DOCUMENT = "benchmarks.md"
 
