@@ -26,13 +26,13 @@ _OPTIONS = {
 
 _LAST_STANDARD = 2  # number of the last of the standard streams: input, output, errors
 _PATH = re.compile(r"(output|hydra\.sweep\.dir)=(?P<path>.*)", re.DOTALL)
-# What Hydra takes as it is, or as a text in quotes, an interpolation, or several values of a sweep; an =
-# is rather a slip than part of a name
+# Paths that stay as they are: plain characters, text in quotes, interpolations, several values of a sweep,
+# and text with =, which is rather a slip than part of a name
 _TAKEN = re.compile(r"[A-Za-z0-9_./\\:@%+ -]*|.*=.*|['\"].*|.*\$\{.*|.*,.*", re.DOTALL)
 
 
 def quoted(argument: str) -> str:
-    """Return an argument with the path in it in quotes where Hydra would not take it, and ~ replaced."""
+    """Return an argument with its path in quotes, where Hydra's grammar needs them, and with ~ expanded."""
     setting = _PATH.fullmatch(argument)
     if setting is None or _TAKEN.fullmatch(setting["path"]):
         return argument
@@ -41,7 +41,7 @@ def quoted(argument: str) -> str:
 
 
 def command_of(arguments: list[str]) -> str | None:
-    """Take the word of a command out of the arguments, wherever it stands, and return it."""
+    """Remove the word of a command from the arguments, wherever it stands, and return it."""
     for place, word in enumerate(arguments):
         if word in COMMANDS and not (place and _OPTIONS.get(arguments[place - 1])):
             return arguments.pop(place)
@@ -88,11 +88,11 @@ def _has_plugin(name: str) -> bool:
 
 
 def prepare_streams() -> None:
-    """Have the standard streams take any output, as a study must not end for it.
+    """Make the standard streams accept any output, so that no study ends because of it.
 
-    Signs that an encoding lacks, such as those of units, are replaced. Streams that a daemon has closed, or
-    that a program without a console never had, lead nowhere; the next file that is opened must not get their
-    numbers, which libraries write errors to.
+    Characters that an encoding lacks, such as those of units, are replaced. Closed streams, as of a daemon or
+    a program without a console, lead nowhere. Files that are opened later do not get their numbers, to which
+    libraries write errors.
     """
     while (number := os.open(os.devnull, os.O_RDWR)) <= _LAST_STANDARD:
         os.set_inheritable(number, True)

@@ -36,7 +36,7 @@ _LONGEST_NAME = 150  # of a job's folder; file systems allow 255 bytes
 
 
 class _Carrier(BaseException):
-    """Carries its cause past Hydra, which would print another line about any `Exception`."""
+    """An exception that carries its cause past Hydra, which prints a line about any `Exception`."""
 
 
 class SweepCallback(Callback):

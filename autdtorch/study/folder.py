@@ -21,7 +21,7 @@ from autdtorch.utils.files import held
 logger = logging.getLogger(__name__)
 
 PREVIOUS = "previous-"
-"""Start of the names of the folders that keep files of earlier studies, and damaged ones."""
+"""Start of the names of folders for files of earlier studies and damaged files."""
 
 _FILES = (RESULTS_FILE, TRIALS_FILE, PROVENANCE_FILE)
 _LOCK_FILE = ".lock"

@@ -149,7 +149,7 @@ class StudyResult:
 
 
 def stored_solution(fields: Mapping[str, Any], transducers: int, points: int) -> Solution:
-    """Return the solution of stored trials, given its `fields` by name, if it can be that of a method.
+    """Return the solution of stored trials with these `fields`, after checking them.
 
     Raises:
         ValueError: another shape or type, or numbers out of range; the message names the field.

@@ -58,7 +58,7 @@ and `seed` gets the numbers of the trials to run, as many as it must return, and
 that has a parameter `goal` gets the goal."""
 
 BLOCK = Method.block
-"""Trials that are run and saved together. The end of the process costs the block in work at most."""
+"""Trials that are run and saved together: a process that ends loses one block at most."""
 
 _COUNTED_SPACING = 2e-3  # [m], of the grid on which the runs of poses are counted, at most
 _MOST_BODIES = 4  # bodies whose operators stay in memory

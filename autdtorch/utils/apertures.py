@@ -71,10 +71,9 @@ class Discs(NamedTuple):
     def pattern(self, wavenumber: complex) -> Array:
         """Return the factor on e^{i k r} / r far from discs of equal radius, with parts (orders, 2, terms).
 
-        It is a polynomial in 1 / r and in u, the square of the sine of the angle from the normal. The order
-        zero is 2 J1(v) / v with v^2 = (k a)^2 u; order n follows from the one before by the recursion of
-        Atkinson (1949) and Wilcox (1956), 2 i k n F_n = n (n - 1) F_(n-1) + B F_(n-1) with the Laplacian B on
-        the sphere.
+        It is a polynomial in 1 / r and in u, the square of the sine of the angle from the normal. Order zero
+        is 2 J1(v) / v with v^2 = (k a)^2 u. The recursion of Atkinson (1949) and Wilcox (1956) gives order n,
+        2 i k n F_n = n (n - 1) F_(n-1) + B F_(n-1). B is the Laplacian on the sphere.
         """
         power = np.arange(PATTERN_TERMS, dtype=np.float64)
         factor = -((wavenumber * float(self.radii[0])) ** 2) / 4

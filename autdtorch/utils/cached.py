@@ -11,8 +11,8 @@ T_co = TypeVar("T_co", covariant=True)
 class cached_property(functools.cached_property[T_co]):  # noqa: TID251
     """`functools.cached_property` as of Python 3.12, also in 3.11.
 
-    That of 3.11 has a lock for all objects of a class: simulations in threads wait for each other, and a
-    process that is forked while another thread holds it waits forever. Without it, two threads may compute a
+    In 3.11 all objects of a class share a lock. Simulations in threads wait for each other, and a process
+    that is forked while another thread holds the lock waits forever. Without it, two threads may compute a
     value at once; both get the first one.
     """
 

@@ -1,4 +1,4 @@
-"""Digests of values, of the package's source and the versions of others: what a result was computed from."""
+"""Digests of values and of the package's source, and versions of packages: the origin of a result."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ def in_digits(number: float, digits: int) -> str:
 
 
 def counted(count: int, noun: str, plural: str | None = None) -> str:
-    """Return a count with its noun, such as "1 run" or "3 runs"; `plural` is that of an irregular noun."""
+    """Return a count with its noun, such as "1 run" or "3 runs"; irregular nouns need a `plural`."""
     return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
 
 

@@ -118,7 +118,7 @@ def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callab
         elif inspect.isclass(value):
             kind: Any = value
             start = vars(kind).get("__init__")
-            # That of a protocol is of `typing`, which needs it as it is.
+            # `typing` makes the constructors of protocols, and needs them as they are.
             if getattr(start, "__module__", "") == kind.__module__ and not hasattr(start, _SUGGESTS):
                 kind.__init__ = suggesting(start)
         return value

@@ -50,8 +50,8 @@ class JsonLines:
     ) -> None:
         """Read the file if it exists, without changing it.
 
-        `key` is the owner of the lines and `head` the first line, with its newline. `use` is called with each
-        row and refuses it by a `ValueError`, `KeyError` or `TypeError`.
+        The checksums of the lines include the `key`. `head` is the first line, with its newline. `use` is
+        called with each row and refuses it by a `ValueError`, `KeyError` or `TypeError`.
         """
         content = path.read_bytes() if path.exists() else b""
         lines = content.removeprefix(head).split(b"\n")

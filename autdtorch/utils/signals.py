@@ -42,7 +42,7 @@ def signals_restored() -> Iterator[None]:
 
 
 def send_again(number: int) -> None:
-    """Send a signal to the main thread a little later, if Python drops what its handler raises now."""
+    """Send a signal to the main thread 1 ms later, where Python would drop what its handler raises now."""
     # a thread without the locks of `threading`, which the main thread may hold
     _thread.start_new_thread(_send_later, (signal.Signals(number),))
 

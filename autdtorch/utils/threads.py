@@ -200,7 +200,7 @@ def spread(function: Callable[[T], R], items: Iterable[T], most: int | None = No
 
 
 def even_parts(count: int, parts: int) -> list[tuple[int, int]]:
-    """Return the first of `count` things, and one past the last, of each of some nearly equal parts."""
+    """Return the bounds of nearly equal parts of `count` things: the first, and one past the last."""
     return list(itertools.pairwise(count * part // parts for part in range(parts + 1)))
 
 

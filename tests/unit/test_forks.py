@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -180,3 +183,16 @@ def test_a_lock_that_a_user_gave_tqdm_stays(monkeypatch: pytest.MonkeyPatch) -> 
         assert tqdm.get_lock() is lock
 
     assert status_of_child(same) == 0
+
+
+PROGRAM = Path(__file__).parents[1] / "in_processes.py"
+
+
+KINDS = ["fork", "dataloader", "spawn", "loky"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks, which is safe with threads on Linux alone")
+def test_processes_of_all_kinds_find_the_same() -> None:
+    command = [sys.executable, "-W", "error", str(PROGRAM), *KINDS]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=280)
+    assert (run.returncode, run.stdout.splitlines()) == (0, [f"{kind} 0" for kind in KINDS]), run.stderr
