@@ -46,7 +46,7 @@ class HalfSpace:
 
 
 def reflection(normal, offset, spacing, incidence, azimuth=0.0, fluid=None):
-    """The reflection coefficient of a half-space, sound-hard (1 in theory) or of a fluid.
+    """The reflection coefficient of a half-space, rigid (1 in theory) or of a fluid.
 
     The surface is `offset` cells from a cell centre. The wave comes at an angle `incidence` [rad] from the
     normal.
@@ -103,7 +103,7 @@ def exact_reflection(incidence, fluid):
 
 
 def _rows(cells, stencil, grid, middle, normal):
-    """The stencil rows (27,) by the value of n . x, of cells near the middle that are not sound-hard."""
+    """The stencil rows (27,) by the value of n . x, of cells near the middle that are not rigid."""
     around = np.array(list(itertools.product(range(-REACH, REACH + 1), repeat=3)))
     values = around @ normal
     aside = np.linalg.norm(around - values[:, None] * normal / (normal @ normal), axis=1)
@@ -115,6 +115,6 @@ def _rows(cells, stencil, grid, middle, normal):
         if abs(place) <= most and place not in rows:
             flat = int(np.ravel_multi_index(tuple(middle + around[number]), grid.shape))
             rows[place] = cells.weight[index[flat]] if flat in index else stencil.weights
-            if flat in cells.sound_hard:
+            if flat in cells.rigid:
                 rows[place] = None
     return {place: row for place, row in rows.items() if row is not None}

@@ -62,8 +62,8 @@ class Assembly:
         """Return cells and weights of points (P, 3) [m], or of nodes (P, n, 3) with `weights` (n,)."""
         nodes, grid = points.reshape(-1, 3), self.grid
         kernels = self._in_air(nodes)
-        sound_hard = np.isin(kernels.index, self.heterogeneous.sound_hard)  # their pressure is not defined
-        kernels = exclude_cells(kernels, grid.to_cells(nodes), sound_hard, grid.shape, grid.kappa)
+        rigid = np.isin(kernels.index, self.heterogeneous.rigid)  # their pressure is not defined
+        kernels = exclude_cells(kernels, grid.to_cells(nodes), rigid, grid.shape, grid.kappa)
         return average_nodes(kernels, weights.numpy())
 
     def _in_air(self, points: Tensor) -> Interpolation:
@@ -87,7 +87,7 @@ class Assembly:
         far = ((corners - cells[:, None]) ** 2).sum(axis=2)
         index = np.ravel_multi_index(tuple(np.moveaxis(corners.clip(0, shape - 1), -1, 0)), self.grid.shape)
         enclosed = np.isin(index, self.heterogeneous.enclosed)
-        open_air = ~np.isin(index, self.heterogeneous.sound_hard)
+        open_air = ~np.isin(index, self.heterogeneous.rigid)
         if len(both := np.flatnonzero(enclosed.any(axis=1) & open_air.any(axis=1))):
             places = np.array(self.grid.origin) + self.grid.spacing * corners[both]
             seen = sees(points.numpy()[both, None], places, walls, self.grid.spacing)

@@ -142,7 +142,7 @@ def _maps_cells(cells: HeterogeneousCells, grid: Grid, matrix: Index, rounding: 
         places = (double @ matrix.T + (shape - 1)) // 2
         return np.asarray(np.ravel_multi_index(tuple(places.T), grid.shape), np.int64)
 
-    if not all(np.array_equal(np.sort(image(hard)), hard) for hard in (cells.sound_hard, cells.shell)):
+    if not all(np.array_equal(np.sort(image(hard)), hard) for hard in (cells.rigid, cells.shell)):
         return False
     images = image(cells.index)
     order = np.argsort(images)

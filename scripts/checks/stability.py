@@ -167,7 +167,7 @@ def _random_state(assembly: Assembly, sources: Sources, seed: int) -> State:
     state.now[inside] = torch.from_numpy(np.random.default_rng(seed).standard_normal(grid.interior)).to(
         assembly.dtype
     )
-    state.now.reshape(-1)[torch.from_numpy(assembly.heterogeneous.sound_hard)] = 0
+    state.now.reshape(-1)[torch.from_numpy(assembly.heterogeneous.rigid)] = 0
     state.before.copy_(state.now)
     return state
 

@@ -1,7 +1,5 @@
 """Gradients of records: the adjoint run of the CPU kernel, and autograd through the reference kernel."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
@@ -11,19 +9,10 @@ from small_scenes import assembled_parts, small_scene
 
 from autdtorch.fdtd import adjoint
 from autdtorch.fdtd.adjoint import recorded
-from autdtorch.fdtd.kernels.contract import (
-    Coefficients,
-    Columns,
-    Kernel,
-    Receivers,
-    Sources,
-    State,
-    uniform_state,
-)
+from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, State, uniform_state
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
-from autdtorch.fdtd.stepping import Assembly
-from autdtorch.scene.obstacles import Box, Obstacle, Sphere
+from autdtorch.scene.obstacles import Box, Sphere
 
 HEAVY = Sphere((4.7e-3, 4.2e-3, 4.6e-3), 1.7e-3, density=20.0, sound_speed=300.0)
 RIGID = Box((3.2e-3, 7e-3, 7e-3), (3e-3, 2.3e-3, 2.3e-3), rigid=True)
@@ -31,25 +20,23 @@ WALL = Box((4e-3, 4e-3, 7.4e-3), (40e-3, 40e-3, 1e-3), density=5.0, sound_speed=
 """Continues through the boundary layers of x and y."""
 
 STEPS = 24
-Parts = tuple[Assembly, Sources, Receivers, torch.Tensor]
-Gradients = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
-def parts(dtype: torch.dtype, *obstacles: Obstacle) -> Parts:
+def parts(dtype, *obstacles):
     """Return a 2 x 2 array in absorbing air, three receivers, and a random signal."""
     signal = torch.randn((STEPS, 2), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     scene = small_scene(obstacles, extent=9e-3, absorption=40.0)
     return *assembled_parts(scene, 1.4e-3, dtype), signal.to(dtype)
 
 
-def differentiable(assembly: Assembly, sources: Sources) -> tuple[Assembly, Sources]:
+def differentiable(assembly, sources):
     weight = assembly.coefficients.heterogeneous_weight.clone().requires_grad_()
     coefficients = replace(assembly.coefficients, heterogeneous_weight=weight)
     force = sources.force.clone().requires_grad_()
     return replace(assembly, coefficients=coefficients), replace(sources, force=force)
 
 
-def gradients(case: Parts, kernel: Kernel | None) -> Gradients:
+def gradients(case, kernel):
     """Return the record and the derivatives of a random loss, by plain autograd without a kernel."""
     assembly, sources, receivers, signal = case
     assembly, sources = differentiable(assembly, sources)
@@ -65,13 +52,13 @@ def gradients(case: Parts, kernel: Kernel | None) -> Gradients:
 
 # float64: rounding over the steps; float32: the design's parity figure, of which rounding takes a tenth
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
-def test_gradients_are_those_of_the_reference_kernel(dtype: torch.dtype, tolerance: float) -> None:
+def test_gradients_are_those_of_the_reference_kernel(dtype, tolerance):
     case = parts(dtype, HEAVY, RIGID)
     for value, oracle in zip(gradients(case, CpuKernel()), gradients(case, None), strict=True):
         assert (value - oracle).abs().max() <= tolerance * oracle.abs().max()
 
 
-def test_walls_through_the_layers_keep_the_gradients_exact() -> None:
+def test_walls_through_the_layers_keep_the_gradients_exact():
     """Derivatives by rows in the layers are zero; all others are those of autograd."""
     case = parts(torch.float64, HEAVY, WALL)
     inside = torch.from_numpy(case[0].grid.inside(case[0].heterogeneous.index))
@@ -83,7 +70,7 @@ def test_walls_through_the_layers_keep_the_gradients_exact() -> None:
     assert (weight - by_weight)[inside].abs().max() <= 1e-10 * by_weight[inside].abs().max()
 
 
-def test_segments_do_not_change_the_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_segments_do_not_change_the_gradients(monkeypatch):
     case = parts(torch.float64, HEAVY, RIGID)
     whole = gradients(case, CpuKernel())
     monkeypatch.setattr(adjoint, "_cuts", lambda *_: [0, 9, 10, STEPS])
@@ -92,7 +79,7 @@ def test_segments_do_not_change_the_gradients(monkeypatch: pytest.MonkeyPatch) -
         assert (part - one).abs().max() <= 1e-13 * one.abs().max()
 
 
-def test_cuts_bound_the_memory() -> None:
+def test_cuts_bound_the_memory():
     """At 100^3 heterogeneous cells the stored states and the record of a segment stay below 1 GiB."""
     state = State(torch.zeros((118,) * 3), torch.zeros(0), ())
     cells = 102**3
@@ -106,7 +93,7 @@ def test_cuts_bound_the_memory() -> None:
 
 
 @pytest.mark.parametrize("kernel", [CpuKernel(), ReferenceKernel()], ids=["cpu", "reference"])
-def test_adjoint_dot_product(kernel: Kernel) -> None:
+def test_adjoint_dot_product(kernel):
     """<c, J f> = <J^T c, f> for forces f and weights c of the record."""
     assembly, sources, receivers, signal = parts(torch.float64, HEAVY, RIGID)
     generator = torch.Generator().manual_seed(3)
@@ -120,7 +107,7 @@ def test_adjoint_dot_product(kernel: Kernel) -> None:
     )
 
 
-def test_a_constant_loss_has_no_gradient() -> None:
+def test_a_constant_loss_has_no_gradient():
     assembly, sources = differentiable(*parts(torch.float64, HEAVY)[:2])
     record = recorded(CpuKernel(), assembly, sources, *parts(torch.float64, HEAVY)[2:])
     (0 * record).sum().backward()
@@ -132,7 +119,7 @@ SHAPE = (7, 8, 9)
 CELL = 3 * 72 + 4 * 9 + 4
 
 
-def pressure(force: torch.Tensor, weight: torch.Tensor, steps: int) -> torch.Tensor:
+def pressure(force, weight, steps):
     """Return the record of two receivers on a tiny grid with two heterogeneous cells and layers of two."""
     heterogeneous = torch.tensor([CELL, CELL + 1])
     profile = torch.tensor([2.0, 1.5, 1.0, 0.5, 0.1], dtype=torch.float64)
@@ -159,7 +146,7 @@ def pressure(force: torch.Tensor, weight: torch.Tensor, steps: int) -> torch.Ten
     return recorded
 
 
-def test_gradients_by_source_and_medium() -> None:
+def test_gradients_by_source_and_medium():
     generator = torch.Generator().manual_seed(0)
     force = torch.randn((2, 2), generator=generator, dtype=torch.float64).requires_grad_()
     weight = (0.05 * torch.rand((2, 27), generator=generator, dtype=torch.float64)).requires_grad_()

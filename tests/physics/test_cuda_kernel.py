@@ -1,7 +1,5 @@
 """The CUDA kernel against the reference kernel: on a GPU, or interpreted by Triton on the CPU."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -15,16 +13,16 @@ pytest.importorskip("triton", reason="the CUDA kernel needs Triton: install autd
 
 from triton.runtime import interpreter
 
-from autdtorch.fdtd.kernels.contract import Coefficients, Kernel, Receivers, Sources, State, uniform_state
+from autdtorch.fdtd.kernels.contract import Receivers, Sources, uniform_state
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.cuda import Blocks, CudaKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import assemble
-from autdtorch.propagators import SimulatedPropagator, make_propagator
+from autdtorch.propagators import make_propagator
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.drive import drive_from_phases
-from autdtorch.scene.obstacles import Box, Obstacle
+from autdtorch.scene.obstacles import Box
 
 needs_gpu = pytest.mark.skipif(
     not torch.cuda.is_available(), reason="needs an NVIDIA GPU: torch.cuda.is_available() is false"
@@ -43,10 +41,8 @@ WHOLE = Blocks(x=32, y=32, z=32, lanes=1024)
 
 BLOCKS = None if torch.cuda.is_available() else WHOLE
 
-Parts = tuple[tuple[int, int, int], Coefficients, Sources, Receivers]
 
-
-def parts(obstacles: tuple[Obstacle, ...], dtype: torch.dtype, absorption: float = 0.0) -> Parts:
+def parts(obstacles, dtype, absorption=0.0):
     """Coefficients of a scene; sources and receivers all over the grid, in special cells too."""
     assembly = assemble(region_of(small_scene(obstacles, SIZE, absorption)), 1e-3, dtype)
     c, shape = assembly.coefficients, assembly.grid.shape
@@ -63,7 +59,7 @@ def parts(obstacles: tuple[Obstacle, ...], dtype: torch.dtype, absorption: float
     return shape, c, Sources(index, force.to(dtype)), receivers
 
 
-def noise(shape: tuple[int, int, int], c: Coefficients) -> State:
+def noise(shape, c):
     """Noise in all cells exercises every part of a step."""
     state = uniform_state(shape, c, 0.0)
     generator = torch.Generator().manual_seed(0)
@@ -73,7 +69,7 @@ def noise(shape: tuple[int, int, int], c: Coefficients) -> State:
     return state
 
 
-def advance(kernel: Kernel, case: Parts, blocks: tuple[int, ...]) -> tuple[State, torch.Tensor]:
+def advance(kernel, case, blocks):
     """Step from noise in calls of several steps each."""
     shape, coefficients, sources, receivers = case
     state, recorded = noise(shape, coefficients), []
@@ -84,7 +80,7 @@ def advance(kernel: Kernel, case: Parts, blocks: tuple[int, ...]) -> tuple[State
     return state, torch.cat(recorded)
 
 
-def assert_same(one: tuple[State, torch.Tensor], other: tuple[State, torch.Tensor], tolerance: float) -> None:
+def assert_same(one, other, tolerance):
     """Fields, all memory and what was recorded, relative to the peak of each."""
     for value, reference in zip(all_tensors(*one), all_tensors(*other), strict=True):
         assert value.shape == reference.shape
@@ -104,9 +100,7 @@ def assert_same(one: tuple[State, torch.Tensor], other: tuple[State, torch.Tenso
         pytest.param((RIGID, WALL), 40.0, torch.float32, 1e-6, id="float32"),
     ],
 )
-def test_cuda_kernel_is_the_reference_kernel(
-    obstacles: tuple[Obstacle, ...], absorption: float, dtype: torch.dtype, tolerance: float
-) -> None:
+def test_cuda_kernel_is_the_reference_kernel(obstacles, absorption, dtype, tolerance):
     case = parts(obstacles, dtype, absorption)
     c = case[1]
     assert (len(c.heterogeneous_index) > 0) == bool(obstacles)
@@ -116,7 +110,7 @@ def test_cuda_kernel_is_the_reference_kernel(
     assert_same(advance(CudaKernel(BLOCKS), case, (1, 1)), expected, tolerance)
 
 
-def test_programs_run_in_any_order(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_programs_run_in_any_order(monkeypatch):
     """Interpreted, they run one after the other: here the last one first."""
     builder = interpreter.InterpreterBuilder
     place = builder.set_grid_idx
@@ -128,7 +122,7 @@ def test_programs_run_in_any_order(monkeypatch: pytest.MonkeyPatch) -> None:
     assert_same(advance(CudaKernel(Blocks(x=16, y=16, z=8, lanes=256)), case, (1,)), expected, 1e-12)
 
 
-def test_a_returned_state_stays_while_another_is_stepped() -> None:
+def test_a_returned_state_stays_while_another_is_stepped():
     case = parts((), torch.float64)
     kernel = CudaKernel(BLOCKS)
     state, _ = advance(kernel, case, (1,))
@@ -137,12 +131,12 @@ def test_a_returned_state_stays_while_another_is_stepped() -> None:
     assert torch.equal(state.now, pressure)
 
 
-def small_propagator(**options: object) -> SimulatedPropagator:
+def small_propagator(**options):
     return make_propagator(small_scene((HEAVY,), SIZE), "full", **options)
 
 
 @pytest.mark.parametrize("name", ["device", "kernel"])
-def test_a_missing_gpu_or_triton_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_gpu_or_triton_is_named(name, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     for version, why in (("12.8", "it finds no GPU or driver"), (None, "it is built for the CPU")):
         monkeypatch.setattr(torch.version, "cuda", version)
@@ -157,7 +151,7 @@ def test_a_missing_gpu_or_triton_is_named(name: str, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("device", ["cuda", "cuda:0", torch.device("cuda")], ids=str)
-def test_a_device_chooses_its_kernel(device: object, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_chooses_its_kernel(device, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     scene = small_scene((HEAVY,), SIZE)
@@ -176,7 +170,7 @@ def test_a_device_chooses_its_kernel(device: object, monkeypatch: pytest.MonkeyP
             plan(scene, **options)
 
 
-def test_every_launch_compiles_for_a_gpu(tmp_path: Path) -> None:
+def test_every_launch_compiles_for_a_gpu(tmp_path):
     """The interpreter accepts more than the compiler."""
     environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
     run = subprocess.run(
@@ -190,7 +184,7 @@ def test_every_launch_compiles_for_a_gpu(tmp_path: Path) -> None:
 
 @needs_gpu
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 1e-4)])
-def test_captured_steps_are_those_of_the_cpu_kernel(dtype: torch.dtype, tolerance: float) -> None:
+def test_captured_steps_are_those_of_the_cpu_kernel(dtype, tolerance):
     """Odd blocks, so that graphs are captured for both fields in turn; the design's parity figures."""
     case = parts((RIGID, WALL), dtype, 40.0)
     expected = advance(CpuKernel(), case, (53, 53, 53))
@@ -198,7 +192,7 @@ def test_captured_steps_are_those_of_the_cpu_kernel(dtype: torch.dtype, toleranc
 
 
 @needs_gpu
-def test_transfer_matrix_is_that_of_the_cpu_kernel() -> None:
+def test_transfer_matrix_is_that_of_the_cpu_kernel():
     scene = small_scene((CUBE,))
     on_gpu, on_cpu = (make_propagator(scene, spacing=2e-3, device=device) for device in ("cuda", "cpu"))
     matrix, drive = on_gpu.transfer_matrix(), drive_from_phases([0.0, 1.0, 2.0, 3.0])

@@ -63,12 +63,12 @@ def test_a_tolerance_is_met(method):
         matrix, error = propagator.transfer_matrix(return_error=True)
         assert relative_error(matrix, exact(RIGID)) < tolerance
         assert error < tolerance
-        assert len(propagator.runs) == runs  # that of the choice
+        assert len(propagator.runs) == runs  # the run that chose the grid
 
 
 @pytest.mark.parametrize("radius", [2.1e-3, 2.25e-3])
 def test_a_coarse_grid_at_a_resonance_tells_of_that_alone(radius):
-    """It is off by several tens of a percent. Required: within a factor of 3, as where nothing resonates."""
+    """The error is several tens of a percent. Required: within a factor of 3, as where nothing resonates."""
     density, speed = 0.1, 0.32
     bubble = Sphere(CENTER, radius, density=density * AIR.density, sound_speed=speed * AIR.sound_speed)
     propagator = make_propagator(small_scene((bubble,)), "box", None, tolerance=0.02)
@@ -126,15 +126,15 @@ def test_errors_are_known_from_either_grid(ratio, error, spacing):
 
 @given(st.floats(0.05, 0.25), st.floats(0.01, 1.0), st.floats(-7, 0))
 def test_estimates_lean_towards_the_usual_error(spacing, scattered, logarithm):
-    """By a fifth of the logarithm, by 10^0.2 at most, and not below 0.37 of it: also of grids that agree."""
+    """The logarithm moves by a fifth towards it, by 0.2 at most, and no claim is below 0.37 of it."""
     free = torch.ones(1, 3, dtype=torch.complex128)
     matrix, usual = free * (1 + scattered), 1.3 * LAW.growth(spacing) * scattered / (1 + scattered)
     coarser = matrix * (1 + 10**logarithm), 1.3 * spacing
-    (told,), (claim,) = (
+    (by_grids,), (claim,) = (
         of(matrix, free, spacing, [coarser], LAW).tolist() for of in (errors_by_grids, grid_errors)
     )
     assert claim >= 0.36 * usual
-    assert claim <= max(told, 0.38 * usual, min(usual, 1.59 * told))
+    assert claim <= max(by_grids, 0.38 * usual, min(usual, 1.59 * by_grids))
     (agreed,) = grid_errors(matrix, free, spacing, [(matrix, 1.3 * spacing)], LAW).tolist()
     assert agreed == pytest.approx(0.37 * usual)
 
@@ -178,7 +178,7 @@ def test_rows_where_nothing_arrives_have_an_error_relative_to_free_space():
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-5])
 def test_exact_spheres_claim_the_waves_left_out(tolerance):
-    """By scattering operators in closed form: measured 1e-7, claimed once the whole tolerance."""
+    """T-matrices in closed form: measured 1e-7, where once the whole tolerance was claimed."""
     propagator = make_propagator(small_scene((RIGID,)), "tmatrix", None, tolerance)
     matrix, error = propagator.transfer_matrix(return_error=True)
     true = relative_error(matrix, exact(RIGID))

@@ -1,20 +1,17 @@
 """The CPU kernel against the reference kernel, and conservation in both."""
 
-from __future__ import annotations
-
 import functools
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
 from small_scenes import CUBE, NO_RECEIVERS, NO_SOURCES, all_tensors, assembled_parts, small_scene
 
-from autdtorch.fdtd.kernels.contract import Coefficients, Kernel, Receivers, Sources, State, uniform_state
+from autdtorch.fdtd.kernels.contract import uniform_state
 from autdtorch.fdtd.kernels.cpu import CpuKernel, _cuts
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
-from autdtorch.fdtd.stepping import Assembly, assemble, drive_signal
+from autdtorch.fdtd.stepping import assemble, drive_signal
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.obstacles import Box
 
@@ -27,11 +24,11 @@ PLATE = Box((12e-3, 12e-3, 21.7e-3), (30e-3, 40e-3, 1.7e-3), density=5.0, sound_
 
 
 @functools.cache  # no kernel changes them
-def scene_parts(dtype: torch.dtype, absorption: float = 0.0) -> tuple[Assembly, Sources, Receivers]:
+def scene_parts(dtype, absorption=0.0):
     return assembled_parts(small_scene((CUBE, RIGID, FAST, PLATE), absorption=absorption), 1e-3, dtype)
 
 
-def advance(kernel: Kernel, dtype: torch.dtype, steps: int) -> tuple[State, torch.Tensor]:
+def advance(kernel, dtype, steps):
     assembly, sources, receivers = scene_parts(dtype, absorption=40.0)
     signal = drive_signal(assembly.steps_per_period, 0, steps).to(dtype)
     return kernel.advance(assembly.silence(sources), assembly.coefficients, sources, receivers, signal)
@@ -41,7 +38,7 @@ def advance(kernel: Kernel, dtype: torch.dtype, steps: int) -> tuple[State, torc
 # of the peak
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
 @pytest.mark.parametrize("steps", [1, 40, 41])  # waves reach all layers in 30
-def test_cpu_kernel_is_the_reference_kernel(dtype: torch.dtype, tolerance: float, steps: int) -> None:
+def test_cpu_kernel_is_the_reference_kernel(dtype, tolerance, steps):
     state, recorded = advance(CpuKernel(), dtype, steps)
     expected, expected_recorded = advance(ReferenceKernel(), dtype, steps)
     for value, reference in zip(
@@ -51,7 +48,7 @@ def test_cpu_kernel_is_the_reference_kernel(dtype: torch.dtype, tolerance: float
 
 
 @pytest.mark.parametrize("chunks", [2, 4])
-def test_chunks_of_planes_are_the_whole(chunks: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_of_planes_are_the_whole(chunks, monkeypatch):
     """Chunks change the order of sums; the number of threads changes nothing."""
     whole = advance(CpuKernel(), torch.float64, 41)
     planes = whole[0].now.shape[0] - 2
@@ -67,11 +64,11 @@ def test_chunks_of_planes_are_the_whole(chunks: int, monkeypatch: pytest.MonkeyP
         assert all(map(torch.equal, all_tensors(*again), all_tensors(*parts)))
 
 
-def test_one_worker_steps_where_processors_are_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_worker_steps_where_processors_are_busy(monkeypatch):
     kernel, used = CpuKernel(), []
     shares = iter([1.0, 0.5, 0.8, 0.95, 1.0])
 
-    def share(work: Callable[[], object], workers: int) -> float:
+    def share(work, workers):
         used.append(workers)
         work()
         return next(shares)
@@ -85,14 +82,14 @@ def test_one_worker_steps_where_processors_are_busy(monkeypatch: pytest.MonkeyPa
     assert used == [2, 2, 1, 1, 2]
 
 
-def closed_box(dtype: torch.dtype) -> Coefficients:
+def closed_box(dtype):
     """Coefficients of air on a grid without absorption: the ring holds the pressure at zero."""
     c = assemble(region_of(small_scene()), 1e-3, dtype).coefficients
     return replace(c, layer_decay=torch.zeros_like(c.layer_decay), layer_gain=torch.zeros_like(c.layer_gain))
 
 
 @pytest.mark.parametrize("kernel", [CpuKernel(), ReferenceKernel()], ids=["cpu", "reference"])
-def test_a_mode_of_a_closed_box_keeps_its_frequency_and_amplitude(kernel: Kernel) -> None:
+def test_a_mode_of_a_closed_box_keeps_its_frequency_and_amplitude(kernel):
     """p = sin(k_x x) sin(k_y y) sin(k_z z) cos(w t) is an exact solution of the scheme, with w from the
     symbol."""
     shape, steps = (24, 26, 28), 400

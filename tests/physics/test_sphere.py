@@ -1,29 +1,25 @@
 """Spheres under point sources, simulated, against the exact series."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 import pyvista as pv
-import torch
 from small_scenes import AIR, relative_error, small_scene
 
 from autdtorch.analytic import fluid_sphere, rigid_sphere
 from autdtorch.propagators import make_propagator
 from autdtorch.scene.obstacles import Mesh, Sphere
-from autdtorch.scene.scene import Scene
 
 CENTER, RADIUS, RATIO = (12.2e-3, 11.9e-3, 12.1e-3), 3.3e-3, 77.0
 
 
-def sphere_scene(rigid: bool) -> Scene:
+def sphere_scene(rigid):
     if rigid:
         return small_scene((Sphere(CENTER, RADIUS, rigid=True),))
     return small_scene((Sphere(CENTER, RADIUS, density=RATIO * AIR.density, sound_speed=AIR.sound_speed),))
 
 
-def exact(scene: Scene, scattered: bool) -> torch.Tensor:
+def exact(scene, scattered):
     arguments = scene.control_points, scene.array.positions, scene.wavenumber, CENTER, RADIUS
     if scene.obstacles[0].rigid:
         field = rigid_sphere(*arguments, scattered=scattered)
@@ -32,7 +28,7 @@ def exact(scene: Scene, scattered: bool) -> torch.Tensor:
     return 4 * math.pi * scene.array.source_strength * field
 
 
-def scattered_error(scene: Scene, spacing: float) -> float:
+def scattered_error(scene, spacing):
     """Return the error of the transfer matrix, relative to the scattered part."""
     simulated = make_propagator(scene, "full", spacing, tolerance=1e-4).transfer_matrix()
     whole = exact(scene, scattered=False)
@@ -42,12 +38,12 @@ def scattered_error(scene: Scene, spacing: float) -> float:
 
 # measured: 3.8 % of the scattered wave at 1 mm, 3.3 cells a radius, for both; the bound leaves a third more
 @pytest.mark.parametrize("rigid", [True, False])
-def test_scattered_wave_of_a_sphere(rigid: bool) -> None:
+def test_scattered_wave_of_a_sphere(rigid):
     assert scattered_error(sphere_scene(rigid), 1e-3) < 0.05
 
 
 @pytest.mark.parametrize("rigid", [True, False])
-def test_the_error_of_a_sphere_is_of_second_order(rigid: bool) -> None:
+def test_the_error_of_a_sphere_is_of_second_order(rigid):
     scene = sphere_scene(rigid)
     coarse, fine = scattered_error(scene, 1.3e-3), scattered_error(scene, 0.65e-3)
     # Half the spacing divides the error by 4, apart from the sphere's place between the cells: measured 3.7
@@ -56,7 +52,7 @@ def test_the_error_of_a_sphere_is_of_second_order(rigid: bool) -> None:
 
 
 @pytest.mark.parametrize("rigid", [True, False])
-def test_spheres_merged_into_one_mesh_are_their_union(rigid: bool) -> None:
+def test_spheres_merged_into_one_mesh_are_their_union(rigid):
     material = {"rigid": True} if rigid else {"density": 100.0, "sound_speed": 340.0}
     places = (12e-3, 10.5e-3, 12e-3), (12.5e-3, 14e-3, 11e-3)
     spheres = [pv.Icosphere(radius=RADIUS, center=place, nsub=3) for place in places]

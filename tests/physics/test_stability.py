@@ -1,7 +1,5 @@
 """Stability: the largest eigenvalue, the energy of random scenes, and short runs of them."""
 
-from __future__ import annotations
-
 import itertools
 import logging
 import math
@@ -14,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 from scipy.sparse.linalg import splu
-from shared.random_scenes import Trial, draw_trial
+from shared.random_scenes import draw_trial
 
 from autdtorch.fdtd import stability
 from autdtorch.fdtd.assembly.element import stiffness_matrix
 from autdtorch.fdtd.assembly.elements import elements_of
-from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
+from autdtorch.fdtd.assembly.heterogeneous import heterogeneous_cells
 from autdtorch.fdtd.grid import make_grid
 from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
@@ -29,7 +27,7 @@ STENCIL = tuned_stencil(2 * math.pi / 8.5)
 SHAPE = (8, 8, 8)
 
 
-def random_weights(seed: int, contrast: float, negative: float) -> tuple[np.ndarray, np.ndarray]:
+def random_weights(seed, contrast, negative):
     """Heterogeneous cells in air: symmetric coupling, some of it negative, over random masses."""
     rng = np.random.default_rng(seed)
     inside = np.zeros(SHAPE, bool)
@@ -52,7 +50,7 @@ def random_weights(seed: int, contrast: float, negative: float) -> tuple[np.ndar
     return index, weight[index]
 
 
-def dense(index: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def dense(index, weight):
     """The operator on all cells but the outermost, which are held at zero."""
     inner = np.zeros(SHAPE, bool)
     inner[1:-1, 1:-1, 1:-1] = True
@@ -68,9 +66,7 @@ def dense(index: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 @settings(max_examples=20)
 @given(st.integers(0, 10**6), st.floats(1, 1e4), st.sampled_from([0.0, 0.2]))
-def test_largest_eigenvalue_is_never_below_the_truth_and_close_to_it(
-    seed: int, contrast: float, negative: float
-) -> None:
+def test_largest_eigenvalue_is_never_below_the_truth_and_close_to_it(seed, contrast, negative):
     index, weight = random_weights(seed, contrast, negative)
     truth = max(np.abs(np.linalg.eigvals(dense(index, weight))).max(), STENCIL.largest_symbol)
     bound = largest_eigenvalue(index, weight, STENCIL, SHAPE)
@@ -78,12 +74,12 @@ def test_largest_eigenvalue_is_never_below_the_truth_and_close_to_it(
     assert truth * (1 - 1e-9) <= bound <= truth * max(stability.MARGIN, stability.CLOSE)
 
 
-def test_of_uniform_air_it_is_that_of_the_shortest_wave() -> None:
+def test_of_uniform_air_it_is_that_of_the_shortest_wave():
     nothing = np.zeros(0, np.int64), np.zeros((0, 27))
     assert largest_eigenvalue(*nothing, STENCIL, SHAPE) == STENCIL.largest_symbol
 
 
-def test_many_cells_get_the_bound(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_many_cells_get_the_bound(monkeypatch, caplog):
     index, weight = random_weights(0, contrast=100.0, negative=0.2)
     iterated = largest_eigenvalue(index, weight, STENCIL, SHAPE)
     monkeypatch.setattr(stability, "MOST_CELLS", len(index) - 1)
@@ -93,7 +89,7 @@ def test_many_cells_get_the_bound(monkeypatch: pytest.MonkeyPatch, caplog: pytes
 
 
 @given(st.floats(2.5, 1e3))
-def test_steps_are_whole_in_the_shortest_block_that_is_long_enough(fewest: float) -> None:
+def test_steps_are_whole_in_the_shortest_block_that_is_long_enough(fewest):
     steps = whole_steps(fewest)
     assert stability.LONG_ENOUGH * steps <= fewest <= steps * (1 + 1e-9)
     for periods in range(1, steps.denominator):
@@ -102,7 +98,7 @@ def test_steps_are_whole_in_the_shortest_block_that_is_long_enough(fewest: float
     assert steps.denominator <= 1 + stability.LONG_ENOUGH / (1 - stability.LONG_ENOUGH) / fewest
 
 
-def test_fewest_steps_are_those_of_leapfrog() -> None:
+def test_fewest_steps_are_those_of_leapfrog():
     steps = fewest_steps(STENCIL, largest=9.0)
     assert STENCIL.time_factor(steps) * 9.0 == pytest.approx(4, rel=1e-12)
     assert all(a < b for a, b in itertools.pairwise(fewest_steps(STENCIL, value) for value in (7, 8, 9)))
@@ -111,10 +107,10 @@ def test_fewest_steps_are_those_of_leapfrog() -> None:
 SCENES = range(12)
 
 
-def operator_of(cells: HeterogeneousCells, shape: tuple[int, int, int]) -> sparse.csc_array:
-    """M^-1/2 K M^-1/2 of the heterogeneous cells that are not sound-hard; all others are held at zero."""
+def operator_of(cells, shape):
+    """M^-1/2 K M^-1/2 of the heterogeneous cells that are not rigid; all others are held at zero."""
     place = np.full(math.prod(shape), -1)
-    open_cells = np.flatnonzero(~np.isin(cells.index, cells.sound_hard))
+    open_cells = np.flatnonzero(~np.isin(cells.index, cells.rigid))
     place[cells.index[open_cells]] = np.arange(len(open_cells))
     weight, root = cells.weight[open_cells], np.sqrt(cells.mass[open_cells])
     neighbour = place[cells.index[open_cells, None] + np.array(OFFSETS) @ (shape[1] * shape[2], shape[2], 1)]
@@ -125,7 +121,7 @@ def operator_of(cells: HeterogeneousCells, shape: tuple[int, int, int]) -> spars
     return sparse.diags_array(weight.sum(axis=1)) - sparse.csc_array((coupling, (row, other)), size)
 
 
-def assert_not_negative(matrix: sparse.csc_array, largest: float) -> None:
+def assert_not_negative(matrix, largest):
     """No eigenvalue below 0 by more than rounding: elimination along the diagonal has positive pivots."""
     rounding = matrix.shape[0] * np.finfo(np.float64).eps * largest
     shifted = sparse.csc_array(matrix + rounding * sparse.eye_array(matrix.shape[0]))
@@ -135,7 +131,7 @@ def assert_not_negative(matrix: sparse.csc_array, largest: float) -> None:
 
 
 @pytest.mark.parametrize("number", SCENES)
-def test_energy_is_symmetric_positive_and_bounded(number: int) -> None:
+def test_energy_is_symmetric_positive_and_bounded(number):
     trial = draw_trial(0, number, long_share=1.0)
     grid = make_grid(region_of(trial.scene), trial.spacing)
     stencil = tuned_stencil(grid.kappa)
@@ -160,9 +156,7 @@ TRIALS = [replace(draw_trial(0, number, long_share=1.0), steps=1_000) for number
 
 
 @pytest.mark.parametrize("trial", TRIALS, ids=lambda trial: str(trial.number))
-def test_random_scenes_are_stable(
-    trial: Trial, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_random_scenes_are_stable(trial, caplog, monkeypatch):
     caplog.set_level(logging.ERROR)
     monkeypatch.setattr("checks.stability.SAMPLES", 4)  # of windows of 31 steps; calls for two steps are slow
     outcome = run_trial(trial)

@@ -1,7 +1,5 @@
 """The time step against the stability limit of whole grids, from steps of the kernel."""
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import replace
@@ -13,16 +11,16 @@ import torch
 from scipy.sparse.linalg import LinearOperator, eigs
 from small_scenes import CUBE, NO_RECEIVERS, NO_SOURCES, relative_error, small_scene
 
-from autdtorch.fdtd.kernels.contract import Coefficients, State, uniform_state
+from autdtorch.fdtd.kernels.contract import uniform_state
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stability import fewest_steps
-from autdtorch.fdtd.stepping import Assembly, assemble, drive_dft, drive_signal
+from autdtorch.fdtd.stepping import assemble, drive_dft, drive_signal
 from autdtorch.propagators import make_propagator
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.obstacles import Box
 
 
-def cube(density: float, sound_speed: float = 340.0) -> tuple[Box, ...]:
+def cube(density, sound_speed=340.0):
     return (Box(CUBE.center, CUBE.size, density=density, sound_speed=sound_speed),)
 
 
@@ -39,32 +37,32 @@ SCENES = {
 }
 
 
-def scaled(c: Coefficients, ratio: float) -> Coefficients:
+def scaled(c, ratio):
     """Return coefficients with another time factor."""
     names = ("face", "edge", "corner", "heterogeneous_weight")
     return replace(c, center=2 - ratio * (2 - c.center), **{name: ratio * getattr(c, name) for name in names})
 
 
-def advance(c: Coefficients, state: State, steps: int) -> State:
+def advance(c, state, steps):
     silence = torch.zeros((steps, 2), dtype=torch.float64)
     return CpuKernel().advance(state, c, NO_SOURCES, NO_RECEIVERS, silence)[0]
 
 
 @functools.cache  # several tests take the same scene
-def assembled(name: str) -> Assembly:
+def assembled(name):
     obstacles, spacing = SCENES[name]
     return assemble(region_of(small_scene(obstacles)), spacing, torch.float64)
 
 
 @functools.cache
-def true_eigenvalue(name: str) -> float:
+def true_eigenvalue(name):
     """Largest eigenvalue of a step on the whole grid without its layers, by Arnoldi."""
     assembly = assembled(name)
     c = assembly.coefficients
     open_ended = replace(c, layer_gain=torch.zeros_like(c.layer_gain))
     factor = assembly.stencil.time_factor(float(assembly.steps_per_period))
 
-    def apply(pressure: np.ndarray) -> np.ndarray:
+    def apply(pressure):
         state = uniform_state(assembly.grid.shape, c, 0.0)
         state.now[1:-1, 1:-1, 1:-1] = torch.from_numpy(pressure).reshape(inner)
         before = state.now.clone()
@@ -79,20 +77,20 @@ def true_eigenvalue(name: str) -> float:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_time_step_is_just_below_the_limit(name: str) -> None:
+def test_time_step_is_just_below_the_limit(name):
     assembly = assembled(name)
     limit = fewest_steps(assembly.stencil, true_eigenvalue(name))
     assert 0.95 <= limit / float(assembly.steps_per_period) <= 1
 
 
 @pytest.mark.parametrize("name", ["paper", "light"])
-def test_a_run_is_bounded_at_the_chosen_time_step_and_blows_up_above_the_limit(name: str) -> None:
+def test_a_run_is_bounded_at_the_chosen_time_step_and_blows_up_above_the_limit(name):
     assembly = assembled(name)
     stencil, c = assembly.stencil, assembly.coefficients
     limit = fewest_steps(stencil, true_eigenvalue(name))
     ratio = stencil.time_factor(limit / 1.05) / stencil.time_factor(float(assembly.steps_per_period))
 
-    def growth(coefficients: Coefficients, steps: int) -> float:
+    def growth(coefficients, steps):
         state = uniform_state(assembly.grid.shape, c, 0.0)
         inner = state.now[1:-1, 1:-1, 1:-1]
         inner.copy_(torch.randn(inner.shape, generator=torch.Generator().manual_seed(0), dtype=inner.dtype))
@@ -106,7 +104,7 @@ def test_a_run_is_bounded_at_the_chosen_time_step_and_blows_up_above_the_limit(n
     assert growth(scaled(c, ratio), 300) > 1e30
 
 
-def test_the_dft_of_a_block_is_exact() -> None:
+def test_the_dft_of_a_block_is_exact():
     """Over blocks of one or several periods."""
     phasor = torch.tensor([0.3 - 2j, 1j], dtype=torch.complex128)
     for steps in (Fraction(12), Fraction(23, 2), Fraction(35, 3), Fraction(17, 4)):
@@ -117,7 +115,7 @@ def test_the_dft_of_a_block_is_exact() -> None:
         assert torch.allclose(drive_dft(recorded, steps.denominator), phasor, rtol=1e-12)
 
 
-def test_a_given_time_step() -> None:
+def test_a_given_time_step():
     scene = small_scene((CUBE,))
     finest = make_propagator(scene, "full", 2e-3, time_step=2e-6)
     chosen = make_propagator(scene, "full", 2e-3)
@@ -128,7 +126,7 @@ def test_a_given_time_step() -> None:
     assert difference < finest.tolerance + chosen.tolerance
 
 
-def test_a_time_step_above_the_limit_is_refused() -> None:
+def test_a_time_step_above_the_limit_is_refused():
     scene = small_scene((CUBE,))
     with pytest.raises(ValueError, match=r"time_step: 3e-06 s; must be at most 2\.3\d+e-06 s") as error:
         make_propagator(scene, "full", 1e-3, time_step=3e-6)

@@ -20,17 +20,17 @@ STENCIL = tuned_stencil(0.7)
 RIGID = 1e5
 
 
-def assembled(density: float, kappa: float, slowness: float) -> float:
+def assembled(density, kappa, slowness):
     """Return the density with which waves keep their flow at a face to air."""
     inner = kappa * slowness
     return density * (math.sin(inner) / inner) / (math.sin(kappa) / kappa)
 
 
-def wave(wavenumber: float, place: float) -> complex:
+def wave(wavenumber, place):
     return cmath.exp(1j * wavenumber * place)
 
 
-def response(layers: list[tuple[float, float, float]], kappa: float) -> tuple[complex, complex]:
+def response(layers, kappa):
     """Return reflection and transmission of a chain of cells with layers between two of them.
 
     A layer is a width, density and slowness; the first and the last have those of the half-spaces.
@@ -52,7 +52,7 @@ def response(layers: list[tuple[float, float, float]], kappa: float) -> tuple[co
     return complex(reflected), complex(passed)
 
 
-def exact_response(layers: list[tuple[float, float, float]], kappa: float) -> tuple[complex, complex]:
+def exact_response(layers, kappa):
     """Return the exact ones, with phases as seen from both planes, by transfer matrices."""
     whole = np.eye(2)
     for width, density, slowness in layers:
@@ -69,9 +69,7 @@ def exact_response(layers: list[tuple[float, float, float]], kappa: float) -> tu
 
 @settings(max_examples=100)
 @given(RATIOS, st.floats(0.3, 1.5), PLACES)
-def test_a_wave_is_reflected_exactly_wherever_the_face_falls(
-    density: float, slowness: float, place: float
-) -> None:
+def test_a_wave_is_reflected_exactly_wherever_the_face_falls(density, slowness, place):
     """The error is of fourth order; its largest coefficient in 18,000 random cases was 0.11."""
     for kappa in (0.1, 0.3, 0.7):
         layers = [(place, 1.0, 1.0), (1 - place, density, slowness)]
@@ -81,9 +79,7 @@ def test_a_wave_is_reflected_exactly_wherever_the_face_falls(
 
 @settings(max_examples=100)
 @given(RATIOS, st.floats(0.3, 1.5), st.floats(0.001, 0.9), PLACES)
-def test_a_layer_thinner_than_a_cell_reflects_and_transmits_exactly(
-    density: float, slowness: float, width: float, share: float
-) -> None:
+def test_a_layer_thinner_than_a_cell_reflects_and_transmits_exactly(density, slowness, width, share):
     """The layer may be anywhere between two planes of cells, and thin; the largest coefficient was 0.32."""
     place = share * (1 - width)
     layers = [(place, 1.0, 1.0), (width, density, slowness), (1 - width - place, 1.0, 1.0)]
@@ -92,22 +88,22 @@ def test_a_layer_thinner_than_a_cell_reflects_and_transmits_exactly(
             assert abs(simulated - exact) < kappa**4 / min(1, density)
 
 
-def corner(place: tuple[float, float]) -> Section:
+def corner(place):
     """Return an element with material 1 in the quarter before the faces at `place`."""
     return Section((1, 1), ((place[0],), (place[1],)), ((1, 0), (0, 0)))
 
 
-def end_of_plate(end: float, low: float, thickness: float) -> Section:
+def end_of_plate(end, low, thickness):
     """Return the elements at the end of a plate of material 1 along the first axis."""
     return Section((1, math.ceil(low + thickness)), ((end,), (low, low + thickness)), ((0, 1, 0), (0, 0, 0)))
 
 
-def materials(density: float) -> MaterialKey:
+def materials(density):
     return MaterialKey((1.0, density), (1.0, 1 / density), (False, density >= RIGID))
 
 
 @pytest.mark.parametrize("place", [(0.5, 0.5), (0.2, 0.7), (0.05, 0.9)])
-def test_fields_at_a_rigid_edge_grow_with_powers_of_two_thirds(place: tuple[float, float]) -> None:
+def test_fields_at_a_rigid_edge_grow_with_powers_of_two_thirds(place):
     fields = plane_fields(corner(place), np.array((1.0, 0.0)), 4)
     # the powers are exact for a circle; the window is a square
     assert fields.order[1:] == pytest.approx(np.arange(1, 5) * 2 / 3, rel=0.02)
@@ -122,13 +118,13 @@ def test_fields_at_a_rigid_edge_grow_with_powers_of_two_thirds(place: tuple[floa
 
 
 @pytest.mark.parametrize("thickness", [0.01, 0.1])
-def test_fields_at_a_thin_plate_grow_with_powers_of_a_half(thickness: float) -> None:
+def test_fields_at_a_thin_plate_grow_with_powers_of_a_half(thickness):
     fields = plane_fields(end_of_plate(0.4, 0.3, thickness), np.array((1.0, 0.0)), 4)
     # the rim is shorter by the thickness
     assert fields.order[1:] == pytest.approx(np.arange(1, 5) / 2, rel=0.02)
 
 
-def whole_element(elements: Prisms) -> np.ndarray:
+def whole_element(elements):
     """Return the stiffness matrix (8, 8) of the first element of a section."""
     coupling, _ = stacked(np.ones(1), [Prisms(*(part[0, 0] for part in elements))], 2, STENCIL)
     return stiffness_matrix(coupling[None])[0]
@@ -139,9 +135,7 @@ def whole_element(elements: Prisms) -> np.ndarray:
 )
 @given(RATIOS)
 @settings(max_examples=10)
-def test_elements_at_an_edge_have_a_positive_energy_and_the_mass_of_their_volume(
-    section: Section, density: float
-) -> None:
+def test_elements_at_an_edge_have_a_positive_energy_and_the_mass_of_their_volume(section, density):
     elements = prisms(section, materials(density), STENCIL)
     matrix = whole_element(elements)
     assert np.linalg.eigvalsh(matrix).min() > -1e-9 * np.abs(matrix).max()  # rounding
@@ -152,7 +146,7 @@ def test_elements_at_an_edge_have_a_positive_energy_and_the_mass_of_their_volume
 
 
 @pytest.mark.parametrize("density", [RIGID, 77.0, 0.1])
-def test_images_of_an_edge_have_images_of_its_elements(density: float) -> None:
+def test_images_of_an_edge_have_images_of_its_elements(density):
     here = prisms(corner((0.2, 0.7)), materials(density), STENCIL)
     exchanged = prisms(corner((0.7, 0.2)), materials(density), STENCIL)
     assert np.array_equal(here.coupling[0, 0], exchanged.coupling[0, 0].transpose(1, 0, 3, 2))
@@ -160,7 +154,7 @@ def test_images_of_an_edge_have_images_of_its_elements(density: float) -> None:
     assert np.array_equal(here.mass[0, 0], prisms(mirrored, materials(density), STENCIL).mass[0, 0, ::-1])
 
 
-def test_an_edge_of_air_in_air_is_none() -> None:
+def test_an_edge_of_air_in_air_is_none():
     """The fit ends where it starts: the stencil's coupling reproduces long waves."""
     elements = prisms(corner((0.3, 0.8)), materials(1.0), STENCIL)
     # fields at the rim of the mesh are no polynomials: 1.3e-3 measured

@@ -1,7 +1,5 @@
 """The boundary layer: its reflection in the discrete scheme, and in the field of a point source."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -54,7 +52,7 @@ def test_a_tuned_layer_reflects_little_at_the_drive_frequency(
         assert max(-wave.imag.min() for wave in waves) < energy
 
 
-def test_layer_absorbs_other_frequencies_too() -> None:
+def test_layer_absorbs_other_frequencies_too():
     # waves of half and of 1.5 times the frequency, which the switch-on excites, at normal incidence
     kappa, steps = 2 * math.pi / 8.5, 13
     profile = tuned_profile(kappa, steps, FINE_LAYER_CELLS)
@@ -64,7 +62,7 @@ def test_layer_absorbs_other_frequencies_too() -> None:
     assert (20 * np.log10(np.abs(reflection(profile, along, turn))) < -40).all()
 
 
-def test_echo_of_a_layer() -> None:
+def test_echo_of_a_layer():
     # required: -70 dB from 0 to 60 degrees and -45 dB at 75, in at most 10 cells at 8.5 cells per wavelength;
     # the other layers are a wavelength off, so that the grid's edges and corners are in it
     angles, echo = measured_reflection(8.5, FINE_LAYER_CELLS, np.array((0.0, 30.0, 60.0, 75.0)), 5, aside=9)

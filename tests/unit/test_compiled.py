@@ -1,7 +1,5 @@
 """Compiled kernels: equal from memory and disk, of the present source; damaged files are compiled again."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import subprocess
@@ -35,7 +33,7 @@ print(sum(sum(one.stats.cache_misses.values()) for one in _entries))
 """
 
 
-def run(cache: Path) -> tuple[str, int]:
+def run(cache):
     """Run `SCRIPT` in a new process; return the digest of its results and the number of kernels compiled."""
     command = [sys.executable, "-c", SCRIPT, str(TESTS)]
     process = subprocess.run(
@@ -49,7 +47,7 @@ def run(cache: Path) -> tuple[str, int]:
     return digest, int(compiled_now)
 
 
-def test_cold_and_warm_caches_give_the_same_results(tmp_path: Path) -> None:
+def test_cold_and_warm_caches_give_the_same_results(tmp_path):
     cold, compiled_first = run(tmp_path)
     warm, compiled_again = run(tmp_path)
     assert compiled_first > 0
@@ -61,7 +59,7 @@ def test_cold_and_warm_caches_give_the_same_results(tmp_path: Path) -> None:
     assert names
 
 
-def test_any_change_of_the_kernels_changes_the_digest(tmp_path: Path) -> None:
+def test_any_change_of_the_kernels_changes_the_digest(tmp_path):
     (tmp_path / "one.py").write_text("a = 1\n", "utf-8")
     (tmp_path / "two.py").write_text("b = 2\n", "utf-8")
     before = compiled._digest.__wrapped__(tmp_path)

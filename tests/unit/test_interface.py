@@ -3,8 +3,6 @@
 In units of a cell and of air. Materials of which one has a mass and the other none show where mass goes.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -16,21 +14,13 @@ from autdtorch.fdtd.assembly.element import (
     FAR,
     LATTICE,
     VERTICES,
-    InterfaceElements,
     Materials,
     stiffness_matrix,
     uniform_coupling,
 )
 from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
-from autdtorch.fdtd.assembly.smooth_faces import (
-    Surface,
-    face_forces,
-    fields,
-    forces,
-    smooth_stiffness,
-    surfaces,
-)
-from autdtorch.fdtd.stencil import Stencil, tuned_stencil
+from autdtorch.fdtd.assembly.smooth_faces import face_forces, fields, forces, smooth_stiffness, surfaces
+from autdtorch.fdtd.stencil import tuned_stencil
 
 STENCIL = tuned_stencil(2 * math.pi / 8.5)
 LONG = tuned_stencil(1e-3)  # of long waves: the terms of second order are 1e-6
@@ -40,23 +30,18 @@ CONTRASTS = st.floats(-3, 5).map(lambda exponent: 10**exponent)
 NORMALS = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array).filter(lambda n: np.linalg.norm(n) > 0.1)
 
 
-def plane(normal: np.ndarray, offset: float) -> np.ndarray:
+def plane(normal, offset):
     """Distance from a plane that passes the middle of the element at `offset`."""
     return np.asarray((LATTICE - 0.5) @ normal / np.linalg.norm(normal) - offset)
 
 
-def sphere(normal: np.ndarray, offset: float, radius: float) -> np.ndarray:
+def sphere(normal, offset, radius):
     """Distance from a sphere whose nearest point to the middle of the element is at `offset`."""
     center = 0.5 + (offset - radius) * normal / np.linalg.norm(normal)
     return np.asarray(np.linalg.norm(LATTICE - center, axis=1) - radius)
 
 
-def element(
-    *distance: np.ndarray,
-    density: tuple[float, ...] = (1, 77),
-    mass: tuple[float, ...] | None = None,
-    stencil: Stencil = STENCIL,
-) -> InterfaceElements:
+def element(*distance, density=(1, 77), mass=None, stencil=STENCIL):
     """One element, obstacle k of which is of material k + 1; masses are 1/density by default."""
     masses = np.array(mass or [1 / d for d in density], float)
     materials = Materials(
@@ -68,7 +53,7 @@ def element(
     return interface_elements(near, materials, stencil)
 
 
-def rigid_element(distance: np.ndarray, reduction: np.ndarray | float = 0.0) -> InterfaceElements:
+def rigid_element(distance, reduction=0.0):
     """One element that a tilted rigid surface cuts."""
     materials = Materials(np.array([1, 1e5]), np.array([1, 1e-5]), np.ones(2), np.array([False, True]))
     reductions = np.broadcast_to(reduction, (1, 3, 3))
@@ -76,13 +61,13 @@ def rigid_element(distance: np.ndarray, reduction: np.ndarray | float = 0.0) -> 
     return interface_elements(near, materials, STENCIL)
 
 
-def energy(cut: InterfaceElements, field: np.ndarray) -> float:
+def energy(cut, field):
     """Energy of a field (8,) at the vertices: the integral of |gradient|^2 / density."""
     return float(field @ stiffness_matrix(cut.coupling)[0] @ field)
 
 
 @pytest.mark.parametrize("density", [1e-3, 1.0, 1e5])
-def test_an_element_of_one_material_is_the_tuned_stencil_over_its_density(density: float) -> None:
+def test_an_element_of_one_material_is_the_tuned_stencil_over_its_density(density):
     inside = np.full(len(LATTICE), -FAR)
     cut = element(inside, density=(1, density))
     # rounding
@@ -91,7 +76,7 @@ def test_an_element_of_one_material_is_the_tuned_stencil_over_its_density(densit
     assert np.allclose(element(-inside).coupling, uniform_coupling(STENCIL), rtol=1e-14)
 
 
-def test_eight_elements_of_air_add_up_to_the_tuned_stencil() -> None:
+def test_eight_elements_of_air_add_up_to_the_tuned_stencil():
     matrix = stiffness_matrix(uniform_coupling(STENCIL)[None])[0]
     sums = np.zeros((3, 3, 3))
     for one, vertex in enumerate(VERTICES):
@@ -103,9 +88,7 @@ def test_eight_elements_of_air_add_up_to_the_tuned_stencil() -> None:
 
 @settings(max_examples=60)
 @given(NORMALS, OFFSETS, CONTRASTS, st.one_of(st.none(), st.floats(1, 30)))
-def test_energy_is_never_negative_at_any_contrast(
-    normal: np.ndarray, offset: float, density: float, radius: float | None
-) -> None:
+def test_energy_is_never_negative_at_any_contrast(normal, offset, density, radius):
     distance = plane(normal, offset) if radius is None else sphere(normal, offset, radius)
     matrix = stiffness_matrix(element(distance, density=(1, density)).coupling)[0]
     size = np.abs(matrix).max()
@@ -120,9 +103,7 @@ LARGE_CONTRASTS = st.floats(2.3, 5).flatmap(lambda exponent: st.sampled_from((10
 
 @settings(max_examples=60)
 @given(NORMALS, OFFSETS, LARGE_CONTRASTS)
-def test_a_field_along_a_plane_surface_has_its_exact_energy(
-    normal: np.ndarray, offset: float, density: float
-) -> None:
+def test_a_field_along_a_plane_surface_has_its_exact_energy(normal, offset, density):
     cut = element(plane(normal, offset), density=(1, density), stencil=LONG)
     volumes = element(plane(normal, offset), density=(1, density), mass=(0, 1)).mass.sum()
     assume(1e-3 < volumes < 1 - 1e-3)  # what is smaller may count as absent
@@ -137,9 +118,7 @@ TILTED = NORMALS.filter(lambda n: np.count_nonzero(np.abs(n) > 0.01) > 1)
 
 @settings(max_examples=60)
 @given(TILTED, OFFSETS, st.floats(0, 0.45))
-def test_a_tilted_rigid_surface_leaves_the_energy_of_the_air(
-    normal: np.ndarray, offset: float, reduction: float
-) -> None:
+def test_a_tilted_rigid_surface_leaves_the_energy_of_the_air(normal, offset, reduction):
     cut = rigid_element(plane(normal, offset))
     air = float(cut.mass.sum())
     for direction in np.eye(3):
@@ -157,9 +136,7 @@ def test_a_tilted_rigid_surface_leaves_the_energy_of_the_air(
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @given(offset=OFFSETS, density=CONTRASTS)
-def test_a_flow_through_a_surface_along_the_grid_meets_its_exact_resistance(
-    axis: int, offset: float, density: float
-) -> None:
+def test_a_flow_through_a_surface_along_the_grid_meets_its_exact_resistance(axis, offset, density):
     normal = np.eye(3)[axis]
     depth = VERTICES[:, axis] - 0.5 - offset
     kinked = np.where(depth < 0, density, 1.0) * depth  # of unit flow
@@ -173,7 +150,7 @@ def test_a_flow_through_a_surface_along_the_grid_meets_its_exact_resistance(
 
 @settings(max_examples=40)
 @given(TILTED, OFFSETS)
-def test_masses_follow_the_flow(normal: np.ndarray, offset: float) -> None:
+def test_masses_follow_the_flow(normal, offset):
     distance = plane(normal, offset)
     for density in (77.0, 1e9):
         air, solid = (element(distance, density=(1, density), mass=mass) for mass in ((1, 0), (0, 1)))
@@ -186,16 +163,14 @@ def test_masses_follow_the_flow(normal: np.ndarray, offset: float) -> None:
 
 @settings(max_examples=40)
 @given(TILTED, OFFSETS, st.floats(1, 30))
-def test_a_surface_within_one_material_leaves_its_masses(
-    normal: np.ndarray, offset: float, radius: float
-) -> None:
+def test_a_surface_within_one_material_leaves_its_masses(normal, offset, radius):
     for distance in (plane(normal, offset), sphere(normal, offset, radius)):
         cut = element(distance, density=(1, 1), mass=(1, 1))
         assert cut.mass[0] == pytest.approx(np.full(8, 1 / 8), rel=1e-9)  # rounding
 
 
 @pytest.mark.parametrize("offset", [-0.6, -0.2, 0.1, 0.5])
-def test_volumes_of_planes(offset: float) -> None:
+def test_volumes_of_planes(offset):
     along, share = element(plane(np.array((0, 1, 0)), offset), stencil=LONG), max(0, 0.5 + offset)
     assert along.mass.sum() == pytest.approx(1 - share + share / 77, rel=1e-5)
     normal, points = np.array((0.8, 0.5, 0.33)), np.random.default_rng(0).random((400_000, 3))
@@ -205,11 +180,11 @@ def test_volumes_of_planes(offset: float) -> None:
     assert cut.mass.sum() == pytest.approx(exact, abs=0.012)
 
 
-def test_of_two_obstacles_the_later_wins_and_touching_ones_leave_no_air() -> None:
+def test_of_two_obstacles_the_later_wins_and_touching_ones_leave_no_air():
     lower, deeper = plane(np.array((1, 0, 0)), 0.3), plane(np.array((1, 0, 0)), -0.1)
     tilted, other = plane(np.array((0.6, 0.0, 0.8)), 0.1), plane(-np.array((0.6, 0.0, 0.8)), -0.1)
 
-    def share(first: np.ndarray, second: np.ndarray, material: int) -> float:
+    def share(first, second, material):
         return element(first, second, density=(1, 5, 9), mass=tuple(np.eye(3)[material])).mass.sum()
 
     for first, second, shares in ((lower, deeper, (0.2, 0.4, 0.4)), (deeper, lower, (0.2, 0.0, 0.8))):
@@ -219,7 +194,7 @@ def test_of_two_obstacles_the_later_wins_and_touching_ones_leave_no_air() -> Non
 
 
 @pytest.mark.parametrize("thickness", [0.01, 0.1, 0.5])
-def test_a_plate_thinner_than_a_cell_between_the_vertices_is_there(thickness: float) -> None:
+def test_a_plate_thinner_than_a_cell_between_the_vertices_is_there(thickness):
     density = 50.0
     plate = np.abs(LATTICE[:, 0] - 0.46) - thickness / 2
     cut = element(plate, density=(1, density), stencil=LONG)
@@ -231,7 +206,7 @@ def test_a_plate_thinner_than_a_cell_between_the_vertices_is_there(thickness: fl
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_face_through_vertices_is_corrected_from_either_side(side: int) -> None:
+def test_a_face_through_vertices_is_corrected_from_either_side(side):
     """All of one material, four vertices of which count to the other."""
     density = 77.0
     distance = LATTICE[:, 0] - 1 if side < 0 else LATTICE[:, 0] - 1e-9
@@ -243,9 +218,7 @@ def test_a_face_through_vertices_is_corrected_from_either_side(side: int) -> Non
 
 
 @given(st.integers(0, 2), st.floats(-0.5, 0.5), CONTRASTS, st.booleans())
-def test_a_face_along_the_grid_has_a_positive_energy_in_every_direction(
-    axis: int, offset: float, contrast: float, behind: bool
-) -> None:
+def test_a_face_along_the_grid_has_a_positive_energy_in_every_direction(axis, offset, contrast, behind):
     """Otherwise boundary layers that it enters give energy.
 
     Two elements in a row represent the rest of each material; along the face there is a wave of the grid.
@@ -262,7 +235,7 @@ def test_a_face_along_the_grid_has_a_positive_energy_in_every_direction(
             assert np.linalg.eigvalsh(along).min() > -1e-9 * max(1, 1 / contrast)
 
 
-def _energy_along(chain: list[np.ndarray], axis: int, wave: np.ndarray) -> np.ndarray:
+def _energy_along(chain, axis, wave):
     """Energy of elements in a row for a wave (2,) along the face, less that without its first component."""
     sides = [other for other in range(3) if other != axis]
     matrices = []
@@ -277,14 +250,14 @@ def _energy_along(chain: list[np.ndarray], axis: int, wave: np.ndarray) -> np.nd
     return matrices[0] - matrices[1]
 
 
-def planes(ratio: float, normal: np.ndarray, depth: np.ndarray) -> Surface:
+def planes(ratio, normal, depth):
     """Return flat surfaces with normals (n, 3), at a signed distance (n,) from the centres."""
     level = depth[:, None] + normal @ (LATTICE - 0.5).T
     _, surface = surfaces(level, np.tile((1.0, ratio), (len(depth), 1)))
     return surface
 
 
-def random_planes(ratio: float) -> Surface:
+def random_planes(ratio):
     random = np.random.default_rng(1)
     normal = random.normal(size=(200, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -295,7 +268,7 @@ RATIOS = pytest.mark.parametrize("ratio", [0.14, 1.5, 8.0, 77.0])
 
 
 @RATIOS
-def test_elements_sharing_a_face_get_opposite_forces(ratio: float) -> None:
+def test_elements_sharing_a_face_get_opposite_forces(ratio):
     """No net force at the vertices of flat surfaces, for all fields along the surface and across it."""
     here = random_planes(ratio)
     middle = here.level[:, len(LATTICE) // 2]
@@ -305,7 +278,7 @@ def test_elements_sharing_a_face_get_opposite_forces(ratio: float) -> None:
 
 
 @RATIOS
-def test_stiffness_gives_the_fields_their_forces(ratio: float) -> None:
+def test_stiffness_gives_the_fields_their_forces(ratio):
     here = random_planes(ratio)
     uniform, mobility = np.full(28, 0.1), np.full((200, 64), 1 / 64)
     coupling, weight = smooth_stiffness(here, mobility, np.tile(uniform, (200, 1)), uniform)
@@ -316,7 +289,7 @@ def test_stiffness_gives_the_fields_their_forces(ratio: float) -> None:
     assert np.linalg.eigvalsh(matrix).min() > -1e-9
 
 
-def test_in_one_material_forces_are_those_of_linear_pressures() -> None:
+def test_in_one_material_forces_are_those_of_linear_pressures():
     here = random_planes(1.0)
     slope = np.concatenate((here.tangents, here.normal[:, None]), axis=1)
     at_vertices = np.array(list(np.ndindex((2,) * 3))) - 0.5

@@ -11,7 +11,7 @@ SHAPE = (24, 22, 20)
 FIRST, LAST = (2, 2, 2), (22, 20, 18)
 
 
-def wave(kappa: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def wave(kappa, seed):
     """A plane wave on all cells, and its wave vector times spacing."""
     vector = np.random.default_rng(seed).normal(size=3)
     vector *= kappa / np.linalg.norm(vector)
@@ -21,7 +21,7 @@ def wave(kappa: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("cells", [17.0, 8.5, 6.0, 4.25])
 @given(seed=st.integers(0, 2**31))
-def test_plane_waves_are_interpolated(cells: float, seed: int) -> None:
+def test_plane_waves_are_interpolated(cells, seed):
     kappa = 2 * math.pi / cells
     field, vector = wave(kappa, seed)
     positions = np.random.default_rng(seed).uniform(7, 13, (5, 3))
@@ -33,7 +33,7 @@ def test_plane_waves_are_interpolated(cells: float, seed: int) -> None:
 
 
 @pytest.mark.parametrize("cells", [17.0, 8.5])
-def test_points_within_a_cell_of_the_rim_are_read_from_inside(cells: float) -> None:
+def test_points_within_a_cell_of_the_rim_are_read_from_inside(cells):
     kappa = 2 * math.pi / cells
     field, vector = wave(kappa, seed=1)
     positions = np.array([[2.5, 2.5, 2.5], [20.5, 18.5, 16.5], [2.5, 10.2, 16.5]])
@@ -48,7 +48,7 @@ def test_points_within_a_cell_of_the_rim_are_read_from_inside(cells: float) -> N
 
 
 @pytest.mark.parametrize("cells", [17.0, 8.5])
-def test_points_next_to_excluded_cells_use_the_others(cells: float) -> None:
+def test_points_next_to_excluded_cells_use_the_others(cells):
     """Up to a cell beyond the last one; a point without adjacent cells reads zero."""
     kappa = 2 * math.pi / cells
     field, vector = wave(kappa, seed=2)
@@ -65,7 +65,7 @@ def test_points_next_to_excluded_cells_use_the_others(cells: float) -> None:
     assert np.array_equal(same.weight, whole.weight)
 
 
-def test_a_point_on_a_cell_centre_is_that_cell() -> None:
+def test_a_point_on_a_cell_centre_is_that_cell():
     weights = interpolate_points(np.array([[9.0, 8.0, 7.0]]), SHAPE, FIRST, LAST, 2 * math.pi / 8.5)
     largest = weights.weight[0].argmax()
     assert weights.index[0, largest] == np.ravel_multi_index((9, 8, 7), SHAPE)
@@ -74,7 +74,7 @@ def test_a_point_on_a_cell_centre_is_that_cell() -> None:
     assert np.sort(np.abs(weights.weight[0]))[-2] < WIDTH_ERROR
 
 
-def test_groups_of_nodes_read_their_mean() -> None:
+def test_groups_of_nodes_read_their_mean():
     positions = np.random.default_rng(0).uniform(7, 13, (6, 3))
     positions[4:] = positions[3]  # of the second group one point alone: fewer cells than the first
     share = np.array([0.2, 0.3, 0.5])

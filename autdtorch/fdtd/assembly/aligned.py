@@ -200,7 +200,7 @@ def _prismatic(
 
 def _densities(materials: Materials) -> Array:
     """Return the densities (m,); rigid materials have one with which the thinnest sheet lets nothing pass."""
-    return np.where(materials.sound_hard, _RIGID_DENSITY, materials.density)
+    return np.where(materials.rigid, _RIGID_DENSITY, materials.density)
 
 
 def _key(materials: Materials) -> MaterialKey:
@@ -208,7 +208,7 @@ def _key(materials: Materials) -> MaterialKey:
     return MaterialKey(
         tuple(_densities(materials).tolist()),
         tuple(materials.mass.tolist()),
-        tuple(materials.sound_hard.tolist()),
+        tuple(materials.rigid.tolist()),
     )
 
 

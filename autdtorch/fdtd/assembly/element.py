@@ -37,7 +37,7 @@ class Materials:
     density: Array  # density (m,)
     mass: Array  # mass of a cell (m,)
     slowness: Array  # wavenumber (m,), 1 for rigid materials
-    sound_hard: NDArray[np.bool_]  # mask of the rigid materials (m,)
+    rigid: NDArray[np.bool_]  # mask of the rigid materials (m,)
 
     @property
     def speed(self) -> Array:

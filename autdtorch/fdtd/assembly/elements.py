@@ -141,7 +141,7 @@ def _finite(
     near = np.asarray((np.abs(distance) < FAR).any(axis=2))
     finite, thin, crossed = near.copy(), np.zeros(len(first), bool), np.zeros(len(first), bool)
     for body, mask, level, here in zip(bodies, finite, distance, near, strict=True):
-        if body.sound_hard:
+        if body.rigid:
             mask[mask] = _thick(body, level[mask], first[mask], whole, grid)
             crossed |= (level < 0).any(axis=1) & (level > 0).any(axis=1) & ~mask
             thin |= here & ~(mask & body.finite)
@@ -149,7 +149,7 @@ def _finite(
             mask &= near_edge & body.finite
             mask[mask] = roughness(level[mask]) > _ROUGH
         mask &= body.finite
-    hard = np.array([body.sound_hard for body in bodies])
+    hard = np.array([body.rigid for body in bodies])
     return np.asarray(finite & (hard[:, None] | ~thin) & ~crossed)
 
 
@@ -197,7 +197,7 @@ def _interface(
     numbers = np.array([body.material for body in bodies], np.int64)
     shapes = [shape for body in bodies for shape in body.shapes]
     edges = [
-        replace(edge, reduction=edge.reduction * (1 if body.sound_hard else _FLUID_REDUCTION))
+        replace(edge, reduction=edge.reduction * (1 if body.rigid else _FLUID_REDUCTION))
         for body in bodies
         if body.finite
         for shape in body.shapes

@@ -33,10 +33,10 @@ from autdtorch.utils.array_types import Array, Index
 logger = logging.getLogger(__name__)
 
 GridShape = tuple[int, int, int]
-# Sum of coupling coefficients, relative to air, up to which a cell in a rigid body is sound-hard. Cells at a
+# Sum of coupling coefficients, relative to air, up to which a cell in a rigid body is excluded. Cells at a
 # surface have 0.3 or more, all others 0.03 or less. Vertices of finite elements inside a body remain
 # unknowns, except in slivers: the least sum is relative to the densest fluid, and above the body's 1e-5.
-_SOUND_HARD_COUPLING = 0.1
+_RIGID_COUPLING = 0.1
 _SLIVER_COUPLING, _LEAST_COUPLING = 1e-3, 3e-5
 # Eigenvalues below this share of the largest are rounding in a condensed stiffness matrix. A higher value
 # would remove energy from nearly constant pressures.
@@ -58,9 +58,9 @@ class HeterogeneousCells:
     # stencil rows K_ij / m_i on (p_j - p_i) for the 27 neighbours (n, 27), before the time factor
     weight: Array
     mass: Array  # m_i (n,), 1 in air
-    sound_hard: Index  # flat indices of the sound-hard cells, ascending
-    shell: Index  # sound-hard cells next to other cells; no cell reads those behind them
-    enclosed: Index  # sound-hard cells of air that no sound reaches, ascending
+    rigid: Index  # flat indices of the rigid cells, ascending
+    shell: Index  # rigid cells next to other cells; no cell reads those behind them
+    enclosed: Index  # rigid cells of air, which no sound reaches, ascending
 
     def mass_of(self, cells: Index) -> Array:
         """Return the mass (k,) of cells (k,) that are heterogeneous or of air."""
@@ -76,8 +76,8 @@ def heterogeneous_cells(elements: Elements, stencil: Stencil) -> HeterogeneousCe
     shape = (x + 1, y + 1, z + 1)
     touched = np.unique(_vertices(elements, shape))
     touched = touched[_inner(touched, shape)]
-    coupling, mass, hard = _without_sound_hard(elements, touched, shape, stencil)
-    walls = elements.materials.sound_hard.any()
+    coupling, mass, hard = _without_rigid(elements, touched, shape, stencil)
+    walls = elements.materials.rigid.any()
     enclosed = enclosed_cells(coupling, touched, hard, shape) if walls else np.zeros(0, np.int64)
     hard[enclosed] = True
     if len(enclosed):
@@ -120,16 +120,16 @@ def _cell_material(elements: Elements) -> NDArray[np.int16]:
     return np.pad(elements.material, ((1, 0),) * 3, mode="edge").ravel()
 
 
-def _without_sound_hard(
+def _without_rigid(
     elements: Elements, touched: Index, shape: GridShape, stencil: Stencil
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return coupling and mass of the touched cells, and the mask (k,) of sound-hard cells."""
+    """Return coupling and mass of the touched cells, and the mask (k,) of rigid cells."""
     vertices, interface = _vertices(elements, shape), elements.interface
-    hard = elements.materials.sound_hard[_cell_material(elements)]
-    hard[vertices] = elements.materials.sound_hard[interface.material]
+    hard = elements.materials.rigid[_cell_material(elements)]
+    hard[vertices] = elements.materials.rigid[interface.material]
     inside, count = hard[touched], -1
-    densest = elements.materials.density[~elements.materials.sound_hard].max()
-    least = np.full(len(hard), _SOUND_HARD_COUPLING * stencil.total)
+    densest = elements.materials.density[~elements.materials.rigid].max()
+    least = np.full(len(hard), _RIGID_COUPLING * stencil.total)
     least[vertices[interface.finite]] = max(_SLIVER_COUPLING / densest, _LEAST_COUPLING) * stencil.total
     hard[touched] = False
     coupling, mass = _assembled(elements, interface, touched, shape, stencil)
@@ -272,7 +272,7 @@ def enclosed_cells(
     """Return the flat indices of cells that are not connected with the outermost ones.
 
     The `touched` cells (n,) have `coupling` (n, 27). All others are connected with the six beside them,
-    unless they are sound-hard.
+    unless they are rigid.
     """
     free = ~hard
     uniform = free.copy()

@@ -149,7 +149,7 @@ def _set_smooth(
 
 def _finite_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -> tuple[Array, Array]:
     """Return coupling (n, 28) and mass (n, 8) of finite elements, the bodies grown by the added thickness."""
-    contrast = np.where(materials.sound_hard, 1, (materials.density - 1) / (materials.density + 1))
+    contrast = np.where(materials.rigid, 1, (materials.density - 1) / (materials.density + 1))
     contrast = contrast[bodies.material, None, None] * bodies.finite[:, :, None]
     grown = bodies.distance - _added_thickness(stencil.kappa) * contrast
     part = shares(volume_coverage, grown, bodies.material, len(materials.density))
@@ -198,7 +198,7 @@ def _lumped_mass(vertex: Index, volumes: Array, materials: Materials) -> Array:
     mean = volumes.mean(axis=1) @ materials.density
     for number, mass in enumerate(materials.mass):
         inside = vertex == number
-        beside = ~inside & ~materials.sound_hard[vertex]
+        beside = ~inside & ~materials.rigid[vertex]
         beside[~inside.any(axis=1)] = True
         near, far = inside @ _HATS.T, beside @ _HATS.T
         passed = np.minimum(1, (materials.density[number] / mean)[:, None] * far)
@@ -251,7 +251,7 @@ def _cut_coupling(volumes: Array, materials: Materials, reductions: Array, stenc
 
     `reductions` (n, 3, 3) is the relative reduction of the stiffness near edges.
     """
-    mobility = volumes @ np.where(materials.sound_hard, 0, 1 / materials.density) / SUBCELLS**3
+    mobility = volumes @ np.where(materials.rigid, 0, 1 / materials.density) / SUBCELLS**3
     tuning = stiffness_matrix(uniform_coupling(stencil)[None])[0] - _PRODUCTS.mean(axis=0)
     near = np.trace(reductions, axis1=1, axis2=2) / 2
     matrix = np.tensordot(mobility, _PRODUCTS, axes=1)
@@ -264,7 +264,7 @@ def _cut_coupling(volumes: Array, materials: Materials, reductions: Array, stenc
 
 def _cut_mass(volumes: Array, materials: Materials) -> Array:
     """Return the masses at the vertices (n, 8), from the share of each material in sub-cells (n, 64, m)."""
-    return np.asarray(volumes @ np.where(materials.sound_hard, 0, materials.mass) @ _HATS / SUBCELLS**3)
+    return np.asarray(volumes @ np.where(materials.rigid, 0, materials.mass) @ _HATS / SUBCELLS**3)
 
 
 def _added_thickness(kappa: float) -> float:

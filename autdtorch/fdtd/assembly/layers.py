@@ -141,7 +141,7 @@ def mean_thickness(materials: Materials, stencil: Stencil) -> Array:
     """
     depth = (np.arange(_PLACES) + 0.5) / _PLACES
     width, mean = np.stack((depth, 1 - depth), axis=1), np.zeros(len(materials.density))
-    for number in np.flatnonzero(~materials.sound_hard)[1:]:
+    for number in np.flatnonzero(~materials.rigid)[1:]:
         density, slowness = (
             np.broadcast_to(part[[0, number]], width.shape)
             for part in (materials.density, materials.slowness)

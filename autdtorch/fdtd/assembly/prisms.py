@@ -255,7 +255,7 @@ def _fitted_couplings(
     fit = least_squares(
         missed, start, slopes, ftol=_FIT_EXACT, xtol=_FIT_EXACT, gtol=_FIT_EXACT, max_nfev=_MOST_FIT_STEPS
     )
-    parts = [section.parts(*place, materials.sound_hard) for place in varied]
+    parts = [section.parts(*place, materials.rigid) for place in varied]
     couplings = roots.couplings(fit.x)
     return np.stack([_apart(coupling, part) for coupling, part in zip(couplings, parts, strict=True)])
 

@@ -35,17 +35,17 @@ class MaterialKey(NamedTuple):
 
     density: tuple[float, ...]  # as assembled
     mass: tuple[float, ...]  # mass of a cell
-    sound_hard: tuple[bool, ...]
+    rigid: tuple[bool, ...]
 
     @property
     def mobility(self) -> Array:
         """Mobility of each material (m,), zero if rigid."""
-        return np.where(self.sound_hard, 0, 1 / np.array(self.density))
+        return np.where(self.rigid, 0, 1 / np.array(self.density))
 
     @property
     def masses(self) -> Array:
         """Mass of each material (m,), zero if rigid."""
-        return np.where(self.sound_hard, 0, self.mass)
+        return np.where(self.rigid, 0, self.mass)
 
 
 class Section(NamedTuple):
@@ -64,10 +64,10 @@ class Section(NamedTuple):
         places = np.array((x, y)) + COLUMNS
         return np.array(self.material)[self.blocks_at(*places.T)]
 
-    def parts(self, x: int, y: int, sound_hard: Sequence[bool]) -> Index:
+    def parts(self, x: int, y: int, rigid: Sequence[bool]) -> Index:
         """Return the part of an element, between rigid materials, that holds each column (4,), else 0."""
         *_, material = self.element(x, y)
-        part, _ = label(~np.array(sound_hard)[material])
+        part, _ = label(~np.array(rigid)[material])
         return np.asarray(part[np.ix_((0, -1), (0, -1))].ravel(), np.int64)
 
     def ends(self, axis: int, begin: int) -> Array:

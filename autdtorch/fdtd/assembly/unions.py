@@ -17,7 +17,7 @@ from autdtorch.fdtd.thin_walls import thickened
 from autdtorch.fdtd.turning import is_along, slender_faces
 from autdtorch.utils.array_types import Array, Index
 
-# Density with which rigid bodies are assembled; cells that remain almost uncoupled become sound-hard
+# Density with which rigid bodies are assembled; cells that remain almost uncoupled become rigid
 _RIGID_DENSITY = 1e5
 # Distance by which bodies are grown, so that touching bodies leave no film of air between them
 _CONTACT_GAP = 1e-9
@@ -32,7 +32,7 @@ class Union:
     continued: bool  # whether they continue through the boundary layers, unchanged from the interior
     # whether blocks represent it: its faces are flat and parallel to the grid, or it is slender
     aligned: bool
-    sound_hard: bool
+    rigid: bool
     finite: bool  # whether finite elements represent its surface, or the edges of a fluid
 
     def distance(self, cell: Array, grid: Grid) -> Array:
@@ -47,7 +47,7 @@ class Union:
 
     def measured(self, spacing: float) -> Union:
         """Return the union with thin rigid sheets thickened, for the lattices on cells of a spacing [m]."""
-        if not self.sound_hard:
+        if not self.rigid:
             return self
         return replace(self, shapes=tuple(thickened(shape, spacing) for shape in self.shapes))
 
@@ -132,5 +132,5 @@ def unions_of(region: Region, grid: Grid, stencil: Stencil) -> tuple[list[Union]
             ratio = fluid.sound_speed / air.sound_speed
             density[number] = fluid.density / air.density / flow_factor(stencil.kappa, ratio)
             factor[number], slowness[number] = speed_factor(stencil, ratio), 1 / ratio
-    sound_hard = np.array([fluid is None for fluid in fluids])
-    return unions, Materials(density, 1 / (density * factor), slowness, sound_hard)
+    rigid = np.array([fluid is None for fluid in fluids])
+    return unions, Materials(density, 1 / (density * factor), slowness, rigid)
