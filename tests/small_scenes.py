@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from autdtorch.fdtd.kernels.contract import Receivers, Sources, State
+from autdtorch.fdtd.kernels.contract import Receivers, Sources, WaveState
 from autdtorch.fdtd.stepping import Assembly, assemble
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
@@ -63,7 +63,7 @@ def assembled_parts(scene: Scene, spacing: float, dtype: torch.dtype) -> tuple[A
     return assembly, sources, assembly.receivers(scene.control_points)
 
 
-def all_tensors(state: State, recorded: torch.Tensor) -> list[torch.Tensor]:
+def all_tensors(state: WaveState, recorded: torch.Tensor) -> list[torch.Tensor]:
     """All results of a run: pressure, record, and the memory of layers and columns."""
     return [state.now, state.before, recorded, *(part for layer in state.memory for part in layer)]
 

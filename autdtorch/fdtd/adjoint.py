@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from autdtorch.fdtd.interpolation import Interpolation
-from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources, State
+from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources, WaveState
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.utils.threads import spread
@@ -62,8 +62,8 @@ class _Run:
     signal: Tensor
 
     def advance(
-        self, state: State, sources: Sources, receivers: Receivers, signal: Tensor
-    ) -> tuple[State, Tensor]:
+        self, state: WaveState, sources: Sources, receivers: Receivers, signal: Tensor
+    ) -> tuple[WaveState, Tensor]:
         """Step a copy of the state."""
         c = self.assembly.coefficients
         state, record = self.kernel.advance(deepcopy(state), c, sources, receivers, signal)
@@ -73,7 +73,9 @@ class _Run:
         """Return cells (k,) as receivers."""
         return Receivers(cells[:, None], torch.ones((len(cells), 1), dtype=self.assembly.dtype, device="cpu"))
 
-    def fields(self, state: State, sources: Sources, cells: Tensor, signal: Tensor) -> tuple[Tensor, Tensor]:
+    def fields(
+        self, state: WaveState, sources: Sources, cells: Tensor, signal: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return the pressure in cells (k,) before the first step (1, k), and after each (steps, k)."""
         first = state.now.reshape(1, -1)[:, cells.to(state.now.device)].cpu()
         return first, self.advance(state, sources, self.single(cells), signal)[1]
@@ -193,7 +195,7 @@ class _Recorded(torch.autograd.Function):
         return by_force, by_weight, None
 
 
-def _cuts(steps: int, state: State, cells: int) -> list[int]:
+def _cuts(steps: int, state: WaveState, cells: int) -> list[int]:
     """Return the ends of segments, with least memory for the record of one and the stored states."""
     numbers = 2 * state.now.numel() + sum(part.numel() for layer in state.memory for part in layer)
     fitting = _SEGMENT_BYTES / (cells * state.now.element_size())

@@ -33,7 +33,7 @@ from scipy.optimize import least_squares
 
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.kernels.contract import Columns
-from autdtorch.fdtd.stencil import OFFSETS, Stencil, flat_strides
+from autdtorch.fdtd.stencil import OFFSETS, Stencil, flat_strides, places_of
 from autdtorch.utils.array_types import Array, Index
 
 # Angles of incidence at which the profile is fitted [rad]
@@ -128,7 +128,7 @@ def layer_columns(
 
     `rows` (n, 27) are the differences of the cells `index` (n,) in the layers from scaled air.
     """
-    places = np.stack(np.unravel_index(index, grid.shape), axis=-1)
+    places = places_of(index, grid.shape)
     strides = flat_strides(grid.shape)
     ahead = np.array(OFFSETS) == 1
     middle, inside = 1 + grid.layer_cells // 2, np.arange(1, grid.layer_cells + 2)

@@ -14,6 +14,7 @@ from torch import Tensor
 from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.placement import grid_offset
 from autdtorch.fdtd.region import Region, Shape, bounds
+from autdtorch.fdtd.stencil import places_of
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.cached import cached_property
 from autdtorch.utils.validation import invalid, positive
@@ -102,7 +103,7 @@ class Grid:
 
     def inside(self, index: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which cells of flat `index` (...) are interior."""
-        places = np.stack(np.unravel_index(index, self.shape), axis=-1)
+        places = places_of(index, self.shape)
         return np.asarray(((places >= np.array(self.first)) & (places < np.array(self.last))).all(axis=-1))
 
     def clip(self, cells: Array) -> Array:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve
 from scipy.sparse import csr_array
 
+from autdtorch.fdtd.stencil import places_of
 from autdtorch.utils.array_types import Array, Index
 
 GridShape = tuple[int, int, int]
@@ -68,21 +69,16 @@ def exclude_cells(
     weight = points.weight.copy()
     weight[rows] = 0
     # The cells of all points have one arrangement: a single matrix holds the systems of all.
-    places = _places(points.index[rows[0]], shape)
+    places = places_of(points.index[rows[0]], shape)
     whole = np.sinc(kappa / np.pi * (places[:, None] - places)).prod(axis=-1)
     whole += _ONE_SIDED_REGULARISATION**2 * np.eye(len(whole))
     for row in rows:
-        off = np.abs(_places(points.index[row], shape) - cells[row])
+        off = np.abs(places_of(points.index[row], shape) - cells[row])
         left = np.flatnonzero(~excluded[row] & (off < _ONE_SIDED_REACH).all(axis=1))
         if (off[left] < 1).all(axis=1).any():
             target = np.sinc(kappa / np.pi * off[left]).prod(axis=-1)
             weight[row, left] = solve(whole[np.ix_(left, left)], target, assume_a="pos", check_finite=False)
     return Interpolation(points.index, weight)
-
-
-def _places(index: Index, shape: GridShape) -> Index:
-    """Return positions (n, 3) of flat indices (n,)."""
-    return np.stack(np.unravel_index(index, shape), axis=-1)
 
 
 @lru_cache(maxsize=64)

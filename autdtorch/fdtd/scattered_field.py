@@ -19,7 +19,7 @@ from torch import Tensor
 from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.region import Shape
-from autdtorch.fdtd.stencil import flat_offsets
+from autdtorch.fdtd.stencil import flat_offsets, places_of
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.turning import turned_shape
 from autdtorch.utils.apertures import Apertures, Discs
@@ -117,7 +117,7 @@ class ScatteredField:
     def positions(self, cells: Index) -> Tensor:
         """Return the centres (n, 3) [m] of cells."""
         grid = self.assembly.grid
-        places = np.stack(np.unravel_index(cells, grid.shape), axis=-1)
+        places = places_of(cells, grid.shape)
         return torch.from_numpy((np.array(grid.origin) + grid.spacing * places) @ self.axes)
 
     def _on_axes(self, points: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.utils.array_types import Array
+from autdtorch.utils.array_types import Array, Index
 
 # The 27 neighbour offsets in row-major order; entry 13 is the cell itself
 OFFSETS = tuple((x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1))
@@ -40,6 +40,11 @@ def flat_strides(shape: Sequence[int]) -> NDArray[np.int64]:
 def flat_offsets(shape: Sequence[int]) -> NDArray[np.int64]:
     """Return the offsets (27,) of flat indices to the neighbours."""
     return np.asarray(np.array(OFFSETS) @ flat_strides(shape), np.int64)
+
+
+def places_of(index: Index, shape: Sequence[int]) -> Index:
+    """Return the cells (..., 3) of flat indices (...)."""
+    return np.stack(np.unravel_index(index, tuple(shape)), axis=-1)
 
 
 @dataclass(frozen=True)

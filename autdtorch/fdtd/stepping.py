@@ -18,7 +18,7 @@ from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogene
 from autdtorch.fdtd.boundary import layer_columns, tuned_profile
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.interpolation import Interpolation, average_nodes, exclude_cells, interpolate_points
-from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, State, uniform_state
+from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, WaveState, uniform_state
 from autdtorch.fdtd.region import Region, Shape
 from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
@@ -53,7 +53,7 @@ class Assembly:
         """Precision of the fields."""
         return self.coefficients.heterogeneous_weight.dtype
 
-    def silence(self, sources: Sources) -> State:
+    def silence(self, sources: Sources) -> WaveState:
         """Return the state before the drive is switched on."""
         faint = _BACKGROUND * float(sources.force.detach().abs().max())
         return uniform_state(self.grid.shape, self.coefficients, faint)

@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 
 from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells
 from autdtorch.fdtd.grid import Grid
-from autdtorch.fdtd.stencil import OFFSETS
+from autdtorch.fdtd.stencil import OFFSETS, places_of
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import Array, Index
@@ -138,7 +138,7 @@ def _maps_cells(cells: HeterogeneousCells, grid: Grid, matrix: Index, rounding: 
     shape = np.array(grid.shape)
 
     def image(index: Index) -> Index:
-        double = 2 * np.stack(np.unravel_index(index, grid.shape), axis=-1) - (shape - 1)
+        double = 2 * places_of(index, grid.shape) - (shape - 1)
         places = (double @ matrix.T + (shape - 1)) // 2
         return np.asarray(np.ravel_multi_index(tuple(places.T), grid.shape), np.int64)
 

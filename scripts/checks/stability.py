@@ -21,7 +21,7 @@ from shared.document import table
 from shared.random_scenes import LONG_SHARE, LONG_STEPS, Trial, draw_trial
 from tqdm import tqdm
 
-from autdtorch.fdtd.kernels.contract import Receivers, Sources, State
+from autdtorch.fdtd.kernels.contract import Receivers, Sources, WaveState
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, assemble, drive_dft, drive_signal
 from autdtorch.propagators.scene_region import region_of
@@ -160,7 +160,7 @@ class _Course:
     where: str
 
 
-def _random_state(assembly: Assembly, sources: Sources, seed: int) -> State:
+def _random_state(assembly: Assembly, sources: Sources, seed: int) -> WaveState:
     """Return random pressure at rest in the interior; none in rigid cells, where it would stay."""
     grid, state = assembly.grid, assembly.silence(sources)
     inside = tuple(slice(low, high) for low, high in zip(grid.first, grid.last, strict=True))
@@ -173,7 +173,7 @@ def _random_state(assembly: Assembly, sources: Sources, seed: int) -> State:
 
 
 def _course(
-    assembly: Assembly, state: State, sources: Sources, receivers: Receivers, mass: Array, steps: int
+    assembly: Assembly, state: WaveState, sources: Sources, receivers: Receivers, mass: Array, steps: int
 ) -> _Course:
     """Step a run and record the norm of its pressure, weighted with the masses as in the energy."""
     at_once = math.ceil(steps / (WINDOWS * SAMPLES))

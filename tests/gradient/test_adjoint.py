@@ -9,7 +9,14 @@ from small_scenes import assembled_parts, small_scene
 
 from autdtorch.fdtd import adjoint
 from autdtorch.fdtd.adjoint import recorded
-from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, State, uniform_state
+from autdtorch.fdtd.kernels.contract import (
+    Coefficients,
+    Columns,
+    Receivers,
+    Sources,
+    WaveState,
+    uniform_state,
+)
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.scene.obstacles import Box, Sphere
@@ -81,7 +88,7 @@ def test_segments_do_not_change_the_gradients(monkeypatch):
 
 def test_cuts_bound_the_memory():
     """At 100^3 heterogeneous cells the stored states and the record of a segment stay below 1 GiB."""
-    state = State(torch.zeros((118,) * 3), torch.zeros(0), ())
+    state = WaveState(torch.zeros((118,) * 3), torch.zeros(0), ())
     cells = 102**3
     for steps in (10, 1000, 10_000):
         cuts = adjoint._cuts(steps, state, cells)

@@ -15,7 +15,7 @@ from triton.runtime import interpreter
 
 from autdtorch.fdtd.kernels.contract import Receivers, Sources, uniform_state
 from autdtorch.fdtd.kernels.cpu import CpuKernel
-from autdtorch.fdtd.kernels.cuda import Blocks, CudaKernel
+from autdtorch.fdtd.kernels.cuda import BlockSizes, CudaKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import assemble
 from autdtorch.propagators import make_propagator
@@ -36,7 +36,7 @@ RIGID = Box((3.4e-3, 4.5e-3, 4.5e-3), (2.2e-3, 5e-3, 4e-3), rigid=True)
 WALL = Box((4.5e-3, 4.5e-3, 7.3e-3), (30e-3, 30e-3, 1.2e-3), density=5.0, sound_speed=300.0)
 """Continues through the boundary layers of x and y."""
 
-WHOLE = Blocks(x=32, y=32, z=32, lanes=1024)
+WHOLE = BlockSizes(x=32, y=32, z=32, lanes=1024)
 """One program a task: interpreted, a program takes the same time however large it is."""
 
 BLOCKS = None if torch.cuda.is_available() else WHOLE
@@ -119,7 +119,7 @@ def test_programs_run_in_any_order(monkeypatch):
     )
     case = parts((RIGID, WALL), torch.float64)
     expected = advance(ReferenceKernel(), case, (1,))
-    assert_same(advance(CudaKernel(Blocks(x=16, y=16, z=8, lanes=256)), case, (1,)), expected, 1e-12)
+    assert_same(advance(CudaKernel(BlockSizes(x=16, y=16, z=8, lanes=256)), case, (1,)), expected, 1e-12)
 
 
 def test_a_returned_state_stays_while_another_is_stepped():

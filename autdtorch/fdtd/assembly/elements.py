@@ -23,7 +23,7 @@ from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, quadratic, rough
 from autdtorch.fdtd.assembly.unions import Union, unions_of
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Region, bounds
-from autdtorch.fdtd.stencil import Stencil
+from autdtorch.fdtd.stencil import Stencil, places_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.threads import spread
@@ -63,9 +63,7 @@ def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
     whole = np.where(cut, -1, material)
     index = np.flatnonzero(cut & ~beside), np.flatnonzero(cut & beside)
     parts = (
-        aligned_elements(
-            np.stack(np.unravel_index(index[0], cut.shape), axis=-1), blocks, materials, stencil
-        ),
+        aligned_elements(places_of(index[0], cut.shape), blocks, materials, stencil),
         _interface(bodies, index[1], whole, grid, materials, stencil),
     )
     order = np.argsort(np.concatenate(index))
@@ -206,7 +204,7 @@ def _interface(
     shape = tuple(cells - 1 for cells in grid.shape)
 
     def chunk(begin: int) -> InterfaceElements:
-        first = np.stack(np.unravel_index(index[begin : begin + _CHUNK], shape), axis=-1)
+        first = places_of(index[begin : begin + _CHUNK], shape)
         centers = np.array(grid.origin) + grid.spacing * (first + 0.5)
         less = reductions(edges, centers, grid.spacing)
         distance = _distances(bodies, first, grid)
@@ -289,7 +287,7 @@ def _at_lattice(measure: Measure, first: Index, lattice: Array) -> Array:
     shape = quarters.reshape(-1, 3).max(axis=0) + 1
     index = np.ravel_multi_index(tuple(np.moveaxis(quarters, -1, 0)), tuple(shape))
     used, place = np.unique(index, return_inverse=True)
-    places = np.stack(np.unravel_index(used, tuple(shape)), axis=-1) / SUBCELLS + first.min(axis=0)
+    places = places_of(used, shape) / SUBCELLS + first.min(axis=0)
     return np.asarray(measure(places)[place.reshape(index.shape)])
 
 

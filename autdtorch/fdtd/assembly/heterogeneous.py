@@ -27,7 +27,7 @@ from autdtorch.fdtd.assembly.element import (
 )
 from autdtorch.fdtd.assembly.elements import Elements
 from autdtorch.fdtd.region import Shape
-from autdtorch.fdtd.stencil import Stencil, flat_offsets
+from autdtorch.fdtd.stencil import Stencil, flat_offsets, places_of
 from autdtorch.utils.array_types import Array, Index
 
 logger = logging.getLogger(__name__)
@@ -104,13 +104,13 @@ def _neighbours(index: Index, shape: GridShape) -> Index:
 
 def _inner(index: Index, shape: GridShape) -> NDArray[np.bool_]:
     """Return the mask (n,) of cells inside the outermost ring, which is always zero."""
-    places = np.stack(np.unravel_index(index, shape), axis=-1)
+    places = places_of(index, shape)
     return np.asarray(((places > 0) & (places < np.array(shape) - 1)).all(axis=1))
 
 
 def _vertices(elements: Elements, shape: GridShape) -> Index:
     """Return the cells (n, 8) at the vertices of the interface elements."""
-    first = np.stack(np.unravel_index(elements.index, elements.material.shape), axis=-1)
+    first = places_of(elements.index, elements.material.shape)
     places = np.moveaxis(first[:, None] + VERTICES, -1, 0)
     return np.asarray(np.ravel_multi_index(tuple(places), shape), np.int64)
 
@@ -173,7 +173,7 @@ def _assembled(
     """Return coupling (n, 27) and mass (n,) of the touched cells, summed over their elements."""
     coupling, mass = np.zeros((len(touched), 27)), np.zeros(len(touched))
     cube = coupling.reshape(-1, 3, 3, 3)
-    places = np.stack(np.unravel_index(touched, shape), axis=-1)
+    places = places_of(touched, shape)
     cells, kinds = tuple(cells - 1 for cells in shape), elements.materials
     # elements by kind: of one material, then those that surfaces intersect
     count = len(kinds.density)

@@ -83,7 +83,7 @@ class Coefficients:
 
 
 @dataclass
-class State:
+class WaveState:
     """Two pressure fields (nx, ny, nz) and the memory of the boundary layers."""
 
     now: Tensor
@@ -91,7 +91,7 @@ class State:
     memory: Memory
 
 
-def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, pressure: float) -> State:
+def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, pressure: float) -> WaveState:
     """Return the state of rest at a uniform pressure on a grid of `shape`."""
     c, cells = coefficients, coefficients.layer_cells
 
@@ -104,7 +104,7 @@ def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, press
     core = c.layer_decay.new_full([length - 2 for length in shape], pressure)
     now = torch.nn.functional.pad(core, (1,) * 6)
     columns = (silent(0, len(each.index), axis=0) for each in (c.columns, c.crossed))
-    return State(now, now.clone(), Memory(*layers, *columns))
+    return WaveState(now, now.clone(), Memory(*layers, *columns))
 
 
 @dataclass(frozen=True)
@@ -131,8 +131,8 @@ class Kernel(Protocol):
         """Return the number of runs on a grid of `shape` that threads may step concurrently."""
 
     def advance(
-        self, state: State, c: Coefficients, sources: Sources, receivers: Receivers, signal: Tensor
-    ) -> tuple[State, Tensor]:
+        self, state: WaveState, c: Coefficients, sources: Sources, receivers: Receivers, signal: Tensor
+    ) -> tuple[WaveState, Tensor]:
         """Step once per row of `signal` (steps, S); return the new state and the record (steps, R).
 
         The new state may share memory with `state`, which must not be used again. The record holds the

@@ -22,7 +22,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from autdtorch.fdtd.kernels.compiled import INNER, entry
-from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, State
+from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, WaveState
 from autdtorch.fdtd.kernels.cpu_intrinsics import add_to_counter, give_way, read_counter, row_offsets
 from autdtorch.fdtd.kernels.cpu_layers import FlatMemory, plane_profiles, rows_profile, stretch
 from autdtorch.fdtd.kernels.cpu_sweep import sweep_planes
@@ -246,8 +246,8 @@ class CpuKernel:
         return thread_count() if len(_cuts(shape)) == 2 else 1
 
     def advance(
-        self, state: State, c: Coefficients, sources: Sources, receivers: Receivers, signal: torch.Tensor
-    ) -> tuple[State, torch.Tensor]:
+        self, state: WaveState, c: Coefficients, sources: Sources, receivers: Receivers, signal: torch.Tensor
+    ) -> tuple[WaveState, torch.Tensor]:
         """See `Kernel.advance`."""
         shape, cuts = state.now.shape, _cuts(state.now.shape)
         plane = shape[1] * shape[2]
@@ -285,7 +285,7 @@ class CpuKernel:
         self._work(lambda: _advance(*arguments), len(cuts) - 1)
         memory.give_back()
         now, before = (state.now, state.before) if len(signal) % 2 == 0 else (state.before, state.now)
-        return State(now, before, state.memory), recorded
+        return WaveState(now, before, state.memory), recorded
 
     def _work(self, advance: Callable[[], object], chunks: int) -> None:
         """Step on as many threads as chunks and free processors; workers that wait are slower than one."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from autdtorch.fdtd.kernels import cuda_steps
 from autdtorch.fdtd.kernels import cuda_tables as tables
-from autdtorch.fdtd.kernels.contract import Coefficients, Layer, Memory, Receivers, Sources, State
+from autdtorch.fdtd.kernels.contract import Coefficients, Layer, Memory, Receivers, Sources, WaveState
 from autdtorch.utils.validation import invalid, no_cuda
 
 _GRAPH_STEPS = 16  # Steps of a captured graph; even, so that both fields return to their places
@@ -26,7 +26,7 @@ _MOST_CACHED = 2**22  # Most cells whose two fields, in single precision, stay i
 _FEWEST_PROGRAMS = 1000  # That occupy a GPU of 132 multiprocessors
 
 
-class Blocks(NamedTuple):
+class BlockSizes(NamedTuple):
     """Sizes of a program's work, powers of two."""
 
     x: int = 16  # planes that a tile marches through
@@ -35,12 +35,12 @@ class Blocks(NamedTuple):
     lanes: int = 16  # columns through a boundary layer
 
 
-def blocks_of(shape: tables.Cells) -> Blocks:
+def blocks_of(shape: tables.Cells) -> BlockSizes:
     """Return the blocks for a grid, by timings on an H100; `docs/decisions/kernels.md` has them."""
     nx, ny, nz = shape
     if nx * ny * nz > _MOST_CACHED:
-        return Blocks(32, 1, 256)
-    blocks = Blocks()
+        return BlockSizes(32, 1, 256)
+    blocks = BlockSizes()
     tiles = triton.cdiv(ny, blocks.y) * triton.cdiv(nz, blocks.z)
     # a march takes its time however few programs there are
     while blocks.x > 1 and triton.cdiv(nx, blocks.x) * tiles < _FEWEST_PROGRAMS:
@@ -61,7 +61,9 @@ class Ends(NamedTuple):
 class DeviceMedium:
     """A medium on the device, and workspace."""
 
-    def __init__(self, c: Coefficients, shape: tables.Cells, blocks: Blocks, device: torch.device) -> None:
+    def __init__(
+        self, c: Coefficients, shape: tables.Cells, blocks: BlockSizes, device: torch.device
+    ) -> None:
         """Copy the medium `c` of a grid to a device."""
         self.coefficients, self.shape, self.blocks, self.device = c, shape, blocks, device
         self.cells, self.depths = c.layer_cells, triton.next_power_of_2(max(1, c.layer_cells))
@@ -88,7 +90,7 @@ class DeviceRun:
     """A state with its sources and receivers: the arguments of all launches."""
 
     def __init__(
-        self, medium: DeviceMedium, state: State, sources: Sources, receivers: Receivers, steps: int
+        self, medium: DeviceMedium, state: WaveState, sources: Sources, receivers: Receivers, steps: int
     ) -> None:
         """Copy a state to the medium's device, for calls of `steps` each."""
         self.medium, self.state, self.sources, self.receivers = medium, state, sources, receivers
@@ -117,7 +119,7 @@ class DeviceRun:
         grid = (triton.cdiv(received.size, block),)
         cuda_steps.read_last[grid](self._fields[self._turn], received, steps - 1, LANES=block)
         now, before = self._fields[self._turn], self._fields[1 - self._turn]
-        self.state = State(now, before, self._memories[self._turn])
+        self.state = WaveState(now, before, self._memories[self._turn])
         return received.recorded.clone()
 
     def _replay(self, steps: int) -> int:
@@ -164,7 +166,7 @@ class DeviceRun:
 class CudaKernel:
     """Kernel on the current CUDA device, which keeps states, the medium and the last run; see `Kernel`."""
 
-    def __init__(self, blocks: Blocks | None = None) -> None:
+    def __init__(self, blocks: BlockSizes | None = None) -> None:
         """Find the device; Triton may interpret without one. By default, `blocks` fit the grid."""
         interpreted = triton.knobs.runtime.interpret
         if not interpreted and not torch.cuda.is_available():
@@ -180,8 +182,8 @@ class CudaKernel:
 
     @torch.no_grad()
     def advance(
-        self, state: State, c: Coefficients, sources: Sources, receivers: Receivers, signal: Tensor
-    ) -> tuple[State, Tensor]:
+        self, state: WaveState, c: Coefficients, sources: Sources, receivers: Receivers, signal: Tensor
+    ) -> tuple[WaveState, Tensor]:
         """See `Kernel.advance`; the record stays on the device."""
         shape = tables.Cells(*state.now.shape)
         medium, run = self._medium, self._run

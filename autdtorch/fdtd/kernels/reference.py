@@ -5,7 +5,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Layer, Memory, Receivers, Sources, State
+from autdtorch.fdtd.kernels.contract import (
+    Coefficients,
+    Columns,
+    Layer,
+    Memory,
+    Receivers,
+    Sources,
+    WaveState,
+)
 from autdtorch.fdtd.stencil import flat_offsets
 
 
@@ -27,8 +35,8 @@ class ReferenceKernel:
         return 1
 
     def advance(
-        self, state: State, c: Coefficients, sources: Sources, receivers: Receivers, signal: Tensor
-    ) -> tuple[State, Tensor]:
+        self, state: WaveState, c: Coefficients, sources: Sources, receivers: Receivers, signal: Tensor
+    ) -> tuple[WaveState, Tensor]:
         """See `Kernel.advance`."""
         recorded = []
         for row in signal:
@@ -36,7 +44,7 @@ class ReferenceKernel:
             recorded.append((state.now.reshape(-1)[receivers.index] * receivers.weight).sum(-1))
         return state, torch.stack(recorded)
 
-    def _step(self, state: State, c: Coefficients, driven: Tensor, force: Tensor) -> State:
+    def _step(self, state: WaveState, c: Coefficients, driven: Tensor, force: Tensor) -> WaveState:
         new = torch.nn.functional.pad(_sweep(state.now, c) - c.keep * _core(state.before), (1,) * 6)
         flat_now, flat_before = state.now.reshape(-1), state.before.reshape(-1)
         now, before = flat_now[c.heterogeneous_index], flat_before[c.heterogeneous_index]
@@ -55,7 +63,7 @@ class ReferenceKernel:
         new = (new + term).reshape(-1).index_add(0, inside, shares.reshape(-1))
         new = new.index_add(0, driven, force).index_fill(0, c.sound_hard_index, 0)
         memory = memory._replace(columns=columns, crossed=crossed)
-        return State(new.reshape(state.now.shape), state.now, memory)
+        return WaveState(new.reshape(state.now.shape), state.now, memory)
 
 
 def _core(field: Tensor) -> Tensor:
