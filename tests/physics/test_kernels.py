@@ -37,7 +37,7 @@ def advance(kernel, dtype, steps):
 # float64: rounding grows with the steps and the sums of 27 terms; float32: the design's parity figure, 1e-4
 # of the peak
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
-@pytest.mark.parametrize("steps", [1, 40, 41])  # waves reach all layers in 30
+@pytest.mark.parametrize("steps", [40, 41])  # waves reach all layers in 30
 def test_cpu_kernel_is_the_reference_kernel(dtype, tolerance, steps):
     state, recorded = advance(CpuKernel(), dtype, steps)
     expected, expected_recorded = advance(ReferenceKernel(), dtype, steps)
