@@ -10,7 +10,7 @@ import numpy as np
 from autdtorch.scene.drive import phases_of, validate_single_drive
 from autdtorch.scene.geometry import Plane, cell_centers_of
 from autdtorch.scene.obstacles import Obstacle
-from autdtorch.scene.obstacles.overlaps import inside_any
+from autdtorch.scene.obstacles.base import inside_any
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import (
     ArrayLike,

@@ -14,8 +14,8 @@ from autdtorch.scene.arrays import TransducerArray, radii_of, range_text, streng
 from autdtorch.scene.geometry import Coordinates, Plane
 from autdtorch.scene.medium import Medium as Medium
 from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.obstacles.base import overlap, shared_box
 from autdtorch.scene.obstacles.moving import moved
-from autdtorch.scene.obstacles.overlaps import overlap, shared_box
 from autdtorch.scene.plausibility import extent_of, unit_hint, warn_of_implausible
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.display import counted, html_facts

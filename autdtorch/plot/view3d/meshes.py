@@ -16,7 +16,7 @@ from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.drive import amplitudes_of
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle
-from autdtorch.scene.obstacles.overlaps import inside_any
+from autdtorch.scene.obstacles.base import inside_any
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.spatial import closest_pair, distances
