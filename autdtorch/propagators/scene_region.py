@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from autdtorch.fdtd.region import Body, Fluid, Region, Shape
-from autdtorch.scene.obstacles import Box, Obstacle
+from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.spatial import mean_thickness
 
@@ -96,8 +96,7 @@ def warn_of_near_points(scene: Scene, name: str, points: torch.Tensor, spacing: 
     """Log which points (P, 3) [m] are less than a cell from a surface, on either side; return whether any."""
     found = False
     for index, obstacle in enumerate(scene.obstacles):
-        lower, upper = points.new_tensor([obstacle.lower, obstacle.upper])
-        around = ((points > lower - spacing) & (points < upper + spacing)).all(dim=-1).nonzero()[:, 0]
+        around = obstacle.near(points, spacing).nonzero()[:, 0]
         gap = obstacle.signed_distance(points[around]) if len(around) else points.new_zeros(0)
         if count := int((gap.abs() < spacing).sum()):
             found, nearest = True, int(gap.abs().argmin())
@@ -122,7 +121,7 @@ def _walls(scene: Scene) -> list[tuple[bool, bool]]:
     for obstacle in scene.obstacles:
         corners = zip(obstacle.lower, obstacle.upper, *scene.domain, strict=True)
         ends = [axis for axis, (low, high, first, last) in enumerate(corners) if low > first or high < last]
-        wall = isinstance(obstacle, Box) and obstacle.rotation == (0.0, 0.0, 0.0) and len(ends) <= 1
+        wall = obstacle.fills_bounds and len(ends) <= 1
         continued = wall and (not ends or normal in (None, ends[0]))
         found.append((wall, continued))
         if continued and ends:

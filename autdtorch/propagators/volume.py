@@ -8,6 +8,7 @@ import torch
 
 from autdtorch.propagators.simulated import Propagator
 from autdtorch.scene.drive import validate_single_drive
+from autdtorch.scene.obstacles.base import inside_any
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.spatial import nearest
@@ -52,9 +53,4 @@ def volume_field(propagator: Propagator, drive: ArrayLike, spacing: float | None
 def are_shown(scene: Scene, points: torch.Tensor) -> torch.Tensor:
     """Return which points (N, 3) [m] are neither in obstacles nor next to transducers, bool (N,)."""
     gap, _ = nearest(points, scene.array.nodes.positions.reshape(-1, 3))
-    valid = gap > _CLEARANCE * scene.wavelength
-    for obstacle in scene.obstacles:
-        lower, upper = points.new_tensor(obstacle.lower), points.new_tensor(obstacle.upper)
-        near = ((points >= lower) & (points <= upper)).all(dim=1)  # distances to meshes are slow
-        valid[near] &= ~obstacle.contains(points[near])
-    return valid
+    return (gap > _CLEARANCE * scene.wavelength) & ~inside_any(points, scene.obstacles)
