@@ -45,7 +45,7 @@ rounding of the simulation, which differs between machines, must not decide betw
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """The problem that a method solves: numbers of transducers and foci, the goal, and what else is known.
+    """The problem that a method solves: transducers, foci, the goal, and further knowledge.
 
     A method that sees magnitudes only needs no more than the two numbers.
 
@@ -132,8 +132,8 @@ class Step(NamedTuple):
 
     Attributes:
         drives: B drives to observe for each of the L trials that go on (L, B, M); B = 0 at the end.
-        search: tensors that the method needs to go on, by name.
-        goes_on: which of the trials that were observed go on (L before,), bool; None for all.
+        search: tensors by name, from which the method goes on.
+        goes_on: True for those of the observed trials that go on, bool; None for all.
     """
 
     drives: torch.Tensor
@@ -146,12 +146,12 @@ class State:
     """The state of T trials of a method. `save_state` and `load_state` keep it in a file.
 
     Attributes:
-        method: whose state it is.
-        problem: what is solved.
+        method: of the trials.
+        problem: of the trials.
         seeds: of the T trials.
         trials: indices of the L trials that go on (L,), of 0 to T - 1.
         drives: B drives for each of them to observe next (L, B, M), complex128.
-        search: what the method needs to go on: tensors by name.
+        search: tensors by name, from which the method goes on.
         best: the best drive of each trial so far, with its history.
     """
 
@@ -198,13 +198,13 @@ def _one_of(name: str, value: object, accepted: Sequence[str]) -> object:
 class Method(ABC):
     """Base of all methods: a frozen dataclass of settings that are checked when it is made.
 
-    A method of a user's adds its settings as fields and implements `begin`, `advance` and
+    A user's method adds its settings as fields and implements `begin`, `advance` and
     `most_evaluations`; ``docs/extending.md`` has an example.
 
     Attributes:
         name: of the method in results and files.
         label: name of the method in figures and tables.
-        random: whether trials differ by random choices. A method without has one trial.
+        random: whether trials differ by random choices; otherwise there is one trial.
         block: number of trials that a study runs and saves together.
     """
 
@@ -251,7 +251,7 @@ class Method(ABC):
         return self.most_evaluations(problem)
 
     def numbers_kept(self, problem: Problem) -> float:
-        """Return about how many float64 numbers a trial keeps, to refuse settings that need too many."""
+        """Estimate the float64 numbers that a trial stores, to refuse settings that need too many."""
         drive = 4.0 * problem.transducers + 2.0 * problem.foci
         # Besides the drives of a step: the score of each evaluation, and the history made of the scores
         return 4.0 * self.most_evaluations(problem) + drive * self.most_at_once(problem)
@@ -268,7 +268,7 @@ class Method(ABC):
         """Begin T trials.
 
         Args:
-            problem: what is solved.
+            problem: of all trials.
             seed: of the random choices, >= 0. Trial t has the same seed for every number of trials.
             trials: number of trials T, or their numbers.
 
@@ -341,7 +341,7 @@ class Method(ABC):
         return replace(state.best, drive=state.problem.quantise(state.best.drive), history=history)
 
     def _doubts(self, state: State) -> Sequence[Iterable[str]]:
-        """Describe what is doubtful about the readings of each trial after `tell`: a lone highest score."""
+        """Describe doubtful readings of each trial after `tell`: a lone highest score."""
         return [lone_score(score) for score in state.best.history] if state.done else []
 
     def _require_state(self, state: State) -> None:

@@ -38,7 +38,7 @@ _PAPERS_FIXED = 6  # Transducer whose phase is fixed in the paper, its 7th
 
 @contextlib.contextmanager
 def _defaults_of_processes() -> Iterator[None]:
-    """Set PyTorch's global state as GPyTorch needs it, whatever it is outside."""
+    """Set PyTorch's global state as GPyTorch needs it, and restore it."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     try:
@@ -242,7 +242,7 @@ class BayesOpt(Method):
         each = zip(fits, drives, generators, strict=True)
         sampled = torch.stack([fit.posterior.sample(drives, fit.read, draws) for fit, drives, draws in each])
         spread = (sampled - mean).abs().square().mean(dim=-1)
-        # The search explores what a sample makes likely; the answer, and the last drive, follow the mean.
+        # The search explores by samples; the answer, and the last drive, follow the mean.
         rows = mean if observed.shape[1] >= self.evaluations - 1 else sampled
         share = (2 * search["variance"] / power).clamp_max(0.5)
         fit = Fit(torch.ones_like(share), share / (1 - share))
@@ -263,7 +263,7 @@ class BayesOpt(Method):
 
 
 def require_transducer(fixed_transducer: int, transducers: int) -> None:
-    """Check that an array has at least two transducers, and the one whose phase is fixed."""
+    """Check that an array has at least two transducers, and that one has the index."""
     integer_at_least("transducers of the objective's array", transducers, 2)
     if not 0 <= fixed_transducer < transducers:
         raise invalid("fixed_transducer", fixed_transducer, f"must be an integer from 0 to {transducers - 1}")

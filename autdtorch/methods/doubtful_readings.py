@@ -33,7 +33,7 @@ _SHOWN = 3  # outliers that are listed
 
 @dataclass(frozen=True, eq=False)
 class Magnitudes:
-    """Readings of which some are lower limits: those of a sensor at the end of its range.
+    """Readings, with lower limits where a sensor is at the end of its range.
 
     An outlier says nothing: its lower limit is 0.
 

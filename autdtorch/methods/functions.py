@@ -29,7 +29,6 @@ from autdtorch.utils.hints import renamed_keywords
 from autdtorch.utils.validation import ArrayLike
 
 _OF_RUN = inspect.signature(run).parameters
-_OBJECTIVE = list(_OF_RUN.values())[1]
 _EITHER, _BY_NAME = inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY
 
 
@@ -55,11 +54,10 @@ def _function(
     parameters = {**settings, **common}
     order = positional.split() or list(parameters)
     rest = [key for key in parameters if key not in order]
+    objective = "Objective" if execute is run else "Objective | ArrayLike"
     signature = inspect.Signature(
         [
-            _OBJECTIVE.replace(
-                annotation="Objective" if execute is run else "Objective | ArrayLike", kind=_EITHER
-            ),
+            inspect.Parameter("objective", _EITHER, annotation=objective),
             *(parameters[key].replace(kind=_EITHER) for key in order),
             *(parameters[key].replace(kind=_BY_NAME) for key in rest),
         ],
@@ -67,10 +65,8 @@ def _function(
     )
 
     def call(*arguments: Any, **keywords: Any) -> Solution:
-        for key in keywords.keys() - signature.parameters.keys():
-            raise TypeError(
-                f"{name}() got an unexpected keyword argument '{key}'"
-            )  # `bind` names missing ones
+        if unknown := keywords.keys() - signature.parameters.keys():  # `bind` would name missing ones first
+            raise TypeError(f"{name}() got an unexpected keyword argument '{min(unknown)}'")
         values = signature.bind(*arguments, **keywords).arguments
         method = kind(**{key: values.pop(key) for key in settings if key in values})
         return execute(method, **values)
@@ -89,10 +85,9 @@ def _on_matrix(
     goal: GoalFunction = _OF_RUN["goal"].default,
 ) -> Solution:
     """Run a method that reads the transfer matrix on an objective, or on the matrix alone."""
-    rows = isinstance(objective, list | tuple)
-    if not isinstance(objective, torch.Tensor | np.ndarray) and not (
-        rows and not any(isinstance(entry, Objective) for entry in cast(Any, objective))
-    ):
+    listed = isinstance(objective, list | tuple)
+    rows = listed and not any(isinstance(entry, Objective) for entry in cast(Any, objective))
+    if not (rows or isinstance(objective, torch.Tensor | np.ndarray)):
         return run(method, cast(Objective, objective), trials, seed, goal=goal)
     matrix = torch.from_numpy(checked_matrix(cast(ArrayLike, objective), "objective"))
     points, transducers = matrix.shape

@@ -102,7 +102,7 @@ class GABS(Method):
     def _begun(self, problem: Problem, orders: torch.Tensor) -> coordinates.Search:
         """Return the state of an ascent in `orders` (T, M), after `first`.
 
-        One transducer is on, or those of the drives to start from.
+        One transducer is on, or all that are on in the drives to start from.
         """
         if self.first is not None:
             others = orders[orders != self.first].reshape(len(orders), -1)

@@ -134,7 +134,7 @@ class _Trial:
     def _start(self, read: Magnitudes, matrix: torch.Tensor | None) -> MatrixPosterior:
         """Return the posterior at which a fit begins: the one before, or the prior's.
 
-        Without either, the rows are those of the matrix, or of phase retrieval, which takes longest of all.
+        Without either, it begins at the matrix, or else at the rows of phase retrieval, which takes longest.
         """
         prior = self.prior or MatrixPrior.unknown(read, self.drives.shape[1])
         if before := self.before:

@@ -166,7 +166,7 @@ class MatrixPosterior:
         return drawn.matrix - 1j * turn.nan_to_num()[:, None] * self.matrix
 
     def outliers(self, drives: torch.Tensor, read: Magnitudes, observed: torch.Tensor) -> torch.Tensor:
-        """Return which of all readings (N, P) of drives (N, M) are far from this fit to those in `read`."""
+        """Return the readings (N, P), bool, of drives (N, M) that are far from this fit to `read`."""
         line = _Linearised.at(self, drives, read)
         left = torch.where(read.outliers, observed - line.magnitudes, line.left).abs()
         doubtful: torch.Tensor = left > _HARMLESS * self.matrix.norm(dim=1)

@@ -29,8 +29,8 @@ the first reading."""
 class Prior:
     """A simulated transfer matrix, and how far to trust it as one of the measured device.
 
-    The measured matrix differs from the simulated one by gain and phase of each transducer, by a scale of all
-    readings, by steps towards variants of the scene, and by errors of single entries.
+    The measured matrix differs from the simulated one by gain and phase of each transducer and by a scale of
+    all readings. Variants of the scene add steps towards them, and single entries have errors.
 
     Attributes:
         transfer_matrix: G (P, M) [Pa] of the simulation; None for the one that the objective has: a
@@ -80,7 +80,7 @@ def prior_of(name: str, value: object) -> Prior | None:
 
 
 def prior_mean(prior: Prior, problem: Problem) -> torch.Tensor:
-    """Return the simulated matrix (P, M) [Pa], after comparing shapes with those of the problem."""
+    """Return the simulated matrix (P, M) [Pa], after checking shapes against the problem."""
     matrix = problem.transfer_matrix if prior.transfer_matrix is None else prior.transfer_matrix
     if matrix is None:
         raise invalid("prior.transfer_matrix", None, "must be given where the objective has none")

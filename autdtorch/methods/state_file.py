@@ -90,7 +90,7 @@ def load_state(path: str | os.PathLike[str], method: Method, problem: Problem) -
 def _require_as_saved(
     arrays: Mapping[str, AnyArray], header: AnyArray | None, origin: dict[str, Any]
 ) -> None:
-    """Check the header of a file: its version, what it is the state of, and the digest of each array."""
+    """Check the header of a file: its version, method and problem, and the digest of each array."""
     if header is None:
         raise ValueError("header: missing; must be a file of save_state, of this version of autdtorch")
     try:
@@ -115,7 +115,7 @@ def _require_as_saved(
 def _origin_of(method: Method, problem: Problem) -> dict[str, Any]:
     """Return the settings of a method and the fields of a problem by name, as JSON gives them.
 
-    Of a tensor, of the scene and of a goal that is no `Goal`, it is a digest.
+    Tensors, the scene and a goal that is no `Goal` are digests.
     """
     origin = {
         "method": method.name,
@@ -157,8 +157,8 @@ def _named(value: object) -> str:
 def _parts(value: object, closure: bool = True) -> Iterator[object]:
     """Yield parts, which have a digest, that distinguish a value from others.
 
-    Of a function, that is its code, its defaults and the values of functions around it, not what it finds by
-    global names. Of an object that is no dataclass, it is the name of its type.
+    The parts of a function are its code, its defaults and the values of functions around it, without global
+    names. The part of an object that is no dataclass is the name of its type.
     """
     if isinstance(value, torch.Tensor):
         yield value.detach().cpu()

@@ -59,7 +59,7 @@ _PARTS = 3  # of the circle of each phase in the beginning; more than 2, for a c
 _MOST_WORK = 3e8  # Products of boxes, foci, transducers and iterations: about half a second
 _BOX_WORK = 60  # of a box, beside foci and transducers
 _MOST_BOXES = 50_000  # at once
-_ITERATIONS = 8  # of the weights a, which begin at those of the box that was divided
+_ITERATIONS = 8  # of the weights a, which begin at the weights of the box that was divided
 _LARGEST_STEP = 2.0  # of the logarithm of a weight
 _MARGIN = 1e-12
 """Relative margin on top of a bound; rounding of the bound and of a pressure is below 1e-13."""
@@ -177,7 +177,7 @@ def contrast_bound(foci: ComplexArray, background: ComplexArray) -> float:
 
 
 def _certified(x: Array, rows: ComplexArray, importance: Array) -> float:
-    """Return the logarithm of the bound that x certifies, whatever the rounding; see `_log_bound`."""
+    """Return the logarithm of the bound that x certifies, in spite of rounding; see `_log_bound`."""
     split, bounds = len(rows), []
     for width in _RANGES:
         log_z = x[split:].clip(x[split:].max() - width)

@@ -23,8 +23,59 @@ _MOST_EXCESS, _INTERVALS, _MOST_RELAXATIONS, _GAIN = 8.0, 16_000, 8, 1e-3
 _LEAST = 1e-10
 
 
+class _BesideOthers(Goal):
+    """Base of goals for some control points, the foci, beside other `points`."""
+
+    points: Sequence[int]
+
+    def __post_init__(self) -> None:
+        """Check the indices."""
+        accepted = "must be indices of control points, each once, at least one"
+        checked = tuple(integers("points", self.points, 0, accepted))
+        if not checked or len(set(checked)) < len(checked):
+            raise invalid("points", self.points, accepted)
+        object.__setattr__(self, "points", checked)
+
+    def check(self, points: int) -> None:
+        """Check that the indices are among the control points, and leave foci."""
+        if max(self.points) >= points or len(self.points) == points:
+            raise invalid(
+                "points", self.points, f"must be indices from 0 to {points - 1}, and not all of them"
+            )
+
+    def wanted(self, points: int) -> Array:
+        """Return 0 for the other points, and the pressures wanted at the foci."""
+        wanted = np.zeros(points)
+        wanted[self._foci(points)] = self._wanted_at_foci(points - len(self.points))
+        return wanted
+
+    def _wanted_at_foci(self, foci: int) -> Array:
+        return np.ones(foci)
+
+    def _foci(self, points: int) -> list[int]:
+        """Return the indices of the foci among so many control points."""
+        return sorted(set(range(points)).difference(self.points))
+
+    def _parts(self, pressure: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the pressures [Pa] of the foci (..., P - K) and of the other points (..., K)."""
+        return pressure[..., self._foci(pressure.shape[-1])], pressure[..., list(self.points)]
+
+    def _rows(self, G: ArrayLike) -> tuple[ComplexArray, ComplexArray]:
+        """Return the checked rows of the foci (P - K, M) and of the other points (K, M)."""
+        matrix = checked_matrix(G)
+        self.check(len(matrix))
+        return matrix[self._foci(len(matrix))], matrix[list(self.points)]
+
+    def _whole(self, at_foci: torch.Tensor, at_others: torch.Tensor) -> torch.Tensor:
+        """Return the values (..., P) of all control points."""
+        whole = at_foci.new_zeros(*at_foci.shape[:-1], at_foci.shape[-1] + len(self.points))
+        whole[..., self._foci(whole.shape[-1])] = at_foci
+        whole[..., list(self.points)] = at_others
+        return whole
+
+
 @dataclass(frozen=True)
-class QuietPoints(Goal):
+class QuietPoints(_BesideOthers):
     """A goal for some control points, while others stay quiet: below a ratio of the weakest of the former.
 
     The other points are scored by `goal`. If the loudest quiet point exceeds its limit by a factor, a score
@@ -49,7 +100,7 @@ class QuietPoints(Goal):
         require_kind("goal", self.goal, Goal)
         if isinstance(self.goal, QuietPoints | Contrast):
             raise invalid("goal", self.goal, "must be a goal without quiet points")
-        object.__setattr__(self, "points", _indices(self.points))
+        super().__post_init__()
         object.__setattr__(self, "ratio", positive("ratio", self.ratio))
 
     @property
@@ -64,7 +115,7 @@ class QuietPoints(Goal):
 
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:
         """Return the score of the other points (...), lowered for the excess of quiet points."""
-        loud, quiet = _parts(self.checked(pressure), self.points)
+        loud, quiet = self._parts(self.checked(pressure))
         score, limit = self.goal(loud), self.ratio * loud.amin(dim=-1)
         tiny = torch.finfo(quiet.dtype).tiny
         excess = (quiet.amax(dim=-1).clamp_min(tiny) / limit.clamp_min(tiny)).log().clamp_min(0)
@@ -74,7 +125,7 @@ class QuietPoints(Goal):
 
     def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
         """Return the derivatives of the goal and of a penalty for the smooth maximum of the excess."""
-        loud, quiet = _parts(pressure, self.points)
+        loud, quiet = self._parts(pressure)
         tiny = torch.finfo(loud.dtype).tiny
         least = (_LEAST * loud.mean(dim=-1, keepdim=True)).clamp_min(math.sqrt(tiny))
         rise, weakest = self.goal.slope(loud, smoothing), WEAKEST_FOCUS.slope(loud, smoothing)
@@ -83,16 +134,11 @@ class QuietPoints(Goal):
         weights = torch.softmax(torch.cat([torch.zeros_like(limit), excess], dim=-1), dim=-1)[..., 1:]
         penalty = _PENALTY * (rise.abs() * loud).sum(dim=-1, keepdim=True)  # of the size of the score
         raised = penalty * weights.sum(dim=-1, keepdim=True) * weakest * self.ratio / limit
-        slope = torch.zeros_like(pressure)
-        slope[..., _others(self.points, pressure.shape[-1])] = rise + raised
-        slope[..., list(self.points)] = -penalty * weights / quiet.clamp_min(tiny)
-        return slope
+        return self._whole(rise + raised, -penalty * weights / quiet.clamp_min(tiny))
 
     def bound(self, G: ArrayLike) -> float:
         """Return the bound from a relaxation with the quiet points; see `Goal.bound`."""
-        matrix = checked_matrix(G)
-        self.check(len(matrix))
-        loud, quiet = _rows(matrix, self.points)
+        loud, quiet = self._rows(G)
         least = self.goal.bound(loud)
         if not isinstance(self.goal, WeakestFocus):
             return least
@@ -116,18 +162,17 @@ class QuietPoints(Goal):
                 break
         return float(scores.max())
 
-    def wanted(self, points: int) -> Array:
-        """Return 0 for quiet points, and what the goal wants for the others."""
-        return _silenced(self.points, self.goal.wanted(points - len(self.points)))
+    def _wanted_at_foci(self, foci: int) -> Array:
+        return self.goal.wanted(foci)
 
     def check(self, points: int) -> None:
         """Check the indices, and the goal for the other points."""
-        _require_others(self.points, points)
+        super().check(points)
         self.goal.check(points - len(self.points))
 
 
 @dataclass(frozen=True)
-class Contrast(Goal):
+class Contrast(_BesideOthers):
     """The pressure of the weakest focus over the rms pressure of the background.
 
     Attributes:
@@ -139,13 +184,9 @@ class Contrast(Goal):
 
     points: Sequence[int]
 
-    def __post_init__(self) -> None:
-        """Check the indices."""
-        object.__setattr__(self, "points", _indices(self.points))
-
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:
         """Return the ratios (...), at most 1e10."""
-        foci, background = _parts(self.checked(pressure), self.points)
+        foci, background = self._parts(self.checked(pressure))
         rms = torch.linalg.vector_norm(background, dim=-1) / math.sqrt(len(self.points))
         least = (_LEAST * foci.amax(dim=-1)).clamp_min(torch.finfo(foci.dtype).tiny)
         ratio: torch.Tensor = foci.amin(dim=-1) / torch.maximum(rms, least)
@@ -153,63 +194,13 @@ class Contrast(Goal):
 
     def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
         """Return the derivatives of the logarithm, with a smooth minimum."""
-        foci, background = _parts(pressure, self.points)
+        foci, background = self._parts(pressure)
         tiny = torch.finfo(foci.dtype).tiny
         weakest = foci.amin(dim=-1, keepdim=True).clamp_min(tiny)
         power = background.square().sum(dim=-1, keepdim=True).clamp_min(tiny)
-        slope = torch.zeros_like(pressure)
-        slope[..., _others(self.points, pressure.shape[-1])] = WEAKEST_FOCUS.slope(foci, smoothing) / weakest
-        slope[..., list(self.points)] = -background / power
-        return slope
+        return self._whole(WEAKEST_FOCUS.slope(foci, smoothing) / weakest, -background / power)
 
     def bound(self, G: ArrayLike) -> float:
         """Return the bound, infinite where drives can silence the background; see `Goal.bound`."""
-        matrix = checked_matrix(G)
-        self.check(len(matrix))
-        bound = contrast_bound(*_rows(matrix, self.points))
+        bound = contrast_bound(*self._rows(G))
         return bound if math.isinf(bound) else min(bound, 1 / _LEAST)
-
-    def wanted(self, points: int) -> Array:
-        """Return 0 for the background, and 1 for each focus."""
-        return _silenced(self.points, np.ones(points - len(self.points)))
-
-    def check(self, points: int) -> None:
-        """Check the indices."""
-        _require_others(self.points, points)
-
-
-def _indices(points: Sequence[int]) -> tuple[int, ...]:
-    """Return indices of control points after checking them."""
-    accepted = "must be indices of control points, each once, at least one"
-    checked = tuple(integers("points", points, 0, accepted))
-    if not checked or len(set(checked)) < len(checked):
-        raise invalid("points", points, accepted)
-    return checked
-
-
-def _require_others(points: Sequence[int], count: int) -> None:
-    """Check that indices are among so many control points, and leave others."""
-    if max(points) >= count or len(points) == count:
-        raise invalid("points", points, f"must be indices from 0 to {count - 1}, and not all of them")
-
-
-def _others(points: Sequence[int], count: int) -> list[int]:
-    """Return the other indices of so many control points."""
-    return sorted(set(range(count)).difference(points))
-
-
-def _parts(pressure: torch.Tensor, points: Sequence[int]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the pressures [Pa] of the other points (..., P - K) and of these (..., K)."""
-    return pressure[..., _others(points, pressure.shape[-1])], pressure[..., list(points)]
-
-
-def _rows(matrix: ComplexArray, points: Sequence[int]) -> tuple[ComplexArray, ComplexArray]:
-    """Return the rows of the other points (P - K, M) and of these (K, M)."""
-    return matrix[_others(points, len(matrix))], matrix[list(points)]
-
-
-def _silenced(points: Sequence[int], others: Array) -> Array:
-    """Return `others` (P - K,) with 0 put in at `points`."""
-    wanted = np.zeros(len(others) + len(points))
-    wanted[_others(points, len(wanted))] = others
-    return wanted

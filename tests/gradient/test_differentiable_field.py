@@ -52,23 +52,23 @@ def test_gradcheck_of_drive_density_and_sound_speed(of_maps):
     assert torch.autograd.gradcheck(field, (drive, *medium), fast_mode=True)
 
 
-def test_every_material_has_its_own_derivative():
+def test_every_material_has_a_derivative():
     """Against differences: each to the 1e-8 that both have, and what rounding leaves of that."""
     scene = small_scene((SPHERE, RIGID, BOX), extent=12e-3)
-    given = dict(zip(("density", "sound_speed"), materials(SPHERE, RIGID, BOX), strict=True))
+    medium = dict(zip(("density", "sound_speed"), materials(SPHERE, RIGID, BOX), strict=True))
 
     def loss(**values):
         return at.differentiable_field(scene, DRIVE, **values, **EXACT).abs().sum()
 
-    loss(**given).backward()
-    fixed = {name: value.detach() for name, value in given.items()}
-    for (name, values), number in itertools.product(given.items(), (0, 2)):
+    loss(**medium).backward()
+    fixed = {name: value.detach() for name, value in medium.items()}
+    for (name, values), number in itertools.product(medium.items(), (0, 2)):
         step = torch.zeros(3, dtype=torch.float64)
         step[number] = 1e-4 * values.detach()[number]
         ends = [float(loss(**(fixed | {name: fixed[name] + way * step}))) for way in (1, -1)]
         slope = (ends[0] - ends[1]) / (2 * float(step[number]))
         assert float(values.grad[number]) == pytest.approx(slope, rel=1e-6)
-    assert all(values.grad[1] == 0 for values in given.values())  # the rigid one
+    assert all(values.grad[1] == 0 for values in medium.values())  # the rigid one
 
 
 def test_several_drives_are_one_by_one():
@@ -77,12 +77,12 @@ def test_several_drives_are_one_by_one():
     field = at.differentiable_field(scene, both, **EXACT)
     field.abs().sum().backward()
     for drive, slope, row in zip(both.detach(), both.grad, field, strict=True):
-        own = drive.clone().requires_grad_()
-        alone = at.differentiable_field(scene, own, **EXACT)
+        single = drive.clone().requires_grad_()
+        alone = at.differentiable_field(scene, single, **EXACT)
         alone.abs().sum().backward()
         # sums of both drives may be taken in another order than those of one
         torch.testing.assert_close(alone, row, rtol=0, atol=1e-12 * float(row.detach().abs().max()))
-        torch.testing.assert_close(own.grad, slope, rtol=0, atol=1e-12 * float(slope.abs().max()))
+        torch.testing.assert_close(single.grad, slope, rtol=0, atol=1e-12 * float(slope.abs().max()))
 
 
 def test_field_and_gradient_by_the_drive_are_those_of_the_propagator():

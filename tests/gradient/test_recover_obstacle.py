@@ -22,13 +22,13 @@ def body() -> at.TMatrix:
 
 
 def test_operator_and_scene_agree_in_a_pose(body):
-    found = body.moved(TRUE[:3], TRUE[3:]).transfer_matrix(ARRAY, SCENE.control_points).abs()
+    moved = body.moved(TRUE[:3], TRUE[3:]).transfer_matrix(ARRAY, SCENE.control_points).abs()
     exact = measured(SCENE, TRUE, 1e-3, seed=0, noise=0.0)
     # cells of 1.5 and 1 mm differ by 0.15 %, the block at rest by 6 %
-    assert float((found - exact).norm() / exact.norm()) < 0.01
+    assert float((moved - exact).norm() / exact.norm()) < 0.01
 
 
-def test_a_pose_is_found_from_noisy_magnitudes(body):
+def test_a_pose_is_fitted_to_noisy_magnitudes(body):
     (fit,) = fits(body, SCENE, measured(SCENE, TRUE, 1e-3, seed=0), [pose_of(0.0, 0.0)])
     place, turn = pose_errors(fit.pose, TRUE)
     # three to seven standard errors, 0.03 mm and 0.6 degrees, that 1 % of noise gives to these 144 magnitudes

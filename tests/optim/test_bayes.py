@@ -75,25 +75,25 @@ def test_foci_that_nothing_reaches(make_objective, random_matrix, dark, with_pri
     matrix = simulated.clone()
     matrix[dark] = 0
     prior = at.Prior(simulated) if with_prior else None
-    found = at.bayes_opt(make_objective(matrix), 16, 4, fixed_transducer=0, prior=prior, **FOCI)
-    assert found.score.tolist() == [0.0]
+    solution = at.bayes_opt(make_objective(matrix), 16, 4, fixed_transducer=0, prior=prior, **FOCI)
+    assert solution.score.tolist() == [0.0]
 
 
 def test_foci_find_the_maximum(make_objective, random_matrix):
     objective = make_objective(random_matrix(3, 6, 4))
     best = at.gradient_ascent(objective).score
-    found = at.bayes_opt(objective, evaluations=30, initial=6, fixed_transducer=0, trials=2, **FOCI)
+    solution = at.bayes_opt(objective, evaluations=30, initial=6, fixed_transducer=0, trials=2, **FOCI)
     # Amplitudes below 1, which gradient ascent may use, and other local maxima are within a few per cent.
-    assert (found.score > 0.9 * best).all()
+    assert (solution.score > 0.9 * best).all()
 
 
-def test_goal_of_ones_own_is_reached_by_the_foci(make_objective, random_matrix):
+def test_goal_of_a_user_is_reached_by_the_foci(make_objective, random_matrix):
     """A goal is improved by its samples, without the smooth minimum: the pressure at the first focus."""
     matrix = random_matrix(2, 4, 3)
     highest = matrix[0].abs().sum()
     options = dict(evaluations=24, initial=6, fixed_transducer=0, goal=lambda p: p[..., 0], **FOCI)
-    found = at.bayes_opt(make_objective(matrix), **options)
-    assert 0.98 * highest < found.score.item() <= highest * (1 + 1e-6)
+    solution = at.bayes_opt(make_objective(matrix), **options)
+    assert 0.98 * highest < solution.score.item() <= highest * (1 + 1e-6)
 
 
 class TestPhasorKernel:
@@ -119,8 +119,8 @@ class TestPhasorKernel:
         intensity = (rows @ drives.T).abs().square()
         kernel, inputs = PhasorKernel("drives", mean, variance), torch.cat([drives.real, drives.imag], dim=-1)
         # 400,000 samples of fourth moments scatter by about 1 %.
-        for found, expected in zip(intensity, kernel(inputs).to_dense(), strict=True):
-            torch.testing.assert_close(found.T.cov(), expected, rtol=0.05, atol=0.05)
+        for sampled, expected in zip(intensity, kernel(inputs).to_dense(), strict=True):
+            torch.testing.assert_close(sampled.T.cov(), expected, rtol=0.05, atol=0.05)
         torch.testing.assert_close(intensity.mean(dim=1), kernel.mean(inputs), rtol=0.02, atol=0)
         torch.testing.assert_close(
             kernel(inputs, diag=True), kernel(inputs).to_dense().diagonal(dim1=1, dim2=2)
@@ -183,14 +183,12 @@ class TestProcesses:
         mean = random_matrix(4, 4, 0).reshape(2, 2, 4)
         rows = Rows(mean, torch.full((2, 2), 0.3, dtype=torch.float64), points[:, 0])
         processes = Processes("phasor", points, values, fit_of(2, 2, 1.0, 1e-3), rows)
-        found, model = processes.at(there), processes.model.posterior(phasors(there))
+        ours, model = processes.at(there), processes.model.posterior(phasors(there))
         features = phasors(there)
         expected = torch.complex(features[..., :4], features[..., 4:]) @ mean.mT
         intensity = expected.abs().square() + 0.3 * 4
-        torch.testing.assert_close(found.mean, intensity + processes.scale * model.mean)
-        torch.testing.assert_close(
-            found.deviation, processes.scale * model.variance.sqrt(), rtol=1e-5, atol=0
-        )
+        torch.testing.assert_close(ours.mean, intensity + processes.scale * model.mean)
+        torch.testing.assert_close(ours.deviation, processes.scale * model.variance.sqrt(), rtol=1e-5, atol=0)
 
     def test_noise_of_readings_is_inferred(self, random_matrix):
         """Readings with complex noise of a hundredth of the mean intensity, as at 20 dB."""
@@ -201,10 +199,10 @@ class TestProcesses:
         sigma = 0.1 * pressure.abs().square().mean().sqrt()
         noise = torch.randn(pressure.shape, dtype=torch.complex128, generator=generator)
         seen = (pressure + sigma * noise).abs()
-        found = fitted("phasor", points, seen, "inferred").noise
+        noise = fitted("phasor", points, seen, "inferred").noise
         expected = sigma.square() / pressure.abs().square().mean(dim=1)
-        assert (found < 2 * expected).all()
-        assert (found > expected / 2).all()
+        assert (noise < 2 * expected).all()
+        assert (noise > expected / 2).all()
         quiet = fitted("phasor", points, pressure.abs(), "inferred").noise
         assert (quiet < 1e-4).all()
 

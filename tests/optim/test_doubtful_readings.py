@@ -1,4 +1,4 @@
-"""Readings that cannot be: outliers, dead sensors and saturated ones are worked around, or told."""
+"""Doubtful readings: outliers, failed sensors and saturated ones are worked around, or told."""
 
 import logging
 import math
@@ -70,8 +70,8 @@ def share(paper_objective, caplog):
 
     def of(change, **options):
         with caplog.at_level(logging.WARNING, "autdtorch"):
-            found = at.identify(Faulty(paper_objective, change), **options)
-        true = paper_objective(found.drive).amin().item() / best
+            solution = at.identify(Faulty(paper_objective, change), **options)
+        true = paper_objective(solution.drive).amin().item() / best
         return true, " ".join(record.getMessage() for record in caplog.records)
 
     return of
@@ -128,18 +128,18 @@ def test_a_coarse_sensor_is_not_taken_for_saturated(
     matrix = random_matrix(points, transducers, 0)
     objective = make_objective(matrix)
     prior = None if evaluations is None else at.Prior(matrix + 0.1 * random_matrix(points, transducers, 50))
-    found = at.identify(Faulty(objective, in_steps(step)), evaluations, prior=prior)
+    solution = at.identify(Faulty(objective, in_steps(step)), evaluations, prior=prior)
     assert caplog.text == ""  # before, "saturates" in all six
     # Steps of a quarter of the pressures: 0.95 to 1 were measured.
-    assert objective(found.drive).amin() > 0.9 * at.gradient_ascent(objective).score
+    assert objective(solution.drive).amin() > 0.9 * at.gradient_ascent(objective).score
 
 
 def test_a_coarse_sensor_that_saturates_gives_lower_limits(make_objective, random_matrix, caplog):
     objective = make_objective(random_matrix(4, 16, 0))
-    found = at.identify(Faulty(objective, in_steps(0.1, most=6.0)))
+    solution = at.identify(Faulty(objective, in_steps(0.1, most=6.0)))
     assert "control point 1 reads 6 Pa" in caplog.text
     assert "saturates" in caplog.text
-    assert objective(found.drive).amin() > 0.9 * at.gradient_ascent(objective).score  # 0.996 was measured
+    assert objective(solution.drive).amin() > 0.9 * at.gradient_ascent(objective).score  # 0.996 was measured
 
 
 def test_with_a_poor_prior_the_doubt_is_of_the_prior_too(make_objective, random_matrix, caplog):
@@ -195,8 +195,8 @@ def test_outliers_of_a_run_with_a_prior_are_told(make_objective, random_matrix, 
     best = at.gradient_ascent(objective).score
     for change in (times(100, [0]), times(100, [9], 1)):
         caplog.clear()
-        found = at.identify(Faulty(objective, change), 24, prior=at.Prior(matrix))
-        assert objective(found.drive).amin() > 0.97 * best
+        solution = at.identify(Faulty(objective, change), 24, prior=at.Prior(matrix))
+        assert objective(solution.drive).amin() > 0.97 * best
         assert "outliers" in caplog.text
 
 

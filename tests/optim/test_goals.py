@@ -9,9 +9,7 @@ from hypothesis import strategies as st
 
 from autdtorch.methods.base import Problem
 from autdtorch.methods.functions import gabs, identify
-from autdtorch.methods.gabs import GABS
 from autdtorch.methods.gradient import climb, random_drives
-from autdtorch.methods.state_file import load_state, save_state
 from autdtorch.objectives.goals import (
     Goal,
     MeanPressure,
@@ -64,7 +62,7 @@ def test_scores_are_those_of_the_definitions():
         assert goal(PRESSURE[0]).shape == ()
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(points=st.integers(2, 6), transducers=st.integers(2, 24), seed=st.integers(0, 1000))
 def test_no_drive_scores_above_the_bound(random_matrix, points, transducers, seed):
     matrix, generator = random_matrix(points, transducers, seed), torch.Generator().manual_seed(seed)
@@ -175,13 +173,11 @@ def test_slopes_are_derivatives(number):
     goal = goals_for(4, unit=2.0)[number]
     pressure = torch.tensor([1.3, 1.9, 2.4, 3.1], dtype=torch.float64)
     exact = derivative(goal, pressure)
-    found = goal.slope(pressure, 1e-4)
-    if (
-        isinstance(goal, QuietPoints) and not goal.unit
-    ):  # half the sum of squares has another size: signs alone
-        assert (torch.sign(found) == torch.sign(exact)).all()
+    slope = goal.slope(pressure, 1e-4)
+    if isinstance(goal, QuietPoints) and not goal.unit:  # half the sum of squares: signs alone are equal
+        assert (torch.sign(slope) == torch.sign(exact)).all()
         return
-    cosine = torch.nn.functional.cosine_similarity(found, exact, dim=0)
+    cosine = torch.nn.functional.cosine_similarity(slope, exact, dim=0)
     assert cosine == pytest.approx(1, abs=1e-6)
 
 
@@ -189,18 +185,6 @@ def test_the_function_of_the_paper_is_its_goal():
     assert goal_of(weakest_focus) == WeakestFocus()
     assert Problem(4, 2, weakest_focus).goal == WeakestFocus()
     assert goal_of(torch.Tensor.sum) is torch.Tensor.sum
-
-
-def test_a_saved_state_goes_on_under_its_own_goal_alone(tmp_path):
-    method, path = GABS(levels=4), tmp_path / "state.npz"
-    problems = [Problem(4, 2, goal) for goal in (WeakestFocus(), WeakestFocus([1, 2]), torch.Tensor.sum)]
-    for own in problems:
-        save_state(path, method, method.start(own))
-        assert load_state(path, method, own).problem is own
-        for other in problems:
-            if other is not own:
-                with pytest.raises(ValueError, match=r"state of .*; must be of"):
-                    load_state(path, method, other)
 
 
 @pytest.mark.parametrize("method", [gabs, identify], ids=["gabs", "identify"])

@@ -56,17 +56,17 @@ def test_free_amplitudes_give_the_wanted_level(random_matrix):
 @pytest.mark.parametrize("algorithm", ["wgs", "diff_pat"])
 def test_points_of_no_pressure_are_quiet(random_matrix, algorithm):
     matrix, wanted = random_matrix(5, 60, 3), torch.tensor([9.0, 9.0, 9.0, 0.0, 0.0]).double()
-    found = pressures(matrix, holography(matrix, wanted, algorithm, iterations=400))
+    reached = pressures(matrix, holography(matrix, wanted, algorithm, iterations=400))
     if algorithm == "wgs":  # ignores points without a target
-        assert found[:3].std() < 1e-3 * found[:3].mean()
+        assert reached[:3].std() < 1e-3 * reached[:3].mean()
     else:
-        assert found[3:].max() < 10 ** (-30 / 20) * found[:3].min()  # 30 dB below
+        assert reached[3:].max() < 10 ** (-30 / 20) * reached[:3].min()  # 30 dB below
 
 
 @settings(max_examples=20)
 @given(st.integers(2, 8), st.floats(3e-3, 15e-3), st.integers(0, 2**31))
 def test_close_foci_do_not_change_places_for_ever(points, spread, seed):
-    """As with the power 1 of the weights, in which one more iteration exchanged 4590 and 2735 Pa."""
+    """With the power 1 of the weights, one more iteration exchanged 4590 and 2735 Pa."""
     array = TransducerArray.grid((10, 10), 10e-3, (0, 0, 0), (0, 0, 1))
     random = torch.Generator().manual_seed(seed)
     foci = torch.rand(points, 3, generator=random, dtype=torch.float64) * spread + torch.tensor([0, 0, 0.15])
@@ -95,10 +95,10 @@ def test_kernels_on_cpus_are_the_definitions(random_matrix, algorithm, free):
     matrix = torch.stack([random_matrix(3, 10, seed) for seed in range(21)])  # a block and a part
     wanted = torch.rand(21, 3, 1, generator=torch.Generator().manual_seed(0)).double() + 0.5
     exact = SOLVERS[algorithm](matrix, wanted, 20, within_largest if free else torch.sgn)
-    found = holography(matrix, wanted[..., 0], algorithm, 20, free)
+    drive = holography(matrix, wanted[..., 0], algorithm, 20, free)
     # free amplitudes are scaled to the wanted level; twenty iterations spread rounding of 1e-16
     assert torch.allclose(
-        torch.nn.functional.normalize(found, dim=-1),
+        torch.nn.functional.normalize(drive, dim=-1),
         torch.nn.functional.normalize(exact[..., 0], dim=-1),
         atol=1e-9,
     )
@@ -111,7 +111,7 @@ def test_a_point_that_no_transducer_reaches_harms_no_other(random_matrix, algori
     drive = holography(matrix, None, algorithm, 100)
     assert torch.allclose(drive.abs(), torch.ones(16).double())
     alone = holography(matrix[[0, 1, 3]], None, algorithm, 100)
-    # the descent also tries to reach the point, in vain
+    # the descent also tries to reach the point
     assert pressures(matrix, drive)[[0, 1, 3]].amin() > 0.9 * pressures(matrix[[0, 1, 3]], alone).amin()
 
 
@@ -141,7 +141,7 @@ def test_goals_tell_the_wanted_pressures(make_objective, random_matrix):
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("arguments", "message"),
     [
         ({"G": torch.ones(2, 3)}, "G: .*complex"),
         ({"G": torch.ones(3, dtype=torch.complex128)}, r"G: shape \(3,\); must be \(..., P, M\)"),
@@ -155,9 +155,9 @@ def test_goals_tell_the_wanted_pressures(make_objective, random_matrix):
         ({"free_amplitudes": 2}, "free_amplitudes: 2"),
     ],
 )
-def test_bad_input_is_named(given, message):
+def test_bad_input_is_named(arguments, message):
     with pytest.raises(ValueError, match=message):
-        holography(**{"G": torch.ones(2, 3, dtype=torch.complex128), **given})
+        holography(**{"G": torch.ones(2, 3, dtype=torch.complex128), **arguments})
 
 
 @pytest.mark.parametrize("algorithm", ["gs", "wgs", "gs_pat"])
@@ -174,11 +174,10 @@ def test_more_starts_find_better_drives_of_symmetric_foci(algorithm):
         assert weakest[1] > 0.97 * focus_bound(matrix)
 
 
-def test_the_best_start_is_found_for_each_set(random_matrix):
+def test_each_set_has_the_best_of_its_starts(random_matrix):
     matrices = torch.stack([random_matrix(4, 8, seed) for seed in range(5)]).reshape(5, 1, 4, 8)
     together = holography(matrices, starts=6)
     for matrix, drive in zip(matrices, together, strict=True):
-        # rounding, which iterations amplify
         alone = holography(matrix, starts=6)
         # rounding, which iterations amplify
         assert torch.allclose(pressures(matrix, drive), pressures(matrix, alone), rtol=1e-6)

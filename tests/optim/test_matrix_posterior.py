@@ -58,11 +58,11 @@ def test_derivatives_are_those_of_the_magnitudes(prior, with_factors):
         by = torch.autograd.grad(
             magnitudes.flatten()[index], (factors, entries), retain_graph=True, allow_unused=True
         )
-        own = tuple(divmod(index, 2))
+        place = tuple(divmod(index, 2))
         if with_factors:
-            torch.testing.assert_close(line.by_factors[own], by[0])
+            torch.testing.assert_close(line.by_factors[place], by[0])
         # PyTorch's gradient of a real function is the conjugate of the derivative by the entry.
-        torch.testing.assert_close(line.by_entries[own], by[1][own[1]].conj())
+        torch.testing.assert_close(line.by_entries[place], by[1][place[1]].conj())
 
 
 def slopes(posterior, drives):
@@ -88,11 +88,11 @@ def test_samples_have_the_covariance_that_readings_leave(prior):
     of_readings = known * variance @ known.T + 1e-6 * torch.eye(6, dtype=torch.float64)
     expected = wanted * variance @ wanted.T - explained @ torch.linalg.solve(of_readings, explained.T)
     draws = generator(5)
-    given = exact((read @ here.matrix.T).abs())
-    samples = torch.stack([here.sample(read, given, draws) for _ in range(3000)])
-    found = (others @ samples.mT).abs().flatten(1).T.cov()
+    readings = exact((read @ here.matrix.T).abs())
+    samples = torch.stack([here.sample(read, readings, draws) for _ in range(3000)])
+    sampled = (others @ samples.mT).abs().flatten(1).T.cov()
     # Of 3000 samples, the standard error of an entry is at most 0.03 of the largest variance.
-    assert (found - expected).abs().max() < 0.13 * expected.diagonal().max()
+    assert (sampled - expected).abs().max() < 0.13 * expected.diagonal().max()
     # Readings leave little of some directions, and most of others.
     assert expected.diagonal().max() < 0.9 * (wanted * variance @ wanted.T).diagonal().max()
 
@@ -116,17 +116,17 @@ def test_a_simulation_is_corrected_by_few_readings(make_objective, random_matrix
         best = at.gradient_ascent(objective).score
         begin = objective(at.gradient_ascent(make_objective(simulated)).drive).amin(dim=1)
         options = {"evaluations": 20, "prior": at.Prior(simulated), "seed": seed}
-        found = at.identify(Noise(objective, 30, seed=seed), **options)
+        fitted = at.identify(Noise(objective, 30, seed=seed), **options)
         foci = at.bayes_opt(Noise(objective, 30, seed=seed), **options, **FOCI)
-        shares.append([begin / best, *(objective(one.drive).amin(dim=1) / best for one in (found, foci))])
-    begin, found, foci = torch.tensor(shares).median(dim=0).values
+        shares.append([begin / best, *(objective(one.drive).amin(dim=1) / best for one in (fitted, foci))])
+    begin, fitted, foci = torch.tensor(shares).median(dim=0).values
     # Measured: 0.81, 0.994 and 0.994.
     assert begin < 0.88
-    assert found > 0.95
+    assert fitted > 0.95
     assert foci > 0.95
 
 
-def test_what_a_variant_changes_is_found(make_objective, random_matrix):
+def test_the_amount_of_a_variant_is_identified(make_objective, random_matrix):
     """One unknown, the amount of the change, explains what would be errors of all entries."""
     simulated, variant = random_matrix(2, 10, 2), random_matrix(2, 10, 3)
     objective = make_objective(simulated - 0.7 * (variant - simulated))

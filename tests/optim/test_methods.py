@@ -1,4 +1,4 @@
-"""What holds for every method: ask and tell, files of states, trials, and settings that are refused."""
+"""Laws of every method: ask and tell, files of states, trials, and settings that are refused."""
 
 import math
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ def objective(make_objective, random_matrix):
 
 @dataclass(frozen=True)
 class OneByOne(at.Method):
-    """A method of one's own: one random drive after the other."""
+    """A user's method: one random drive after the other."""
 
     evaluations: int = 5
 
@@ -70,10 +70,10 @@ def test_a_loop_of_ones_own_with_states_from_a_file_finds_what_run_finds(objecti
     assert (state.done, first.evaluations) == (True, 0)
     torch.manual_seed(1)
     global_state = torch.get_rng_state()
-    found, expected = method.best(state), at.run(method, objective, seed=3, trials=trials)
+    solution, expected = method.best(state), at.run(method, objective, seed=3, trials=trials)
     assert torch.equal(torch.get_rng_state(), global_state)
-    assert torch.equal(found.drive, expected.drive)
-    assert torch.equal(found.history, expected.history)
+    assert torch.equal(solution.drive, expected.drive)
+    assert torch.equal(solution.history, expected.history)
 
 
 def test_a_run_stops_and_goes_on_from_its_file(objective, tmp_path):
@@ -105,36 +105,6 @@ def test_a_method_of_ones_own_runs_as_ours_do(objective):
     assert (OneByOne.name, OneByOne.label) == ("OneByOne", "OneByOne")
 
 
-def test_the_goal_is_a_function_of_its_own(objective):
-    solution = at.run(at.RandomSearch(6), objective, goal=lambda pressure: pressure.mean(dim=-1))
-    assert torch.equal(solution.score, solution.pressure.mean(dim=-1))
-
-
-class Broken:
-    """An objective with a broken sensor."""
-
-    def __init__(self, objective, pressure):
-        self.scene, self.evaluations, self.pressure = objective.scene, 0, pressure
-
-    def __call__(self, drive):
-        return self.pressure
-
-
-@pytest.mark.parametrize(
-    ("pressure", "goal", "message"),
-    [
-        (torch.full((2, 3), torch.nan), at.weakest_focus, "pressure of the objective: .*nan.* Pa"),
-        (torch.ones(2, 2), at.weakest_focus, r"objective: shape \(2, 2\); must be \(2, 3\)"),
-        (torch.ones(2, 3) * 1j, at.weakest_focus, "pressure of the objective: .*real"),
-        (torch.ones(2, 3), lambda pressure: pressure, r"score: shape \(1, 2, 3\); must be \(1, 2\)"),
-    ],
-    ids=["nan", "shape", "complex", "score"],
-)
-def test_pressures_and_scores_of_another_kind_are_refused(objective, pressure, goal, message):
-    with pytest.raises(ValueError, match=message):
-        at.run(at.RandomSearch(evaluations=2), Broken(objective, pressure), goal=goal)
-
-
 WRONG_SCORES = {
     "each focus": lambda pressure: pressure,
     "one for all": lambda pressure: pressure.min(),
@@ -149,8 +119,8 @@ WRONG_SCORES = {
 
 
 @pytest.mark.parametrize("goal", WRONG_SCORES.values(), ids=WRONG_SCORES)
-@each([*METHODS[1:3], METHODS[6], METHODS[7], *METHODS[8:]])
-def test_a_goal_that_gives_no_scores_is_refused_by_every_method(objective, method, goal):
+@each([at.GABS(levels=4), METHODS[7], METHODS[9], METHODS[11]])  # those with a matrix begin with the goal
+def test_a_goal_that_gives_no_scores_is_refused(objective, method, goal):
     problem = at.Problem.of(objective, goal)
     with pytest.raises(ValueError, match=r"^score") as refused:
         method.tell(state := method.start(problem), objective(method.ask(state)))
@@ -171,8 +141,8 @@ def test_a_goal_that_changes_its_argument_harms_nothing(objective):
     def goal(pressure):
         return pressure.mul_(-1).amax(dim=-1).neg()
 
-    found, expected = (at.run(at.GABS(levels=4), objective, goal=one) for one in (goal, at.weakest_focus))
-    assert torch.equal(found.pressure, expected.pressure)
+    changed, expected = (at.run(at.GABS(levels=4), objective, goal=one) for one in (goal, at.weakest_focus))
+    assert torch.equal(changed.pressure, expected.pressure)
 
 
 def test_a_problem_without_geometry_or_matrix_is_refused_where_they_are_needed():
@@ -195,7 +165,7 @@ def test_different_seeds_and_trials_are_unrelated():
 
 
 @each(METHODS)
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_solution_is_consistent(make_objective, random_matrix, method, seed):
     matrix = random_matrix(3, 5, seed)
     objective = make_objective(matrix)
@@ -208,8 +178,8 @@ def test_solution_is_consistent(make_objective, random_matrix, method, seed):
     if getattr(method, "passes", 1) == 1:  # else a trial may end early
         assert solution.evaluations.tolist() == [evaluations] * trials
     assert (solution.history.diff(dim=1) >= 0).all()
-    # The last drive, which identify returns, is the best but for rounding; that of the highest posterior mean
-    # but for the noise that a few readings leave open.
+    # The last drive, which identify returns, is the best within rounding; the drive of the highest posterior
+    # mean is so within the noise that few readings leave open.
     apart = 1e-2 if getattr(method, "model", "") == "foci" else 1e-4
     if getattr(method, "prior", None) is None:  # with the prior of another matrix it may be any
         torch.testing.assert_close(solution.history[:, -1], solution.score, rtol=apart, atol=0)
@@ -231,27 +201,26 @@ def test_on_a_device_of_few_levels_the_drive_is_the_one_it_played(objective, met
 
 @each([method for method in RANDOM if not isinstance(method, at.BayesOpt)])
 def test_a_trial_depends_on_its_seed_and_not_on_the_trials_beside_it(objective, method):
-    many = at.run(method, objective, trials=4, seed=3)
-    for trials in ([0, 1], [3, 1]):
-        some = at.run(method, objective, trials=trials, seed=3)
-        for name in ("drive", "history", "evaluations"):
-            assert torch.equal(getattr(some, name), getattr(many, name)[trials])
+    many, trials = at.run(method, objective, trials=3, seed=3), [2, 1]
+    some = at.run(method, objective, trials=trials, seed=3)
+    for name in ("drive", "history", "evaluations"):
+        assert torch.equal(getattr(some, name), getattr(many, name)[trials])
     if getattr(method, "order", "random") == "random":
-        assert not torch.equal(at.run(method, objective, trials=4, seed=4).drive, many.drive)
+        assert not torch.equal(at.run(method, objective, seed=4).drive[0], many.drive[0])
 
 
 @each([method for method in METHODS if isinstance(method, at.BayesOpt)])
 def test_a_block_of_bayes_opt_is_the_same_on_any_number_of_threads(objective, method):
     threads = torch.get_num_threads()
     try:
-        found = []
+        solutions = []
         for count in (1, 3):
             torch.set_num_threads(count)
-            found.append(at.run(method, objective, trials=5, seed=3))
+            solutions.append(at.run(method, objective, trials=3, seed=3))
     finally:
         torch.set_num_threads(threads)
-    assert torch.equal(found[0].drive, found[1].drive)
-    assert torch.equal(found[0].history, found[1].history)
+    assert torch.equal(solutions[0].drive, solutions[1].drive)
+    assert torch.equal(solutions[0].history, solutions[1].history)
 
 
 @pytest.mark.parametrize("method", [at.identify, at.gradient_ascent])
@@ -327,24 +296,32 @@ def test_bad_hyperparameters_are_named(objective, method, options, message):
 
 @pytest.mark.parametrize("transducers", [2, 5, 6])
 def test_bayes_opt_runs_with_its_defaults_on_few_transducers(make_objective, random_matrix, transducers):
-    found = at.bayes_opt(make_objective(random_matrix(2, transducers, 0)), 12, 6)
-    assert found.drive[0, -1].angle() == pytest.approx(0, abs=1e-12)
+    solution = at.bayes_opt(make_objective(random_matrix(2, transducers, 0)), 12, 6)
+    assert solution.drive[0, -1].angle() == pytest.approx(0, abs=1e-12)
+    with pytest.raises(ValueError, match="transducers of the objective's array: 1; must be an integer >= 2"):
+        at.bayes_opt(make_objective(random_matrix(2, 1, 0)))
 
 
-def heard(matrix, drives):
+def magnitudes(matrix, drives):
     return (drives @ matrix.mT).abs()
 
 
-@pytest.mark.parametrize("reading", [-0.1, 1e300, float("nan")], ids=["negative", "huge", "not a number"])
-def test_a_reading_that_cannot_be_is_refused_and_harms_nothing(random_matrix, reading):
+WRONG_READINGS = {
+    "negative": (lambda good: good - 9, r"objective\[0, 0\]: -.*; must be a magnitude"),
+    "huge": (lambda good: 1e300 * good, "must be a magnitude"),
+    "not a number": (lambda good: good * math.nan, "nan.* Pa"),
+    "complex": (lambda good: good * 1j, "real"),
+    "shape": (lambda good: good[:, :2], r"shape \(1, 2\); must be \(1, 3\)"),
+}
+
+
+@pytest.mark.parametrize(("change", "message"), WRONG_READINGS.values(), ids=WRONG_READINGS)
+def test_a_reading_that_cannot_be_is_refused_and_harms_nothing(random_matrix, change, message):
     matrix, method = random_matrix(3, 8, 0), at.GABS(levels=4)
     state = method.start(at.Problem(8, 3))
-    good = heard(matrix, method.ask(state))
-    bad = good.clone()
-    bad[-1, 1] = reading
-    before = state.drives.clone()
-    with pytest.raises(ValueError, match="pressure of the objective"):
-        method.tell(state, bad)
+    good, before = magnitudes(matrix, method.ask(state)), state.drives.clone()
+    with pytest.raises(ValueError, match=message):
+        method.tell(state, change(good))
     assert torch.equal(state.drives, before)
     assert method.tell(state, good).evaluations == len(good)
 
@@ -356,32 +333,27 @@ def test_ask_tell_and_best_refuse_what_does_not_fit_the_state(random_matrix):
         method.best(state)
     for other in (at.LSSG(), at.GABS(levels=3)):
         with pytest.raises(ValueError, match=r"^state: .*must be of "):
-            other.tell(state, heard(matrix, method.ask(state)))
+            other.tell(state, magnitudes(matrix, method.ask(state)))
     while not state.done:
-        state = method.tell(state, heard(matrix, method.ask(state)))
+        state = method.tell(state, magnitudes(matrix, method.ask(state)))
     with pytest.raises(ValueError, match="it is done"):
         method.tell(state, torch.zeros(0, 3))
 
 
 def test_drives_that_a_caller_scales_in_place_leave_the_state_alone(random_matrix):
-    matrix, method, found = random_matrix(3, 8, 0), at.GABS(levels=3), []
+    matrix, method, drives_of = random_matrix(3, 8, 0), at.GABS(levels=3), []
     for in_place in (False, True):
         state = method.start(at.Problem(8, 3))
         while not state.done:
             drives = method.ask(state)
-            state = method.tell(state, heard(matrix, drives.mul_(0.5) if in_place else 0.5 * drives))
-        found.append(method.best(state).drive)
-    assert torch.equal(*found)
+            state = method.tell(state, magnitudes(matrix, drives.mul_(0.5) if in_place else 0.5 * drives))
+        drives_of.append(method.best(state).drive)
+    assert torch.equal(*drives_of)
 
 
-def test_bayes_opt_needs_two_transducers(make_objective, random_matrix):
-    with pytest.raises(ValueError, match="transducers of the objective's array: 1; must be an integer >= 2"):
-        at.bayes_opt(make_objective(random_matrix(2, 1, 0)), fixed_transducer=0)
-
-
-@each(METHODS)
+@each([at.GABS(levels=4), METHODS[9], METHODS[11]])
 def test_scores_of_a_goal_with_parameters_carry_no_gradient(objective, method):
     weight = torch.ones((), dtype=torch.float64, requires_grad=True)
-    found = at.run(method, objective, goal=lambda pressure: weight * pressure.amin(dim=-1))
-    assert not found.score.requires_grad
-    assert not found.history.requires_grad
+    solution = at.run(method, objective, goal=lambda pressure: weight * pressure.amin(dim=-1))
+    assert not solution.score.requires_grad
+    assert not solution.history.requires_grad

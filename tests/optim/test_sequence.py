@@ -55,15 +55,15 @@ def test_a_limit_above_the_steps_of_the_path_costs_nothing():
 
 def test_foci_are_not_lost_on_the_way():
     # weights that overshoot leave 0.55 of the mean in some frames; 0.95 was measured
-    found = pressures(circling(200), drive_sequence(circling(200), even=False)).amin(dim=1)
-    assert found.min() > 0.9 * found.mean()
+    weakest = pressures(circling(200), drive_sequence(circling(200), even=False)).amin(dim=1)
+    assert weakest.min() > 0.9 * weakest.mean()
 
 
-def test_targets_are_kept_along_the_path():
+def test_targets_hold_along_the_path():
     matrix = circling(60)
-    found = pressures(matrix, drive_sequence(matrix, [2.0, 1.0], 0.5))
+    reached = pressures(matrix, drive_sequence(matrix, [2.0, 1.0], 0.5))
     # the best weakest focus of ten iterations leaves 9 % for the other at most
-    assert (found[:, 0] / found[:, 1] / 2 - 1).abs().max() < 0.2
+    assert (reached[:, 0] / reached[:, 1] / 2 - 1).abs().max() < 0.2
     other = torch.tensor([2.0, 1.0]).double().expand(60, 2)
     assert torch.equal(drive_sequence(matrix, other, 0.5), drive_sequence(matrix, [2.0, 1.0], 0.5))
 
@@ -77,7 +77,7 @@ def test_a_frame_alone_is_near_the_bound():
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("arguments", "message"),
     [
         ({"G": torch.ones(2, 3, dtype=torch.complex128)}, r"G: shape \(2, 3\); must be \(T, P, M\)"),
         ({"targets": [1.0]}, r"targets: shape \(1,\); must be \(2,\) or \(4, 2\)"),
@@ -91,6 +91,6 @@ def test_a_frame_alone_is_near_the_bound():
         ({"closed": 1}, "closed: 1"),
     ],
 )
-def test_bad_input_is_named(given, message):
+def test_bad_input_is_named(arguments, message):
     with pytest.raises(ValueError, match=message):
-        drive_sequence(**{"G": torch.ones(4, 2, 3, dtype=torch.complex128), **given})
+        drive_sequence(**{"G": torch.ones(4, 2, 3, dtype=torch.complex128), **arguments})

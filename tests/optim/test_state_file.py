@@ -34,16 +34,16 @@ SMALL = [
 def states(make_objective, random_matrix, tmp_path_factory):
     """Every method, its problem, and the arrays of its state before and after the first evaluations."""
     objective, folder = make_objective(random_matrix(2, 4, 0)), tmp_path_factory.mktemp("states")
-    found, problem = [], at.Problem.of(objective)
+    cases, problem = [], at.Problem.of(objective)
     for method in SMALL:
         state = method.start(problem, seed=0)
         for _ in range(2):
             if not state.done:
                 at.save_state(folder / "state.npz", method, state)
                 with np.load(folder / "state.npz") as file:
-                    found.append((method, problem, dict(file)))
+                    cases.append((method, problem, dict(file)))
                 state = method.tell(state, objective(method.ask(state)))
-    return found
+    return cases
 
 
 def test_every_method_is_here(states):
@@ -124,16 +124,16 @@ def test_fields_that_nobody_saved_are_refused(states, tmp_path):
         at.load_state(tmp_path / "state.npz", method, problem)
 
 
-def test_a_state_goes_on_in_its_own_scene_and_matrix_alone(make_objective, random_matrix, tmp_path):
+def test_a_state_goes_on_in_the_same_scene_and_matrix_alone(make_objective, random_matrix, tmp_path):
     method, path = at.GABS(levels=3), tmp_path / "state.npz"
-    own = at.Problem.of(make_objective(random_matrix(2, 4, 0)))
-    points = own.scene.control_points + 1e-3
+    problem = at.Problem.of(make_objective(random_matrix(2, 4, 0)))
+    moved = dataclasses.replace(problem.scene, control_points=problem.scene.control_points + 1e-3)
     others = {
-        "scene": dataclasses.replace(own, scene=dataclasses.replace(own.scene, control_points=points)),
-        "transfer_matrix": dataclasses.replace(own, transfer_matrix=random_matrix(2, 4, 1)),
-        "start": dataclasses.replace(own, start=torch.ones(4, dtype=torch.complex128)),
+        "scene": dataclasses.replace(problem, scene=moved),
+        "transfer_matrix": dataclasses.replace(problem, transfer_matrix=random_matrix(2, 4, 1)),
+        "start": dataclasses.replace(problem, start=torch.ones(4, dtype=torch.complex128)),
     }
-    at.save_state(path, method, method.start(own))
+    at.save_state(path, method, method.start(problem))
     at.load_state(path, method, at.Problem.of(make_objective(random_matrix(2, 4, 0))))
     for name, other in others.items():
         with pytest.raises(ValueError, match=rf"state of .*gabs.*{name}.*; must be of .*{name}"):
@@ -149,6 +149,8 @@ def around(weight):
 
 
 GOALS = {
+    "paper's": lambda: at.weakest_focus,
+    "weighted": lambda: at.WeakestFocus([1, 2]),
     "lowest": lambda: lambda pressure: pressure.amin(dim=-1),
     "lowest of all but one": lambda: lambda pressure: pressure[..., 1:].amin(dim=-1),
     "highest": lambda: lambda pressure: -pressure.amax(dim=-1),
@@ -172,9 +174,9 @@ def test_a_state_goes_on_under_a_function_of_the_same_code_and_values_alone(tmp_
                 at.load_state(path, method, at.Problem(4, 2, GOALS[other]()))
 
 
-# What each method keeps in files of this version. Where it changes, `_VERSION` must, too.
-KEPT_VERSION = 3
-KEPT = {
+# The search of each method in files of this version. Where it changes, `_VERSION` must, too.
+VERSION = 3
+SEARCHES = {
     "lss": "",
     "lssg": "before foci order weights",
     "gabs": "before order weights",
@@ -187,14 +189,14 @@ KEPT = {
 }
 
 
-def test_what_methods_keep_belongs_to_the_version_of_the_format(make_objective, random_matrix):
+def test_searches_of_methods_belong_to_the_version_of_the_format(make_objective, random_matrix):
     objective = make_objective(random_matrix(2, 4, 0))
-    kept = {name: set() for name in METHODS}
+    names_of = {name: set() for name in METHODS}
     for method in SMALL:
         state = method.start(at.Problem.of(objective))
-        kept[method.name] |= set(state.search)
+        names_of[method.name] |= set(state.search)
         while not state.done:
             state = method.tell(state, objective(method.ask(state)))
-            kept[method.name] |= set(state.search)
-    found = {name: " ".join(sorted(names)) for name, names in kept.items()}
-    assert (state_file._VERSION, found) == (KEPT_VERSION, KEPT)
+            names_of[method.name] |= set(state.search)
+    searches = {name: " ".join(sorted(names)) for name, names in names_of.items()}
+    assert (state_file._VERSION, searches) == (VERSION, SEARCHES)

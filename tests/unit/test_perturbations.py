@@ -33,7 +33,7 @@ amplitudes = st.lists(st.just(0.0) | st.floats(1e-9, 1), min_size=4, max_size=4)
 
 
 class Recorder:
-    """An objective of 1 Pa everywhere that keeps the drives."""
+    """An objective of 1 Pa everywhere that records the drives."""
 
     def __init__(self):
         self.scene = SCENE
@@ -161,7 +161,7 @@ def test_a_problem_has_the_matrix_of_the_simulation_inside(make, simulated):
     assert Problem.of(make(Recorder())).transfer_matrix is None
 
 
-def test_an_objective_of_ones_own_is_given_batches():
+def test_an_objective_of_a_user_gets_batches():
     recorder = Recorder()
     wrapped = Noise(FailedTransducers(recorder, [2]), 20, reference=1.0)
     assert wrapped(random_drive(1)[0]).shape == true_pressure(wrapped, random_drive(1)[0]).shape == (3,)
@@ -200,7 +200,7 @@ def test_levels_that_are_the_devices_are_played_as_they_are(simulated):
     torch.testing.assert_close(device.history, plain.history, rtol=1e-13, atol=0)
 
 
-def test_dead_transducers_are_silent_and_nobody_is_told():
+def test_failed_transducers_are_silent_and_nobody_is_told():
     recorder = Recorder()
     broken = FailedTransducers(recorder, [0, 2])
     drive = random_drive(3)
@@ -250,7 +250,7 @@ def test_true_pressure_keeps_the_device_and_drops_the_sensor(simulated):
         lambda inner: FailedTransducers(inner, [0]),
         lambda inner: Drift(inner, phase=0.1),
     ],
-    ids=["none", "noise", "quantised", "dead", "drift"],
+    ids=["none", "noise", "quantised", "failed", "drift"],
 )
 def test_a_drive_that_no_array_can_play_is_refused_and_not_counted(make, simulated):
     objective = make(simulated)

@@ -20,7 +20,7 @@ Value = Callable[[torch.Tensor], torch.Tensor]
 
 
 class Effort(NamedTuple):
-    """The effort of a search: points that are compared, those climbed from, and evaluations of a climb."""
+    """The effort of a search: numbers of points to compare, of climbs, and of evaluations of each climb."""
 
     candidates: int
     starts: int
@@ -133,7 +133,7 @@ class FocusAcquisition:
             minimum: torch.Tensor = fatmin(self._goal.levels(pressure), dim=-1, tau=_SMOOTH_MINIMUM)
             return minimum
         pressure = unit * pressure
-        lost = ~pressure.isfinite()  # where a search left what the process can calculate
+        lost = ~pressure.isfinite()  # where a search left the range of the process
         score = differentiable_scores(self._goal, pressure.masked_fill(lost, 0)) / unit[..., 0]
         return score.masked_fill(lost.any(dim=-1), torch.nan)
 

@@ -1,4 +1,4 @@
-"""Gaussian processes over drives: those of all trials, and of all foci, in the batch shape of one model."""
+"""Gaussian processes over drives: one model holds the processes of all trials and foci in its batch shape."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ def holography(
     if algorithm == "diff_pat":
         drive = descent(matrix, wanted, drive, iterations, free)
     if not torch.isfinite(torch.view_as_real(drive).sum()):
-        # Names what is not finite. To check all matrices before would take longer than "naive".
+        # Names the entry that is not finite. To check all matrices before would take longer than "naive".
         complex_tensor("G", G)
         raise invalid("G", G, "must not overflow in products of its entries")
     return drive[..., 0]

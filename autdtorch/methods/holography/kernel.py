@@ -158,8 +158,8 @@ def _reweighted(y, w, t, weight, level, count):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _keep(x, z, level, highest, x_best, z_best, transducers):  # type: ignore[no-untyped-def]
-    """Keep the drives of the sets whose level is their highest."""
+def _store_best(x, z, level, highest, x_best, z_best, transducers):  # type: ignore[no-untyped-def]
+    """Store the drives of the sets whose level is their highest so far."""
     for lane in range(_LANES):
         if level[lane] > highest[lane]:
             highest[lane] = level[lane]
@@ -236,7 +236,7 @@ def _solve(matrix, wanted, first, last, algorithm, iterations, free, drive):  # 
                 _forward(a, b, x, z, y, w, points, transducers)
                 if algorithm == _WGS:
                     _reweighted(y, w, t, weight, level, count)
-                    _keep(x, z, level, highest, x_best, z_best, transducers)
+                    _store_best(x, z, level, highest, x_best, z_best, transducers)
             if algorithm == _WGS:
                 x[:], z[:] = x_best, z_best
         for lane in range(_LANES):

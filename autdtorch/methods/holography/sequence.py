@@ -101,10 +101,10 @@ def _forward(rows: ComplexArray, first: ComplexArray, limit: float, iterations: 
 
 
 def _closed(rows: ComplexArray, drives: ComplexArray, limit: float, iterations: int) -> ComplexArray:
-    """Return drives (T, M) of a path that begins again, from those of one lap.
+    """Return drives (T, M) of a path that begins again, from the drives of one lap.
 
-    A second lap begins at the end of the first. What the phases of the foci miss after a lap is spread evenly
-    over its frames. The last frames are held near the first one, by a limit for each step that is left.
+    A second lap begins at the end of the first. The difference of the foci's phases after a lap is spread
+    evenly over its frames. The last frames stay near the first one, by a limit for each step that is left.
     """
     ends = _forward(np.stack([rows[-1], rows[0]]), drives[-1], limit, iterations)
     lap, around = np.concatenate([drives, ends[1:]]), np.concatenate([rows, rows[:1]])
@@ -158,8 +158,8 @@ def _near_both(
 ) -> ComplexArray:
     """Return the drive (M,) nearest to one of any amplitudes, within limits of two others.
 
-    The phases are at most `limit` from those of `before` and `reach` from those of `first`. These two are at
-    most the sum of both limits apart.
+    The phases are at most `limit` from `before` and `reach` from `first`, which are at most the sum of both
+    limits apart.
     """
     step = np.angle(drive * before.conj()).clip(-limit, limit)
     if reach < math.pi:

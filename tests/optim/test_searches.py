@@ -1,11 +1,88 @@
+"""LSSG, GABS and random search against plain loops, and where they end."""
+
 import cmath
 import math
 
 import pytest
 import torch
 
-from autdtorch.methods.functions import gabs, lssg
+from autdtorch.methods.functions import gabs, lss, lssg, random_search
 from autdtorch.methods.seeds import trial_seed
+from autdtorch.objectives.objective import weakest_focus
+from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise
+
+
+def focus_drives(scene):
+    return drive_from_phases(focus_phases(scene.array.positions, scene.control_points, scene.wavenumber))
+
+
+def test_single_focus_in_free_space_gets_all_there_is(make_objective):
+    scene = make_objective(torch.ones(1, 5, dtype=torch.complex128)).scene
+    phases = focus_phases(scene.array.positions, scene.control_points, scene.wavenumber)
+    solution = lssg(make_objective(drive_from_phases(-phases)))
+    # Five terms of magnitude 1, all in phase.
+    assert solution.pressure.item() == pytest.approx(5, rel=1e-12)
+
+
+def test_drive_is_a_normalised_sum_of_focus_drives_with_offsets_on_the_grid(make_objective, random_matrix):
+    levels = 8
+    objective = make_objective(random_matrix(3, 6, 1))
+    solution = lssg(objective, levels)
+    drives = focus_drives(objective.scene)
+    weights = torch.linalg.lstsq(drives.T, solution.drive[0]).solution
+    offsets = torch.angle(weights / weights[0]) * levels / (2 * math.pi)
+    # Six equations for three weights, solved to rounding.
+    torch.testing.assert_close(normalise(weights @ drives), solution.drive[0], rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(offsets, offsets.round(), rtol=0, atol=1e-9)
+    assert solution.amplitudes.max().item() == pytest.approx(1, rel=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_never_worse_than_the_plain_sum_of_focus_drives(make_objective, random_matrix, seed):
+    objective = make_objective(random_matrix(4, 6, seed))
+    plain = lss(objective)
+    assert torch.equal(plain.drive, normalise(focus_drives(objective.scene).sum(dim=0))[None])
+    # The start is among the drives tried, up to the rounding of its sum.
+    assert lssg(objective).score >= plain.score * (1 - 1e-12)
+
+
+def turned(weights, focus, levels):
+    """The weights with each offset of one focus (levels, P)."""
+    moved = weights.repeat(levels, 1)
+    moved[:, focus] = weights[focus] * drive_from_phases(2 * math.pi * torch.arange(levels).double() / levels)
+    return moved
+
+
+def test_further_passes_end_where_no_single_offset_can_improve(make_objective, random_matrix):
+    levels = 6
+    objective = make_objective(random_matrix(4, 6, 3))
+    solution = lssg(objective, levels, passes=40)
+    count = int(solution.evaluations)
+    assert count == objective.evaluations < 40 * 4 * levels
+    assert solution.history.shape == (1, 40 * 4 * levels)
+    assert (solution.history[0, count - 1 :] == solution.score).all()
+    assert torch.equal(solution.history[:, : 4 * levels], lssg(objective, levels).history)
+    drives = focus_drives(objective.scene)
+    weights = torch.linalg.lstsq(drives.T, solution.drive[0]).solution
+    for focus in range(4):
+        scores = weakest_focus(objective(normalise(turned(weights, focus, levels) @ drives)))
+        assert (scores <= solution.score * (1 + 1e-9)).all()  # six equations for four weights, to rounding
+
+
+def test_order_of_the_foci_is_the_one_asked_for(make_objective, random_matrix):
+    levels = 4
+    objective = make_objective(random_matrix(3, 6, 1))
+    solution = lssg(objective, levels, order=[2, 0, 1])
+    drives = focus_drives(objective.scene)
+    weights = torch.ones(3, dtype=torch.complex128)
+    seen = []
+    for focus in (2, 0, 1):
+        tried = turned(weights, focus, levels)
+        scores = weakest_focus(objective(normalise(tried @ drives)))
+        weights = tried[scores.argmax()]
+        seen.append(scores.max().item())
+    assert solution.history[0, levels - 1 :: levels].tolist() == pytest.approx(seen, rel=1e-12)
+    assert not torch.equal(solution.history, lssg(objective, levels).history)
 
 
 def weakest(matrix, drive):
@@ -140,3 +217,29 @@ def test_near_ties_do_not_hang_on_the_last_digit(make_objective, paper_objective
         solution = gabs(make_objective(matrix * (1 + 1e-7 * noise)), trials=10, **options)
         torch.testing.assert_close(solution.drive, expected.drive, rtol=0, atol=1e-12)
         assert torch.equal(solution.score, solution.history[:, -1])
+
+
+def test_longer_search_begins_with_the_shorter(make_objective, random_matrix):
+    objective = make_objective(random_matrix(3, 5, 0))
+    long, short = (random_search(objective, evaluations=count, trials=3) for count in (200, 64))
+    assert torch.equal(long.history[:, :64], short.history)
+
+
+def test_scores_are_those_of_uniform_phases(make_objective, random_matrix):
+    objective = make_objective(random_matrix(2, 4, 0))
+    best = random_search(objective, evaluations=8, trials=400).score
+    phases = 2 * math.pi * torch.rand(400, 8, 4, generator=torch.Generator().manual_seed(5)).double()
+    scores = weakest_focus(objective(drive_from_phases(phases).flatten(0, 1))).reshape(400, 8)
+    expected = scores.amax(dim=1)
+    error = math.sqrt((best.var() + expected.var()).item() / 400)
+    assert abs(best.mean() - expected.mean()).item() < 4 * error
+
+
+@pytest.mark.parametrize("levels", [2, 5])
+def test_phases_are_on_the_levels_and_all_of_them_occur(make_objective, random_matrix, levels):
+    objective = make_objective(random_matrix(2, 4, 0))
+    solution = random_search(objective, evaluations=3, levels=levels, trials=50)
+    steps = solution.phases * levels / (2 * math.pi)
+    torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-12)
+    assert set(steps.round().flatten().tolist()) == set(range(levels))
+    torch.testing.assert_close(solution.amplitudes, torch.ones(50, 4).double(), rtol=1e-15, atol=0)
