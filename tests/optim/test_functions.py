@@ -66,13 +66,12 @@ def test_old_names_of_the_goal_elsewhere(objective):
         assert problem.score is problem.goal
 
 
-def test_variants_have_the_settings_of_their_configs():
-    for name, method in VARIANTS.items():
-        if (path := CONFIGS / f"{name}.yaml").exists():
-            settings = yaml.safe_load(path.read_text())
-            kind = METHODS[settings.pop("_target_").removeprefix("autdtorch.")]
-            settings = {key: float(value) if value == "1e-4" else value for key, value in settings.items()}
-            assert kind(**settings) == method, name
+@pytest.mark.parametrize("path", CONFIGS.glob("*.yaml"), ids=lambda path: path.stem)
+def test_configs_have_the_settings_of_a_class_or_a_variant(path):
+    settings = yaml.safe_load(path.read_text(encoding="utf-8"))
+    kind = METHODS[settings.pop("_target_").removeprefix("autdtorch.")]
+    settings = {key: float(value) if value == "1e-4" else value for key, value in settings.items()}
+    assert kind(**settings) == VARIANTS.get(path.stem, kind())
 
 
 @dataclass(frozen=True)

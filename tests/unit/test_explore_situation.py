@@ -1,19 +1,17 @@
 """Situations of a live view: bodies that are moved and turned, planes, and what is undone."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from small_scenes import AIR, small_scene
 
 import autdtorch as at
 from autdtorch.plot.explore import situation as situation_module
-from autdtorch.plot.explore.catalogue import offered
+from autdtorch.plot.explore.display import offered
 from autdtorch.plot.explore.picture import followed
 from autdtorch.plot.explore.situation import SCENE_PLANE, Body, History, Situation
 
@@ -138,17 +136,6 @@ def test_the_history_of_large_meshes_is_short(monkeypatch):
         assert history.can_undo
         history.undo()
     assert not history.can_undo
-
-
-@pytest.mark.parametrize(
-    "name", ["gabs", "lssg", "identify", "bo", "bo_circle", "bo_foci", "gs_pat", "diff_pat"]
-)
-def test_methods_have_the_settings_of_their_configs(name):
-    config = yaml.safe_load(Path(f"configs/method/{name}.yaml").read_text("utf-8"))
-    method = offered()[{"bo": "bayes_opt"}.get(name, name)]
-    for key, value in config.items():
-        if key != "_target_" and hasattr(method, key):
-            assert getattr(method, key) == (float(value) if value == "1e-4" else value)
 
 
 @pytest.mark.parametrize("rows", [1, 3])

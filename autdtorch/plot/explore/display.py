@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from autdtorch.methods.base import Method
+from autdtorch.methods.catalogue import METHODS, VARIANTS, label_of
 from autdtorch.plot import colours
 from autdtorch.plot.data import in_decibels
 from autdtorch.plot.explore import saving
 from autdtorch.plot.explore.calculation import Result
-from autdtorch.plot.explore.catalogue import choices
 from autdtorch.plot.explore.picture import Picture, Scale
 from autdtorch.plot.explore.situation import SCENE_PLANE, History, Situation
 from autdtorch.plot.view3d.meshes import map_colours
@@ -130,7 +130,7 @@ def first_state(situation: Situation, methods: dict[str, Method]) -> dict[str, A
     """Return the first state of the page, without the values that `Display.place` sets."""
     return _scene_state(situation) | {
         "message": "", "status": "", "summary": "", "saved": "", "python": "", "rows": [],
-        "columns": _COLUMNS, "methods": choices(methods), "method": "gradient_ascent", "follow": False,
+        "columns": _COLUMNS, "methods": _choices(methods), "method": "gradient_ascent", "follow": False,
         "busy": False, "progress": 0,
         "units": [("dB", "dB"), ("Pa", "Pa")], "unit": "dB", "reference": 1.0,
         "volume": False, "surface": _FIRST_SURFACE, "dark": False, "scale_low": "", "scale_high": "",
@@ -217,3 +217,14 @@ def _three_digits(value: float) -> str:
 def _gradient(name: str) -> str:
     """Return a colour map, from its lower end on, as the background of a legend."""
     return f"background: linear-gradient(to right, {', '.join(map_colours(name, 9))})"
+
+
+def offered() -> dict[str, Method]:
+    """Return the methods that a live view offers, by name: holography by its algorithms."""
+    return {name: kind() for name, kind in METHODS.items() if name != "holography"} | VARIANTS
+
+
+def _choices(methods: dict[str, Method]) -> list[tuple[str, str]]:
+    """Return names and labels, those first that need least time."""
+    first = ("gradient_ascent", "identify", "gabs")
+    return [(name, label_of(name)) for name in sorted(methods, key=lambda name: name not in first)]

@@ -17,8 +17,7 @@ import torch
 from autdtorch.plot.data import largest
 from autdtorch.plot.explore import saving
 from autdtorch.plot.explore.calculation import Calculator, Failure, Finished, Report, Request, Result
-from autdtorch.plot.explore.catalogue import offered
-from autdtorch.plot.explore.display import MM, Display, refusal
+from autdtorch.plot.explore.display import MM, Display, offered, refusal
 from autdtorch.plot.explore.picture import Grip
 from autdtorch.plot.explore.situation import History, Situation, in_phase, same_array
 from autdtorch.scene.geometry import rotation_matrix
