@@ -101,30 +101,22 @@ class TestPhasorKernel:
         parts = uniform(2, count, transducers, seed=3)
         return torch.polar(parts[0], 2 * math.pi * parts[1])
 
-    def test_is_the_covariance_of_intensities(self):
-        # 400,000 samples of fourth moments scatter by about 1 %.
+    @pytest.mark.parametrize("with_rows", [False, True])
+    def test_is_the_covariance_of_intensities(self, with_rows):
         drives, generator = self.drives(4, 3), torch.Generator().manual_seed(1)
-        rows = torch.randn(400_000, 3, dtype=torch.complex128, generator=generator) / math.sqrt(3)
-        intensity = (rows @ drives.T).abs().square()
-        inputs = torch.cat([drives.real, drives.imag], dim=-1)
-        expected = PhasorKernel("drives")(inputs).to_dense()
-        torch.testing.assert_close(intensity.T.cov(), expected, rtol=0.05, atol=0.005)
-
-    def test_rows_that_are_expected_shift_intensities_and_couple_them(self):
-        drives, generator = self.drives(4, 3), torch.Generator().manual_seed(1)
-        mean = torch.randn(2, 3, dtype=torch.complex128, generator=generator)
-        variance = torch.tensor([0.5, 2.0], dtype=torch.float64)
+        mean = with_rows * torch.randn(2, 3, dtype=torch.complex128, generator=generator)
+        variance = torch.tensor([0.5, 2.0] if with_rows else [1 / 3, 1 / 3], dtype=torch.float64)
         parts = torch.randn(2, 400_000, 3, dtype=torch.complex128, generator=generator)
-        rows = mean[:, None] + variance.sqrt()[:, None, None] * parts
-        intensity = (rows @ drives.T).abs().square()
-        kernel, inputs = PhasorKernel("drives", mean, variance), torch.cat([drives.real, drives.imag], dim=-1)
+        intensity = ((mean[:, None] + variance.sqrt()[:, None, None] * parts) @ drives.T).abs().square()
+        kernel = PhasorKernel("drives", mean, variance) if with_rows else PhasorKernel("drives")
+        inputs = torch.cat([drives.real, drives.imag], dim=-1)
+        expected = kernel(inputs).to_dense().expand(2, 4, 4)
         # 400,000 samples of fourth moments scatter by about 1 %.
-        for sampled, expected in zip(intensity, kernel(inputs).to_dense(), strict=True):
-            torch.testing.assert_close(sampled.T.cov(), expected, rtol=0.05, atol=0.05)
-        torch.testing.assert_close(intensity.mean(dim=1), kernel.mean(inputs), rtol=0.02, atol=0)
-        torch.testing.assert_close(
-            kernel(inputs, diag=True), kernel(inputs).to_dense().diagonal(dim1=1, dim2=2)
-        )
+        for sampled, covariance in zip(intensity, expected, strict=True):
+            torch.testing.assert_close(sampled.T.cov(), covariance, rtol=0.05, atol=0.05)
+        torch.testing.assert_close(intensity.mean(dim=1), kernel.mean(inputs).expand(2, 4), rtol=0.02, atol=0)
+        diagonal = kernel(inputs, diag=True).expand(2, 4)
+        torch.testing.assert_close(diagonal, expected.diagonal(dim1=1, dim2=2))
 
     def test_phases_are_drives_that_are_fully_on(self):
         points, others = uniform(5, 3), uniform(4, 3, seed=1)
@@ -164,31 +156,23 @@ class TestProcesses:
             assert (deviation < 0.02).all()
             torch.testing.assert_close(mean, modelled, rtol=0.02, atol=0)
 
-    def test_posterior_written_out_is_that_of_the_model(self):
-        points, values, at_points = uniform(2, 9, 3), 1 + uniform(2, 9, 2, seed=1), uniform(2, 4, 3, seed=2)
-        for kernel, observed, feature in (
-            ("circle", values[..., :1], on_circle),
-            ("phasor", values, phasors),
-        ):
-            processes = Processes(kernel, points, observed, fit_of(2, observed.shape[2], 0.5, 1e-3))
-            mean, deviation = processes.at(at_points)
-            expected = processes.model.posterior(feature(at_points))
-            torch.testing.assert_close(mean, processes.mean + processes.scale * expected.mean)
-            torch.testing.assert_close(
-                deviation, processes.scale * expected.variance.sqrt(), rtol=1e-5, atol=0
-            )
-
-    def test_posterior_with_rows_is_that_of_the_model(self, random_matrix):
+    @pytest.mark.parametrize("kernel", ["circle", "phasor", "rows"])
+    def test_posterior_written_out_is_that_of_the_model(self, random_matrix, kernel):
         points, values, there = uniform(2, 9, 3), 1 + uniform(2, 9, 2, seed=1), uniform(2, 4, 3, seed=2)
-        mean = random_matrix(4, 4, 0).reshape(2, 2, 4)
-        rows = Rows(mean, torch.full((2, 2), 0.3, dtype=torch.float64), points[:, 0])
-        processes = Processes("phasor", points, values, fit_of(2, 2, 1.0, 1e-3), rows)
-        ours, model = processes.at(there), processes.model.posterior(phasors(there))
-        features = phasors(there)
-        expected = torch.complex(features[..., :4], features[..., 4:]) @ mean.mT
-        intensity = expected.abs().square() + 0.3 * 4
-        torch.testing.assert_close(ours.mean, intensity + processes.scale * model.mean)
-        torch.testing.assert_close(ours.deviation, processes.scale * model.variance.sqrt(), rtol=1e-5, atol=0)
+        rows, mean, feature = None, None, phasors(there)
+        if kernel == "circle":
+            values, feature = values[..., :1], on_circle(there)
+        if kernel == "rows":
+            g = random_matrix(4, 4, 0).reshape(2, 2, 4)
+            rows = Rows(g, torch.full((2, 2), 0.3, dtype=torch.float64), points[:, 0])
+            pressure = torch.complex(feature[..., :4], feature[..., 4:]) @ g.mT
+            kernel, mean = "phasor", pressure.abs().square() + 0.3 * 4
+        processes = Processes(kernel, points, values, fit_of(2, values.shape[2], 0.5, 1e-3), rows)
+        ours, model = processes.at(there), processes.model.posterior(feature)
+        mean = processes.mean if mean is None else mean
+        torch.testing.assert_close(ours.mean, mean + processes.scale * model.mean)
+        deviation = processes.scale * model.variance.sqrt()
+        torch.testing.assert_close(ours.deviation, deviation, rtol=1e-5, atol=0)
 
     def test_noise_of_readings_is_inferred(self, random_matrix):
         """Readings with complex noise of a hundredth of the mean intensity, as at 20 dB."""

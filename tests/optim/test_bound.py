@@ -37,26 +37,12 @@ def test_no_method_is_above(make_objective, random_matrix, points, transducers, 
     assert objective(random_drives(200, transducers, generator)).amin(dim=1).max() <= bound
 
 
-def test_one_focus_gets_the_sum_of_all_transducers(random_matrix):
-    matrix = random_matrix(1, 7, 0)
-    bound = focus_bound(matrix)
-    best = matrix.abs().sum().item()
-    # It must not be below by a rounding error.
-    assert best < bound < best * (1 + 1e-9)
-
-
 @pytest.mark.parametrize("size", [2, 3, 8])
 def test_foci_that_share_the_power(size):
     # sum_p |p_p|^2 = M sum_i |q_i|^2 <= M^2, and the foci can share it evenly.
     turns = torch.outer(torch.arange(size), torch.arange(size)).double()
     matrix = torch.polar(torch.ones(size, size).double(), 2 * math.pi * turns / size)
     assert focus_bound(matrix) == pytest.approx(math.sqrt(size), rel=1e-6)
-
-
-def test_a_focus_far_stronger_than_the_others_does_not_count(random_matrix):
-    weak, strong = random_matrix(1, 6, 0), 100 * random_matrix(1, 6, 1)
-    # The drive that is best for the weak focus gives the strong one more.
-    assert focus_bound(torch.cat([weak, strong])) == pytest.approx(weak.abs().sum().item(), rel=1e-5)
 
 
 def test_phases_units_and_silent_transducers_change_nothing(random_matrix):
@@ -69,13 +55,6 @@ def test_phases_units_and_silent_transducers_change_nothing(random_matrix):
     silent = torch.zeros(3, 1, dtype=torch.complex128)
     assert focus_bound(torch.cat([matrix, silent], dim=1)) == pytest.approx(bound, rel=1e-5)
     assert focus_bound(matrix.numpy()) == bound
-
-
-@pytest.mark.parametrize("factor", [0, 1e-200])
-def test_a_focus_that_next_to_nothing_reaches(random_matrix, factor):
-    matrix = random_matrix(3, 5, 0)
-    matrix[1] *= factor
-    assert focus_bound(matrix) == pytest.approx(matrix[1].abs().sum().item(), rel=1e-5, abs=0)
 
 
 def test_paper_scene_without_obstacles_is_solved(paper_objective):
@@ -134,10 +113,12 @@ def test_few_foci_nearly_attain_their_bound(random_matrix, points, transducers):
         assert score <= goal.bound(matrix) < 1.01 * score
 
 
-def test_foci_of_which_one_decides_have_the_bound_of_that_one(random_matrix):
-    # the weak one alone: a thousand times less than the others reach
-    matrix = random_matrix(4, 16, 0) * torch.tensor([1.0, 1e3, 2e3, 1e3], dtype=torch.float64)[:, None]
-    assert focus_bound(matrix) == pytest.approx(matrix[0].abs().sum().item(), rel=1e-5)
+@pytest.mark.parametrize("scales", [[1], [1, 100], [1, 1e3, 2e3, 1e3], [1, 0, 1], [1, 1e-200, 1]])
+def test_a_focus_far_weaker_than_the_others_decides_alone(random_matrix, scales):
+    matrix = random_matrix(len(scales), 16, 0) * torch.tensor(scales, dtype=torch.float64)[:, None]
+    weakest = float(matrix.abs().sum(dim=1).min())  # all in phase, which gives the others more
+    # It must not be below by a rounding error.
+    assert weakest <= focus_bound(matrix) <= weakest * (1 + (1e-9 if len(scales) == 1 else 1e-5))
 
 
 def polished(matrix, starts):
