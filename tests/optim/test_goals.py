@@ -199,44 +199,31 @@ def test_methods_that_see_magnitudes_reach_targets(make_objective, random_matrix
     )
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: WeakestFocus([1, 0]), "weights: .*; must be numbers > 0"),
-        (lambda: TargetPressures([]), "targets: .*; must be numbers > 0"),
-        (lambda: TargetPressures([[1.0]]), "targets: .*; must be numbers > 0"),
-        (lambda: QuietPoints(weakest_focus, [1], 0.1), "goal: .*Goal"),
-        (
-            lambda: QuietPoints(QuietPoints(WeakestFocus(), [1], 0.1), [2], 0.1),
-            "goal: .*; must be a goal without",
-        ),
-        (lambda: WeakestFocus([1, 2, 3])(torch.ones(1)), "weights: .*; must be 1 numbers"),
-        (lambda: QuietPoints(WeakestFocus(), [1], 0.1)(torch.ones(1)), "points: .*; must be indices"),
-        (lambda: QuietPoints(WeakestFocus(), [], 0.1), "points: .*; must be indices of control points"),
-        (lambda: QuietPoints(WeakestFocus(), [1, 1], 0.1), "points: .*; must be indices of control points"),
-        (lambda: Contrast([]), "points: .*; must be indices of control points"),
-        (lambda: Problem(4, 2, Contrast([0, 1])), "points: .*, and not all of them"),
-        (
-            lambda: QuietPoints(Contrast([1]), [2], 0.1),
-            "goal: .*; must be a goal without",
-        ),
-        (lambda: QuietPoints(WeakestFocus(), [1], 0), "ratio: 0; must be finite and > 0"),
-        (lambda: Problem(4, 2, WeakestFocus([1, 2, 3])), "weights: .*; must be 2 numbers"),
-        (
-            lambda: Problem(4, 2, QuietPoints(WeakestFocus(), [2], 0.1)),
-            "points: .*; must be indices from 0 to 1",
-        ),
-        (lambda: Problem(4, 2, QuietPoints(WeakestFocus(), [0, 1], 0.1)), "points: .*, and not all of them"),
-        (
-            lambda: Problem(4, 3, QuietPoints(TargetPressures([1]), [0], 0.1)),
-            "targets: .*; must be 2 numbers",
-        ),
-        (
-            lambda: TargetPressures([1.0]).bound(torch.ones(2, 3, dtype=torch.complex128)),
-            "targets: .*; must be 2",
-        ),
-    ],
-)
+INDICES = "points: .*; must be indices of control points"
+WEAKEST = WeakestFocus()
+BAD_GOALS = [
+    (lambda: WeakestFocus([1, 0]), "weights: .*; must be numbers > 0"),
+    (lambda: TargetPressures([]), "targets: .*; must be numbers > 0"),
+    (lambda: TargetPressures([[1.0]]), "targets: .*; must be numbers > 0"),
+    (lambda: QuietPoints(weakest_focus, [1], 0.1), "goal: .*Goal"),
+    (lambda: QuietPoints(QuietPoints(WEAKEST, [1], 0.1), [2], 0.1), "goal: .*; must be a goal without"),
+    (lambda: QuietPoints(Contrast([1]), [2], 0.1), "goal: .*; must be a goal without"),
+    (lambda: QuietPoints(WEAKEST, [], 0.1), INDICES),
+    (lambda: QuietPoints(WEAKEST, [1, 1], 0.1), INDICES),
+    (lambda: QuietPoints(WEAKEST, [1], 0), "ratio: 0; must be finite and > 0"),
+    (lambda: Contrast([]), INDICES),
+    (lambda: WeakestFocus([1, 2, 3])(torch.ones(1)), "weights: .*; must be 1 numbers"),
+    (lambda: QuietPoints(WEAKEST, [1], 0.1)(torch.ones(1)), "points: .*; must be indices"),
+    (lambda: TargetPressures([1.0]).bound(torch.ones(2, 3) + 0j), "targets: .*; must be 2"),
+    (lambda: Problem(4, 2, WeakestFocus([1, 2, 3])), "weights: .*; must be 2 numbers"),
+    (lambda: Problem(4, 2, Contrast([0, 1])), "points: .*, and not all of them"),
+    (lambda: Problem(4, 2, QuietPoints(WEAKEST, [2], 0.1)), "points: .*; must be indices from 0 to 1"),
+    (lambda: Problem(4, 2, QuietPoints(WEAKEST, [0, 1], 0.1)), "points: .*, and not all of them"),
+    (lambda: Problem(4, 3, QuietPoints(TargetPressures([1]), [0], 0.1)), "targets: .*; must be 2 numbers"),
+]
+
+
+@pytest.mark.parametrize(("make", "message"), BAD_GOALS)
 def test_bad_goals_are_named(make, message):
     with pytest.raises(ValueError, match=message):
         make()

@@ -190,9 +190,9 @@ def test_solution_is_consistent(make_objective, random_matrix, method, seed):
 
 
 @each(BLACK_BOX)
-@pytest.mark.parametrize("on_off", [False, True])
-def test_on_a_device_of_few_levels_the_drive_is_the_one_it_played(objective, method, on_off):
-    solution = at.run(method, Quantised(objective, 6, on_off), trials=2 if method.random else 1)
+def test_on_a_device_of_few_levels_the_drive_is_the_one_it_played(objective, method):
+    device = Quantised(objective, 6, on_off=method.random)  # amplitudes of the others stay
+    solution = at.run(method, device, trials=2 if method.random else 1)
     steps = solution.phases * 6 / (2 * math.pi)
     torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-12)
     # Played without the wrapper it gives what was observed; both roundings of an amplitude differ.
