@@ -66,7 +66,7 @@ def test_old_names_of_the_goal_elsewhere(objective):
         assert problem.score is problem.goal
 
 
-@pytest.mark.parametrize("path", CONFIGS.glob("*.yaml"), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_configs_have_the_settings_of_a_class_or_a_variant(path):
     settings = yaml.safe_load(path.read_text(encoding="utf-8"))
     kind = METHODS[settings.pop("_target_").removeprefix("autdtorch.")]
