@@ -1,4 +1,4 @@
-"""A shape and an array form of the user's own take part in all, by one class or function and one entry."""
+"""A new shape is one class and one entry of a table, a new array form one function and one entry."""
 
 import math
 from dataclasses import dataclass, replace

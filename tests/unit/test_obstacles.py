@@ -193,15 +193,6 @@ def test_voxels_that_fill_a_box_are_that_box():
     torch.testing.assert_close(voxels.signed_distance(along), box.signed_distance(along), rtol=0, atol=1e-12)
 
 
-def test_voxel_mask_is_read_from_numpy_files(tmp_path):
-    mask = np.random.default_rng(1).random((4, 3, 2)) < 0.5
-    np.save(tmp_path / "mask.npy", mask)
-    np.savez_compressed(tmp_path / "mask.npz", mask)
-    wanted = VoxelMask(mask, 1e-3, (1.0, 2.0, 3.0), density=100.0, sound_speed=340.0)
-    for name in ("mask.npy", "mask.npz"):
-        assert VoxelMask.load(tmp_path / name, 1e-3, (1, 2, 3), density=100.0, sound_speed=340.0) == wanted
-
-
 ANGLES = st.tuples(*[st.floats(-3, 3)] * 3)
 
 

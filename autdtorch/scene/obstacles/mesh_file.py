@@ -188,7 +188,7 @@ class _Element(NamedTuple):
 
 
 _Table: TypeAlias = dict[str, tuple[Index, Array]]
-"""Of each property, how many values each element has (n,), and all values (sum of these,)."""
+"""Properties by name: the number of values of each element (n,), and all values (sum of these,)."""
 
 
 def _ply(content: bytes) -> Polygons:
