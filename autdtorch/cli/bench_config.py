@@ -38,8 +38,8 @@ class Bench:
         self.limits = hardware.Limits(**limits)
         self.is_dry = boolean("hardware.dry_run", section["dry_run"])  # frames are printed, nothing is opened
         self._emulated = boolean("hardware.emulated", section["emulated"]) or self.is_dry
-        noiseless = {"kind": "emulated", "snr": None}
-        self._sensor = _sensor(noiseless if self.is_dry else section_of(section, "sensor"), self._emulated)
+        sensor = {"kind": "emulated", "snr": None} if self.is_dry else section_of(section, "sensor")
+        self._sensor, self._kind = _sensor(sensor, self._emulated), sensor["kind"]
         _require_fit(section, self._emulated)
         self.device = hardware.DEVICES[section["device"]].configured(section)
         self.transducers = self._wired(len(scene.array))
@@ -51,8 +51,7 @@ class Bench:
     @property
     def settings(self) -> dict[str, Any]:
         """Settings that identify the trial beside its device."""
-        kind = next(name for name, config in hardware.SENSORS.items() if type(self._sensor) is config)
-        settings = {"sensor": kind, **self._sensor.settings}
+        settings = {"sensor": self._kind, **self._sensor.settings}
         if self._emulated:
             snr = getattr(self._sensor, "snr", None)
             settings |= {"emulated": True, "snr [dB]": snr, "failed": self._failed}

@@ -22,6 +22,18 @@ def random_drive(count: int) -> torch.Tensor:
     return drive_from_phases(2 * torch.pi * phases, amplitudes)
 
 
+def noted(monkeypatch, method, note):
+    """A list that grows by `note` of the arguments with each call of a method of `Autd3Port`."""
+
+    def call(port, *arguments):
+        real(port, *arguments)
+        notes.append(note(*arguments))
+
+    real, notes = getattr(Autd3Port, method), []
+    monkeypatch.setattr(Autd3Port, method, call)
+    return notes
+
+
 class Noting:
     """The kit's client, noting what the boards have taken: of each pattern, whether something is on."""
 
@@ -86,12 +98,7 @@ class TestWithTheKit:
     def test_boards_on_the_network_take_the_drives_and_are_off_in_the_end(self, kit, monkeypatch):
         from autd3.commands import Clear, Pattern
 
-        def send_and_note(port, what, command):
-            send(port, what, command)
-            sent.append(type(command))
-
-        send, sent = Autd3Port._send, []
-        monkeypatch.setattr(Autd3Port, "_send", send_and_note)
+        sent = noted(monkeypatch, "_send", lambda what, command: type(command))
         boards = kit.UdpEmulator(2)
         with open_autd3(2, range(300), boards.option(), settle=0) as link:
             link.play(random_drive(300))
@@ -100,12 +107,7 @@ class TestWithTheKit:
             open_autd3(2, [498], boards.option())
 
     def test_the_timer_of_a_limited_link_switches_them_off(self, kit, monkeypatch):
-        def write(port, data):
-            real(port, data)
-            played.append(any(data))
-
-        real, played = Autd3Port.write, []
-        monkeypatch.setattr(Autd3Port, "write", write)
+        played = noted(monkeypatch, "write", any)
         boards = kit.UdpEmulator(1)
         with open_autd3(1, network=boards.option(), settle=0) as link:
             limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.02))
@@ -118,7 +120,7 @@ class TestWithTheKit:
             with pytest.raises(LimitError, match="in a row"):
                 limited.require_on()
 
-    @pytest.mark.timeout(20)
+    @pytest.mark.timeout(120)
     @pytest.mark.usefixtures("stray_signals_do_no_harm")
     def test_signals_at_any_moment_leave_the_boards_off(self, kit, monkeypatch):
         drive, boards = random_drive(249), kit.UdpEmulator(1)
@@ -137,16 +139,11 @@ class TestWithTheKit:
 
     @pytest.mark.usefixtures("stray_signals_do_no_harm")
     def test_a_signal_while_boards_are_looked_for_lets_go_of_them(self, kit, monkeypatch):
-        def note_and_close(port):
-            close(port)
-            closed.append(port)
-
-        close, closed = Autd3Port.close, []
-        monkeypatch.setattr(Autd3Port, "close", note_and_close)
+        closed = noted(monkeypatch, "close", lambda: True)
         boards = kit.UdpEmulator(1)
         main = threading.main_thread().ident
-        threading.Timer(0.05, signal.pthread_kill, (main, signal.SIGTERM)).start()
-        with pytest.raises(Signalled), ended_by_signals():
+        with pytest.raises(Signalled), ended_by_signals():  # noqa: PT012
+            threading.Timer(0.05, signal.pthread_kill, (main, signal.SIGTERM)).start()
             open_autd3(1, network=boards.option())  # takes 0.3 s
         assert len(closed) == 1
         with open_autd3(1, network=boards.option()):
@@ -166,12 +163,14 @@ class TestWithTheKit:
         boards = kit.UdpEmulator(1)
         link = open_autd3(1, network=boards.option(), settle=0)
         client, link._port._client = link._port._client, Mute()
-        monkeypatch.setattr(module, "_TIMEOUT", 0.02)
-        with pytest.raises(LinkError, match=r"AUTD3 cannot be written to: no answer within 0.02 s"):
-            link.play(random_drive(249))
+        with monkeypatch.context() as impatient:
+            impatient.setattr(module, "_TIMEOUT", 0.02)
+            with pytest.raises(LinkError, match=r"AUTD3 cannot be written to: no answer within 0.02 s"):
+                link.play(random_drive(249))
         link._port._client = client  # the cable is in again
         link.play(random_drive(249))
         link._port._client = Mute()
+        monkeypatch.setattr(module, "_TIMEOUT", 0.02)
         with pytest.raises(LinkError, match=r"no answer within 0.02 s; the outputs may still be on"):
             link.close()
         monkeypatch.setattr(module, "_OPENING_TIMEOUT", 0.02)

@@ -8,7 +8,7 @@ import tty
 import pytest
 import torch
 
-from autdtorch.hardware import OPENMPD, SONICSURFACE, ULTRAINO, LinkError, open_link
+from autdtorch.hardware import AUTD3, OPENMPD, SONICSURFACE, ULTRAINO, LinkError, open_link
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs a pseudo-terminal")
 
@@ -69,6 +69,7 @@ def test_a_line_that_takes_nothing_is_an_error_and_no_hang(line, monkeypatch):
     [
         (SONICSURFACE, "/dev/none", LinkError, r"/dev/none cannot be opened: .*\. Ports: "),
         (SONICSURFACE, 3, ValueError, "port: 3; must be a str"),
+        (AUTD3, "/dev/none", ValueError, "port: '/dev/none'; must be None, as AUTD3 is on the network"),
         (OPENMPD, "/dev/none", ValueError, "port: '/dev/none'; must be None, as OpenMPD has no serial line"),
     ],
 )

@@ -40,6 +40,9 @@ class _Autd3(Device):
 
     def open_port(self, place: Mapping[str, Any], backend: Any = None) -> Port:
         network = place.get("network")
+        for name, value in {**place, "backend": backend}.items():
+            if name != "network" and value is not None:
+                raise invalid(name, value, f"must be None, as {self.name} is on the network")
         return Autd3Port(self.boards, _network(network) if isinstance(network, str) else network)
 
     def emulated_port(self, bench: EmulatedBench) -> Port:

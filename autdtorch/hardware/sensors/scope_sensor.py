@@ -211,7 +211,11 @@ class ScopeSensor:
                 break
             self._scales = fitted
             self.recaptures += 1
-        self._require_unclipped(waveforms)
+        for microphone, waveform in zip(self._microphones, waveforms, strict=True):
+            if waveform.clipped:
+                clipped = f"{waveform.clipped} of {len(waveform.volts)} samples are clipped"
+                loudest = f"by more than {microphone.loudest:g} Pa: raise `loudest`"
+                raise SensorError(f"input {microphone.input}: {clipped}, {loudest}")
         # Samples that all have the same code do not show the noise of their rounding.
         steps = torch.tensor([one.resolution for one in waveforms], **REAL)
         variance = fit.residual.square().maximum(steps.square() / 12)
@@ -227,13 +231,6 @@ class ScopeSensor:
             return LockIn(self._frequency, *moments.pop())
         except ValueError as error:
             raise SensorError(f"capture does not suit the frequency: {error}") from error
-
-    def _require_unclipped(self, waveforms: Sequence[Waveform]) -> None:
-        for microphone, waveform in zip(self._microphones, waveforms, strict=True):
-            if waveform.clipped:
-                clipped = f"{waveform.clipped} of {len(waveform.volts)} samples are clipped"
-                loudest = f"by more than {microphone.loudest:g} Pa: raise `loudest`"
-                raise SensorError(f"input {microphone.input}: {clipped}, {loudest}")
 
 
 def _fitted(scale: float, waveform: Waveform, noise: float) -> float:
