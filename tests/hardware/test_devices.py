@@ -173,34 +173,32 @@ def test_amplitudes_rounded_up_to_full_are_accepted_and_more_is_not() -> None:
         hw.AUTD3.levels([1.1 + 0j])
 
 
+NEAREST = {"autd3": "AUTD3", "autd33": "AUTD3", "OpenMDP": "OPENMPD", "x": "SONICSURFACE"}
+
+
 @pytest.mark.parametrize(
-    ("device", "levels", "message"),
+    ("call", "message"),
     [
-        (hw.AUTD3, ([256], [0]), r"AUTD3 phase: \(256,\); .* 0 to 255"),
-        (hw.OPENMPD, ([0], [65]), r"OpenMPD duty: \(65,\); .* 0 to 64"),
-        (hw.OPENMPD, ([0, 1], [64]), r"OpenMPD duty: shape \(1,\); must be \(2,\)"),
-        (hw.SONICSURFACE, ([33],), r"SonicSurface phase: \(33,\); must be integers from 0 to 32"),
-        (hw.SONICSURFACE, (np.array([0.5]),), r"must be integers"),
+        (lambda: hw.AUTD3.drive([256], [0]), r"AUTD3 phase: \(256,\); .* 0 to 255"),
+        (lambda: hw.OPENMPD.drive([0], [65]), r"OpenMPD duty: \(65,\); .* 0 to 64"),
+        (lambda: hw.OPENMPD.drive([0, 1], [64]), r"OpenMPD duty: shape \(1,\); must be \(2,\)"),
+        (lambda: hw.SONICSURFACE.drive([33]), r"SonicSurface phase: \(33,\); must be integers from 0 to 32"),
+        (lambda: hw.SONICSURFACE.drive(np.array([0.5])), r"must be integers"),
+        (lambda: hw.SONICSURFACE.with_boards(2), "boards: 2; must be"),
+        (lambda: hw.ULTRAINO.with_boards(15), "boards: 15; must be"),
+        (lambda: hw.AUTD3.with_boards(0), "boards: 0; must be"),
+        *(
+            (lambda name=name: hw.open_link(name), rf"'{name}'; must be a Device, such as hardware\.{device}")
+            for name, device in {
+                "autd3": "AUTD3",
+                "autd33": "AUTD3",
+                "OpenMDP": "OPENMPD",
+                "x": "SONICS",
+            }.items()
+        ),
     ],
 )
-def test_levels_out_of_range_are_refused(device: hw.Device, levels, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        device.drive(*levels)
-
-
-@pytest.mark.parametrize(("device", "boards"), [(hw.SONICSURFACE, 2), (hw.ULTRAINO, 15), (hw.AUTD3, 0)])
-def test_a_number_of_boards_that_a_device_cannot_have_is_refused(device: hw.Device, boards: int) -> None:
-    with pytest.raises(ValueError, match=rf"boards: {boards}; must be"):
-        device.with_boards(boards)
-
-
-@pytest.mark.parametrize(
-    ("name", "suggested"),
-    [("autd3", "AUTD3"), ("autd33", "AUTD3"), ("OpenMDP", "OPENMPD"), ("x", "SONICSURFACE")],
-)
-def test_a_name_given_as_a_device_is_answered_with_the_nearest_device_once(name: str, suggested: str) -> None:
-    with pytest.raises(
-        ValueError, match=rf"'{name}'; must be a Device, such as hardware\.{suggested}"
-    ) as caught:
-        hw.open_link(name)  # type: ignore[arg-type]
-    assert "did you mean" not in str(caught.value)
+def test_levels_boards_and_devices_that_there_are_not_are_refused(call, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        call()
+    assert "did you mean" not in str(caught.value)  # the nearest device is named once
