@@ -201,8 +201,9 @@ def check_goal(goal: Goal, scenes: Mapping[str, Scene], methods: Mapping[str, St
         with within("goal"):
             goal.check(len(scene.control_points))
     for name, method in methods.items():
-        takes_goal = isinstance(method, Method) or goal_keyword(method) is not None
-        if goal != WEAKEST_FOCUS and not takes_goal:
+        if goal == WEAKEST_FOCUS or isinstance(method, Method):
+            continue
+        if goal_keyword(method) is None:
             accepted = f"must have a parameter `goal`, for the goal {goal.name}"
             raise invalid(f"method {name}", name_of(method), accepted)
 
