@@ -5,10 +5,8 @@ rigid, thin, touching or overlapping, with sources and control points close to t
 """
 
 import math
-import tempfile
 import warnings
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,7 +45,8 @@ KINDS = {
 UNBOUNDED = 1e3
 """Extent of a wall [cells]."""
 
-TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+TETRAHEDRON = np.eye(4)[:, 1:], np.array([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
+"""Vertices and triangles of a corner of a cube of edge 1."""
 
 
 @dataclass(frozen=True)
@@ -256,10 +255,7 @@ def _make(
         mask = rng.uniform(size=(3, 3, 3)) < 0.6
         mask[1, 1, 1] = True
         return VoxelMask(mask, x / 3, tuple((center - x / 2).tolist()), **material)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "tetrahedron.obj"
-        path.write_text(TETRAHEDRON, encoding="utf-8")
-        return Mesh(str(path), scale=x, offset=middle, rotation=angles, **material)
+    return Mesh.from_surface(TETRAHEDRON, x, middle, angles, **material)
 
 
 def _hollow(size: Array, wall: float, **placed: Any) -> Mesh:

@@ -9,6 +9,7 @@ import sys
 from typing import Any
 
 import pytest
+from checks.damage import check
 from shared.document import DOCS, with_block
 from shared.runner import SCRIPTS, commands, run
 
@@ -81,3 +82,9 @@ def test_a_command_without_its_package_is_refused_in_a_line(monkeypatch, capsys)
     assert end.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("checks/bound.py needs acoustools, which is not installed")
+
+
+def test_damaged_files_change_no_number_and_cost_no_undamaged_line(tmp_path) -> None:
+    counts, wrong = check(damages=15, seed=1, folder=tmp_path)
+    assert counts.total() == 15
+    assert wrong == []

@@ -1,3 +1,5 @@
+"""Cases, errors and reports of the benchmarks and studies in `scripts/`."""
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -5,11 +7,20 @@ from pathlib import Path
 import pytest
 import torch
 from benchmarks.accuracy import Row, compare, observed_order, store_reference, worst_point, write_report
+from benchmarks.scaling import foci
 from shared import cases, document
 from shared.cases import cube_case, piston_case, simulate, slab_case, sphere_case, wall_case
+from shared.scenes import autd3_array, with_array
+from small_scenes import small_scene
+from studies.conditions import CONDITIONS, Method, outcome
 
 import autdtorch as at
 from autdtorch.analytic.green import free_space_matrix
+from autdtorch.objectives.simulated import SimulatedObjective
+from autdtorch.plot.costs import fit_power
+from autdtorch.propagators import FreeSpacePropagator
+
+SIZES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 
 
 @pytest.mark.parametrize("spacings", [(1.0, 0.7), (1.0, 0.7, 0.5)])
@@ -71,3 +82,42 @@ def test_a_report_names_the_limits_that_are_exceeded(tmp_path: Path, monkeypatch
     assert write_report(rows, page) == []
     (failed,) = write_report([Row("slab", "default", 1.0, 0.02, None, 1.0, True), *rows], page)
     assert failed.startswith("slab, default, 1 mm, total: 2 %")
+
+
+@pytest.mark.parametrize(
+    ("costs", "exponent", "sizes"),
+    [
+        ([0.3 * size**-4.0 for size in SIZES], -4.0, (1.0, 16.0)),
+        ([max(4.0, size) for size in SIZES], 1.0, (8.0, 32.0)),  # a constant overhead is not fitted
+        ([max(0.125, 1 / size) for size in SIZES], -1.0, (1.0, 4.0)),
+    ],
+)
+def test_exponent_of_a_power_law_is_its_power(
+    costs: list[float], exponent: float, sizes: tuple[float, float]
+) -> None:
+    fit = fit_power(SIZES, costs)
+    assert fit is not None
+    assert (fit.exponent, *fit.sizes) == pytest.approx((exponent, *sizes), rel=1e-12)
+    assert fit_power(SIZES, [1.0, 1.2, 0.9, 1.0, 1.1, 1.7]) is None  # they do not grow
+
+
+def test_domain_holds_paper_and_large_array() -> None:
+    scene = foci(4)
+    lower, upper = torch.tensor(with_array(scene, autd3_array((2, 1))).domain)
+    assert (lower < torch.tensor(scene.domain[0])).all()
+    assert (upper > torch.tensor(scene.domain[1])).all()
+
+
+@pytest.mark.parametrize("condition", CONDITIONS)
+def test_trials_together_are_those_one_by_one(condition: str) -> None:
+    scene = small_scene()
+    objective = SimulatedObjective(scene, FreeSpacePropagator(scene))
+    alone, together = (
+        outcome(Method("gabs", {"levels": 4}, joined), objective, CONDITIONS[condition], trials=3)
+        for joined in (False, True)
+    )
+    # GABS sums in equal groups, as all trials take the same steps.
+    assert torch.equal(alone.true, together.true)
+    assert torch.equal(alone.observed, together.observed)
+    if condition == "undisturbed":
+        assert torch.equal(alone.true, alone.observed)
