@@ -1,4 +1,4 @@
-"""Refuse to build for a Python that is too old: pip would say so only after it found no packages for it.
+"""Refuse to build for a Python that is too old: pip would say so only after a search for packages.
 
 `pyproject.toml` names the file to hatchling. It runs in that Python.
 """

@@ -14,8 +14,8 @@ from torch.utils.data import DataLoader
 import autdtorch as at
 
 
-def found(seed: int) -> list[float]:
-    """Numbers of a simulation, and of methods that work on threads of PyTorch and of their own."""
+def numbers(seed: int) -> list[float]:
+    """Numbers of a simulation, and of methods that work on threads of PyTorch and of methods."""
     logging.disable()
     objective = at.SimulatedObjective(
         scene := small_scene((CUBE,)), at.make_propagator(scene, "box", 2e-3, cache=False)
@@ -26,19 +26,19 @@ def found(seed: int) -> list[float]:
 
 
 def in_processes(kind: str) -> list[list[float]]:
-    """`found` of seeds 0 and 1, in two processes; spawned ones share nothing, so that one is enough."""
+    """`numbers` of seeds 0 and 1, in two processes; spawned ones share nothing, so that one is enough."""
     if kind == "dataloader":
-        loader = DataLoader([0, 1], batch_size=None, num_workers=2, collate_fn=found)
+        loader = DataLoader([0, 1], batch_size=None, num_workers=2, collate_fn=numbers)
         return list(loader)
     if kind == "loky":
-        return list(Parallel(n_jobs=2, backend="loky")(delayed(found)(seed) for seed in (0, 1)))
+        return list(Parallel(n_jobs=2, backend="loky")(delayed(numbers)(seed) for seed in (0, 1)))
     with multiprocessing.get_context(kind).Pool(2 if kind == "fork" else 1) as pool:
-        return pool.map_async(found, (0, 1), chunksize=1).get(timeout=100)
+        return pool.map_async(numbers, (0, 1), chunksize=1).get(timeout=100)
 
 
 if __name__ == "__main__":
     torch.set_num_threads(4)  # on any machine
     torch.randn(1500, 1500).matmul(torch.randn(1500, 1500))  # starts PyTorch's threads
-    expected = [found(0), found(1)]
+    expected = [numbers(0), numbers(1)]
     for kind in sys.argv[1:]:
         print(kind, sum(one != other for one, other in zip(in_processes(kind), expected, strict=True)))

@@ -58,7 +58,7 @@ INSIDE_METHODS |= {"at", "farthest", "near", "section", "wanted", "write_file"}
 
 
 class Made(NamedTuple):
-    """An argument of which each call needs its own."""
+    """An argument that each call makes anew."""
 
     make: Callable[[Path], Any]
 
@@ -150,9 +150,9 @@ def image() -> Any:
     """An image of 2 by 2 by 2 voxels of a body."""
     import pyvista
 
-    found = pyvista.ImageData(dimensions=(3, 3, 3), spacing=(1e-3,) * 3)
-    found.cell_data["body"] = np.ones(8, np.uint8)
-    return found
+    grid = pyvista.ImageData(dimensions=(3, 3, 3), spacing=(1e-3,) * 3)
+    grid.cell_data["body"] = np.ones(8, np.uint8)
+    return grid
 
 
 def scope() -> hardware.Oscilloscope:
@@ -355,10 +355,10 @@ class Call(NamedTuple):
         assert value is not inspect.Parameter.empty, f"add {self.name}.{parameter} to public_calls.py"
         return value.make(folder) if isinstance(value, Made) else value
 
-    def arguments(self, folder: Path, /, **given: Any) -> dict[str, Any]:
-        """Values that it accepts, by parameter, those given among them."""
+    def arguments(self, folder: Path, /, **chosen: Any) -> dict[str, Any]:
+        """Values that it accepts, by parameter, with some chosen."""
         return {
-            name: given[name] if name in given else self.argument(name, folder) for name in self.parameters
+            name: chosen[name] if name in chosen else self.argument(name, folder) for name in self.parameters
         }
 
     def bound(self, folder: Path) -> Callable[..., Any]:
@@ -366,8 +366,10 @@ class Call(NamedTuple):
         if self.owner is None:
             return self.function
         maker = INSTANCES.get(self.owner.__name__)
-        own = Call(self.owner.__name__, self.owner)
-        instance = own.function(**own.arguments(folder)) if maker is None else maker.make(folder)
+        maker_call = Call(self.owner.__name__, self.owner)
+        instance = (
+            maker_call.function(**maker_call.arguments(folder)) if maker is None else maker.make(folder)
+        )
         return getattr(instance, self.function.__name__)
 
 
@@ -378,20 +380,20 @@ def _parameters(function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]
 
 @cache
 def _annotations(function: Callable[..., Any]) -> dict[str, str]:
-    given = _parameters(function).values()
-    return {one.name: str(one.annotation) for one in given if one.name != "self"}
+    parameters = _parameters(function).values()
+    return {one.name: str(one.annotation) for one in parameters if one.name != "self"}
 
 
 def public_calls() -> dict[str, Call]:
     """All that have parameters, by name."""
-    found = [
+    calls = [
         call
         for module in (at, at.analytic, hardware, propagators)
         for name in getattr(module, "__all__", dir(module))
         if callable(thing := getattr(module, name))
         for call in (_calls_of(thing) if inspect.isclass(thing) else [Call(name, thing)])
     ]
-    return {call.name: call for call in found if call.parameters and call.name not in NOT_CALLED_BY_USERS}
+    return {call.name: call for call in calls if call.parameters and call.name not in NOT_CALLED_BY_USERS}
 
 
 def _calls_of(kind: type) -> Iterator[Call]:

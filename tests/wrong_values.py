@@ -24,7 +24,7 @@ class Wrong(NamedTuple):
 
 
 class OwnTensor(torch.Tensor):
-    """A tensor of a class of its own."""
+    """A tensor of a subclass."""
 
 
 def deep(levels: int) -> list[Any]:
@@ -165,14 +165,14 @@ def spoiled(valid: object) -> Iterator[Wrong]:
     yield Wrong("itself, of objects", array.astype(object))
     yield Wrong("itself, as text", array.astype(str), never=True)
     yield Wrong("itself, on meta", tensor.to("meta"), never=True)
-    yield Wrong("itself, of its own class", tensor.as_subclass(OwnTensor))
+    yield Wrong("itself, of a subclass", tensor.as_subclass(OwnTensor))
     for end in (math.nan, math.inf):
         numbers.flat[-1] = end
         yield Wrong(f"itself, with {end}", numbers.copy(), never=True)
     if array.ndim == 0:
         return
     first, *rest = array.tolist()
-    rows = [np.ma.array(row, mask=own) for row, own in zip(array, mask, strict=True)]
+    rows = [np.ma.array(row, mask=hidden) for row, hidden in zip(array, mask, strict=True)]
     yield Wrong("its rows, masked", rows, never=True)
     yield Wrong("itself, sparse", tensor.to_sparse())
     for name, entry in {"text": "a", "None": None, "a boolean": True, "10^400": 10**400}.items():

@@ -210,7 +210,7 @@ def figure(rows: Sequence[Row]) -> Figure:
 def write_report(rows: Sequence[Row], page: Page) -> list[str]:
     """Write the block, accuracy.json and accuracy.png; return the exceeded limits."""
     count, failed = exceeded(rows)
-    limits = "\n".join(failed) if failed else f"All {count} required limits are kept."
+    limits = "\n".join(failed) if failed else f"All {count} required limits hold."
     legend = "Total error by spacing; scattered error and run time at 1 mm; observed order."
     page.write("![Error over run time](accuracy.png)", f"{legend} {limits}", error_table(rows))
     page.write_rows("accuracy.json", map(asdict, rows))

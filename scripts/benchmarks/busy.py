@@ -82,7 +82,7 @@ def busy(processes: int) -> Iterator[None]:
 
 
 def simulated(checkout: Path, settings: dict[str, str], repeats: int) -> dict[str, float]:
-    """Return the seconds of each scene, measured in a process of its own."""
+    """Return the seconds of each scene, measured in a new process."""
     environment = os.environ | {"PYTHONPATH": str(checkout)} | settings
     command = [sys.executable, "-W", "ignore", "-c", CHILD, str(ROOT / "configs" / "scene"), str(repeats)]
     ended = subprocess.run(command, env=environment, cwd=checkout, capture_output=True, text=True, check=True)

@@ -2,7 +2,7 @@
 
 The paper's two cubes at 1 mm, 100^3 cells and their boundary layers, in 1008 steps; gradients by the drive,
 also by the materials of the cubes, and also by density and sound speed of every cell. Each case has a
-process of its own, which compiles the kernel first. Fills in a block of the documentation.
+new process, which compiles the kernel first. Fills in a block of the documentation.
 
     python scripts/benchmark.py gradient            5 minutes on 2 idle cores
 """

@@ -1,4 +1,4 @@
-"""Run time against error of Deepwave, Devito, j-Wave and k-wave-python beside our own.
+"""Run time against error of Deepwave, Devito, j-Wave and k-wave-python beside ours.
 
 Makes a virtual environment for each peer in `--venvs`, then writes peers.json, peers.png and a block of the
 documentation. Scenes, receivers and errors are those of `benchmark.py accuracy`: the transfer matrix of one
@@ -274,7 +274,7 @@ def peer_points(setting: Setting, venvs: Path) -> Iterator[Point | Refusal]:
 
 
 def our_points(name: str) -> Iterator[Point]:
-    """Measure our own solver in a case."""
+    """Measure our solver in a case."""
     case = CASES[name]()
     simulate(case, OUR_SPACINGS[0])  # compiles the kernel
     for spacing in OUR_SPACINGS:

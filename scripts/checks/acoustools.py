@@ -2,7 +2,7 @@
 
 Needs `pip install 'autdtorch[crosscheck]'`. Fills in a block of the documentation. The sources are points:
 AcousTools' pistons with radius 0. Scenes and errors are those of `benchmark.py accuracy`, with rigid cubes.
-The reference is the exact series for the sphere, and the limit of our own grids for the cubes.
+The reference is the exact series for the sphere, and the limit of our grids for the cubes.
 
     python scripts/check.py acoustools
 """

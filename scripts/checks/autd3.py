@@ -69,7 +69,7 @@ def main(page: Page, resolution: float) -> None:
         table(("theirs", "ours", "relative difference", "what explains it"), lines),
         f"Transducer positions agree within {1e9 * largest_shift():.0f} nm. The emulator's instant field is "
         f"{abs(factor):.4f} times ours and {late:.1f} degrees late, by its model of a transducer; its "
-        f"peak is {peak:.3f} times the emulator's own RMS field, where a sine has the square root of 2.",
+        f"peak is {peak:.3f} times the RMS field of the emulator, where a sine has the square root of 2.",
         run_times(grid),
     )
 

@@ -50,8 +50,8 @@ def new_environment(folder: Path) -> Path:
     venv.create(folder, with_pip=True)
     if sys.prefix != sys.base_prefix:
         base = {"base": str(folder), "platbase": str(folder)}
-        own = Path(sysconfig.get_path("purelib", "venv", base))
-        (own / "zz_older.pth").write_text(f"{sysconfig.get_path('purelib')}\n", encoding="utf-8")
+        packages = Path(sysconfig.get_path("purelib", "venv", base))
+        (packages / "zz_older.pth").write_text(f"{sysconfig.get_path('purelib')}\n", encoding="utf-8")
     return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 

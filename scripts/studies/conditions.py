@@ -28,7 +28,7 @@ SHOWN = "three_cubes"
 """Scene of the table in the document."""
 
 Wrap = Callable[[at.Objective, int], at.Objective]
-"""Puts an objective under a condition, given the number of the trial."""
+"""Puts an objective under a condition, for the number of a trial."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.utils.array_types import Array
 
 TRUE_OFFSET, TRUE_ROTATION = (2e-3, -1.5e-3, 3e-3), (12.0, -9.0, 14.0)
-"""The pose to be found [m], [degrees]."""
+"""The pose to recover [m], [degrees]."""
 
 TILTS = ((0.0, 0.0), (20.0, 20.0), (20.0, -20.0), (-20.0, 20.0), (-20.0, -20.0))
 """Rotations about y and z from which fits start [degrees]; some poses are missed from the first alone."""

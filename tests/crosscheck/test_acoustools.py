@@ -77,6 +77,6 @@ def test_solvers_of_holography_agree_on_one_matrix(points: int) -> None:
     }
     for algorithm, drive in theirs.items():
         ours = at.holography(matrix, None, algorithm, 100)
-        found, wanted = ((matrix @ one[..., None])[..., 0].abs() for one in (ours, drive[..., 0]))
+        reached, wanted = ((matrix @ one[..., None])[..., 0].abs() for one in (ours, drive[..., 0]))
         # both round in single precision, and a hundred iterations spread that
-        assert torch.allclose(found, wanted, rtol=1e-4, atol=1e-4 * float(wanted.max())), algorithm
+        assert torch.allclose(reached, wanted, rtol=1e-4, atol=1e-4 * float(wanted.max())), algorithm

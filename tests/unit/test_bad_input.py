@@ -98,9 +98,9 @@ def test_a_value_of_a_wrong_kind_is_refused_in_a_line_that_names_the_field(call,
             if annotation == "Any" or (callable(valid) and callable(wrong.value)):
                 continue  # errors of a function show where it is called
             error = refusal(function, call.arguments(tmp_path, **{parameter: wrong.value}))
-            found = complaint(call, parameter, wrong, error)
-            if found and (call.name, parameter, wrong.name) not in EXPECTED:
-                complaints.append(f"{parameter} = {wrong.name}: {found}")
+            text = complaint(call, parameter, wrong, error)
+            if text and (call.name, parameter, wrong.name) not in EXPECTED:
+                complaints.append(f"{parameter} = {wrong.name}: {text}")
     if complaints:
         pytest.fail("\n".join(complaints), pytrace=False)
 
@@ -112,8 +112,8 @@ ROOM = ((0, 0, 0), (0.1, 0.1, 0.1))  # m
 
 
 def grid(**changes: Any) -> at.TransducerArray:
-    given = {"shape": (4, 4), "pitch": 10e-3, "center": (1e-3, 50e-3, 50e-3), **changes}
-    return at.TransducerArray.grid(**given)
+    defaults = {"shape": (4, 4), "pitch": 10e-3, "center": (1e-3, 50e-3, 50e-3), **changes}
+    return at.TransducerArray.grid(**defaults)
 
 
 def scene(**changes: Any) -> at.Scene:
@@ -121,8 +121,8 @@ def scene(**changes: Any) -> at.Scene:
 
 
 def box(**changes: Any) -> at.Box:
-    given = {"center": (41e-3, 50e-3, 50e-3), "size": (10e-3,) * 3, "density": 100.0, "sound_speed": 340.0}
-    return at.Box(**given | changes)
+    defaults = {"center": (41e-3, 50e-3, 50e-3), "size": (10e-3,) * 3, "density": 100.0, "sound_speed": 340.0}
+    return at.Box(**defaults | changes)
 
 
 def plane(*size: float) -> at.Plane:

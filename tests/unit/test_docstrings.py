@@ -58,13 +58,13 @@ def public_members():
                 yield name, thing
             elif inspect.isclass(thing):
                 yield name, thing
-                inherited = {own for base in thing.__mro__[1:] for own in vars(base)} - {"__init__"}
-                for own, member in vars(thing).items():
-                    if own in inherited:
+                inherited = {key for base in thing.__mro__[1:] for key in vars(base)} - {"__init__"}
+                for key, member in vars(thing).items():
+                    if key in inherited:
                         continue  # documented in the base class
                     function = inspect.unwrap(getattr(member, "__func__", member))
-                    if own[0] != "_" or (own in ("__init__", "__call__") and function.__doc__):
-                        yield f"{name}.{own}", function
+                    if key[0] != "_" or (key in ("__init__", "__call__") and function.__doc__):
+                        yield f"{name}.{key}", function
 
 
 MEMBERS = dict(public_members())
@@ -80,8 +80,8 @@ def written(thing):
 
 def entries(doc, title):
     """Return the texts of the entries of a section by name."""
-    found = re.search(rf"^{title}:\n((?:    .*\n|\n)+)", f"{doc}\n", re.M)
-    return dict(re.findall(r"^    (\w+): (.*\n(?:      .*\n|\n)*)", found[1] if found else "", re.M))
+    section = re.search(rf"^{title}:\n((?:    .*\n|\n)+)", f"{doc}\n", re.M)
+    return dict(re.findall(r"^    (\w+): (.*\n(?:      .*\n|\n)*)", section[1] if section else "", re.M))
 
 
 def described(thing):
@@ -109,9 +109,9 @@ def described(thing):
 @pytest.mark.parametrize("name", MEMBERS)
 def test_docstrings_give_shapes_and_units(name):
     wrong = []
-    for own, annotation, text in described(MEMBERS[name]):
+    for part, annotation, text in described(MEMBERS[name]):
         if ARRAYS.search(str(annotation)) and not SHAPE.search(text):
-            wrong.append(f"{own}: no shape in {text!r}")
-        if QUANTITY.search(str(annotation)) and own in UNIT_OF and f"[{UNIT_OF[own]}]" not in text:
-            wrong.append(f"{own}: no [{UNIT_OF[own]}] in {text!r}")
+            wrong.append(f"{part}: no shape in {text!r}")
+        if QUANTITY.search(str(annotation)) and part in UNIT_OF and f"[{UNIT_OF[part]}]" not in text:
+            wrong.append(f"{part}: no [{UNIT_OF[part]}] in {text!r}")
     assert not wrong

@@ -29,9 +29,9 @@ def point(program: str, error: float, seconds: float, remaining: float = 0.0, ca
 def test_tasks_and_answers_survive_their_files(tmp_path: Path) -> None:
     for one in (task(), Answer(np.array([[1 + 2j]]), 0.5, 2.0, 0.0, 60)):
         one.save(tmp_path / "one.npz")
-        found = vars(type(one).load(tmp_path / "one.npz"))
-        assert all(np.array_equal(found[name], value) for name, value in vars(one).items())
-        assert [type(value) for value in found.values()] == [type(value) for value in vars(one).values()]
+        loaded = vars(type(one).load(tmp_path / "one.npz"))
+        assert all(np.array_equal(loaded[name], value) for name, value in vars(one).items())
+        assert [type(value) for value in loaded.values()] == [type(value) for value in vars(one).values()]
 
 
 def test_phasors_are_those_of_our_sign() -> None:

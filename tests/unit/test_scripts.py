@@ -20,9 +20,9 @@ OUTPUT: dict[str, Any] = {"capture_output": True, "text": True, "timeout": 120}
 
 @pytest.mark.parametrize("script", FOLDERS)
 def test_every_command_has_a_summary_and_its_block_in_the_documentation(script: str) -> None:
-    found = commands(FOLDERS[script])
-    assert found
-    for name, summary in found.items():
+    summaries = commands(FOLDERS[script])
+    assert summaries
+    for name, summary in summaries.items():
         assert summary.endswith(".")
         source = (SCRIPTS / FOLDERS[script] / f"{name}.py").read_text(encoding="utf-8")
         for document in re.findall(r'^DOCUMENT = "(.+)"', source, re.MULTILINE):

@@ -240,7 +240,7 @@ def test_an_equal_scene_serves_and_another_does_not(objective):
 def test_matrix_and_objective_serve_alike(objective):
     G = objective.transfer_matrix
     torch.testing.assert_close(at.holography(objective), at.holography(G), rtol=0, atol=0)
-    ours, theirs = (at.gradient_ascent(given, starts=2, steps=20) for given in (G, objective))
+    ours, theirs = (at.gradient_ascent(source, starts=2, steps=20) for source in (G, objective))
     torch.testing.assert_close(ours.drive, theirs.drive, rtol=0, atol=0)
     torch.testing.assert_close(ours.pressure, theirs.pressure)  # one sum is of complex, one of real numbers
 

@@ -87,15 +87,15 @@ def profile(name: str, grid: Grid, dimension: Dimension, task: Task, shift: floa
     width = task.layer_cells
     depth = np.maximum(width - place, place - (cells - 1 - width)).clip(0) / width
     courant = task.sound_speed * task.time_step / task.spacing
-    found = Function(
+    factor = Function(
         name=name,
         grid=grid,
         dimensions=(dimension,),
         shape=(cells,),
         **({"staggered": dimension} if shift else {}),
     )
-    found.data[:] = np.exp(-LAYER_ATTENUATION * 3 / width * depth**2 * courant / 2)
-    return found
+    factor.data[:] = np.exp(-LAYER_ATTENUATION * 3 / width * depth**2 * courant / 2)
+    return factor
 
 
 if __name__ == "__main__":

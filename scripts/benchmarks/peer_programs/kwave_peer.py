@@ -38,7 +38,7 @@ def simulate(task: Task) -> Answer:
     source.p = task.source_weights[order, None] * task.drive(-0.5)[None]
     source.p_mode = "additive"
     where, order = mask(density.shape, task.receiver_cells + width)
-    found = kspaceFirstOrder(
+    outputs = kspaceFirstOrder(
         grid,
         kWaveMedium(sound_speed=task.sound_speed, density=density),
         source,
@@ -50,7 +50,7 @@ def simulate(task: Task) -> Answer:
         quiet=True,
     )
     recorded = np.empty((task.steps, len(order)), np.float32)
-    recorded[:, order] = found["p"].T
+    recorded[:, order] = outputs["p"].T
     seconds = time.perf_counter() - begin
     return Answer(task.phasors(recorded), 0.0, seconds, 0.0, density.size)
 

@@ -35,8 +35,8 @@ class Stored:
     def load(cls, path: Path) -> Self:
         """Read a file of `save`."""
         with np.load(path) as stored:
-            found = {name: stored[name] for name in (one.name for one in fields(cls))}
-        return cls(**{name: value if value.ndim else value.item() for name, value in found.items()})
+            values = {name: stored[name] for name in (one.name for one in fields(cls))}
+        return cls(**{name: value if value.ndim else value.item() for name, value in values.items()})
 
 
 @dataclass(frozen=True)
