@@ -93,7 +93,7 @@ class Device(ABC):
     def as_built(
         self, transfer_matrix: torch.Tensor, transducers: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return matrix (P, M) and `transducers` (M,) for an emulated bench.
+        """Return matrix (P, M) [Pa] and `transducers` (M,) for an emulated bench.
 
         A device whose files correct deviations of its transducers has these deviations there.
         """
