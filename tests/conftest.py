@@ -41,7 +41,7 @@ if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
 
 @pytest.fixture(autouse=True)
 def nothing_from_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Simulate anew in every test, even if the user has a cache on disk."""
+    """Hide the cache on disk of a user from all tests."""
     monkeypatch.delenv("AUTDTORCH_CACHE_DIR", raising=False)
 
 

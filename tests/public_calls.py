@@ -58,7 +58,7 @@ INSIDE_METHODS |= {"at", "farthest", "near", "section", "wanted", "write_file"}
 
 
 class Made(NamedTuple):
-    """An argument that each call makes anew."""
+    """An argument that must not be shared by two calls."""
 
     make: Callable[[Path], Any]
 

@@ -28,7 +28,7 @@ from autdtorch.propagators import SimulatedPropagator
 DOCUMENT = "benchmarks.md"
 TOLERANCES = (0.05, 0.02, 0.01)
 FINER, FINEST = 2.5, 0.45
-"""Ratio of a scene's spacing to that of its reference, and the coarsest spacing [mm] of a reference."""
+"""Refinement of the reference, and its coarsest spacing [mm]."""
 
 FACTOR, NEGLIGIBLE = 3.0, 0.05
 """Largest ratio of claim and truth, and share of the tolerance below which both may be anything."""

@@ -1,8 +1,8 @@
 """Error and time of matrices that were asked for by tolerance.
 
 Fills in a block of the documentation. Each scene is simulated for each tolerance with `spacing=None`, and on
-ten grids. Required: the true error is within the tolerance in 95 % of the cases, the estimate within a factor
-of three of the true error in 90 %, and the time at most three times that of the coarsest sufficient grid.
+ten grids. Required: true errors meet the tolerance in 95 % of the cases. Estimates are within a factor of
+three of true errors in 90 %. Times are at most three times those of the coarsest sufficient grid.
 
     python scripts/benchmark.py tolerance           about 40 minutes on 2 idle cores
     python scripts/benchmark.py tolerance --every 4
@@ -31,7 +31,7 @@ SPACINGS = (2.4, 2.0, 1.65, 1.35, 1.1, 0.9, 0.75, 0.6, 0.5, 0.4)  # [mm]
 REFERENCE = 0.3  # [mm], where there is no exact solution
 
 FACTOR = 3.0
-"""Largest ratio of an estimate to the true error, and of a time to that of the coarsest sufficient grid."""
+"""Largest ratio of estimate and true error, and of a time and that on the coarsest sufficient grid."""
 
 OPTIONS = {"--every": {"type": int, "default": 1, "help": "measure each n-th scene"}}
 
