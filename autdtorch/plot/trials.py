@@ -93,7 +93,8 @@ def _trial_panels(
     if len(scenes) == 1 and width * len(data) <= _WIDTH:
         figure = style.new_figure(_WIDTH, 0.7 + _ROW)
         return figure, list(figure.subplots(1, len(data), squeeze=False)[0]), len(data)
-    sizes = (one.size for scenes in data.values() for methods in scenes.values() for one in methods.values())
+    by_scene_and_method = (by_method for of_scenes in data.values() for by_method in of_scenes.values())
+    sizes = (values.size for by_method in by_scene_and_method for values in by_method.values())
     row = _ROW if max(sizes) >= _FEWEST else _LOW_ROW
     figure = style.new_figure(max(_WIDTH, width), 0.7 + max(_ROW, row * len(data)))
     return figure, list(figure.subplots(len(data), squeeze=False, sharex=True)[:, 0]), 1

@@ -13,8 +13,8 @@ def scene():
     array = at.TransducerArray.grid((4, 4), 10e-3, (1e-3, 50e-3, 50e-3))
     foci = at.circle_points((80e-3, 50e-3, 50e-3), 25e-3, 3, (1, 0, 0))
     obstacles = (
-        at.Box((40e-3, 45e-3, 50e-3), (14e-3,) * 3, density=100.0, sound_speed=340.0),
-        at.Sphere((30e-3, 70e-3, 60e-3), 4e-3, rigid=True),
+        at.Box((40e-3, 45e-3, 50e-3), (14e-3,) * 3, rigid=True),
+        at.Sphere((30e-3, 70e-3, 60e-3), 3e-3, rigid=True),
     )
     plane = at.Plane((80e-3, 50e-3, 50e-3), (1, 0, 0), (100e-3, 100e-3))
     domain = [[0, 0, 0], [0.1, 0.1, 0.1]]

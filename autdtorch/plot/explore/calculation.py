@@ -110,21 +110,14 @@ class Progress:
 
 
 @dataclass(frozen=True)
-class Failure:
-    """An error that ended a request."""
-
-    request: Request
-    error: Exception
-
-
-@dataclass(frozen=True)
 class Finished:
-    """The end of a request: no result of it follows."""
+    """The end of a request, after which no result of it follows, and the error that ended it, if any."""
 
     request: Request
+    error: Exception | None = None
 
 
-Report = Result | Progress | Failure | Finished
+Report = Result | Progress | Finished
 
 
 class Calculator:
@@ -168,8 +161,9 @@ class Calculator:
                 continue
             except Exception as error:  # the page shows it; the next request may well succeed
                 logger.debug("request %d", request.number, exc_info=True)
-                self._report(Failure(request, error))
-            self._report(Finished(request))
+                self._report(Finished(request, error))
+            else:
+                self._report(Finished(request))
 
     def _next(self) -> Request | None:
         with self._changed:

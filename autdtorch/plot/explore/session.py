@@ -16,7 +16,7 @@ import torch
 
 from autdtorch.plot.data import largest
 from autdtorch.plot.explore import saving
-from autdtorch.plot.explore.calculation import Calculator, Failure, Finished, Report, Request, Result
+from autdtorch.plot.explore.calculation import Calculator, Finished, Report, Request, Result
 from autdtorch.plot.explore.display import MM, Display, offered, refusal
 from autdtorch.plot.explore.picture import Grip
 from autdtorch.plot.explore.situation import History, Situation, in_phase, same_array
@@ -320,15 +320,10 @@ class Session:
             elif not is_newest:
                 return
             elif isinstance(report, Finished):
-                self.ready.set()
-            elif isinstance(report, Failure):
-                self._search, self._running = None, False
-                self._state.update(
-                    {"message": refusal(report.error), "status": "", "busy": False,
-                     "shown": report.request.number}
-                )  # fmt: skip
-                self._ask_waiting()
-                self.failure = report.error
+                if report.error is not None:
+                    self._fail(report.error)
+                if report.request is self._request:  # else a change of the view waited for its end
+                    self.ready.set()
             elif self._running:
                 text = f"{report.label}: {report.evaluations} of at most {report.most} evaluations"
                 self._state.progress = 100 * report.evaluations / max(report.most, 1)
@@ -352,6 +347,14 @@ class Session:
         self._cancelled = "" if request.fine else self._cancelled
         if is_newest:
             self._ask_waiting()
+
+    def _fail(self, error: Exception) -> None:
+        """Show the error that ended the newest request."""
+        self._search, self._running = None, False
+        message = {"message": refusal(error), "status": "", "busy": False, "shown": self._request.number}
+        self._state.update(message)
+        self._ask_waiting()
+        self.failure = error
 
     def _ask_waiting(self) -> None:
         """Ask for a change of the view that waited for the end of a method."""
