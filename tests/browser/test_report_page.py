@@ -73,13 +73,12 @@ def reports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 def as_large_as_the_papers(results: StudyResult) -> StudyResult:
     """Results of six methods in each scene."""
-    found = {}
-    for name, scene in results.scenes.items():
-        methods = dict(scene.methods)
-        for other in ("lssg", "bo_foci", "identify", "gradient_ascent"):
-            methods.setdefault(other, methods["gabs"])
-        found[name] = replace(scene, methods=methods)
-    return replace(results, scenes=found)
+    others = ("lssg", "bo_foci", "identify", "gradient_ascent")
+    scenes = {
+        name: replace(scene, methods=dict.fromkeys(others, scene.methods["gabs"]) | scene.methods)
+        for name, scene in results.scenes.items()
+    }
+    return replace(results, scenes=scenes)
 
 
 @pytest.fixture(params=["many", "single"])
@@ -143,8 +142,8 @@ def test_a_report_of_the_papers_size_is_not_long(browser, reports):
 
 
 def test_links_lead_to_the_sections(page):
-    found = "all => all.map(one => document.querySelector(one.getAttribute('href'))?.textContent)"
-    assert page.eval_on_selector_all("nav a", found) == page.eval_on_selector_all(
+    targets = "all => all.map(one => document.querySelector(one.getAttribute('href'))?.textContent)"
+    assert page.eval_on_selector_all("nav a", targets) == page.eval_on_selector_all(
         "h2", "all => all.map(one => one.textContent)"
     )
 

@@ -147,9 +147,9 @@ def test_labels_of_the_axes_are_in_the_window_and_clear_of_the_colour_bars() -> 
 def test_obstacles_are_drawn_where_they_are_in_millimetres_as_far_as_the_domain(tmp_path: Path) -> None:
     def bounds(scene: at.Scene) -> list[tuple[float, ...]]:
         plotter = view3d(scene)
-        found = [mesh.bounds for mesh in plotter.meshes]
+        boxes = [mesh.bounds for mesh in plotter.meshes]
         plotter.close()
-        return found
+        return boxes
 
     wall = at.Box((50e-3, 40e-3, 40e-3), (10e-3, 1.0, 1.0), rigid=True)
     outside = at.Sphere((85e-3, 85e-3, 85e-3), 8e-3, rigid=True)  # only its bounding box is inside
