@@ -195,7 +195,7 @@ class Calculator:
             drive = request.method.best(state).drive[0]
         elif request.follow:
             drive = _followed(propagator, drive)
-        cells = (self._spacing if fine else self._coarse(situation)) if _has_cells(propagator) else None
+        cells = self._cells(situation, fine) if _has_cells(propagator) else None
         step = plane_spacing(situation.sheet, situation.scene.wavelength, fine)
         first = step if cells is None else max(step, quick_spacing(situation, cells))
         result = _field(request, propagator, drive, cells, first)
@@ -217,17 +217,18 @@ class Calculator:
         """Return the propagator of a situation: the last one, if it has the same scene."""
         propagator = self._propagators.get(fine)
         if propagator is None or propagator.scene is not situation.scene:
+            scene, spacing = situation.scene, self._cells(situation, fine)
             if fine:
-                propagator = make_propagator(situation.scene, spacing=self._spacing)
+                propagator = make_propagator(scene, spacing=spacing)
             else:
-                coarse = self._coarse(situation)
-                propagator = make_propagator(situation.scene, spacing=coarse, tolerance=_COARSE_TOLERANCE)
+                propagator = make_propagator(scene, spacing=spacing, tolerance=_COARSE_TOLERANCE)
             self._propagators[fine] = propagator
         return propagator
 
-    def _coarse(self, situation: Situation) -> float:
-        """Return the edge of a cell [m] while something is dragged."""
-        return max(self._spacing, min(_COARSER * self._spacing, _COARSEST * situation.scene.wavelength))
+    def _cells(self, situation: Situation, fine: bool) -> float:
+        """Return the edge of a cell [m]."""
+        coarse = min(_COARSER * self._spacing, _COARSEST * situation.scene.wavelength)
+        return self._spacing if fine else max(self._spacing, coarse)
 
     def _steps(self, request: Request, propagator: Propagator) -> Iterator[State]:
         """Yield the states of a method's trial."""
