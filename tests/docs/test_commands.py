@@ -321,7 +321,10 @@ RULES = [
     (r"ssh ", left_out("needs another machine")),
     (r"autdtorch .*hydra/launcher=mine", launches),
     (r"python scripts/hardware_trial.py \$bench method=identify", runs("hardware.emulated=true")),
-    (r"python scripts/hardware_trial.py \$bench", runs("hardware.emulated=true method=gabs method.levels=2 method.passes=1")),
+    (
+        r"python scripts/hardware_trial.py \$bench",
+        runs("hardware.emulated=true method=gabs method.levels=2 method.passes=1"),
+    ),
     (r"autdtorch hardware=emulated|python scripts/hardware_trial.py ", runs()),
     (r"autdtorch .*poses=", runs("solver.spacing=2e-3 poses.count=3")),
     (r"autdtorch --help", starts),
