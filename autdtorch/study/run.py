@@ -61,7 +61,7 @@ BLOCK = Method.block
 """Trials that are run and saved together: a process that ends loses one block at most."""
 
 _COUNTED_SPACING = 2e-3  # [m], of the grid on which the runs of poses are counted, at most
-_MOST_BODIES = 4  # bodies whose operators stay in memory
+_MOST_BODIES = 4  # bodies whose T-matrices stay in memory
 
 _MOST_SAMPLES = 10**6  # of an observation plane: 16 complex columns of them are 256 MB
 
@@ -97,7 +97,7 @@ def run_study(
             and packages, is taken from there. Without text, or with methods, obstacles or a goal that are not
             autdtorch's, everything is computed.
         poses: whether the scenes are poses of the obstacles, in order. Methods start at the drives of
-            the scene before, and the method "auto" of the solver takes scattering operators where these are
+            the scene before, and the method "auto" of the solver takes T-matrices where these are
             fewer simulations in all.
 
     Raises:
@@ -151,7 +151,7 @@ def run_study(
 
 
 def _for_poses(scenes: Mapping[str, Scene], solver: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of `make_propagator` for poses of obstacles: by operators where they pay.
+    """Return the arguments of `make_propagator` for poses of obstacles: T-matrices where they pay.
 
     Runs are counted on a coarse grid, those of the boxes at the first pose.
     """
@@ -174,7 +174,7 @@ def _for_poses(scenes: Mapping[str, Scene], solver: Mapping[str, Any]) -> dict[s
     runs = sum(one.runs for one in bodies.values())
     if runs > len(scenes) * each.planned_runs:
         return dict(solver)
-    logger.debug("scattering operators: %d runs for all poses", runs)
+    logger.debug("T-matrices: %d runs for all poses", runs)
     return {**solver, "method": "tmatrix"}
 
 

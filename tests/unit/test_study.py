@@ -265,7 +265,7 @@ def test_poses_start_at_the_drives_of_the_scene_before(tmp_path):
         assert float(after.history[0, 0]) == pytest.approx(float(observed))
 
 
-def test_poses_are_simulated_by_operators_where_these_are_fewer_runs():
+def test_poses_are_simulated_by_tmatrices_where_these_are_fewer_runs():
     cube = Box((12e-3,) * 3, (3e-3,) * 3, rigid=True)
     scenes = {f"{step}": scene(None, (cube,)).moved((0, 1e-5 * step, 0)) for step in range(60)}
     solver = {"spacing": 2e-3, "tolerance": 0.1}
