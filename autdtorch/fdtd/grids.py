@@ -104,6 +104,11 @@ class Grouping:
     aligned: bool
 
     @property
+    def cells(self) -> int:
+        """Cells of all grids, boundary layers included."""
+        return sum(grid.cells for grid in self.grids)
+
+    @property
     def coupled_pairs(self) -> int:
         """Pairs of a radiating cell of one box and a scattering cell of another."""
         return sum(one.radiating * other.scattering for one, other in permutations(self.grids, 2))

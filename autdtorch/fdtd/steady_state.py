@@ -25,6 +25,9 @@ from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_basis, drive_s
 from autdtorch.utils.array_types import COMPLEX, Index
 
 Phasors = NDArray[np.complex128]
+MOST_JUDGED = 64
+"""Receivers of a kind whose pressure decides when a run has converged."""
+
 # Fewest periods of a block. Shorter blocks cost more overhead, and their phasors cover less time.
 _FEWEST_PERIODS = 3
 _PARTS = 4  # Windows per block

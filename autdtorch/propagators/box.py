@@ -24,12 +24,11 @@ from autdtorch.fdtd.grid import Grid, make_box
 from autdtorch.fdtd.grids import one_box
 from autdtorch.fdtd.region import Body, Region
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
-from autdtorch.fdtd.steady_state import SteadyState, run_to_steady_state
+from autdtorch.fdtd.steady_state import MOST_JUDGED, SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble_on
 from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_array
 from autdtorch.fdtd.turning import is_turned, turned
 from autdtorch.propagators.multiple_scattering import Observe, iterated
-from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import PressureMap, Run, Simulation, Stepped
 from autdtorch.propagators.store import BODIES, MOST_BYTES
 from autdtorch.scene.arrays import apertures_of, strengths_of

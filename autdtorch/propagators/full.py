@@ -9,9 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from autdtorch.fdtd.steady_state import run_to_steady_state
+from autdtorch.fdtd.steady_state import MOST_JUDGED, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble
-from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
 from autdtorch.scene.scene import require_inside
 from autdtorch.utils.apertures import Apertures

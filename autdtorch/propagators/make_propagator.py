@@ -9,11 +9,10 @@ from typing import Literal
 
 import torch
 
-from autdtorch.fdtd.grid import warn_if_coarse
 from autdtorch.propagators.free_space import FreeSpacePropagator
+from autdtorch.propagators.notices import warn_of_scene
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.refinement import Budget, refined
-from autdtorch.propagators.scene_region import warn_of_ending_walls, warn_of_near_points
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.propagators.store import store_in
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
@@ -105,9 +104,5 @@ def make_propagator(
         propagator = SimulatedPropagator(planned, store)
     if time_step is not None:
         logger.debug("time step %.4g us", 1e6 * propagator.time_step)  # refuses one that is not stable
-    warn_if_coarse(planned.region.sound_speeds, scene.frequency, propagator.spacing)
-    warn_of_ending_walls(scene)
-    propagator.warn_of_thin_walls()
-    warn_of_near_points(scene, "array.positions", scene.array.positions, propagator.spacing)
-    warn_of_near_points(scene, "control_points", scene.control_points, propagator.spacing)
+    warn_of_scene(propagator.plan)
     return propagator

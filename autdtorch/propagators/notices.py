@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 
-from autdtorch.propagators.scene_region import warn_of_near_points
+from autdtorch.fdtd.grid import warn_if_coarse
+from autdtorch.fdtd.thin_walls import warn_of_thin_walls
+from autdtorch.fdtd.turning import axes_along, flat_faces
+from autdtorch.propagators.plan import Plan
+from autdtorch.propagators.scene_region import warn_of_ending_walls, warn_of_near_points
 from autdtorch.propagators.simulation import PressureMap, Run, Simulation
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.display import counted
 
 logger = logging.getLogger(__name__)
@@ -82,6 +87,19 @@ class Notices:
         if kind not in self._logged:
             self._logged.add(kind)
             logger.warning(text, *values)
+
+
+def warn_of_scene(plan: Plan) -> None:
+    """Log what of a scene is less accurate on the grids of a plan, or is not simulated as it is drawn."""
+    scene, region, spacing = plan.scene, plan.region, plan.spacing
+    warn_if_coarse(region.sound_speeds, scene.frequency, spacing)
+    warn_of_ending_walls(scene)
+    grids: Iterable[tuple[Sequence[int], Array]] = zip(plan.grouping.groups, plan.grouping.axes, strict=True)
+    if plan.method == "tmatrix":  # each body has a grid along its faces
+        grids = [([number], axes_along([flat_faces(shape)])) for number, shape in enumerate(region.shapes)]
+    warn_of_thin_walls(region, spacing, grids)
+    warn_of_near_points(scene, "array.positions", scene.array.positions, spacing)
+    warn_of_near_points(scene, "control_points", scene.control_points, spacing)
 
 
 def warn_of_unsettled(runs: Sequence[Run], tolerance: float) -> None:

@@ -11,7 +11,6 @@ import torch
 
 from autdtorch.analytic.green import PAIR_BYTES, free_space_matrix
 from autdtorch.fdtd.grid_errors import errors_by_grids, grid_errors, rigid_errors, shape_errors, sizes
-from autdtorch.fdtd.thin_walls import warn_of_thin_walls
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.propagators.notices import Notices, warn_of_unsettled
@@ -63,6 +62,7 @@ class SimulatedPropagator:
         spacing: edge of a cell [m].
         tolerance: relative distance to the steady state at which a run ends.
         max_periods: periods after which a run ends in any case, with a `SteadyStateWarning`.
+        plan: the plan.
         simulation: the grids and the runs on them.
     """
 
@@ -73,7 +73,7 @@ class SimulatedPropagator:
         """
         self.scene, self.method, self.spacing = plan.scene, plan.method, plan.spacing
         self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
-        self._plan, self._store, self._coarser = plan, store or Store(), tuple(others)
+        self.plan, self._store, self._coarser = plan, store or Store(), tuple(others)
         self.simulation = simulation_of(plan, self._store)
         self._notices = Notices(self.simulation)
 
@@ -103,7 +103,7 @@ class SimulatedPropagator:
     @property
     def cells(self) -> int:
         """Number of cells of all grids."""
-        return self._plan.cells
+        return self.plan.cells
 
     def warn_of_ringing(self) -> None:
         """Log if the control points' sound rings, where grids may agree and be wrong together."""
@@ -113,11 +113,6 @@ class SimulatedPropagator:
     def planned_runs(self) -> int:
         """Number of simulations of the control points' transfer matrix."""
         return self.simulation.matrix_runs(self.scene.control_points)
-
-    def warn_of_thin_walls(self) -> None:
-        """Log which obstacles have walls thinner than a cell, oblique to their grid."""
-        grids = zip(self._plan.grouping.groups, self._plan.grouping.axes, strict=True)
-        warn_of_thin_walls(self._plan.region, self.spacing, grids)
 
     @overload
     def transfer_matrix(
@@ -189,7 +184,7 @@ class SimulatedPropagator:
             for part in (self.simulation.transfer_matrix(points).matrix, self._free(points))
         )
         shape, rigid_error = (
-            float(errors(matrix, free, self._plan.region)) for errors in (shape_errors, rigid_errors)
+            float(errors(matrix, free, self.plan.region)) for errors in (shape_errors, rigid_errors)
         )
         return self._error(points) if self._coarser else math.inf, shape, rigid_error
 
@@ -248,7 +243,7 @@ class SimulatedPropagator:
     @cached_property
     def _others(self) -> tuple[Simulation, ...]:
         """Simulations on other grids, for the error estimate."""
-        return self._coarser or (simulation_of(self._plan.second, self._store),)
+        return self._coarser or (simulation_of(self.plan.second, self._store),)
 
     def _error(self, points: torch.Tensor) -> float:
         """Return the relative error of the matrix of points, estimated from other grids."""
@@ -270,9 +265,9 @@ class SimulatedPropagator:
         grids = [(other, simulation.plan.spacing) for other, simulation, _ in calm]
         # only boxes know the incident field
         of_grids = errors_by_grids if self.method == "full" else grid_errors
-        errors = of_grids(matrix, free, self.spacing, grids, self._plan.law)
+        errors = of_grids(matrix, free, self.spacing, grids, self.plan.law)
         errors = torch.where(matrix.any(dim=1), errors, 0.0)  # silence is exact
-        region = self._plan.region
+        region = self.plan.region
         return errors + shape_errors(matrix, free, region) + rigid_errors(matrix, free, region)
 
     def _free(self, points: torch.Tensor) -> torch.Tensor:

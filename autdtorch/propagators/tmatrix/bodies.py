@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
+import numpy as np
 import torch
 
 from autdtorch.analytic.spherical_waves import enough_degrees
@@ -14,6 +15,9 @@ from autdtorch.scene.obstacles import Obstacle, Sphere
 from autdtorch.scene.obstacles.moving import circumscribed
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import LENGTH_TOLERANCE
+
+_MOST_BODIES, _MOST_WAVES = 3, 2000
+"""Bodies, and waves around all, up to which "auto" takes T-matrices."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,26 +49,28 @@ def has_closed_form(obstacles: Sequence[Obstacle], medium: Medium) -> bool:
     return len(obstacles) == 1 and type(obstacles[0]) is Sphere and medium.absorption == 0
 
 
-def waves_to_simulate(scene: Scene, bodies: Sequence[Body], error: float) -> int:
+def waves_to_simulate(scene: Scene, error: float) -> int:
     """Return the number of waves, up to a relative error, of the bodies that have no closed form."""
-    simulated = [
-        body
-        for body in bodies
-        if not has_closed_form([scene.obstacles[index] for index in body.obstacles], scene.medium)
-    ]
-    return waves_of(scene, simulated, error)
+    simulated = [body for body in bodies_of(scene.obstacles) if not _has_closed_form(scene, body)]
+    return sum(_waves(scene, body.radius, error) for body in simulated)
 
 
-def fewest_waves(scene: Scene, error: float) -> int:
-    """Return a lower limit of `waves_to_simulate`, from bounding boxes alone."""
-    simulated = [one for one in scene.obstacles if not has_closed_form([one], scene.medium)]
-    edges = [max(high - low for low, high in zip(one.lower, one.upper, strict=True)) for one in simulated]
-    return max(((enough_degrees(scene.wavenumber * edge / 2, error) + 1) ** 2 for edge in edges), default=0)
+def fewer_waves(scene: Scene, error: float, runs: int) -> int | None:
+    """Return `waves_to_simulate` if T-matrices take fewer simulations than so many runs, or else None.
 
-
-def waves_of(scene: Scene, bodies: Sequence[Body], error: float) -> int:
-    """Return the number of waves of bodies, up to a relative error."""
-    return sum((enough_degrees(scene.wavenumber * body.radius, error) + 1) ** 2 for body in bodies)
+    Points and transducers must be outside of all bodies, and bodies and waves few: more are slower.
+    """
+    unknown = [obstacle for obstacle in scene.obstacles if not has_closed_form([obstacle], scene.medium)]
+    edges = [max(np.subtract(obstacle.upper, obstacle.lower)) for obstacle in unknown]
+    if any(_waves(scene, edge / 2, error) > runs for edge in edges):  # without its circumscribed sphere
+        return None
+    bodies = bodies_of(scene.obstacles)
+    places = torch.cat([scene.control_points, scene.array.nodes.positions.reshape(-1, 3)])
+    many = (
+        len(bodies) > _MOST_BODIES or sum(_waves(scene, body.radius, error) for body in bodies) > _MOST_WAVES
+    )
+    waves = sum(_waves(scene, body.radius, error) for body in bodies if not _has_closed_form(scene, body))
+    return None if many or waves > runs or not are_outside(places, bodies).all() else waves
 
 
 def are_outside(points: torch.Tensor, bodies: Sequence[Body]) -> torch.Tensor:
@@ -79,3 +85,12 @@ def _body(obstacles: Sequence[Obstacle], chosen: tuple[int, ...]) -> Body:
 
 def _overlap(one: Body, other: Body) -> bool:
     return float((one.center - other.center).norm()) <= one.radius + other.radius + LENGTH_TOLERANCE
+
+
+def _has_closed_form(scene: Scene, body: Body) -> bool:
+    return has_closed_form([scene.obstacles[index] for index in body.obstacles], scene.medium)
+
+
+def _waves(scene: Scene, radius: float, error: float) -> int:
+    """Return the number of waves around a sphere, up to a relative error."""
+    return int((enough_degrees(scene.wavenumber * radius, error) + 1) ** 2)

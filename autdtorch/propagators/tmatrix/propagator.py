@@ -13,15 +13,13 @@ import torch
 
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.grid_errors import grid_errors, rigid_errors, shape_errors, sizes
-from autdtorch.fdtd.thin_walls import warn_of_thin_walls
-from autdtorch.fdtd.turning import axes_along, flat_faces
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.propagators.simulation import Run
 from autdtorch.propagators.store import Store
 from autdtorch.propagators.tmatrix.bodies import Body, are_outside, bodies_of
 from autdtorch.propagators.tmatrix.body import Placed, Solver, placed
-from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
+from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster, scattered_waves, waves_at
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import require_clear
 from autdtorch.utils.array_types import COMPLEX, REAL
@@ -51,6 +49,7 @@ class TMatrixPropagator:
         method: "tmatrix".
         spacing: edge of a cell [m].
         tolerance: relative error at which waves are left out, and at which runs end.
+        plan: the plan.
         max_periods: periods after which a run ends in any case.
     """
 
@@ -66,7 +65,7 @@ class TMatrixPropagator:
         """
         self.scene, self.method, self.spacing = plan.scene, plan.method, plan.spacing
         self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
-        self._plan, self._store = plan, store or Store()
+        self.plan, self._store = plan, store or Store()
         self._make_box = make_box or functools.partial(SimulatedPropagator, plan.by_box, self._store)
 
     def __repr__(self) -> str:
@@ -87,23 +86,17 @@ class TMatrixPropagator:
     @property
     def cells(self) -> int:
         """Number of cells of all grids; 0 where T-matrices have a closed form."""
-        return self._plan.cells if self._plan.runs else 0
+        return self.plan.cells if self.plan.runs else 0
 
     @cached_property
     def bodies(self) -> TMatrixCluster:
         """The bodies of the scene."""
-        return TMatrixCluster(TMatrix(*body.matrix(self._store)) for body in placed_bodies(self._plan))
-
-    def warn_of_thin_walls(self) -> None:
-        """Log which obstacles have walls thinner than a cell, oblique to a grid along their own faces."""
-        shapes = self._plan.region.shapes
-        grids = [([number], axes_along([flat_faces(shape)])) for number, shape in enumerate(shapes)]
-        warn_of_thin_walls(self._plan.region, self.spacing, grids)
+        return TMatrixCluster(TMatrix(*body.matrix(self._store)) for body in placed_bodies(self.plan))
 
     @property
     def planned_runs(self) -> int:
         """Number of simulations of all T-matrices, if none is there."""
-        return sum(body.runs for body in placed_bodies(self._plan))
+        return sum(body.runs for body in placed_bodies(self.plan))
 
     def serves(self, points: ArrayLike) -> torch.Tensor:
         """Return which points (P, 3) [m] are outside all bodies' spheres; none if a transducer is not."""
@@ -163,17 +156,17 @@ class TMatrixPropagator:
     def _wave_errors(self, points: torch.Tensor, matrix: torch.Tensor) -> torch.Tensor:
         """Return the estimated errors (P,) of rows of G (P, M) that the waves serve."""
         free = free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
-        region = self._plan.region
-        if not self._plan.runs:  # exact but for the waves left out
-            more = self._plan.at(self.spacing, _MORE_WAVES * self.tolerance)
+        region = self.plan.region
+        if not self.plan.runs:  # exact but for the waves left out
+            more = self.plan.at(self.spacing, _MORE_WAVES * self.tolerance)
             other, served = TMatrixPropagator(more, self._store)._by_waves(points)
             left_out = (matrix - other).norm(dim=1) / sizes(matrix, free)
             errors = torch.full((len(points),), self.tolerance, **REAL)
             return torch.where(served, left_out + _ROUNDING, errors)
-        second = TMatrixPropagator(self._plan.second, self._store)
+        second = TMatrixPropagator(self.plan.second, self._store)
         other = second.transfer_matrix(points)
         others = [(other, second.spacing)]
-        errors = grid_errors(matrix, free, self.spacing, others, self._plan.law)
+        errors = grid_errors(matrix, free, self.spacing, others, self.plan.law)
         known = shape_errors(matrix, free, region) + rigid_errors(matrix, free, region)
         return self.tolerance + errors + known
 
@@ -222,7 +215,7 @@ class TMatrixPropagator:
 
     def _converged(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return G (P, M) at points (P, 3), and where (P,) the waves have converged to the tolerance."""
-        waves, scattered = self.bodies.outgoing_waves(points), self._scattered
+        waves, scattered = waves_at(self.bodies, points), self._scattered
         direct = free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
         matrix = waves @ scattered[0] + direct
         left_out = self._left_out(waves.detach(), scattered)
@@ -231,7 +224,7 @@ class TMatrixPropagator:
     @cached_property
     def _scattered(self) -> list[torch.Tensor]:
         """Outgoing waves (N, M) of all bodies, by all degrees and with the highest ones left out."""
-        return self.bodies.scattered_waves(self.scene.array, (0, _FEWER, 2 * _FEWER))
+        return scattered_waves(self.bodies, self.scene.array, (0, _FEWER, 2 * _FEWER))
 
     @staticmethod
     def _left_out(waves: torch.Tensor, scattered: Sequence[torch.Tensor]) -> torch.Tensor:

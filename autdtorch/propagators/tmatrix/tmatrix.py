@@ -197,61 +197,6 @@ class TMatrix:
             radius = positive("radius", float(arrays["radius"]), "m")
             return cls(matrix, complex(arrays["wavenumber"]), radius, center, axes)
 
-    def incoming_waves(self, array: TransducerArray) -> torch.Tensor:
-        """Return the coefficients (N, M) [Pa] of the regular waves of unit drives around the body."""
-        positions, weights = array.nodes
-        offsets = self._offsets("array.positions", positions)
-        means = [
-            torch.einsum(
-                "mnk,n->km",
-                outgoing_waves(self.degree, self.wavenumber, some, conjugate=True),
-                weights.to(torch.complex128),
-            )
-            for some in parts_of(offsets, len(self.matrix))
-        ]
-        return 4j * math.pi * self.wavenumber * strengths_of(array) * torch.cat(means, dim=1)
-
-    def outgoing_waves(self, points: torch.Tensor) -> torch.Tensor:
-        """Return the outgoing waves (P, N) at points (P, 3) [m]."""
-        return outgoing_waves(self.degree, self.wavenumber, self._offsets("points", points))
-
-    def regular_waves_of(self, other: TMatrix) -> torch.Tensor:
-        """Return S (N, K): outgoing waves of another body as regular waves around this one.
-
-        The waves of the other are sampled on shells inside this body's sphere, where they are regular, and
-        their harmonics are divided by j_l in the least-squares sense over shells.
-        """
-        heights, weights = np.polynomial.legendre.leggauss(self.degree + other.degree + 1)
-        count = 2 * (self.degree + other.degree + 1)
-        turns = 2 * math.pi * torch.arange(count, **REAL) / count
-        height = torch.from_numpy(heights)[:, None]
-        across = (1 - height.square()).sqrt()
-        places = across * turns.cos(), across * turns.sin(), height.expand(-1, count)
-        directions = torch.stack(places, dim=-1).reshape(-1, 3)
-        area = torch.from_numpy(np.repeat(weights * 2 * math.pi / count, count))
-        back = (harmonics(self.degree, directions).conj() * area[:, None]).mT
-        radii = torch.tensor(_SHELLS, **REAL) * self.radius
-        sizes = regular_radial(self.degree, self.wavenumber * radii[:, None])
-        waves: torch.Tensor = torch.zeros((), **COMPLEX)
-        for radius, size in zip(radii, sizes, strict=True):
-            shell = self.center + radius * directions @ self.axes.mT
-            waves = waves + size.conj()[:, None] * (back @ other.outgoing_waves(shell))
-        return waves / sizes.abs().square().sum(dim=0)[:, None]
-
-    def without_highest(self, fewer: int) -> torch.Tensor:
-        """Return T (N, N) with 0 in place of its `fewer` highest degrees."""
-        low = degrees(self.degree) <= self.degree - fewer
-        return torch.where(low[:, None] & low, self.matrix, 0) if fewer else self.matrix
-
-    def _offsets(self, name: str, positions: torch.Tensor) -> torch.Tensor:
-        """Return positions (..., 3) in the coordinates of the body, after checking that they are outside."""
-        offsets = positions - self.center
-        nearest = float(torch.linalg.vector_norm(offsets, dim=-1).detach().amin())
-        if nearest < self.radius - LENGTH_TOLERANCE:
-            accepted = f"must be at least {self.radius:.4g} m from the centre of the body"
-            raise ValueError(f"{name}: {nearest:.4g} m at the nearest; {accepted}")
-        return offsets @ self.axes
-
 
 @dataclass(frozen=True, eq=False)
 class TMatrixCluster:
@@ -301,36 +246,100 @@ class TMatrixCluster:
         places, grid = points_grid("points", points)
         targets = places.cpu()
         direct = free_space_matrix(targets, array, self.bodies[0].wavenumber)
-        (scattered,) = self.scattered_waves(array)
-        parts = [self.outgoing_waves(part) @ scattered for part in parts_of(targets, len(scattered))]
+        (scattered,) = scattered_waves(self, array)
+        parts = [waves_at(self, part) @ scattered for part in parts_of(targets, len(scattered))]
         return (direct + torch.cat(parts)).reshape(*grid, -1)
-
-    def outgoing_waves(self, points: torch.Tensor) -> torch.Tensor:
-        """Return the outgoing waves (P, N) of all bodies at points (P, 3) [m]."""
-        return torch.cat([body.outgoing_waves(points) for body in self.bodies], dim=1)
-
-    def scattered_waves(self, array: TransducerArray, left_out: Sequence[int] = (0,)) -> list[torch.Tensor]:
-        """Return the coefficients (N, M) [Pa] of all bodies' outgoing waves under unit drives of an array.
-
-        Once for each number of highest degrees that are left out, whose coefficients are 0.
-        """
-        incident = [body.incoming_waves(array) for body in self.bodies]
-        count = sum(map(len, incident))
-        require_memory("bodies", f"{count} waves", _ENTRY_BYTES * count**2)
-        between = [
-            [
-                torch.zeros_like(body.matrix) if other is body else body.regular_waves_of(other)
-                for other in self.bodies
-            ]
-            for body in self.bodies
-        ]
-        return [
-            solved([body.without_highest(fewer) for body in self.bodies], between, incident)
-            for fewer in left_out
-        ]
 
 
 def parts_of(points: torch.Tensor, waves: int) -> tuple[torch.Tensor, ...]:
     """Return points (P, ..., 3) in parts, so that few of so many waves at them are in memory at once."""
     each = points[0].numel() // 3
     return torch.split(points, max(1, _AT_ONCE // (each * waves)))
+
+
+def waves_at(cluster: TMatrixCluster, points: torch.Tensor) -> torch.Tensor:
+    """Return the outgoing waves (P, N) of all bodies at points (P, 3) [m]."""
+    return torch.cat([_outgoing_waves(body, points) for body in cluster.bodies], dim=1)
+
+
+def scattered_waves(
+    cluster: TMatrixCluster, array: TransducerArray, left_out: Sequence[int] = (0,)
+) -> list[torch.Tensor]:
+    """Return the coefficients (N, M) [Pa] of all bodies' outgoing waves under unit drives of an array.
+
+    Once for each number of highest degrees that are left out, whose coefficients are 0.
+    """
+    incident = [_incoming_waves(body, array) for body in cluster.bodies]
+    count = sum(map(len, incident))
+    require_memory("bodies", f"{count} waves", _ENTRY_BYTES * count**2)
+    between = [
+        [
+            torch.zeros_like(body.matrix) if other is body else _regular_waves(body, other)
+            for other in cluster.bodies
+        ]
+        for body in cluster.bodies
+    ]
+    return [
+        solved([_without_highest(body, fewer) for body in cluster.bodies], between, incident)
+        for fewer in left_out
+    ]
+
+
+def _incoming_waves(body: TMatrix, array: TransducerArray) -> torch.Tensor:
+    """Return the coefficients (N, M) [Pa] of the regular waves of unit drives around a body."""
+    positions, weights = array.nodes
+    offsets = _offsets(body, "array.positions", positions)
+    means = [
+        torch.einsum(
+            "mnk,n->km",
+            outgoing_waves(body.degree, body.wavenumber, some, conjugate=True),
+            weights.to(torch.complex128),
+        )
+        for some in parts_of(offsets, len(body.matrix))
+    ]
+    return 4j * math.pi * body.wavenumber * strengths_of(array) * torch.cat(means, dim=1)
+
+
+def _outgoing_waves(body: TMatrix, points: torch.Tensor) -> torch.Tensor:
+    """Return the outgoing waves (P, N) of a body at points (P, 3) [m]."""
+    return outgoing_waves(body.degree, body.wavenumber, _offsets(body, "points", points))
+
+
+def _regular_waves(body: TMatrix, other: TMatrix) -> torch.Tensor:
+    """Return S (N, K): outgoing waves of another body as regular waves around this one.
+
+    The waves of the other are sampled on shells inside this body's sphere, where they are regular, and
+    their harmonics are divided by j_l in the least-squares sense over shells.
+    """
+    heights, weights = np.polynomial.legendre.leggauss(body.degree + other.degree + 1)
+    count = 2 * (body.degree + other.degree + 1)
+    turns = 2 * math.pi * torch.arange(count, **REAL) / count
+    height = torch.from_numpy(heights)[:, None]
+    across = (1 - height.square()).sqrt()
+    places = across * turns.cos(), across * turns.sin(), height.expand(-1, count)
+    directions = torch.stack(places, dim=-1).reshape(-1, 3)
+    area = torch.from_numpy(np.repeat(weights * 2 * math.pi / count, count))
+    back = (harmonics(body.degree, directions).conj() * area[:, None]).mT
+    radii = torch.tensor(_SHELLS, **REAL) * body.radius
+    sizes = regular_radial(body.degree, body.wavenumber * radii[:, None])
+    waves: torch.Tensor = torch.zeros((), **COMPLEX)
+    for radius, size in zip(radii, sizes, strict=True):
+        shell = body.center + radius * directions @ body.axes.mT
+        waves = waves + size.conj()[:, None] * (back @ _outgoing_waves(other, shell))
+    return waves / sizes.abs().square().sum(dim=0)[:, None]
+
+
+def _without_highest(body: TMatrix, fewer: int) -> torch.Tensor:
+    """Return T (N, N) with 0 in place of its `fewer` highest degrees."""
+    low = degrees(body.degree) <= body.degree - fewer
+    return torch.where(low[:, None] & low, body.matrix, 0) if fewer else body.matrix
+
+
+def _offsets(body: TMatrix, name: str, positions: torch.Tensor) -> torch.Tensor:
+    """Return positions (..., 3) in the coordinates of a body, after checking that they are outside."""
+    offsets = positions - body.center
+    nearest = float(torch.linalg.vector_norm(offsets, dim=-1).detach().amin())
+    if nearest < body.radius - LENGTH_TOLERANCE:
+        accepted = f"must be at least {body.radius:.4g} m from the centre of the body"
+        raise ValueError(f"{name}: {nearest:.4g} m at the nearest; {accepted}")
+    return offsets @ body.axes

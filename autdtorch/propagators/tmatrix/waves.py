@@ -18,10 +18,10 @@ from autdtorch.analytic.spherical_waves import mirrored, outgoing_waves, paritie
 from autdtorch.fdtd.grids import Grouping, one_box
 from autdtorch.fdtd.kernels.choice import make_kernel
 from autdtorch.fdtd.scattered_field import ScatteredField
-from autdtorch.fdtd.steady_state import SteadyState, run_to_steady_state
+from autdtorch.fdtd.steady_state import MOST_JUDGED, SteadyState, run_to_steady_state
 from autdtorch.fdtd.symmetry import symmetries
 from autdtorch.propagators.box import BoxSimulation
-from autdtorch.propagators.plan import MOST_JUDGED, Plan
+from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.store import Store
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.utils.apertures import Apertures

@@ -1,0 +1,160 @@
+"""The memory and the time of runs on grids, from the geometry, before anything is allocated."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from autdtorch.fdtd.grid import domain_extent
+from autdtorch.fdtd.grids import USUAL_PERIODS, Grouping
+from autdtorch.fdtd.interpolation import interpolation_width
+from autdtorch.fdtd.kernels.choice import make_kernel
+from autdtorch.fdtd.region import Region
+from autdtorch.fdtd.steady_state import MOST_JUDGED, phasors_kept
+from autdtorch.utils.cached import cached_property
+from autdtorch.utils.spatial import doubled_normals
+from autdtorch.utils.threads import thread_count
+
+# Fitted to transfer matrices of boxes and domains at 0.6 to 2 mm: `scripts/check.py estimate` reports errors.
+
+_CELL_BYTES, _FIELD_NUMBERS = 3.0, 2.5
+"""Memory of a cell: of the assembly [bytes], and numbers in each run."""
+
+_CELL_MEMORY, _ELEMENT_BYTES, _COLUMN_BYTES = 2_000.0, 14_000.0, 18_000.0
+"""Memory [bytes] of a heterogeneous cell, of an element while its surface is assembled, and of an element
+that a surface cuts in a boundary layer."""
+
+_ALIKE, _FORCES = 0.25, 3.0
+"""Memory and time of assembling elements along the grid, nearly all of which are alike, and time of those
+with forces, at tilted surfaces of fluids; relative to tilted surfaces of rigid bodies."""
+
+_ELEMENTS, _MOST_ELEMENTS = 1.4, 4096
+"""Elements assembled for each that a surface cuts, as some are only near it; the most at once by a thread."""
+
+_RECORDED = 44
+"""Memory [bytes] of a recorded number, and of what is made of it for the Fourier sums."""
+
+_CELL_STEPS, _COLUMN_STEPS = 15.0, 150.0
+"""Time of a step of a heterogeneous cell, and of one that a surface cuts in a boundary layer. This and the
+following times are in steps of a cell of air."""
+
+_PAIR_STEPS, _ASSEMBLY_STEPS, _MESH_STEPS = 11.0, 60_000.0, 60_000.0
+"""Time of one term of a sum over radiating cells, of the assembly of a heterogeneous cell, and of what a mesh
+adds to that."""
+
+_RUN_STEPS, _SCENE_STEPS = 4e7, 1e8
+"""Further time of a run and of a scene."""
+
+_BESIDE, _SHARE_INSIDE = 2.0, 0.5
+"""Heterogeneous cells for each area of a cell of a rigid or fluid surface; their share of the cuboid around
+an obstacle of another sound speed."""
+
+
+class Heterogeneity(NamedTuple):
+    """Estimated numbers of cells and elements that are not uniform air, on all grids of a plan."""
+
+    cut: float  # elements that surfaces cut
+    cells: float  # heterogeneous cells: beside surfaces, and inside another medium
+    columns: float  # elements that surfaces cut in the boundary layers
+    meshed: float  # those at meshes
+    assembled: float  # those beside surfaces, by the time of assembling them
+
+
+@dataclass(frozen=True)
+class Costs:
+    """The costs of runs on the grids of a region.
+
+    Attributes:
+        region: the region.
+        grouping: its grids.
+        spacing: edge of a cell [m].
+        kernel: name of the kernel.
+        runs: number of runs.
+        itemsize: memory of a number of the fields [bytes].
+        in_boxes: whether grids are boxes around bodies, not the whole domain.
+        receivers: of a run, at the most.
+        terms: of the sum over radiating cells for each of them.
+        meshes: whether each body is a mesh, whose distances are slow.
+    """
+
+    region: Region
+    grouping: Grouping
+    spacing: float
+    kernel: str
+    runs: int
+    itemsize: int
+    in_boxes: bool
+    receivers: int
+    terms: int
+    meshes: tuple[bool, ...]
+
+    @property
+    def memory(self) -> float:
+        """The most memory in use at a time [bytes]."""
+        grouping, filled, cells = self.grouping, self._heterogeneity, self._cells_read
+        block = 3 * max(grid.steps_per_period for grid in grouping.grids)
+        run = _FIELD_NUMBERS * self.itemsize * grouping.cells
+        run += cells * (16 * phasors_kept(cells) + _RECORDED * block)
+        judged = min(MOST_JUDGED, self.receivers) if self.in_boxes else 0
+        lasting = _CELL_BYTES * grouping.cells + _CELL_MEMORY * filled.cells + _COLUMN_BYTES * filled.columns
+        assembled = min(_ELEMENTS * filled.cut / len(grouping.grids), _MOST_ELEMENTS * thread_count())
+        assembled *= _ALIKE if grouping.aligned else 1
+        running = 24 * judged * cells + min(self.runs, self._at_once) * run
+        return lasting + max(_ELEMENT_BYTES * assembled, running)
+
+    @property
+    def work(self) -> float:
+        """Expected time of all runs, in steps of a cell of air."""
+        grids, passes, filled = self.grouping.grids, self.grouping.passes, self._heterogeneity
+        single = _CELL_STEPS * filled.cells + _COLUMN_STEPS * filled.columns
+        stepping = sum(grid.work for grid in grids) + max(grid.steps for grid in grids) * single
+        # coupled boxes are stepped to looser tolerances, and empty grids have no resonances
+        ringing = USUAL_PERIODS if filled.cells and passes == 1 and self.in_boxes else 1.0
+        run = _RUN_STEPS + ringing * passes * stepping
+        assembly = _SCENE_STEPS + _ASSEMBLY_STEPS * filled.assembled + _MESH_STEPS * filled.meshed
+        pairs = sum(grid.radiating for grid in grids) * self.terms if self.in_boxes else 0
+        return assembly + _PAIR_STEPS * pairs + math.ceil(self.runs / self._at_once) * run
+
+    @cached_property
+    def _heterogeneity(self) -> Heterogeneity:
+        """Counts from the geometry: on boxes around all bodies, or on the domain and its layers."""
+        region, spacing = self.region, self.spacing
+        inner = outer = np.array([[-np.inf] * 3, [np.inf] * 3])
+        if not self.in_boxes:
+            inner = np.array(region.domain)
+            layer = domain_extent(region, spacing).layer_cells(region.wavenumber * spacing)
+            outer = inner + spacing * layer * np.array([[-1.0], [1.0]])
+        cut = cells = columns = meshed = assembled = 0.0
+        for body, is_mesh in zip(region.bodies, self.meshes, strict=True):
+            vertices, triangles = (part.numpy() for part in body.shape.surface())
+            doubled = doubled_normals(np.clip(vertices, *inner)[triangles])
+            continued = doubled_normals(np.clip(vertices, *outer)[triangles])
+            area = float(np.linalg.norm(doubled, axis=1).sum()) / 2
+            # a plane of normal n cuts |nx| + |ny| + |nz| elements for each area of a cell
+            cut += float(np.abs(doubled).sum()) / 2 / spacing**2
+            columns += (float(np.linalg.norm(continued, axis=1).sum()) / 2 - area) / spacing**2
+            beside = _BESIDE * area / spacing**2
+            cells += beside
+            meshed += beside if is_mesh else 0.0
+            assembled += beside * (_ALIKE if self.grouping.aligned else _FORCES if body.fluid else 1)
+            if body.fluid and body.fluid.sound_speed != region.fluid.sound_speed:
+                box = np.clip([body.shape.lower, body.shape.upper], *inner)
+                cells += _SHARE_INSIDE * float(np.prod(box[1] - box[0])) / spacing**3
+        return Heterogeneity(cut, cells, columns, meshed, assembled)
+
+    @property
+    def _cells_read(self) -> int:
+        """Most cells of a grid whose phasors a run keeps."""
+        if self.in_boxes:
+            return max(grid.radiating for grid in self.grouping.grids)
+        width = interpolation_width(self.region.wavenumber * self.spacing)
+        return min(self.grouping.cells, self.receivers * width**3)
+
+    @property
+    def _at_once(self) -> int:
+        """Runs side by side; coupled boxes run one after the other."""
+        grids = self.grouping.grids
+        return make_kernel(self.kernel).at_once(grids[0].shape) if len(grids) == 1 else 1
