@@ -3,13 +3,11 @@
 Needs `pip install 'autdtorch[crosscheck]'`. Fills in a block of the documentation. Matrices are random, in
 single precision, with a row for each point and the 249 transducers of an AUTD3. Each time is the shortest of
 five. The share of the bound is the median over sets of random foci, with the paper's two cubes before them.
-Sequences are closed circles of 200 frames behind these cubes or around them.
 
     python scripts/benchmark.py holography        about a minute on 2 idle cores
 """
 
 import functools
-import math
 import time
 from collections.abc import Callable, Iterator
 
@@ -32,36 +30,15 @@ SETS, TRANSDUCERS, ITERATIONS, REPEATS = 2048, 249, 50, 5
 POINTS = (1, 32)
 SETTLED = 0.3  # [s]
 ALGORITHMS = ("naive", "gs", "wgs", "gs_pat")
-FRAMES, PHASE_STEP = 200, math.pi / 4
-CIRCLES = {  # centre [m], radius [m], normal, foci on the circle
-    "30 mm, behind": ((80e-3, 50e-3, 50e-3), 30e-3, (1, 0, 0), 1),
-    "15 mm, behind": ((80e-3, 50e-3, 50e-3), 15e-3, (1, 0, 0), 2),
-    "20 mm, behind": ((80e-3, 50e-3, 50e-3), 20e-3, (1, 0, 0), 4),
-    "40 mm, around": ((41e-3, 50e-3, 50e-3), 40e-3, (0, 0, 1), 1),
-    "40 mm, around, two foci": ((41e-3, 50e-3, 50e-3), 40e-3, (0, 0, 1), 2),
-}
 
 
 def main(page: Page) -> None:
     """Measure, and write the block."""
-    head = [
-        "circle",
-        "foci",
-        "frames/s",
-        "largest step [rad]",
-        "even [%]",
-        "amplitudes 1 [%]",
-        "no limit [%]",
-    ]
     page.write(
         f"Sets a second, {ITERATIONS} iterations, {TRANSDUCERS} transducers, amplitudes 1:",
         table(["points", "algorithm", "autdtorch", "AcousTools", "ratio"], printed(rates())),
         "Share of the bound on the weakest focus, 200 iterations (median of 30 sets behind two cubes):",
         table(["foci", *ALGORITHMS, "diff_pat"], printed(shares())),
-        f"Closed sequences of {FRAMES} frames, phase steps up to {PHASE_STEP:.3f} rad. Levels of the\n"
-        "weakest frame are shares of the mean of all, with amplitudes lowered to one level and without,\n"
-        "and of the weakest frame without a limit:",
-        table(head, printed(sequences())),
     )
 
 
@@ -116,28 +93,3 @@ def shares() -> Iterator[list[str]]:
             drive = at.holography(sets, wanted, algorithm)
             row.append(f"{100 * float((weakest(sets, drive) / bounds).median()):.0f} %")
         yield row
-
-
-def sequences() -> Iterator[list[str]]:
-    """Yield rows for sequences: frames a second, phase steps, and how even the frames are."""
-    scene = with_array(paper_scene("two_cubes"), autd3_array())
-    propagator = at.make_propagator(scene, "box", 1e-3, cache=False)
-    for name, (center, radius, normal, foci) in CIRCLES.items():
-        circle = at.circle_points(center, radius, FRAMES, normal)
-        places = torch.stack([circle.roll(-focus * FRAMES // foci, 0) for focus in range(foci)], dim=1)
-        matrix = propagator.transfer_matrix(places.flatten(0, 1)).reshape(FRAMES, foci, -1)
-        closed = functools.partial(at.drive_sequence, matrix, None, PHASE_STEP, closed=True)
-        drives, seconds = shortest(closed, REPEATS)
-        steps = (drives * drives.roll(1, 0).conj()).angle().abs()
-        even, uneven, free = (
-            weakest(matrix, drive)
-            for drive in (drives, closed(even=False), at.drive_sequence(matrix, even=False))
-        )
-        yield [
-            name,
-            str(foci),
-            f"{FRAMES / seconds:,.0f}",
-            f"{float(steps.max()):.3f}",
-            *(f"{100 * float(level.min() / level.mean()):.1f}" for level in (even, uneven)),
-            f"{100 * float(even.min() / free.min()):.0f}",
-        ]
