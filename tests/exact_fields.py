@@ -7,8 +7,6 @@ truncation error is (k STEP)^2 / 3 = 3e-7 of k |p| in a plane wave, and more whe
 
 import math
 
-import torch
-
 from autdtorch.analytic.green import green
 
 WAVELENGTH = 8.5e-3
@@ -32,9 +30,3 @@ def slope(values):
 def relative(difference, points, sources):
     """The largest |difference| over the direct wave."""
     return float((difference / green(points, sources, K)).abs().max())
-
-
-def piston_directivity(angle, ka):
-    """Pressure of a piston at angles (...) [rad] from its axis over the one on its axis, float64."""
-    argument = (ka * torch.sin(angle)).clamp(min=1e-9)
-    return 2 * torch.special.bessel_j1(argument) / argument

@@ -4,16 +4,29 @@ The time factor is e^{-i w t}. A point source has the field e^{ikr} / (4 pi r) o
 the source strength S. Ratios are obstacle over medium: density_ratio = rho_1 / rho, speed_ratio = c_1 / c.
 """
 
-from autdtorch.analytic.green import green, piston_field
-from autdtorch.analytic.planes import fluid_half_space, fluid_slab, rigid_plane
-from autdtorch.analytic.sphere import fluid_sphere, rigid_sphere
+from autdtorch.analytic.green import green, piston_directivity, piston_field, piston_on_axis
+from autdtorch.analytic.planes import (
+    fluid_half_space,
+    fluid_slab,
+    rigid_plane,
+    slab_coefficients,
+    soft_plane,
+    step_coefficients,
+)
+from autdtorch.analytic.sphere import fluid_sphere, rigid_sphere, soft_sphere
 
 __all__ = [
     "fluid_half_space",
     "fluid_slab",
     "fluid_sphere",
     "green",
+    "piston_directivity",
     "piston_field",
+    "piston_on_axis",
     "rigid_plane",
     "rigid_sphere",
+    "slab_coefficients",
+    "soft_plane",
+    "soft_sphere",
+    "step_coefficients",
 ]

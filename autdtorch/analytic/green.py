@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import torch
+from scipy.special import j1
 
 from autdtorch.scene.arrays import TransducerArray, strengths_of
 from autdtorch.utils.array_types import COMPLEX
@@ -21,6 +22,7 @@ from autdtorch.utils.validation import (
     not_negative,
     points_tensor,
     positive,
+    real_tensor,
     unit_vector,
 )
 
@@ -113,6 +115,49 @@ def piston_field(
         factor = weight * edge / (rim + z) * torch.sinc(wavenumber * path / (2 * math.pi))
         total += factor * torch.exp(0.5j * wavenumber * (rim + z))
     return total / (4 * math.pi**2 * radius**2)
+
+
+def piston_directivity(angle: ArrayLike, wavenumber: float, radius: float) -> torch.Tensor:
+    """Return the directivity of a piston, 2 J_1(ka sin angle) / (ka sin angle), which is 1 on the axis.
+
+    Args:
+        angle: from the axis, any shape [rad].
+        wavenumber: k [rad/m], > 0.
+        radius: a [m], > 0.
+
+    Returns:
+        complex128 in the shape of `angle`.
+
+    Raises:
+        ValueError: not finite, or an argument <= 0.
+
+    Source: Morse & Ingard, Theoretical Acoustics (1968), section 7.4; Pierce, Acoustics, chapter 5.
+    """
+    angles = real_tensor("angle", angle, "rad").detach()
+    reach = real_wavenumber(wavenumber) * positive("radius", radius, "m")
+    argument = reach * np.sin(angles.cpu().numpy())
+    safe = np.where(argument == 0, 1, argument)
+    ratio = np.where(argument == 0, 1, 2 * j1(safe) / safe)
+    return torch.as_tensor(ratio, **COMPLEX).to(angles.device)
+
+
+def piston_on_axis(distance: ArrayLike, wavenumber: float, radius: float) -> torch.Tensor:
+    """Return the pressure on the axis of a piston: (e^{ik sqrt(z^2 + a^2)} - e^{ikz}) / (2 pi i k a^2).
+
+    `distance` is z from the piston [m], any shape, >= 0; the rest is as for `piston_directivity`.
+    The result [1/m], complex128 in the shape of `distance`, is e^{ikz} / (4 pi z) far away, as `green`.
+
+    Source: Pierce, Acoustics, section 5-7; Morse & Ingard, Theoretical Acoustics (1968), section 7.4.
+    """
+    z = real_tensor("distance", distance, "m").detach()
+    if (z < 0).any():
+        raise ValueError(f"distance: {float(z.min()):g} m; every entry must be >= 0")
+    wavenumber, radius = real_wavenumber(wavenumber), positive("radius", radius, "m")
+    rim = torch.hypot(z, torch.full_like(z, radius))
+    # Written as a product, the difference of the two waves does not cancel far away.
+    half_path = radius**2 / (rim + z) / 2
+    amplitude = torch.sinc(wavenumber * half_path / math.pi) / (2 * math.pi * (rim + z))
+    return amplitude * torch.exp(0.5j * wavenumber * (rim + z))
 
 
 def _wavenumber(value: complex) -> tuple[float, float]:

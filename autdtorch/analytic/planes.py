@@ -24,8 +24,10 @@ from autdtorch.utils.validation import (
     Vector,
     boolean,
     finite_vector,
+    invalid,
     points_tensor,
     positive,
+    real_tensor,
     unit_vector,
 )
 
@@ -64,6 +66,23 @@ def rigid_plane(
     heights = _heights("sources", origins, origin, axis, -LENGTH_TOLERANCE)
     image = green(targets, origins - 2 * heights[:, None] * axis, wavenumber)
     return image if boolean("scattered", scattered) else green(targets, origins, wavenumber) + image
+
+
+def soft_plane(
+    points: ArrayLike,
+    sources: ArrayLike,
+    wavenumber: float,
+    origin: Vector,
+    normal: Vector,
+    *,
+    scattered: bool = False,
+) -> torch.Tensor:
+    """Return the field of point sources in front of a pressure-release plane: source minus image source.
+
+    Arguments, returns and errors as for `rigid_plane`.
+    """
+    image = -rigid_plane(points, sources, wavenumber, origin, normal, scattered=True)
+    return image if boolean("scattered", scattered) else green(points, sources, wavenumber) + image
 
 
 def fluid_half_space(
@@ -229,6 +248,56 @@ def vertical_wavenumber(wavenumber: float, kappa: ComplexArray) -> ComplexArray:
     """
     below: ComplexArray = np.sqrt(-1j * (wavenumber - kappa)) * np.exp(0.25j * np.pi)
     return below * np.sqrt(wavenumber + kappa)
+
+
+def step_coefficients(
+    angle: ArrayLike, density_ratio: float, speed_ratio: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the reflection and transmission coefficients of a plane wave at a fluid half-space.
+
+    Beyond the critical angle the transmitted wave decays, and |R| = 1.
+
+    Args:
+        angle: of incidence, any shape [rad], in [0, pi/2).
+        density_ratio: rho_1 / rho > 0.
+        speed_ratio: c_1 / c > 0.
+
+    Returns:
+        R and T, complex128 in the shape of `angle`: reflected and transmitted pressure at the faces over the
+        incident pressure at the front face.
+
+    Raises:
+        ValueError: an argument out of the range given above.
+
+    Source: Brekhovskikh & Godin, Acoustics of Layered Media I (1990), section 2.2; Pierce, Acoustics,
+        section 3-6.
+    """
+    return _coefficients(angle, Layering(1.0, density_ratio, speed_ratio))
+
+
+def slab_coefficients(
+    angle: ArrayLike, wavenumber: float, thickness: float, density_ratio: float, speed_ratio: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the reflection and transmission coefficients of a plane wave at a fluid slab in a medium.
+
+    Arguments, returns and errors as for `step_coefficients`, with `wavenumber` k of the medium [rad/m], > 0,
+    and `thickness` [m], > 0.
+
+    Source: Brekhovskikh & Godin, Acoustics of Layered Media I (1990), chapter 2; Pierce, Acoustics,
+        section 3-7.
+    """
+    thickness = positive("thickness", thickness, "m")
+    return _coefficients(angle, Layering(wavenumber, density_ratio, speed_ratio, thickness))
+
+
+def _coefficients(angle: ArrayLike, layering: Layering) -> tuple[torch.Tensor, torch.Tensor]:
+    angles = real_tensor("angle", angle, "rad").detach()
+    if ((angles < 0) | (angles >= math.pi / 2)).any():
+        raise invalid("angle", angles, "every entry must be in [0, pi/2)", "rad")
+    kappa = layering.wavenumber * np.sin(angles.cpu().numpy()).astype(np.complex128)
+    reflected = torch.from_numpy(np.asarray(layering.reflected(kappa)))
+    transmitted = torch.from_numpy(np.asarray(layering.transmitted(kappa, layering.depth)))
+    return reflected.to(angles.device), transmitted.to(angles.device)
 
 
 def _scaled_cosine_and_sine(inner: ComplexArray, length: float) -> tuple[ComplexArray, ComplexArray]:

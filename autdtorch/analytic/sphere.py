@@ -38,6 +38,7 @@ Radial: TypeAlias = Callable[[torch.Tensor, int], torch.Tensor]
 _BLOCK = 256  # points summed at a time, to limit memory
 _NEGLIGIBLE = 1e-17  # fraction of the largest term at which a series ends
 _MOST_ORDERS = 2**16  # enough for a point on the surface and a source 6e-4 radii off it
+_SOFT = 1e20  # admittance of a surface without pressure
 _CENTER = 1e-100  # replacement for k r = 0, where the field has a limit but its factors do not
 
 
@@ -72,6 +73,25 @@ def rigid_sphere(
     """
     setup = _setup(points, sources, wavenumber, center, radius)
     return _field_outside(setup, lambda _: 0.0, boolean("scattered", scattered))
+
+
+def soft_sphere(
+    points: ArrayLike,
+    sources: ArrayLike,
+    wavenumber: float,
+    center: Vector,
+    radius: float,
+    *,
+    scattered: bool = False,
+) -> torch.Tensor:
+    """Return the field of point sources outside a pressure-release sphere.
+
+    Arguments, returns and errors as for `rigid_sphere`.
+
+    Source: Anderson (1950), JASA 22, 426, for rho_1 -> 0.
+    """
+    setup = _setup(points, sources, wavenumber, center, radius)
+    return _field_outside(setup, lambda _: _SOFT, boolean("scattered", scattered))
 
 
 def fluid_sphere(

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from autdtorch.fdtd.grid import domain_extent
-from autdtorch.fdtd.grids import USUAL_PERIODS, Grouping
+from autdtorch.fdtd.grouping import USUAL_PERIODS, Grouping
 from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels.choice import make_kernel
 from autdtorch.fdtd.region import Region

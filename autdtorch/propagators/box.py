@@ -21,7 +21,7 @@ import torch
 from scipy.spatial import KDTree
 
 from autdtorch.fdtd.grid import Grid, make_box
-from autdtorch.fdtd.grids import one_box
+from autdtorch.fdtd.grouping import one_box
 from autdtorch.fdtd.region import Body, Region
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
 from autdtorch.fdtd.steady_state import MOST_JUDGED, SteadyState, run_to_steady_state

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from autdtorch.fdtd.grid import domain_extent
-from autdtorch.fdtd.grids import grid_cost
+from autdtorch.fdtd.grouping import grid_cost
 from autdtorch.fdtd.kernels.choice import make_kernel
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stepping import assemble, drive_signal

@@ -17,7 +17,7 @@ from typing import Protocol, Self
 import numpy as np
 import torch
 
-from autdtorch.fdtd.grids import MOST_PASSES
+from autdtorch.fdtd.grouping import MOST_PASSES
 from autdtorch.fdtd.steady_state import Extrapolation, SteadyState
 from autdtorch.utils.array_types import COMPLEX, REAL
 

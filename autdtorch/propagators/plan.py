@@ -13,7 +13,7 @@ from autdtorch.analytic.green import PAIR_BYTES
 from autdtorch.fdtd.costs import Costs
 from autdtorch.fdtd.grid import MAX_CELLS, coarsest_spacing, require_spacing, second_spacing
 from autdtorch.fdtd.grid_errors import Law
-from autdtorch.fdtd.grids import Grouping, choose_grids
+from autdtorch.fdtd.grouping import Grouping, choose_grids
 from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels.choice import available_kernel, precision_of
 from autdtorch.fdtd.region import Region

@@ -12,7 +12,7 @@ from typing import TypeVar, cast
 
 import torch
 
-from autdtorch.fdtd.grids import USUAL_PERIODS
+from autdtorch.fdtd.grouping import USUAL_PERIODS
 from autdtorch.fdtd.kernels.choice import make_kernel
 from autdtorch.fdtd.steady_state import SILENCE, SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly

@@ -8,7 +8,7 @@ import torch
 from small_scenes import AIR, relative_error
 
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.fdtd.grids import cheapest_boxes, one_box
+from autdtorch.fdtd.grouping import cheapest_boxes, one_box
 from autdtorch.propagators import SimulatedPropagator, make_propagator
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.scene_region import region_of
