@@ -179,7 +179,7 @@ class BoxSimulation(Simulation):
         return super()._fields(drive, points)
 
     def _radiates(self, points: torch.Tensor) -> bool:
-        """Return whether the field at points (P, 3) is that of the Huygens surfaces, and these are kept.
+        """Return whether the Huygens surfaces radiate the field at points (P, 3), and fit into the store.
 
         For sources next to an obstacle, runs that begin at points are more accurate.
         """
@@ -218,15 +218,16 @@ class BoxSimulation(Simulation):
 
     @cached_property
     def _judged(self) -> Judged:
-        """Receivers that judge a radiation: control points, and a sphere around the obstacles.
+        """Receivers that judge a radiation: control points, and a sphere a wavelength around the obstacles.
 
-        The former may be in a shadow, the latter see all that is scattered.
+        The former may be in a shadow, the latter receive all that is scattered. At the obstacles' surface,
+        pressure converges later.
         """
         scene = self.plan.scene
         places = scene.control_points
         places = places[:: math.ceil(len(places) / MOST_JUDGED)]
         center, radius = circumscribed(scene.obstacles)
-        around = sphere_points(center, radius, MOST_JUDGED)
+        around = sphere_points(center, radius + scene.wavelength, MOST_JUDGED)
         apart = torch.cdist(around, scene.array.nodes.positions.reshape(-1, 3)).amin(dim=1)
         around = around[apart > self.plan.spacing]  # their own 1/r would hide the rest
         groups = [part[~self.silent(part[:, None])] for part in (places, around)]

@@ -90,7 +90,7 @@ class Notices:
 
 
 def warn_of_scene(plan: Plan) -> None:
-    """Log what of a scene is less accurate on the grids of a plan, or is not simulated as it is drawn."""
+    """Log the parts of a scene that are less accurate on the grids of a plan, and walls that end."""
     scene, region, spacing = plan.scene, plan.region, plan.spacing
     warn_if_coarse(region.sound_speeds, scene.frequency, spacing)
     warn_of_ending_walls(scene)

@@ -94,7 +94,7 @@ class Plan:
 
     @property
     def law(self) -> Law:
-        """How its errors grow with the spacing."""
+        """The growth of its errors with the spacing."""
         return Law(self.region.shortest_wavelength, self.grouping.aligned)
 
     @property

@@ -54,7 +54,7 @@ class Budget:
 
     @property
     def is_unlimited(self) -> bool:
-        """Whether neither time nor memory is limited."""
+        """True if neither time nor memory is limited."""
         return self.seconds is None and self.memory is None
 
     def fits(self, plan: Plan, last: Plan, taken: float) -> bool:
@@ -72,9 +72,8 @@ class Budget:
 def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
     """Return a propagator whose estimated error is within the tolerance of a plan.
 
-    Where the budget does not suffice, it is the finest that fits, and where the surface of an obstacle is not
-    known well enough, it is one that does not add to that. A warning says which error it has, and one that
-    obstacles resonate.
+    Where the budget does not suffice, it is the finest that fits. Where the surface of an obstacle is not
+    known well enough, it is one that does not add to that error. Warnings name the error, and resonances.
     """
     propagator = _refined(pilot, budget, store)
     propagator.warn_of_ringing()

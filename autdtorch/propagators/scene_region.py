@@ -94,12 +94,12 @@ def warn_of_ending_walls(scene: Scene) -> None:
 
 def warn_of_near_points(scene: Scene, name: str, points: torch.Tensor, spacing: float) -> bool:
     """Log which points (P, 3) [m] are less than a cell from a surface, on either side; return whether any."""
-    found = False
+    is_near = False
     for index, obstacle in enumerate(scene.obstacles):
         around = obstacle.near(points, spacing).nonzero()[:, 0]
         gap = obstacle.signed_distance(points[around]) if len(around) else points.new_zeros(0)
         if count := int((gap.abs() < spacing).sum()):
-            found, nearest = True, int(gap.abs().argmin())
+            is_near, nearest = True, int(gap.abs().argmin())
             point = int(around[nearest])
             logger.warning(
                 "%s[%d] at %s mm is %.2g mm %s obstacle %d%s: less accurate within a cell, %.2g mm, of a"
@@ -107,7 +107,7 @@ def warn_of_near_points(scene: Scene, name: str, points: torch.Tensor, spacing: 
                 1e3 * abs(float(gap[nearest])), "inside" if gap[nearest] < 0 else "from", index,
                 f", and {count - 1} more are near it" if count > 1 else "", 1e3 * spacing,
             )  # fmt: skip
-    return found
+    return is_near
 
 
 def _walls(scene: Scene) -> list[tuple[bool, bool]]:
@@ -117,13 +117,13 @@ def _walls(scene: Scene) -> list[tuple[bool, bool]]:
     the first one continue. Other shapes were measured to be unstable in the layers, and so were edges where
     walls of two directions meet.
     """
-    found, normal = [], None
+    walls, normal = [], None
     for obstacle in scene.obstacles:
         corners = zip(obstacle.lower, obstacle.upper, *scene.domain, strict=True)
         ends = [axis for axis, (low, high, first, last) in enumerate(corners) if low > first or high < last]
         wall = obstacle.fills_bounds and len(ends) <= 1
         continued = wall and (not ends or normal in (None, ends[0]))
-        found.append((wall, continued))
+        walls.append((wall, continued))
         if continued and ends:
             normal = ends[0]
-    return found
+    return walls

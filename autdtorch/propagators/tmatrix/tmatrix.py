@@ -51,7 +51,7 @@ _AT_ONCE = 200_000
 """Waves at points that are computed at once: 3 MB, which fit into a cache."""
 
 _SHELLS = (0.55, 0.7, 0.85, 0.99)
-"""Radii of shells over that of the circumscribed sphere: j_l is small on one at most."""
+"""Radii of shells, relative to the circumscribed sphere: j_l is small on one of them at most."""
 
 _ENTRY_BYTES = 48.0
 """Memory of a pair of waves in the system of equations [bytes]."""
