@@ -125,8 +125,8 @@ def add_legend(figure: Figure, handles: Sequence[Artist], title: str | None = No
     while columns > 1 and sum(max(column) for column in np.array_split(widths, columns)) > room:
         columns -= 1
     columns = math.ceil(len(handles) / math.ceil(len(handles) / columns))  # rows of equal length
-    lines = max(str(handle.get_label()).count("\n") + 1 for handle in handles)
-    further = lines * math.ceil(len(handles) / columns) - 1
+    longest = max(str(handle.get_label()).count("\n") + 1 for handle in handles)
+    further = longest * math.ceil(len(handles) / columns) - 1
     figure.set_figheight(figure.get_figheight() + 1.3 * further * size / 72)
     figure.legend(handles=handles, title=title, loc="outside upper center", ncols=columns)
 

@@ -26,11 +26,11 @@ from autdtorch.fdtd.region import Body, Region
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
 from autdtorch.fdtd.steady_state import MOST_JUDGED, SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble_on
-from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_array
+from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_array, orbits_of_transducers
 from autdtorch.fdtd.turning import is_turned, turned
 from autdtorch.propagators.multiple_scattering import Observe, iterated
 from autdtorch.propagators.simulation import PressureMap, Run, Simulation, Stepped
-from autdtorch.propagators.store import BODIES, MOST_BYTES
+from autdtorch.propagators.store import BODIES, MOST_BYTES, key_of
 from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.obstacles import Obstacle
@@ -158,16 +158,16 @@ class BoxSimulation(Simulation):
         return Orbits(False, *orbits_of_array(self.symmetries), np.zeros((0, 0), np.int64))
 
     def _matrix(self, points: torch.Tensor) -> PressureMap:
-        if self._radiates(points) and not self.orbits(points).from_points:
-            radiation = self._store.get(
-                digest_of(self.plan.key, "transducers"), self._radiation_of_transducers
-            )
-            if radiation.reaches(points):
-                array = self.plan.scene.array
-                alone = [apertures_of(array).chosen(slice(index, index + 1)) for index in range(len(array))]
-                strength = strengths_of(array)[:, None].to(torch.complex128)
-                return self._total(radiation, alone, strength, points)
-        return super()._matrix(points)
+        orbits = self.orbits(points)
+        if orbits.from_points or not self._radiates(points):
+            return self._matrix_of_orbits(points, orbits)
+        key = digest_of(self.plan.key, "transducers")
+        radiation = self._store.get(key, self._radiation_of_transducers)
+        if not radiation.reaches(points):  # the boxes were simulated as one
+            return self._matrix_of_orbits(points, orbits_of_transducers(points, self.symmetries))
+        array = self.plan.scene.array
+        alone = [apertures_of(array).chosen(slice(index, index + 1)) for index in range(len(array))]
+        return self._total(radiation, alone, strengths_of(array)[:, None].to(torch.complex128), points)
 
     def _fields(self, drive: torch.Tensor, points: torch.Tensor) -> PressureMap:
         if self._radiates(points):
@@ -277,7 +277,7 @@ class BoxSimulation(Simulation):
             pressure = audible * (incident[:, runs] + sum(reading.field(part) for reading, part in parts))
             return [pressure[group] for group in groups]
 
-        bodies = [_Body(self, transform, stepped) for transform in transforms]
+        bodies = [_Scatterer(self, transform, stepped) for transform in transforms]
         if len(bodies) == 1:
 
             @torch.no_grad()  # holds in one thread only
@@ -311,7 +311,7 @@ class BoxSimulation(Simulation):
 
 
 @dataclass(frozen=True, eq=False)
-class _Body:
+class _Scatterer:
     """The obstacles of a box, whose answers to incident fields are simulated."""
 
     simulation: BoxSimulation
@@ -341,7 +341,7 @@ class _Body:
         """Return the amplitudes of the Huygens surface."""
         return self.transform.amplitudes(phasors)
 
-    def incoming(self, other: _Body, outgoing: torch.Tensor) -> torch.Tensor:
+    def incoming(self, other: _Scatterer, outgoing: torch.Tensor) -> torch.Tensor:
         """Return the field (n, R) that the Huygens surface of another box radiates to this one."""
         return other.transform.box.radiated(outgoing, self.transform.box.driven)
 
@@ -378,7 +378,7 @@ def assembled_box(
         return _AssembledBox(assemble_on(here, turned(still, axes), dtype, time_step))
 
     medium = region.fluid, region.attenuation, region.frequency
-    key = digest_of("box", bodies, axes, here, *medium, str(dtype), time_step)
+    key = key_of("box", bodies, axes, here, *medium, str(dtype), time_step)
     return replace(BODIES.get(key, assembled).assembly, grid=grid)
 
 

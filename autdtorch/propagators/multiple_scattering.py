@@ -33,7 +33,7 @@ Observe = Callable[[torch.Tensor], Sequence[torch.Tensor]]
 """Observe: maps phasors (k,) or (k, R) to the quantities that must all converge."""
 
 
-class Body(Protocol):
+class Scatterer(Protocol):
     """A body whose answers are simulated, as phasors (k, R) of some of its cells."""
 
     def answers(self, incoming: torch.Tensor, tolerances: Sequence[float]) -> list[SteadyState]:
@@ -66,7 +66,7 @@ def solved(
 
 
 def iterated(
-    bodies: Sequence[Body],
+    bodies: Sequence[Scatterer],
     incident: Sequence[torch.Tensor],
     observe: Observe,
     floors: torch.Tensor,

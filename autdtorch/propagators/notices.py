@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import warnings
 from collections.abc import Iterable, Sequence
 
 import torch
@@ -16,6 +15,7 @@ from autdtorch.propagators.scene_region import warn_of_ending_walls, warn_of_nea
 from autdtorch.propagators.simulation import PressureMap, Run, Simulation
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.display import counted
+from autdtorch.utils.units import warn_user
 
 logger = logging.getLogger(__name__)
 
@@ -58,12 +58,13 @@ class Notices:
     def of_sources(self, result: PressureMap) -> None:
         """Log that a source is next to an obstacle, where runs began at the transducers."""
         if result.runs and not result.from_points and "source" not in self._logged:
+            self._logged.add("source")
             nodes = self._plan.scene.array.nodes.positions
             if any(map(self._simulation.near_obstacle, nodes)):
-                text = "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than"
-                self._once(
-                    "source", f"{text} %.2g mm", 1e3 * self._plan.source_clearance, 1e3 * self._plan.spacing
-                )
+                logger.warning(
+                    "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g"
+                    " mm", 1e3 * self._plan.source_clearance, 1e3 * self._plan.spacing,
+                )  # fmt: skip
 
     def of_faint_points(self, matrix: torch.Tensor, free: torch.Tensor) -> None:
         """Log that the matrix at control points is rounding, relative to free space: methods would use it."""
@@ -103,13 +104,13 @@ def warn_of_scene(plan: Plan) -> None:
 
 
 def warn_of_unsettled(runs: Sequence[Run], tolerance: float) -> None:
-    """Warn the caller of a public, decorated method of runs that did not converge."""
+    """Warn of runs that did not converge."""
     if unsettled := [run for run in runs if not run.reached]:
         periods, residual = max(run.periods for run in unsettled), max(run.remaining for run in unsettled)
-        warnings.warn(
+        warn_user(
             f"no steady state after {periods} periods in {len(unsettled)} of {counted(len(runs), 'run')}"
             f": estimated relative error up to {residual:.1e}, tolerance {tolerance:g}; raise "
-            "max_periods or tolerance", SteadyStateWarning, stacklevel=4,
+            "max_periods or tolerance", SteadyStateWarning,
         )  # fmt: skip
 
 

@@ -36,7 +36,7 @@ from autdtorch.utils.validation import (
 
 logger = logging.getLogger(__name__)
 
-_HARDENED = 0.25
+_TAKEN_AS_RIGID = 0.25
 """Share of the error asked for up to which bodies are taken as rigid, where the spacing is chosen by it."""
 
 _NO_EFFECT = ("observation_plane", "name")
@@ -75,7 +75,8 @@ class Plan:
     @property
     def with_materials(self) -> Self:
         """The plan without bodies that are taken as rigid; see `with_rigid`."""
-        return replace(self, region=with_rigid(region_of(self.scene), 0.0)).at(self.spacing, self.tolerance)
+        plan = replace(self, region=with_rigid(region_of(self.scene), 0.0))
+        return plan.at(self.spacing, self.tolerance, self.time_step)
 
     @property
     def second(self) -> Self:
@@ -176,7 +177,7 @@ def plan(
     tolerance = positive("tolerance", tolerance)
     if tolerance >= 1:
         raise invalid("tolerance", tolerance, "must be in (0, 1)")
-    most = _HARDENED * tolerance if spacing is None else tolerance
+    most = _TAKEN_AS_RIGID * tolerance if spacing is None else tolerance
     spacing = coarsest_spacing(region) if spacing is None else positive("spacing", spacing, "m")
     region = with_rigid(region, most)
     max_periods = integer_at_least("max_periods", max_periods, 1)

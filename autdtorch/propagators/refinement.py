@@ -37,7 +37,7 @@ _AIM = 0.5
 _SHAPE = 3.0
 """Ratio of the errors of uncertain surfaces and of the grid from which a finer grid is of no use."""
 
-_HARDENING = 0.3
+_RIGID_SHARE = 0.3
 """Error of bodies taken as rigid, relative to the tolerance, from which their materials count."""
 
 _SETTLED = 0.03
@@ -94,7 +94,7 @@ def _refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
         error, shape, rigid_error = propagator.known_errors()
         taken = time.perf_counter() - begin
         logger.debug("spacing %.3g mm: estimated error %.2g", 1e3 * plan.spacing, error)
-        if rigid_error > _HARDENING * tolerance:
+        if rigid_error > _RIGID_SHARE * tolerance:
             logger.debug(
                 "obstacles taken as rigid would leave an error of %.2g: their materials count", rigid_error
             )

@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 _STIFF = 2.0
 # Relative difference of a sphere from a rigid one, times its density ratio. Narrow resonances have up to half
 # more, which is still less than the error of a grid at such a contrast.
-_HARDNESS = 1.4
+_NEAR_RIGID = 1.4
 
 
 def region_of(scene: Scene) -> Region:
@@ -79,7 +79,7 @@ def difference_from_rigid(body: Body, region: Region) -> float:
         return math.inf
     thickness = mean_thickness(*(part.numpy() for part in body.shape.surface()))
     moved = 1 + 1 / (region.wavenumber * thickness)
-    return float(_HARDNESS * (moved + 1 / stiffer) / heavier)
+    return float(_NEAR_RIGID * (moved + 1 / stiffer) / heavier)
 
 
 def warn_of_ending_walls(scene: Scene) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, Protocol, overload, runtime_checkable
 
@@ -105,9 +106,10 @@ class SimulatedPropagator:
         """Number of cells of all grids."""
         return self.plan.cells
 
+    @one_library_thread()
     def warn_of_ringing(self) -> None:
         """Log if the control points' sound rings, where grids may agree and be wrong together."""
-        self._error(self.scene.control_points)
+        self._error(self._results(self.scene.control_points, with_error=True), self.scene.control_points)
 
     @property
     def planned_runs(self) -> int:
@@ -146,16 +148,14 @@ class SimulatedPropagator:
         """
         with_error = boolean("return_error", return_error)
         places = self._places(points)
-        result = self.simulation.transfer_matrix(places)
+        results = self._results(places, with_error)
+        result = results[0]
         self._notices.of_sources(result)
         self._notices.of_cavities(places, result.matrix)
         if points is None:
             self._notices.of_faint_points(result.matrix, self._free(places))
-        judged = [self.simulation, *self._others] if with_error and not self._coarser else [self.simulation]
-        warn_of_unsettled(
-            [run for each in judged for run in each.transfer_matrix(places).runs], self.tolerance
-        )
-        return (result.matrix.clone(), self._error(places)) if with_error else result.matrix.clone()
+        matrix = result.matrix.clone()
+        return (matrix, self._error(results, places)) if with_error else matrix
 
     @one_library_thread()
     def point_errors(self, points: ArrayLike | None = None) -> torch.Tensor:
@@ -164,13 +164,10 @@ class SimulatedPropagator:
         Points and errors are those of `transfer_matrix`.
         """
         places = self._places(points)
-        result, free = self.simulation.transfer_matrix(places), self._free(places)
-        others = [other.transfer_matrix(places) for other in self._others]
-        self._notices.of_ringing(max(each.periods for each in (result, *others)))
-        settling = result.residual * result.matrix.norm() / sizes(result.matrix, free)
-        settling = torch.where(result.matrix.any(dim=1), settling, 0.0)
-        matrices = [each.matrix for each in (result, *others)]
-        return self._errors(matrices, [each.periods for each in (result, *others)], free) + settling
+        results, free = self._results(places, with_error=True), self._free(places)
+        matrix, residual = results[0].matrix, results[0].residual
+        settling = torch.where(matrix.any(dim=1), residual * matrix.norm() / sizes(matrix, free), 0.0)
+        return self._errors(results, free) + settling
 
     @one_library_thread()
     def known_errors(self) -> tuple[float, float, float]:
@@ -179,14 +176,10 @@ class SimulatedPropagator:
         The error is that by the grids given, infinite without any. For the last part see `rigid_errors`.
         """
         points = self.scene.control_points
-        matrix, free = (
-            part.reshape(1, -1)
-            for part in (self.simulation.transfer_matrix(points).matrix, self._free(points))
-        )
-        shape, rigid_error = (
-            float(errors(matrix, free, self.plan.region)) for errors in (shape_errors, rigid_errors)
-        )
-        return self._error(points) if self._coarser else math.inf, shape, rigid_error
+        results = self._results(points, with_error=bool(self._coarser))
+        matrix, free = (part.reshape(1, -1) for part in (results[0].matrix, self._free(points)))
+        shape, rigid = (float(of(matrix, free, self.plan.region)) for of in (shape_errors, rigid_errors))
+        return self._error(results, points) if self._coarser else math.inf, shape, rigid
 
     @one_library_thread()
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
@@ -245,24 +238,29 @@ class SimulatedPropagator:
         """Simulations on other grids, for the error estimate."""
         return self._coarser or (simulation_of(self.plan.second, self._store),)
 
-    def _error(self, points: torch.Tensor) -> float:
-        """Return the relative error of the matrix of points, estimated from other grids."""
-        result, *others = (each.transfer_matrix(points) for each in (self.simulation, *self._others))
-        periods = [each.periods for each in (result, *others)]
-        self._notices.of_ringing(max(periods))
-        flat = [each.matrix.reshape(1, -1) for each in (result, *others)]
-        return result.residual + float(self._errors(flat, periods, self._free(points).reshape(1, -1)))
+    def _results(self, points: torch.Tensor, with_error: bool) -> list[PressureMap]:
+        """Return the transfer matrices of points, of this grid and, for its error, of others."""
+        result = self.simulation.transfer_matrix(points)
+        others = [other.transfer_matrix(points) for other in self._others] if with_error else []
+        judged = [result] if self._coarser else [result, *others]  # coarse grids on the way do not matter
+        warn_of_unsettled([run for each in judged for run in each.runs], self.tolerance)
+        return [result, *others]
 
-    def _errors(
-        self, matrices: Sequence[torch.Tensor], periods: Sequence[int], free: torch.Tensor
-    ) -> torch.Tensor:
+    def _error(self, results: Sequence[PressureMap], points: torch.Tensor) -> float:
+        """Return the relative error of the first matrix of points, estimated from those of other grids."""
+        flat = [replace(each, matrix=each.matrix.reshape(1, -1)) for each in results]
+        return results[0].residual + float(self._errors(flat, self._free(points).reshape(1, -1)))
+
+    def _errors(self, results: Sequence[PressureMap], free: torch.Tensor) -> torch.Tensor:
         """Return the errors (P,) of the rows of the first matrix by grid, shape and bodies taken as rigid.
 
-        The others are those of `_others`; `free` is the matrix in free space.
+        The other results are those of `_others`; `free` is the matrix in free space.
         """
-        matrix, others = matrices[0], list(zip(matrices[1:], self._others, periods[1:], strict=True))
-        calm = [other for other in others if other[2] <= _LONGER * periods[0]] or others[-1:]
-        grids = [(other, simulation.plan.spacing) for other, simulation, _ in calm]
+        (result, *others), matrix = results, results[0].matrix
+        self._notices.of_ringing(max(each.periods for each in results))
+        pairs = list(zip(others, self._others, strict=True))
+        calm = [pair for pair in pairs if pair[0].periods <= _LONGER * result.periods] or pairs[-1:]
+        grids = [(other.matrix, simulation.plan.spacing) for other, simulation in calm]
         # only boxes know the incident field
         of_grids = errors_by_grids if self.method == "full" else grid_errors
         errors = of_grids(matrix, free, self.spacing, grids, self.plan.law)

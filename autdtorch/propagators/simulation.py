@@ -216,7 +216,11 @@ class Simulation(ABC):
 
     def _matrix(self, points: torch.Tensor) -> PressureMap:
         """Simulate the transfer matrix of points (P, 3), none of them silent."""
-        array, orbits = self.plan.scene.array, self.orbits(points)
+        return self._matrix_of_orbits(points, self.orbits(points))
+
+    def _matrix_of_orbits(self, points: torch.Tensor, orbits: Orbits) -> PressureMap:
+        """Simulate the transfer matrix of points by a run for each of the orbits' representatives."""
+        array = self.plan.scene.array
         targets, transducers = Apertures.of_points(points), apertures_of(array)
         sources, receivers = (targets, transducers) if orbits.from_points else (transducers, targets)
         begins = "points" if orbits.from_points else "transducers"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import uuid
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar
@@ -56,7 +57,7 @@ class Store:
     @property
     def nbytes(self) -> int:
         """Memory of all results [bytes]."""
-        return sum(result.nbytes for result in self._results.values())
+        return sum(result.nbytes for result in list(self._results.values()))  # other threads add some
 
     def get(self, key: str, make: Callable[[], ResultT]) -> ResultT:
         """Return the result of a key, which is not to be changed; `make` it if it is not in memory."""
@@ -75,10 +76,6 @@ class Store:
     def forget(self) -> None:
         """Keep no result in memory, such as before a measurement of time."""
         self._results.clear()
-
-    def has(self, key: str) -> bool:
-        """Return whether the folder, if there is one, has a file of a key."""
-        return self.folder is None or self._path(self.folder, key).exists()
 
     def load(self, key: str, shape: tuple[int, ...], count: int) -> tuple[ComplexArray, list[float]] | None:
         """Return a saved matrix and its `count` numbers; None if there is none, or a damaged or other one."""
@@ -124,8 +121,15 @@ BODIES = Store(most_bytes=MOST_BYTES // 4)
 
 
 def key_of(*parts: object) -> str:
-    """Return a digest of parts, of this package's source and of the versions of others."""
-    return digest_of(source_digest(), package_versions(), *parts)
+    """Return a digest of parts, of this package's source and of the versions of others.
+
+    What has no digest, such as an obstacle of the user's with a function in a field, gets a new key.
+    """
+    try:
+        return digest_of(source_digest(), package_versions(), *parts)
+    except TypeError as error:
+        logger.info("results are not found again: %s", error)
+        return uuid.uuid4().hex
 
 
 def store_in(folder: str | os.PathLike[str] | Literal[False] | None) -> Store:

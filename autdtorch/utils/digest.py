@@ -42,6 +42,7 @@ def source_digest() -> str:
     return digest.hexdigest()
 
 
+@lru_cache
 def package_versions(*more: str) -> dict[str, str]:
     """Return the versions of the numerical packages that are installed, and of others by name."""
     versions = {}
@@ -59,7 +60,7 @@ def _add(digest: Any, part: Any) -> None:
     elif hasattr(part, "__array__"):
         array = np.ascontiguousarray(part)
         digest.update(f"array {array.dtype.str} {array.shape}\n".encode() + array.tobytes())
-    elif dataclasses.is_dataclass(part):
+    elif dataclasses.is_dataclass(part) and "__dataclass_fields__" in vars(type(part)):
         named = [(field, getattr(part, field.name)) for field in dataclasses.fields(part)]
         compared = {
             field.name: value for field, value in named if field.compare or hasattr(value, "__array__")

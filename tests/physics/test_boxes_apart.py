@@ -97,6 +97,16 @@ def test_boxes_whose_iteration_does_not_converge_are_joined(monkeypatch):
     assert [run.periods for run in apart.runs] == [run.periods for run in one.runs]
 
 
+def test_points_between_boxes_whose_iteration_does_not_converge_are_read_from_the_one(monkeypatch):
+    """More points than transducers: runs from these, whose one box holds the points."""
+    monkeypatch.setattr("autdtorch.propagators.multiple_scattering.MOST_PASSES", 1)
+    between = torch.tensor(NEAR) + torch.linspace(0.4, 0.6, 5)[:, None] * (
+        torch.tensor(FAR) - torch.tensor(NEAR)
+    )
+    matrix, whole = (each(spheres()).transfer_matrix(between) for each in (boxes, together))
+    assert relative_error(matrix, whole) < 2 * TOLERANCE
+
+
 def test_near_obstacles_share_a_box_and_far_ones_where_that_is_cheaper():
     near = Sphere((NEAR[0], NEAR[1], NEAR[2] + 9e-3), 3e-3, rigid=True)
     scene = far_apart(Sphere(NEAR, 4e-3, rigid=True), Sphere(FAR, 4e-3, rigid=True), near)

@@ -137,6 +137,10 @@ def test_t_matrices_are_kept_on_disk(tmp_path):
         by_tmatrix(scene_of(shifted(SMALL, torch.zeros(3).double())), cache=tmp_path).transfer_matrix(), first
     )
     assert [path.stat().st_mtime_ns for path in tmp_path.glob("*.matrix")] == [before]
+    whole = kept.read_bytes()
+    kept.write_bytes(whole[:-1])  # damaged: written again, from memory
+    by_tmatrix(scene, cache=tmp_path).transfer_matrix()
+    assert kept.read_bytes() == whole
 
 
 def test_gradients_by_the_points_are_those_of_finite_differences():

@@ -21,7 +21,7 @@ _MOST_BODIES, _MOST_WAVES = 3, 2000
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class ObstacleGroup:
     """Obstacles that scatter as one body.
 
     Attributes:
@@ -35,7 +35,7 @@ class Body:
     radius: float
 
 
-def bodies_of(obstacles: Sequence[Obstacle]) -> list[Body]:
+def bodies_of(obstacles: Sequence[Obstacle]) -> list[ObstacleGroup]:
     """Return the bodies of obstacles: those whose spheres overlap are joined, until none do."""
     bodies = [_body(obstacles, (index,)) for index in range(len(obstacles))]
     while pair := next((pair for pair in combinations(bodies, 2) if _overlap(*pair)), None):
@@ -73,21 +73,21 @@ def fewer_waves(scene: Scene, error: float, runs: int) -> int | None:
     return None if many or waves > runs or not are_outside(places, bodies).all() else waves
 
 
-def are_outside(points: torch.Tensor, bodies: Sequence[Body]) -> torch.Tensor:
+def are_outside(points: torch.Tensor, bodies: Sequence[ObstacleGroup]) -> torch.Tensor:
     """Return which points (P, 3) [m] are outside the spheres of all bodies."""
     apart = torch.stack([(points - body.center).norm(dim=1) - body.radius for body in bodies])
     return (apart > LENGTH_TOLERANCE).all(dim=0)
 
 
-def _body(obstacles: Sequence[Obstacle], chosen: tuple[int, ...]) -> Body:
-    return Body(chosen, *circumscribed([obstacles[index] for index in chosen]))
+def _body(obstacles: Sequence[Obstacle], chosen: tuple[int, ...]) -> ObstacleGroup:
+    return ObstacleGroup(chosen, *circumscribed([obstacles[index] for index in chosen]))
 
 
-def _overlap(one: Body, other: Body) -> bool:
+def _overlap(one: ObstacleGroup, other: ObstacleGroup) -> bool:
     return float((one.center - other.center).norm()) <= one.radius + other.radius + LENGTH_TOLERANCE
 
 
-def _has_closed_form(scene: Scene, body: Body) -> bool:
+def _has_closed_form(scene: Scene, body: ObstacleGroup) -> bool:
     return has_closed_form([scene.obstacles[index] for index in body.obstacles], scene.medium)
 
 

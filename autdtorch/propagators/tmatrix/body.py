@@ -25,6 +25,7 @@ from autdtorch.scene.scene import OverlapWarning, ScaleWarning, Scene
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.cached import cached_property
 from autdtorch.utils.memory import require_memory
+from autdtorch.utils.units import warn_user
 
 logger = logging.getLogger(__name__)
 
@@ -131,7 +132,7 @@ class Placed(NamedTuple):
             matrix, axes = simulated.matrix.clone(), simulated.axes
             if simulated.residual > body.solver.error:
                 _warn_of_unsettled(body.solver, simulated.residual)
-            elif not store.has(key):
+            elif store.folder is not None and store.load(key, tuple(matrix.shape), 1) is None:
                 store.save(key, matrix.numpy(), simulated.residual)
         place = self.turn @ center + self.shift
         return BodyMatrix(matrix, scene.complex_wavenumber, radius, place, self.turn @ axes)
@@ -176,9 +177,8 @@ def _simulated(body: StillBody) -> SimulatedT:
 
 
 def _warn_of_unsettled(solver: Solver, residual: float) -> None:
-    warnings.warn(
+    warn_user(
         f"no steady state of the waves of a body after {solver.max_periods} periods: estimated relative "
         f"error up to {residual:.1e}, tolerance {solver.error:g}; raise max_periods or tolerance",
         SteadyStateWarning,
-        stacklevel=4,  # about where the T-matrix is made
     )

@@ -17,7 +17,7 @@ from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.propagators.simulation import Run
 from autdtorch.propagators.store import Store
-from autdtorch.propagators.tmatrix.bodies import Body, are_outside, bodies_of
+from autdtorch.propagators.tmatrix.bodies import ObstacleGroup, are_outside, bodies_of
 from autdtorch.propagators.tmatrix.body import Placed, Solver, placed
 from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster, scattered_waves, waves_at
 from autdtorch.scene.drive import validate_drive
@@ -91,7 +91,8 @@ class TMatrixPropagator:
     @cached_property
     def bodies(self) -> TMatrixCluster:
         """The bodies of the scene."""
-        return TMatrixCluster(TMatrix(*body.matrix(self._store)) for body in placed_bodies(self.plan))
+        with torch.inference_mode(False):  # later calls may need gradients
+            return TMatrixCluster(TMatrix(*body.matrix(self._store)) for body in placed_bodies(self.plan))
 
     @property
     def planned_runs(self) -> int:
@@ -105,7 +106,7 @@ class TMatrixPropagator:
         return outside & are_outside(nodes, self._spheres).all()
 
     @cached_property
-    def _spheres(self) -> list[Body]:
+    def _spheres(self) -> list[ObstacleGroup]:
         return bodies_of(self.scene.obstacles)
 
     @overload
@@ -224,7 +225,8 @@ class TMatrixPropagator:
     @cached_property
     def _scattered(self) -> list[torch.Tensor]:
         """Outgoing waves (N, M) of all bodies, by all degrees and with the highest ones left out."""
-        return scattered_waves(self.bodies, self.scene.array, (0, _FEWER, 2 * _FEWER))
+        with torch.inference_mode(False):
+            return scattered_waves(self.bodies, self.scene.array, (0, _FEWER, 2 * _FEWER))
 
     @staticmethod
     def _left_out(waves: torch.Tensor, scattered: Sequence[torch.Tensor]) -> torch.Tensor:

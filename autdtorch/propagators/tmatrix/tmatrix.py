@@ -29,6 +29,7 @@ from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.files import read_arrays, write_arrays
+from autdtorch.utils.hints import renamed_keywords
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.units import turn_tensor, warn_user
@@ -212,6 +213,7 @@ class TMatrixCluster:
 
     bodies: tuple[TMatrix, ...]
 
+    @renamed_keywords(operators="bodies")
     def __init__(self, bodies: Iterable[TMatrix]) -> None:
         """Check the bodies; see the class."""
         bodies = members("bodies", bodies, TMatrix)
