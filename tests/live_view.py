@@ -18,10 +18,12 @@ IDLE = "document.querySelector('section.picture[aria-busy=false]') !== null"
 def opened(browser, explorer, width=1280, **options):
     """The page of a live view, with a fine result."""
     page = new_page(browser, viewport={"width": width, "height": 900}, **options)
-    page.goto(explorer.address)
-    wait_for_fine(page)
-    yield page
-    page.close()
+    try:
+        page.goto(explorer.address)
+        wait_for_fine(page)
+        yield page
+    finally:
+        page.close()
 
 
 def new_page(browser, **options):
@@ -36,10 +38,18 @@ def wait_for_fine(page):
 
 
 def wait_for_text(page, element, text, also="true"):
-    page.wait_for_function(
-        f"([name, text]) => document.getElementById(name)?.textContent.includes(text) && {also}",
-        arg=[element, text],
-    )
+    condition = f"([name, text]) => document.getElementById(name)?.textContent.includes(text) && {also}"
+    wait_in_page(page, condition, [element, text])
+
+
+def wait_in_page(page, condition, argument):
+    """Wait for a condition, by the clock: a page that is not drawn has no frames. Failures show it."""
+    try:
+        page.wait_for_function(condition, arg=argument, polling=100)
+    except Exception as error:
+        picture = page.locator("section.picture").first.evaluate("element => element.outerHTML.slice(0, 300)")
+        error.add_note(f"{picture}\n{page.inner_text('body')}")
+        raise
 
 
 @contextlib.contextmanager
@@ -48,9 +58,7 @@ def settled(page):
     wait_for_fine(page)
     before = page.get_attribute("section.picture", "data-shown")
     yield
-    page.wait_for_function(
-        "old => document.querySelector('section.picture').dataset.shown > Number(old)", arg=before
-    )
+    wait_in_page(page, "old => document.querySelector('section.picture').dataset.shown > Number(old)", before)
     wait_for_fine(page)
 
 

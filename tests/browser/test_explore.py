@@ -1,10 +1,12 @@
 """The live view in a real browser: what a user does there changes scene, drive and picture."""
 
+import threading
 from dataclasses import replace
 
 import numpy as np
 import torch
 from live_view import (
+    PATIENCE,
     center_of_box,
     drag,
     enter,
@@ -21,6 +23,7 @@ from live_view import (
 )
 
 import autdtorch as at
+from autdtorch.plot.explore import calculation
 
 
 def cube_of(explorer):
@@ -35,12 +38,15 @@ def test_it_opens_with_a_good_drive_and_its_readings(live):
     assert "cube and sphere" in page.title()
 
 
-def test_a_move_during_a_search_begins_it_again(live):
+def test_a_move_during_a_search_begins_it_again(live, monkeypatch):
     explorer, page = live
+    moved, observed = threading.Event(), calculation.observed
+    monkeypatch.setattr(calculation, "observed", lambda *call: moved.wait(PATIENCE) and observed(*call))
     page.click("#in_phase")
     page.click("#find")
     set_slider(page, "body_y", 47.0)
     wait_for(lambda: abs(cube_of(explorer).center[1] - 47e-3) < 1e-9)
+    moved.set()
     wait_for(lambda: not torch.equal(explorer.drive, torch.ones_like(explorer.drive)))
     explorer.ready()
     assert share_of_bound(explorer) > 0.97
