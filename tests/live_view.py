@@ -131,12 +131,18 @@ def share_of_bound(explorer):
 
 
 def center_of_box(page):
-    """A point of the window [pixels] where only the obstacle's grey is."""
-    seen = still(page)
-    grey = (np.ptp(seen, axis=-1) < 12) & (seen.mean(axis=-1) > 90) & (seen.mean(axis=-1) < 215)
-    blocks = np.lib.stride_tricks.sliding_window_view(grey, (25, 25))[::5, ::5].mean(axis=(2, 3))
+    """A point of the window [pixels] where only the obstacle's grey is, once it is drawn."""
+    blocks = np.zeros((1, 1))
+
+    def is_drawn():
+        nonlocal blocks
+        seen = still(page)
+        grey = (np.ptp(seen, axis=-1) < 12) & (seen.mean(axis=-1) > 90) & (seen.mean(axis=-1) < 215)
+        blocks = np.lib.stride_tricks.sliding_window_view(grey, (25, 25))[::5, ::5].mean(axis=(2, 3))
+        return blocks.max() > 0.9
+
+    wait_for(is_drawn)
     row, column = np.unravel_index(blocks.argmax(), blocks.shape)
-    assert blocks.max() > 0.9, "no obstacle is seen"
     box = page.locator(".view").bounding_box()
     return box["x"] + float(5 * column + 12), box["y"] + float(5 * row + 12)
 
