@@ -10,7 +10,7 @@ from scipy.special import j1
 
 from autdtorch.scene.arrays import TransducerArray, strengths_of
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.memory import require_memory
+from autdtorch.utils.process import require_memory
 from autdtorch.utils.spatial import distances
 from autdtorch.utils.units import real_wavenumber
 from autdtorch.utils.validation import (

@@ -11,7 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from autdtorch.cli.settings import is_given, scene_of, section_of, solver_of
 from autdtorch.io.drive_file import load_drive
 from autdtorch.plot.explore import explore
-from autdtorch.utils.signals import signals_restored
+from autdtorch.utils.process import signals_restored
 from autdtorch.utils.validation import invalid, path_of, require_known, within
 
 _KEYS = ("port", "browser", "drive")

@@ -12,13 +12,17 @@ import logging
 import os
 import re
 import shlex
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import hydra
+import psutil
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
@@ -28,7 +32,6 @@ import autdtorch
 from autdtorch.cli.arguments import command_of, is_sweep, prepare_streams, quoted
 from autdtorch.cli.config_files import CONFIGS, register
 from autdtorch.cli.errors import AGAIN, FULL_ERROR, FailedJob, in_one_line, stop
-from autdtorch.cli.workers import end_workers_with_us, leave_workers_alone
 
 logger = logging.getLogger(__name__)
 
@@ -183,3 +186,37 @@ def _job_folder(overrides: str) -> str:
 
 
 OmegaConf.register_new_resolver("job_folder", _job_folder, replace=True)
+
+
+_ENDING = ("SIGTERM", "SIGHUP")  # at Ctrl-C joblib ends its workers
+
+
+def end_workers_with_us() -> None:
+    """Kill the workers of this process at signals that end it; others would go on, and hold their folders.
+
+    Signals that are ignored, as by ``nohup``, or handled, stay so.
+    """
+    if threading.current_thread() is not threading.main_thread():  # which alone receives signals
+        return
+    for number in _signals():
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, _end)
+
+
+def leave_workers_alone() -> None:
+    """Take back `end_workers_with_us`."""
+    for number in _signals():
+        if signal.getsignal(number) is _end:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _signals() -> list[signal.Signals]:
+    return [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
+
+
+def _end(number: int, _: FrameType | None) -> None:
+    for worker in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.Error):  # it has ended
+            worker.kill()
+    signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), number)

@@ -27,7 +27,7 @@ from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources, WaveState
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
-from autdtorch.utils.threads import spread
+from autdtorch.utils.process import spread
 
 # Memory [bytes] of the record of a segment; larger only where the stored states would take more
 _SEGMENT_BYTES = 128 * 2**20

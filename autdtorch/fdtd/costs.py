@@ -14,9 +14,8 @@ from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels.choice import make_kernel
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import MOST_JUDGED, phasors_kept
-from autdtorch.utils.cached import cached_property
+from autdtorch.utils.process import cached_property, thread_count
 from autdtorch.utils.spatial import doubled_normals
-from autdtorch.utils.threads import thread_count
 
 # Fitted to transfer matrices of boxes and domains at 0.6 to 2 mm: `scripts/check.py estimate` reports errors.
 

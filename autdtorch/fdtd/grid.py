@@ -16,7 +16,7 @@ from autdtorch.fdtd.placement import grid_offset
 from autdtorch.fdtd.region import Region, Shape, bounds
 from autdtorch.fdtd.stencil import places_of
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.cached import cached_property
+from autdtorch.utils.process import cached_property
 from autdtorch.utils.validation import invalid, positive
 
 logger = logging.getLogger(__name__)

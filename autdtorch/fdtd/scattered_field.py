@@ -24,7 +24,7 @@ from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.turning import turned_shape
 from autdtorch.utils.apertures import Apertures, Discs
 from autdtorch.utils.array_types import COMPLEX, Array, Index
-from autdtorch.utils.cached import cached_property
+from autdtorch.utils.process import cached_property
 
 # Distance [cells] from the rim of the interior within which points are not read from the grid. Interpolation
 # is poor there, and the Huygens surface, two cells from the rim, is farther than half a cell from such a

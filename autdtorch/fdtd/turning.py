@@ -17,7 +17,7 @@ from torch import Tensor
 
 from autdtorch.fdtd.region import Region, Shape
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.cached import cached_property
+from autdtorch.utils.process import cached_property
 from autdtorch.utils.spatial import doubled_normals
 from autdtorch.utils.validation import Vector
 

@@ -18,8 +18,7 @@ from filelock import FileLock
 from autdtorch.objectives.objective import validate_magnitudes
 from autdtorch.scene.drive import validate_single_drive
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.files import held
-from autdtorch.utils.json_lines import JsonLines, line_of, row_of
+from autdtorch.utils.files import JsonLines, held, line_of, row_of
 from autdtorch.utils.validation import integer_at_least, not_negative, real_tensor, require_kind
 
 _ORIGIN, _NUMBER = "origin", "evaluation"

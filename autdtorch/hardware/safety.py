@@ -19,7 +19,7 @@ import torch
 from autdtorch.hardware.link import Link
 from autdtorch.hardware.played import AmplitudeScale
 from autdtorch.hardware.sensors.sensor import Sensor, SensorError, checked_reading
-from autdtorch.utils.signals import send_again
+from autdtorch.utils.process import send_again
 from autdtorch.utils.validation import (
     integer_at_least,
     invalid,

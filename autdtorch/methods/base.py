@@ -24,7 +24,7 @@ from autdtorch.objectives.objective import (
 from autdtorch.objectives.perturbations import quantised, simulated_matrix
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
-from autdtorch.utils.memory import require_memory
+from autdtorch.utils.process import require_memory
 from autdtorch.utils.validation import (
     complex_tensor,
     integer_at_least,

@@ -20,7 +20,7 @@ from autdtorch.objectives.goals import scores_of
 from autdtorch.objectives.objective import GoalFunction
 from autdtorch.scene.drive import drive_from_phases, phases_of
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.threads import one_library_thread
+from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import integer_at_least, invalid, number_between, require_one_of
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from autdtorch.methods.seeds import generators_of, uniform
 from autdtorch.objectives.goals import scores_of, slope_of
 from autdtorch.objectives.objective import GoalFunction
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.threads import one_library_thread
+from autdtorch.utils.process import one_library_thread
 
 # First and last value, in equal ratios between: smoothing of `Goal.slope`, and step in amplitudes
 _SMOOTHING = (0.3, 1e-4)

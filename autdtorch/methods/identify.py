@@ -21,7 +21,7 @@ from autdtorch.methods.seeds import generators_of, restored, states_of
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import scores_of
 from autdtorch.objectives.objective import GoalFunction
-from autdtorch.utils.threads import one_library_thread
+from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import invalid
 
 _LEAST = 64  # evaluations without the setting; more where transducers need them

@@ -10,7 +10,7 @@ import torch
 
 from autdtorch.methods.doubtful_readings import Magnitudes, gross_outliers, range_ends, reads_finely
 from autdtorch.methods.matrix_posterior import MatrixPosterior, MatrixPrior
-from autdtorch.utils.threads import one_library_thread
+from autdtorch.utils.process import one_library_thread
 
 _OF_POSTERIOR = ("factors", "entries", "variance")  # its tensors, from which the next fit goes on
 _SCREENINGS = 8  # fits, each without the outliers that the one before shows

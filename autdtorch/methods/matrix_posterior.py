@@ -8,7 +8,7 @@ import torch
 
 from autdtorch.methods.doubtful_readings import Magnitudes
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.threads import one_library_thread
+from autdtorch.utils.process import one_library_thread
 
 _STEPS = 10  # of the Gauss-Newton search
 _HALVINGS = 6  # of a step that raises the misfit

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 import torch
 
-from autdtorch.utils.memory import require_memory
+from autdtorch.utils.process import require_memory
 from autdtorch.utils.validation import integer_at_least, integers, invalid
 
 Trials: TypeAlias = int | Sequence[int]

@@ -29,7 +29,7 @@ import numpy as np
 import scipy.optimize
 
 from autdtorch.utils.array_types import Array, ComplexArray
-from autdtorch.utils.threads import one_library_thread
+from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import ArrayLike, complex_tensor
 
 #: Orders of Schatten norms that approach the largest eigenvalue, which has kinks at its minima.

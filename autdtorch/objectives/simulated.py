@@ -10,7 +10,7 @@ from autdtorch.objectives.objective import observe_drives
 from autdtorch.propagators import Propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.display import counted
-from autdtorch.utils.threads import one_library_thread
+from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import invalid, require_kind, require_one_of
 
 _PRODUCTS = 2**16  # of transfer matrix and drives, that are computed at once

@@ -38,9 +38,8 @@ from autdtorch.scene.obstacles.moving import circumscribed, is_movable, shifted
 from autdtorch.scene.scene import require_clear
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL, Array, Index
-from autdtorch.utils.cached import cached_property
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.threads import one_library_thread, spread
+from autdtorch.utils.process import cached_property, one_library_thread, spread
 
 logger = logging.getLogger(__name__)
 

@@ -14,8 +14,7 @@ from autdtorch.fdtd.stepping import Assembly, assemble
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
 from autdtorch.scene.scene import require_inside
 from autdtorch.utils.apertures import Apertures
-from autdtorch.utils.cached import cached_property
-from autdtorch.utils.threads import one_library_thread
+from autdtorch.utils.process import cached_property, one_library_thread
 
 
 class DomainSimulation(Simulation):

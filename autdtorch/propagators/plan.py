@@ -23,8 +23,7 @@ from autdtorch.propagators.tmatrix.bodies import fewer_waves, waves_to_simulate
 from autdtorch.scene.arrays import apertures_of
 from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.cached import cached_property
-from autdtorch.utils.memory import require_memory
+from autdtorch.utils.process import cached_property, require_memory
 from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import (
     integer_at_least,

@@ -21,10 +21,8 @@ from autdtorch.propagators.store import Store
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.cached import cached_property
 from autdtorch.utils.display import counted
-from autdtorch.utils.memory import require_memory
-from autdtorch.utils.threads import one_library_thread
+from autdtorch.utils.process import cached_property, one_library_thread, require_memory
 from autdtorch.utils.validation import ArrayLike, boolean, points_grid
 
 _LONGER = 1.5

@@ -23,9 +23,9 @@ from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.cached import cached_property
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.display import counted
+from autdtorch.utils.process import cached_property
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.validation import ArrayLike, invalid, points_tensor
 

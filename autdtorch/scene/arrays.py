@@ -16,7 +16,7 @@ from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.display import counted
 from autdtorch.utils.hints import suggesting
-from autdtorch.utils.memory import require_memory
+from autdtorch.utils.process import require_memory
 from autdtorch.utils.spatial import require_distinct
 from autdtorch.utils.validation import (
     ArrayLike,

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import torch
 
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.memory import require_memory
+from autdtorch.utils.process import require_memory
 from autdtorch.utils.units import angle as checked_angle
 from autdtorch.utils.validation import (
     ArrayLike,

@@ -10,8 +10,7 @@ from typing import Any
 
 import autdtorch
 from autdtorch.utils.digest import digest_of, package_versions, source_digest
-from autdtorch.utils.files import replace_file
-from autdtorch.utils.json_lines import line_of, row_of
+from autdtorch.utils.files import line_of, replace_file, row_of
 
 PROVENANCE_FILE = "provenance.json"
 

@@ -36,7 +36,7 @@ from autdtorch.study.results import MethodResult, SceneResult, Simulation, Study
 from autdtorch.study.trial_file import TrialFile
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.display import counted
-from autdtorch.utils.memory import require_memory
+from autdtorch.utils.process import require_memory
 from autdtorch.utils.progress import Progress, show_progress
 from autdtorch.utils.spatial import nearest
 from autdtorch.utils.validation import (

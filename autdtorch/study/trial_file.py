@@ -15,7 +15,7 @@ from autdtorch.methods.solution import Solution, joined
 from autdtorch.objectives.metrics import focus_metrics
 from autdtorch.study.results import stored_solution
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.json_lines import JsonLines
+from autdtorch.utils.files import JsonLines
 from autdtorch.utils.validation import integer_at_least, invalid, not_negative, real_tensor, require_kind
 
 TRIALS_FILE = "trials.jsonl"

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 from tqdm.std import TqdmDefaultWriteLock
 
-from autdtorch.utils.threads import in_forked
+from autdtorch.utils.process import in_forked
 
 logger = logging.getLogger(__name__)
 

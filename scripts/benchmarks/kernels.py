@@ -22,7 +22,7 @@ from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import Assembly, assemble, assemble_on
 from autdtorch.propagators.scene_region import region_of
-from autdtorch.utils.threads import spread
+from autdtorch.utils.process import spread
 
 DOCUMENT = "performance.md"
 OPTIONS = {"--seconds": {"type": float, "default": 0.4, "help": "of each repeat"}}

@@ -30,7 +30,7 @@ from autdtorch.study.provenance import PROVENANCE_FILE
 from autdtorch.study.results_file import RESULTS_FILE
 from autdtorch.study.run import run_study
 from autdtorch.study.trial_file import TRIALS_FILE
-from autdtorch.utils.json_lines import SET_ASIDE
+from autdtorch.utils.files import SET_ASIDE
 
 LOG_FILE = "trial.jsonl"
 

@@ -28,7 +28,7 @@ class Page:
 
     def write(self, *parts: str) -> None:
         """Write a copy of the page with the paragraphs as the block, after machine, date and command."""
-        from autdtorch.utils.threads import thread_count
+        from autdtorch.utils.process import thread_count
 
         machine = f"{os.cpu_count()} cores ({thread_count()} threads)"
         measured = f"Measured on {machine}, {date.today().isoformat()}:\n\n    {command_line()}"

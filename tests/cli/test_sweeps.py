@@ -211,7 +211,7 @@ def test_an_unfinished_study_is_left_out(run, tmp_path, capsys):
 #: As a sweep does it, without the packages of a sweep. A suite that `nohup` started ignores SIGHUP.
 WORKERS = """
 import signal, subprocess, sys, time
-from autdtorch.cli.workers import end_workers_with_us
+from autdtorch.cli.main import end_workers_with_us
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 worker = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(300)"])
 end_workers_with_us()

@@ -13,7 +13,7 @@ from filelock import FileLock, Timeout
 from autdtorch.hardware import EmulatedSensor, LogError
 from autdtorch.methods.run import observed
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.json_lines import SET_ASIDE, line_of, row_of
+from autdtorch.utils.files import SET_ASIDE, line_of, row_of
 
 
 def full_on(rows: int = 1) -> torch.Tensor:

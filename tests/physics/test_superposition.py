@@ -51,7 +51,7 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch):
     targets, origins, amplitude = places(3000, 200)
     sums = []
     for threads in (1, 2, 5):
-        monkeypatch.setattr("autdtorch.utils.threads.thread_count", lambda count=threads: count)
+        monkeypatch.setattr("autdtorch.utils.process.thread_count", lambda count=threads: count)
         sums += [superposition(targets, origins, amplitude, 740.0, dtype=torch.float32)]
         sums += [superposition(origins, targets, amplitude[:1].repeat(3000, 1), 740.0)]
     for one, other in (sums[2:4], sums[4:]):

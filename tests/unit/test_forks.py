@@ -20,8 +20,8 @@ from tqdm.std import TqdmDefaultWriteLock
 
 import autdtorch.fdtd.kernels.compiled  # what the two name to `os.register_at_fork`
 import autdtorch.utils.progress  # noqa: F401
-from autdtorch.utils import threads
-from autdtorch.utils.cached import cached_property
+from autdtorch.utils import process
+from autdtorch.utils.process import cached_property
 
 pytestmark = [
     pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks here"),
@@ -106,7 +106,7 @@ def test_threads_that_compute_a_property_at_once_get_the_same_value() -> None:
 
 
 def one_thread() -> None:
-    with threads.one_library_thread():
+    with process.one_library_thread():
         pass
 
 
@@ -121,7 +121,7 @@ def kernel_compiled() -> None:
 
 
 LOCKS = {
-    "number of threads": (threads._outside._lock, one_thread),
+    "number of threads": (process._outside._lock, one_thread),
     "compiler": (global_compiler_lock, kernel_compiled),
 }
 

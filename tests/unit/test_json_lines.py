@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autdtorch.utils.json_lines import SET_ASIDE, JsonLines, line_of
+from autdtorch.utils.files import SET_ASIDE, JsonLines, line_of
 
 ROWS = [{"number": 0, "text": "°\n"}, {"number": 1, "values": [0.1, -0.0, 5e-324]}, {"number": 2}]
 HEAD = line_of({"origin": "here"}) + b"\n"

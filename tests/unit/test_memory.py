@@ -13,7 +13,7 @@ from small_scenes import CUBE, small_scene
 import autdtorch as at
 from autdtorch.propagators import Propagator
 from autdtorch.study.run import run_study
-from autdtorch.utils import memory
+from autdtorch.utils import process
 
 AIR = small_scene()
 OBJECTIVE = at.SimulatedObjective(AIR, at.make_propagator(AIR))
@@ -55,7 +55,7 @@ def test_too_much_memory_is_refused_with_both_figures(what: str) -> None:
 @pytest.mark.parametrize("propagator", [FREE, BOX], ids=["free space", "box"])
 def test_many_points_are_refused(propagator: Propagator, monkeypatch: pytest.MonkeyPatch) -> None:
     points = at.circle_points((0.1, 0, 0), 0.02, 5000, (1, 0, 0))
-    monkeypatch.setattr(memory, "available_memory", lambda: 1_000_000)
+    monkeypatch.setattr(process, "available_memory", lambda: 1_000_000)
     for call in (propagator.transfer_matrix, functools.partial(propagator.field, DRIVE.expand(3, 4))):
         with pytest.raises(ValueError, match=r"^points: \(5000, 3\); needs about"):
             call(points)
@@ -68,7 +68,7 @@ def test_many_transducers_need_no_matrix_of_their_distances() -> None:
 
 def test_the_first_evaluations_by_strength_count(monkeypatch: pytest.MonkeyPatch) -> None:
     # each trial plays every transducer alone, all in one call of the objective: 16 bytes x M^2, and copies
-    monkeypatch.setattr(memory, "available_memory", lambda: 10_000_000)
+    monkeypatch.setattr(process, "available_memory", lambda: 10_000_000)
     array = at.TransducerArray.grid((16, 16), 10e-3, (0, 0, 0))
     scene = at.Scene(array, AIR.medium, 40e3, [(0.1, 0.0, 0.0)])
     objective = at.SimulatedObjective(scene, at.make_propagator(scene))
@@ -80,7 +80,7 @@ def test_the_first_evaluations_by_strength_count(monkeypatch: pytest.MonkeyPatch
 def test_a_study_needs_the_memory_of_a_block_of_its_trials(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(memory, "available_memory", lambda: 20_000_000)
+    monkeypatch.setattr(process, "available_memory", lambda: 20_000_000)
     with pytest.raises(ValueError, match=r"^evaluations: 3000; needs about"):
         at.random_search(OBJECTIVE, evaluations=3000, trials=300)
     method = functools.partial(at.random_search, evaluations=3000)
@@ -91,7 +91,7 @@ def test_a_study_needs_the_memory_of_a_block_of_its_trials(
 def test_a_chosen_spacing_is_refused_by_the_tolerance(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = small_scene((CUBE,))
     coarse = at.estimate(scene, 2e-3, method="box").memory
-    monkeypatch.setattr(memory, "available_memory", lambda: int(6 * coarse))
+    monkeypatch.setattr(process, "available_memory", lambda: int(6 * coarse))
     with pytest.raises(ValueError, match=r"^tolerance: 0\.0001; needs about"):
         at.make_propagator(scene, "box", spacing=None, tolerance=1e-4)
     reached = at.make_propagator(scene, "box", spacing=None, tolerance=1e-4, seconds=1e3)
@@ -108,21 +108,21 @@ def group(folder: Path, most: object, used: int, inactive: int) -> None:
 @pytest.fixture
 def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of control groups, with no other limit of the process."""
-    monkeypatch.setattr(memory, "_MOUNT", tmp_path / "fs")
-    monkeypatch.setattr(memory, "_CGROUP", tmp_path / "cgroup")
-    monkeypatch.setattr(memory, "_left_to_process", lambda: iter(()))
+    monkeypatch.setattr(process, "_MOUNT", tmp_path / "fs")
+    monkeypatch.setattr(process, "_CGROUP", tmp_path / "cgroup")
+    monkeypatch.setattr(process, "_left_to_process", lambda: iter(()))
     (tmp_path / "fs").mkdir()
     return tmp_path
 
 
 def test_the_tightest_of_nested_groups_counts(groups: Path) -> None:
-    assert memory.available_memory() > 10_000_000  # without groups, the machine's
+    assert process.available_memory() > 10_000_000  # without groups, the machine's
     (groups / "cgroup").write_text("0::/job/step\n", encoding="utf-8")
     group(groups / "fs/job", most=5_000_000, used=4_000_000, inactive=500_000)
     group(groups / "fs/job/step", most="max", used=1_000_000, inactive=0)
-    assert memory.available_memory() == 1_500_000  # what is cached of files can be dropped
+    assert process.available_memory() == 1_500_000  # what is cached of files can be dropped
     group(groups / "fs/job", most=1_000_000, used=2_000_000, inactive=0)
-    assert memory.available_memory() == 0
+    assert process.available_memory() == 0
 
 
 def test_groups_of_the_first_version_count(groups: Path) -> None:
@@ -132,4 +132,4 @@ def test_groups_of_the_first_version_count(groups: Path) -> None:
     (own / "memory.limit_in_bytes").write_text("3000000\n", encoding="ascii")
     (own / "memory.usage_in_bytes").write_text("2000000\n", encoding="ascii")
     (own / "memory.stat").write_text("cache 7\ntotal_inactive_file 0\n", encoding="ascii")
-    assert memory.available_memory() == 1_000_000
+    assert process.available_memory() == 1_000_000

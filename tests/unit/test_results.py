@@ -21,7 +21,7 @@ from autdtorch.study import provenance as origins
 from autdtorch.study.provenance import PROVENANCE_FILE, Provenance, load_provenance
 from autdtorch.study.results import MethodResult, SceneResult, Simulation, StudyResult
 from autdtorch.study.results_file import RESULTS_FILE, load_results, save_results
-from autdtorch.utils.json_lines import line_of
+from autdtorch.utils.files import line_of
 
 FREE_SPACE = Simulation("free_space", 8.5e-3, None, None, (), 0.25, 0.5)
 RUN_PAIR = (Run(183, 1.9e-3, True, 4.5), Run(600, 3e-2, False, 9.0))

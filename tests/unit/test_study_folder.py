@@ -23,7 +23,7 @@ from autdtorch.study.provenance import PROVENANCE_FILE, load_provenance
 from autdtorch.study.results_file import RESULTS_FILE, load_results
 from autdtorch.study.run import run_study
 from autdtorch.study.trial_file import TRIALS_FILE
-from autdtorch.utils.json_lines import SET_ASIDE
+from autdtorch.utils.files import SET_ASIDE
 
 FILES = (RESULTS_FILE, TRIALS_FILE, PROVENANCE_FILE)
 SIMULATED = {"method": "auto", "spacing": 2e-3, "tolerance": 0.2, "kernel": "reference"}

@@ -10,12 +10,12 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info
 
-from autdtorch.utils import threads
+from autdtorch.utils import process
 
 
 @pytest.fixture(autouse=True)
 def four_threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(threads, "_processors", lambda: 8)
+    monkeypatch.setattr(process, "_processors", lambda: 8)
     before = torch.get_num_threads()
     torch.set_num_threads(4)
     yield
@@ -31,11 +31,11 @@ def in_new_thread() -> int:
 
 
 def test_it_is_one_inside_and_what_it_was_outside() -> None:
-    with threads.one_library_thread():
+    with process.one_library_thread():
         assert torch.get_num_threads() == 1
-        assert threads.thread_count() == 4
-        with threads.one_library_thread():
-            assert threads.thread_count() == 4
+        assert process.thread_count() == 4
+        with process.one_library_thread():
+            assert process.thread_count() == 4
         assert torch.get_num_threads() == 1
     assert torch.get_num_threads() == in_new_thread() == 4
 
@@ -45,8 +45,8 @@ def test_numpy_has_one_thread_inside_and_what_it_had_outside() -> None:
         return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
 
     before = counts()
-    with threads.one_library_thread():
-        with threads.one_library_thread():
+    with process.one_library_thread():
+        with process.one_library_thread():
             pass
         assert all(count == 1 for count in counts())
     assert counts() == before
@@ -57,13 +57,13 @@ def test_threads_that_leave_in_the_order_they_entered_leave_nothing_behind() -> 
     seen = []
 
     def second() -> None:
-        with threads.one_library_thread():
-            seen.append(threads.thread_count())
+        with process.one_library_thread():
+            seen.append(process.thread_count())
             entered.set()
             left.wait(10)
 
     other = threading.Thread(target=second)
-    with threads.one_library_thread():
+    with process.one_library_thread():
         other.start()
         assert entered.wait(10)
     left.set()
@@ -75,7 +75,7 @@ def test_threads_that_leave_in_the_order_they_entered_leave_nothing_behind() -> 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks here")
 @pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")
 def test_a_child_has_one_thread_also_after_leaving_what_its_parent_had_entered() -> None:
-    with threads.one_library_thread():
+    with process.one_library_thread():
         child = os.fork()
     if child == 0:
         libraries = [each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"]

@@ -30,7 +30,7 @@ def setting(name: str, value: object) -> Iterator[None]:
 
 @contextlib.contextmanager
 def threads(count: int) -> Iterator[None]:
-    processors = mock.patch("autdtorch.utils.threads._processors", return_value=count)
+    processors = mock.patch("autdtorch.utils.process._processors", return_value=count)
     with setting("num_threads", count), processors:
         yield
 

@@ -8,7 +8,7 @@ import torch
 from autdtorch.methods.base import NEAR_TIE
 from autdtorch.methods.solution import Solution
 from autdtorch.study.trial_file import TRIALS_FILE, TrialFile
-from autdtorch.utils.json_lines import SET_ASIDE, line_of, row_of
+from autdtorch.utils.files import SET_ASIDE, line_of, row_of
 
 ORIGIN = "the study's"
 SHAPES = {"a": (3, 2)}

@@ -19,7 +19,7 @@ from autdtorch.fdtd.assembly.prisms import Prisms, prisms, stacked
 from autdtorch.fdtd.assembly.sections import MaterialKey, Section
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.cached import cached_property
+from autdtorch.utils.process import cached_property
 
 _ROUNDING = 1e-6  # Distance [cells] up to which planes are one
 # Distance [cells] to which planes move from vertices: an edge then lies in an element

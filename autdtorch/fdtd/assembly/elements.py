@@ -25,8 +25,8 @@ from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Region, bounds
 from autdtorch.fdtd.stencil import Stencil, places_of
 from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.process import spread
 from autdtorch.utils.progress import show_progress
-from autdtorch.utils.threads import spread
 
 _CHUNK = 8192  # Interface elements assembled at a time
 # Depths below its surface [cells]: a body that contains points this deep is thick. Sound would pass through

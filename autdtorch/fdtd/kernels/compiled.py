@@ -16,7 +16,7 @@ from numba.core import event
 from numba.core.caching import IndexDataCacheFile
 from numba.core.compiler_lock import global_compiler_lock
 
-from autdtorch.utils.threads import hold_at_fork
+from autdtorch.utils.process import hold_at_fork
 
 logger = logging.getLogger(__name__)
 

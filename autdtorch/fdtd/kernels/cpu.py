@@ -28,7 +28,7 @@ from autdtorch.fdtd.kernels.cpu_layers import FlatMemory, plane_profiles, rows_p
 from autdtorch.fdtd.kernels.cpu_sweep import sweep_planes
 from autdtorch.fdtd.stencil import OFFSETS
 from autdtorch.utils.array_types import AnyArray
-from autdtorch.utils.threads import spread, thread_count
+from autdtorch.utils.process import spread, thread_count
 
 # Fewest cells and planes of a chunk, for which a second thread and the sums at its ends pay
 _CHUNK_CELLS, _CHUNK_PLANES = 200_000, 32

@@ -19,7 +19,7 @@ from torch import Tensor
 from autdtorch.fdtd.kernels.compiled import INNER, entry
 from autdtorch.utils.apertures import PATTERN_TERMS, Discs
 from autdtorch.utils.array_types import COMPLEX, AnyArray
-from autdtorch.utils.threads import even_parts, spread
+from autdtorch.utils.process import even_parts, spread
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 _PAIRS = 100_000  # Pairs of a point and a source in a task: less than a millisecond

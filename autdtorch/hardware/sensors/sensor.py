@@ -16,7 +16,7 @@ import torch
 
 from autdtorch.objectives.objective import validate_magnitudes
 from autdtorch.objectives.perturbations import SNRS, random_rms
-from autdtorch.utils.signals import send
+from autdtorch.utils.process import send
 from autdtorch.utils.validation import (
     finite_number,
     integer_at_least,

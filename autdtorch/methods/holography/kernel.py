@@ -17,7 +17,7 @@ from numba import njit
 
 from autdtorch.fdtd.kernels.compiled import INNER, entry
 from autdtorch.methods.holography.algorithms import DAMPING, TINY, UNREACHED
-from autdtorch.utils.threads import even_parts, spread, thread_count
+from autdtorch.utils.process import even_parts, spread, thread_count
 
 _LANES = np.uint64(16)  # Sets of a block
 _TASKS = 4  # Tasks a thread, so that none waits long for another

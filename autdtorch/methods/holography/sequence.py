@@ -17,7 +17,7 @@ import torch
 from autdtorch.methods.holography.algorithms import DAMPING, TINY, UNREACHED
 from autdtorch.methods.holography.holography import checked_targets
 from autdtorch.utils.array_types import Array, ComplexArray
-from autdtorch.utils.threads import one_library_thread
+from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import (
     ArrayLike,
     boolean,

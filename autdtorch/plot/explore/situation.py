@@ -13,7 +13,7 @@ from autdtorch.scene.obstacles import Mesh, Obstacle
 from autdtorch.scene.obstacles.moving import is_movable, is_turnable, shifted, turned
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
-from autdtorch.utils.cached import cached_property
+from autdtorch.utils.process import cached_property
 from autdtorch.utils.validation import ArrayLike, Vector, finite_vector, require_one_of
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}

@@ -23,7 +23,7 @@ from autdtorch.plot.view3d.opengl import require_rendering
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.files import in_folder
 from autdtorch.utils.hints import with_extra
-from autdtorch.utils.signals import signals_restored
+from autdtorch.utils.process import signals_restored
 from autdtorch.utils.validation import (
     ArrayLike,
     boolean,

@@ -23,8 +23,7 @@ from autdtorch.scene.obstacles import Obstacle, Sphere
 from autdtorch.scene.obstacles.moving import at_rest, circumscribed, is_movable, shifted
 from autdtorch.scene.scene import OverlapWarning, ScaleWarning, Scene
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.cached import cached_property
-from autdtorch.utils.memory import require_memory
+from autdtorch.utils.process import cached_property, require_memory
 from autdtorch.utils.units import warn_user
 
 logger = logging.getLogger(__name__)

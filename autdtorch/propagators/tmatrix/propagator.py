@@ -23,8 +23,7 @@ from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster, scatt
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import require_clear
 from autdtorch.utils.array_types import COMPLEX, REAL
-from autdtorch.utils.cached import cached_property
-from autdtorch.utils.threads import one_library_thread
+from autdtorch.utils.process import cached_property, one_library_thread
 from autdtorch.utils.validation import ArrayLike, boolean, differentiable_points, points_grid, points_tensor
 
 logger = logging.getLogger(__name__)

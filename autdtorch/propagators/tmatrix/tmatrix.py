@@ -30,8 +30,7 @@ from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.files import read_arrays, write_arrays
 from autdtorch.utils.hints import renamed_keywords
-from autdtorch.utils.memory import require_memory
-from autdtorch.utils.threads import one_library_thread
+from autdtorch.utils.process import one_library_thread, require_memory
 from autdtorch.utils.units import turn_tensor, warn_user
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,

@@ -26,9 +26,8 @@ from autdtorch.propagators.store import Store
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.cached import cached_property
+from autdtorch.utils.process import cached_property, one_library_thread, spread
 from autdtorch.utils.progress import show_progress
-from autdtorch.utils.threads import one_library_thread, spread
 
 
 @dataclass(frozen=True)

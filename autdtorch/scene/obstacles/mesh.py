@@ -18,10 +18,10 @@ from autdtorch.scene.obstacles.mesh_file import read_mesh
 from autdtorch.scene.obstacles.mesh_repair import repaired
 from autdtorch.scene.obstacles.mesh_solid import Triangles, outer_parts, solid_of
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.cached import cached_property
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import replacing
 from autdtorch.utils.hints import suggesting
+from autdtorch.utils.process import cached_property
 from autdtorch.utils.spatial import doubled_normals
 from autdtorch.utils.units import angles
 from autdtorch.utils.validation import Vector, boolean, finite_vector, invalid, positive, real_tensor, within

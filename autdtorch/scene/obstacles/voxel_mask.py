@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from autdtorch.scene.obstacles.base import Obstacle
 from autdtorch.scene.obstacles.voxel_surface import ThinError, VoxelCubes, VoxelSurface
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.cached import cached_property
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import read_arrays, write_arrays
 from autdtorch.utils.hints import suggesting
+from autdtorch.utils.process import cached_property
 from autdtorch.utils.validation import (
     Vector,
     boolean,

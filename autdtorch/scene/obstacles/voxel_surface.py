@@ -21,7 +21,7 @@ from scipy.sparse import coo_array, csr_array
 from autdtorch.scene.obstacles.mesh import MeshDistance
 from autdtorch.scene.obstacles.primitives import BOX_TRIANGLES
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.cached import cached_property
+from autdtorch.utils.process import cached_property
 from autdtorch.utils.spatial import doubled_normals
 
 _BLUR = 0.5  # Standard deviation of the first smoothing [voxels]

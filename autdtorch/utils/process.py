@@ -1,4 +1,4 @@
-"""Work spread over threads, and forks of a process while its other threads compute.
+"""This process: its signals, forks, threads and available memory.
 
 Threads live for one call, so that none spins while it waits and none is missing after a fork.
 
@@ -8,22 +8,75 @@ thread held is never released there, and whoever acquires it waits forever.
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import functools
 import itertools
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
+from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, Self, TypeVar, overload
 
+import psutil
 import torch
 from threadpoolctl import ThreadpoolController
 
-from autdtorch.utils.signals import restore_handlers, saved_handlers, send_again
+from autdtorch.utils.validation import invalid
+
+_LATER = 1e-3  # [s]
+
+
+def saved_handlers(numbers: Iterable[int]) -> dict[int, Any]:
+    """Return the handlers of signals by number; none outside the main thread, which alone may set them."""
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    return {number: signal.getsignal(number) for number in numbers}
+
+
+def restore_handlers(handlers: dict[int, Any]) -> None:
+    """Set handlers of `saved_handlers` again, and empty the dictionary."""
+    while handlers:
+        number, handler = handlers.popitem()
+        signal.signal(number, handler or signal.SIG_DFL)  # None where it is not Python's
+
+
+@contextlib.contextmanager
+def signals_restored() -> Iterator[None]:
+    """Restore the handlers of SIGINT and SIGTERM, and the descriptor that wakes the main thread."""
+    if not (handlers := saved_handlers((signal.SIGINT, signal.SIGTERM))):
+        yield
+        return
+    signal.set_wakeup_fd(descriptor := signal.set_wakeup_fd(-1))
+    try:
+        yield
+    finally:
+        restore_handlers(handlers)
+        signal.set_wakeup_fd(descriptor)
+
+
+def send_again(number: int) -> None:
+    """Send a signal to the main thread 1 ms later, where Python would drop what its handler raises now."""
+    # a thread without the locks of `threading`, which the main thread may hold
+    _thread.start_new_thread(_send_later, (signal.Signals(number),))
+
+
+def _send_later(number: signal.Signals) -> None:
+    time.sleep(_LATER)
+    send(number)
+
+
+def send(number: signal.Signals) -> None:
+    """Send a signal to the main thread."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+    else:
+        _thread.interrupt_main(number)  # calls the handler once a wait has ended
 
 
 class _Lock(Protocol):
@@ -206,3 +259,88 @@ def even_parts(count: int, parts: int) -> list[tuple[int, int]]:
 
 def _processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+T_co = TypeVar("T_co", covariant=True)
+
+
+class cached_property(functools.cached_property[T_co]):  # noqa: TID251
+    """`functools.cached_property` as of Python 3.12, also in 3.11.
+
+    In 3.11 all objects of a class share a lock. Simulations in threads wait for each other, and a process
+    that is forked while another thread holds the lock waits forever. Without it, two threads may compute a
+    value at once; both get the first one.
+    """
+
+    @overload
+    def __get__(self, instance: None, owner: type[Any] | None = None) -> Self: ...
+
+    @overload
+    def __get__(self, instance: object, owner: type[Any] | None = None) -> T_co: ...
+
+    def __get__(self, instance: object, owner: type[Any] | None = None) -> Self | T_co:
+        """Compute and store the value, which Python then reads without this call."""
+        if instance is None:
+            return self
+        assert self.attrname is not None  # Python sets it when the class is made
+        value: T_co = instance.__dict__.setdefault(self.attrname, self.func(instance))
+        return value
+
+
+_NEGLIGIBLE = 1e6  # bytes; asking the system takes a millisecond
+
+_CGROUP = Path("/proc/self/cgroup")
+_MOUNT = Path("/sys/fs/cgroup")
+# Files of a control group by version: the limit, the memory in use, and the reclaimable part of it.
+_FILES_1 = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+_FILES_2 = ("memory.max", "memory.current", "inactive_file")
+
+
+def available_memory() -> int:
+    """Return the memory [bytes] that the machine, control groups and limits leave to this process."""
+    left = [psutil.virtual_memory().available, *_left_in_groups(), *_left_to_process()]
+    return int(max(0, min(left)))
+
+
+def require_memory(field: str, value: object, needed: float, unit: str = "") -> None:
+    """Refuse an argument that needs more memory [bytes] than is available."""
+    if needed < _NEGLIGIBLE:
+        return
+    if needed > (available := available_memory()):
+        left = f"this process may use {available / 1e9:.3g} GB"
+        raise invalid(field, value, f"needs about {needed / 1e9:.3g} GB of memory, {left}", unit)
+
+
+def _left_in_groups() -> Iterator[int]:
+    """Yield the memory left in each control group of this process."""
+    with contextlib.suppress(OSError):  # not Linux
+        for line in _CGROUP.read_text("utf-8").splitlines():
+            _, controllers, path = line.split(":", 2)
+            if not controllers:
+                root, files = _MOUNT, _FILES_2
+            elif "memory" in controllers.split(","):
+                root, files = _MOUNT / "memory", _FILES_1
+            else:
+                continue
+            here = root / path.lstrip("/")
+            for folder in (here, *here.parents):
+                if folder.is_relative_to(root):
+                    yield from _left_in_group(folder, *files)
+
+
+def _left_in_group(folder: Path, limit: str, usage: str, inactive: str) -> Iterator[int]:
+    # a group without a limit has no such file, or "max" in it
+    with contextlib.suppress(OSError, ValueError):
+        most, used = (int((folder / name).read_text("ascii")) for name in (limit, usage))
+        statistics = dict(line.split() for line in (folder / "memory.stat").read_text("ascii").splitlines())
+        yield most - used + int(statistics.get(inactive, 0))
+
+
+def _left_to_process() -> Iterator[int]:
+    """Yield the memory left below the limit of `ulimit -v`."""
+    with contextlib.suppress(ImportError):  # Windows
+        import resource
+
+        most = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if most != resource.RLIM_INFINITY:
+            yield most - psutil.Process().memory_info().vms
