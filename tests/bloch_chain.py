@@ -4,8 +4,6 @@ On a plane of integer normal n all cells with equal n . x have equal stencil row
 multiplies them by known phases, which leaves one unknown for each value of n . x: a chain.
 """
 
-from __future__ import annotations
-
 import cmath
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Faults of an emulated bench: a loose plug, a busy hub or a hung chip, and whatever disturbs a sensor."""
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Callable, Sequence
 

@@ -1,7 +1,5 @@
 """Simulate and search in this process, then in others of each kind; print what differs. A program."""
 
-from __future__ import annotations
-
 import logging
 import multiprocessing
 import sys

@@ -4,8 +4,6 @@ Arguments belong to names of parameters, which have one meaning almost everywher
 soon as it is public; add a parameter with a new name or another meaning here, unless it has a default.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace

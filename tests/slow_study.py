@@ -1,7 +1,5 @@
 """A study of two scenes and twelve slow trials, run as a program so that a test can kill it."""
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 import time

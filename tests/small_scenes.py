@@ -1,7 +1,5 @@
 """Small scenes that several tests share: a 2 x 2 array in front of an obstacle, 24 mm across."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Values that a user could give by mistake or in bad faith, of every kind."""
 
-from __future__ import annotations
-
 import datetime
 import math
 import warnings

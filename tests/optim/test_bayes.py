@@ -53,12 +53,7 @@ def test_fixed_transducer_stays_at_phase_zero_and_all_are_fully_on(solution):
 def test_score_that_never_changes_is_no_error(make_objective, matrix, options):
     objective = make_objective(matrix)
     solution = at.bayes_opt(
-        objective,
-        evaluations=6,
-        initial=3,
-        fixed_transducer=0,
-        goal=lambda p: 1 + 0 * p[..., 0],
-        **options,
+        objective, evaluations=6, initial=3, fixed_transducer=0, goal=lambda p: 1 + 0 * p[..., 0], **options
     )
     assert solution.score.tolist() == [1.0]
 

@@ -7,56 +7,46 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autdtorch.methods.base import Problem
-from autdtorch.methods.functions import gabs, identify
+import autdtorch as at
 from autdtorch.methods.gradient import climb, random_drives
-from autdtorch.objectives.goals import (
-    Goal,
-    MeanPressure,
-    TargetPressures,
-    WeakestFocus,
-    derivative,
-    goal_of,
-)
-from autdtorch.objectives.objective import weakest_focus
-from autdtorch.objectives.quiet import Contrast, QuietPoints
+from autdtorch.objectives.goals import derivative, goal_of
 
 PRESSURE = torch.tensor([[4.0, 2.0, 0.3, 1.0], [1.0, 8.0, 0.1, 4.0]], dtype=torch.float64)
 DB30 = 10 ** (-30 / 20)
 
 
-def goals_for(points: int, unit: float) -> list[Goal]:
+def goals_for(points: int, unit: float) -> list[at.Goal]:
     weights = [1.0 + (point % 3) for point in range(points)]
     return [
-        WeakestFocus(),
-        WeakestFocus(weights),
-        MeanPressure(),
-        TargetPressures([unit * weight for weight in weights]),
-        QuietPoints(WeakestFocus(), [points - 1], 0.1),
-        QuietPoints(WeakestFocus(weights[1:]), [0], DB30),
-        QuietPoints(MeanPressure(), [0], 0.3),
-        QuietPoints(TargetPressures([unit] * (points - 1)), [1], 0.1),
-        Contrast([0]),
-        Contrast(range(1, points)),
+        at.WeakestFocus(),
+        at.WeakestFocus(weights),
+        at.MeanPressure(),
+        at.TargetPressures([unit * weight for weight in weights]),
+        at.QuietPoints(at.WeakestFocus(), [points - 1], 0.1),
+        at.QuietPoints(at.WeakestFocus(weights[1:]), [0], DB30),
+        at.QuietPoints(at.MeanPressure(), [0], 0.3),
+        at.QuietPoints(at.TargetPressures([unit] * (points - 1)), [1], 0.1),
+        at.Contrast([0]),
+        at.Contrast(range(1, points)),
     ]
 
 
 def test_scores_are_those_of_the_definitions():
     # one by one: the least over its weight, the mean, and the rms of the relative deviations
     for goal, scores in (
-        (WeakestFocus(), [0.3, 0.1]),
-        (WeakestFocus([8, 1, 0.3, 1]), [0.5, 0.125]),
-        (MeanPressure(), [1.825, 3.275]),
-        (TargetPressures([4, 2, 0.3, 2]), [-0.25, -math.sqrt((0.75**2 + 3**2 + (2 / 3) ** 2 + 1) / 4)]),
-        (QuietPoints(WeakestFocus(), [2], 0.3), [1.0, 1.0]),  # 0.3 and 0.1 of the weakest other
-        (QuietPoints(WeakestFocus(), [2], 0.15), [1 / 4, 1.0]),
-        (QuietPoints(MeanPressure(), [0, 2], 4), [1.5, 6.0]),
+        (at.WeakestFocus(), [0.3, 0.1]),
+        (at.WeakestFocus([8, 1, 0.3, 1]), [0.5, 0.125]),
+        (at.MeanPressure(), [1.825, 3.275]),
+        (at.TargetPressures([4, 2, 0.3, 2]), [-0.25, -math.sqrt((0.75**2 + 3**2 + (2 / 3) ** 2 + 1) / 4)]),
+        (at.QuietPoints(at.WeakestFocus(), [2], 0.3), [1.0, 1.0]),  # 0.3 and 0.1 of the weakest other
+        (at.QuietPoints(at.WeakestFocus(), [2], 0.15), [1 / 4, 1.0]),
+        (at.QuietPoints(at.MeanPressure(), [0, 2], 4), [1.5, 6.0]),
         (
-            QuietPoints(TargetPressures([2, 1, 1]), [0], 4 / 0.3),
+            at.QuietPoints(at.TargetPressures([2, 1, 1]), [0], 4 / 0.3),
             [-0.7 / math.sqrt(3), -math.sqrt((9 + 0.81 + 9) / 3)],
         ),
-        (Contrast([0, 2]), [1 / math.sqrt((4**2 + 0.3**2) / 2), 4 / math.sqrt((1 + 0.1**2) / 2)]),
-        (Contrast([0, 1, 3]), [0.3 / math.sqrt(7), 0.1 / math.sqrt(27)]),
+        (at.Contrast([0, 2]), [1 / math.sqrt((4**2 + 0.3**2) / 2), 4 / math.sqrt((1 + 0.1**2) / 2)]),
+        (at.Contrast([0, 1, 3]), [0.3 / math.sqrt(7), 0.1 / math.sqrt(27)]),
     ):
         assert goal(PRESSURE).tolist() == pytest.approx(scores, rel=1e-12)
         assert goal(PRESSURE[0]).shape == ()
@@ -77,7 +67,7 @@ def test_gradient_ascent_comes_near_the_bounds(random_matrix):
     gaps = []
     for seed in range(5):
         matrix, generator = random_matrix(4, 16, seed), torch.Generator().manual_seed(seed)
-        for goal in (WeakestFocus([1, 2, 1, 1]), QuietPoints(WeakestFocus(), [3], DB30)):
+        for goal in (at.WeakestFocus([1, 2, 1, 1]), at.QuietPoints(at.WeakestFocus(), [3], DB30)):
             drive = climb(goal, matrix, random_drives(16, 16, generator), 300)
             gaps.append(1 - float(goal((matrix @ drive).abs())) / goal.bound(matrix))
     assert sorted(gaps)[len(gaps) // 2] < 0.08
@@ -87,10 +77,10 @@ def test_bounds_are_met_where_the_best_drive_is_known():
     # orthogonal rows of unit entries: the drive of one focus leaves all others at 0
     turns = torch.outer(torch.arange(8), torch.arange(8)).double()
     matrix = torch.polar(torch.ones(8, 8).double(), 2 * math.pi * turns / 8)
-    assert QuietPoints(WeakestFocus(), range(1, 8), 1e-3).bound(matrix) == pytest.approx(8, rel=1e-5)
-    assert MeanPressure().bound(matrix) == pytest.approx(math.sqrt(8), rel=1e-5)
-    assert TargetPressures([8]).bound(matrix[:1]) == pytest.approx(0, abs=1e-9)
-    assert TargetPressures([16]).bound(matrix[:1]) == pytest.approx(-0.5, rel=1e-5)
+    assert at.QuietPoints(at.WeakestFocus(), range(1, 8), 1e-3).bound(matrix) == pytest.approx(8, rel=1e-5)
+    assert at.MeanPressure().bound(matrix) == pytest.approx(math.sqrt(8), rel=1e-5)
+    assert at.TargetPressures([8]).bound(matrix[:1]) == pytest.approx(0, abs=1e-9)
+    assert at.TargetPressures([16]).bound(matrix[:1]) == pytest.approx(-0.5, rel=1e-5)
 
 
 def test_a_quiet_point_like_its_focus_costs_all_that_the_penalty_leaves():
@@ -98,7 +88,7 @@ def test_a_quiet_point_like_its_focus_costs_all_that_the_penalty_leaves():
     # |p| is alike at both: the excess is 1 / ratio, and the best drive takes the penalty
     for ratio in (0.8, 0.65):
         expected = 5 * ratio**2
-        bound = QuietPoints(WeakestFocus(), [1], ratio).bound(matrix)
+        bound = at.QuietPoints(at.WeakestFocus(), [1], ratio).bound(matrix)
         # the search ends after eight relaxations; 0.15 is left at 0.65
         assert expected <= bound < expected + 0.25
 
@@ -106,15 +96,15 @@ def test_a_quiet_point_like_its_focus_costs_all_that_the_penalty_leaves():
 def test_gabs_finds_foci_beside_quiet_points(make_objective, random_matrix):
     # the first transducers alone cannot leave a point quiet: a lower score must not look better to them
     objective = make_objective(random_matrix(4, 24, 0))
-    solution = gabs(objective, passes=2, goal=QuietPoints(WeakestFocus(), [3], 0.1))
-    alone = gabs(make_objective(random_matrix(4, 24, 0)[:3]), passes=2)
+    solution = at.gabs(objective, passes=2, goal=at.QuietPoints(at.WeakestFocus(), [3], 0.1))
+    alone = at.gabs(make_objective(random_matrix(4, 24, 0)[:3]), passes=2)
     assert solution.score > 0.6 * alone.score  # 0.9 was measured
     assert solution.pressure[0, 3] < 0.15 * solution.pressure[0, :3].min()
 
 
 def test_a_transducer_that_reaches_quiet_points_alone_can_cancel_them():
     matrix = torch.tensor([[1, 0], [1, 1]], dtype=torch.complex128)
-    goal = QuietPoints(WeakestFocus(), [1], 0.1)
+    goal = at.QuietPoints(at.WeakestFocus(), [1], 0.1)
     # the drive (1, -1) has the pressures 1 and 0
     assert goal((matrix @ torch.tensor([1, -1], dtype=torch.complex128)).abs()) == 1
     assert goal.bound(matrix) == pytest.approx(1, rel=1e-5)
@@ -124,7 +114,7 @@ def test_a_transducer_that_reaches_quiet_points_alone_can_cancel_them():
 @pytest.mark.parametrize("transducers", [1, 2, 5])
 def test_a_focus_parallel_to_a_quiet_point_has_a_bound(random_matrix, transducers, ratio):
     row = random_matrix(1, transducers, 0)
-    matrix, goal = torch.cat([row, 0.3 * row]), QuietPoints(WeakestFocus(), [1], ratio)
+    matrix, goal = torch.cat([row, 0.3 * row]), at.QuietPoints(at.WeakestFocus(), [1], ratio)
     drives = random_drives(50, transducers, torch.Generator().manual_seed(0))
     drives = torch.cat([drives, (row / row.abs()).conj(), 0 * row])
     assert goal((drives @ matrix.T).abs()).max() <= goal.bound(matrix) + 1e-12
@@ -132,17 +122,17 @@ def test_a_focus_parallel_to_a_quiet_point_has_a_bound(random_matrix, transducer
 
 def test_the_bound_of_contrast_is_the_best_drive_for_one_focus(random_matrix):
     # max |f q|^2 / mean |B q|^2 has the drive (B^H B)^-1 f^H, whatever its amplitudes
-    matrix, goal = random_matrix(40, 6, 0), Contrast(range(1, 40))
+    matrix, goal = random_matrix(40, 6, 0), at.Contrast(range(1, 40))
     focus, background = matrix[0], matrix[1:]
     drive = torch.linalg.solve(background.mH @ background, focus.conj())
     best = float(goal((matrix @ drive).abs()))
     assert best * (1 - 1e-9) <= goal.bound(matrix) < best * (1 + 1e-5)
     # a background of fewer points than transducers can be silenced
-    assert math.isinf(Contrast(range(1, 6)).bound(matrix[:6]))
+    assert math.isinf(at.Contrast(range(1, 6)).bound(matrix[:6]))
 
 
 def test_contrast_of_silence_is_finite():
-    goal = Contrast([1])
+    goal = at.Contrast([1])
     assert goal(torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]).double()).tolist() == [0, 1e10, 0]
 
 
@@ -165,7 +155,7 @@ def test_a_failed_transducer_changes_no_bound(random_matrix):
 
 
 def test_the_gradient_is_finite_where_targets_are_met():
-    assert derivative(TargetPressures([1.0, 2.0]), torch.tensor([1.0, 2.0]).double()).tolist() == [0, 0]
+    assert derivative(at.TargetPressures([1.0, 2.0]), torch.tensor([1.0, 2.0]).double()).tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("number", range(10))
@@ -174,7 +164,7 @@ def test_slopes_are_derivatives(number):
     pressure = torch.tensor([1.3, 1.9, 2.4, 3.1], dtype=torch.float64)
     exact = derivative(goal, pressure)
     slope = goal.slope(pressure, 1e-4)
-    if isinstance(goal, QuietPoints) and not goal.unit:  # half the sum of squares: signs alone are equal
+    if isinstance(goal, at.QuietPoints) and not goal.unit:  # half the sum of squares: signs alone are equal
         assert (torch.sign(slope) == torch.sign(exact)).all()
         return
     cosine = torch.nn.functional.cosine_similarity(slope, exact, dim=0)
@@ -182,44 +172,47 @@ def test_slopes_are_derivatives(number):
 
 
 def test_the_function_of_the_paper_is_its_goal():
-    assert goal_of(weakest_focus) == WeakestFocus()
-    assert Problem(4, 2, weakest_focus).goal == WeakestFocus()
+    assert goal_of(at.weakest_focus) == at.WeakestFocus()
+    assert at.Problem(4, 2, at.weakest_focus).goal == at.WeakestFocus()
     assert goal_of(torch.Tensor.sum) is torch.Tensor.sum
 
 
-@pytest.mark.parametrize("method", [gabs, identify], ids=["gabs", "identify"])
+@pytest.mark.parametrize("method", [at.gabs, at.identify], ids=["gabs", "identify"])
 def test_methods_that_see_magnitudes_reach_targets(make_objective, random_matrix, method):
     objective = make_objective(random_matrix(3, 12, 0))
-    goal = TargetPressures([1.0, 2.0, 1.5])  # far below what 12 transducers of about 1 Pa reach
+    goal = at.TargetPressures([1.0, 2.0, 1.5])  # far below what 12 transducers of about 1 Pa reach
     solution = method(objective, goal=goal)
     assert goal.bound(objective.transfer_matrix) == 0
     # identify fits the matrix; 16 phases of amplitude 1 leave GABS several per cent
     assert (solution.pressure / torch.tensor(goal.targets) - 1).abs().max() < (
-        0.02 if method is identify else 0.2
+        0.02 if method is at.identify else 0.2
     )
 
 
 INDICES = "points: .*; must be indices of control points"
-WEAKEST = WeakestFocus()
+WEAKEST = at.WeakestFocus()
 BAD_GOALS = [
-    (lambda: WeakestFocus([1, 0]), "weights: .*; must be numbers > 0"),
-    (lambda: TargetPressures([]), "targets: .*; must be numbers > 0"),
-    (lambda: TargetPressures([[1.0]]), "targets: .*; must be numbers > 0"),
-    (lambda: QuietPoints(weakest_focus, [1], 0.1), "goal: .*Goal"),
-    (lambda: QuietPoints(QuietPoints(WEAKEST, [1], 0.1), [2], 0.1), "goal: .*; must be a goal without"),
-    (lambda: QuietPoints(Contrast([1]), [2], 0.1), "goal: .*; must be a goal without"),
-    (lambda: QuietPoints(WEAKEST, [], 0.1), INDICES),
-    (lambda: QuietPoints(WEAKEST, [1, 1], 0.1), INDICES),
-    (lambda: QuietPoints(WEAKEST, [1], 0), "ratio: 0; must be finite and > 0"),
-    (lambda: Contrast([]), INDICES),
-    (lambda: WeakestFocus([1, 2, 3])(torch.ones(1)), "weights: .*; must be 1 numbers"),
-    (lambda: QuietPoints(WEAKEST, [1], 0.1)(torch.ones(1)), "points: .*; must be indices"),
-    (lambda: TargetPressures([1.0]).bound(torch.ones(2, 3) + 0j), "targets: .*; must be 2"),
-    (lambda: Problem(4, 2, WeakestFocus([1, 2, 3])), "weights: .*; must be 2 numbers"),
-    (lambda: Problem(4, 2, Contrast([0, 1])), "points: .*, and not all of them"),
-    (lambda: Problem(4, 2, QuietPoints(WEAKEST, [2], 0.1)), "points: .*; must be indices from 0 to 1"),
-    (lambda: Problem(4, 2, QuietPoints(WEAKEST, [0, 1], 0.1)), "points: .*, and not all of them"),
-    (lambda: Problem(4, 3, QuietPoints(TargetPressures([1]), [0], 0.1)), "targets: .*; must be 2 numbers"),
+    (lambda: at.WeakestFocus([1, 0]), "weights: .*; must be numbers > 0"),
+    (lambda: at.TargetPressures([]), "targets: .*; must be numbers > 0"),
+    (lambda: at.TargetPressures([[1.0]]), "targets: .*; must be numbers > 0"),
+    (lambda: at.QuietPoints(at.weakest_focus, [1], 0.1), "goal: .*Goal"),
+    (lambda: at.QuietPoints(at.QuietPoints(WEAKEST, [1], 0.1), [2], 0.1), "goal: .*; must be a goal without"),
+    (lambda: at.QuietPoints(at.Contrast([1]), [2], 0.1), "goal: .*; must be a goal without"),
+    (lambda: at.QuietPoints(WEAKEST, [], 0.1), INDICES),
+    (lambda: at.QuietPoints(WEAKEST, [1, 1], 0.1), INDICES),
+    (lambda: at.QuietPoints(WEAKEST, [1], 0), "ratio: 0; must be finite and > 0"),
+    (lambda: at.Contrast([]), INDICES),
+    (lambda: at.WeakestFocus([1, 2, 3])(torch.ones(1)), "weights: .*; must be 1 numbers"),
+    (lambda: at.QuietPoints(WEAKEST, [1], 0.1)(torch.ones(1)), "points: .*; must be indices"),
+    (lambda: at.TargetPressures([1.0]).bound(torch.ones(2, 3) + 0j), "targets: .*; must be 2"),
+    (lambda: at.Problem(4, 2, at.WeakestFocus([1, 2, 3])), "weights: .*; must be 2 numbers"),
+    (lambda: at.Problem(4, 2, at.Contrast([0, 1])), "points: .*, and not all of them"),
+    (lambda: at.Problem(4, 2, at.QuietPoints(WEAKEST, [2], 0.1)), "points: .*; must be indices from 0 to 1"),
+    (lambda: at.Problem(4, 2, at.QuietPoints(WEAKEST, [0, 1], 0.1)), "points: .*, and not all of them"),
+    (
+        lambda: at.Problem(4, 3, at.QuietPoints(at.TargetPressures([1]), [0], 0.1)),
+        "targets: .*; must be 2 numbers",
+    ),
 ]
 
 

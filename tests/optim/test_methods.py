@@ -129,10 +129,7 @@ def test_a_goal_that_gives_no_scores_is_refused(objective, method, goal):
 
 @each([at.Identify(evaluations=20), at.GradientAscent(steps=5)])
 def test_a_method_that_climbs_refuses_goals_without_a_gradient(objective, method):
-    for goal in (
-        lambda pressure: pressure.detach().amin(dim=-1),
-        lambda pressure: pressure.amin(-1).numpy(),
-    ):
+    for goal in (lambda pressure: pressure.detach().amin(dim=-1), lambda pressure: pressure.amin(-1).numpy()):
         with pytest.raises(ValueError, match=r"goal: .*must be differentiable"):
             at.run(method, objective, goal=goal)
 

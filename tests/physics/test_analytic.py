@@ -1,7 +1,5 @@
 """Point sources at planes, slabs and spheres: energy, boundary conditions and limits; all in float64."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Point sources and pistons in free space against the equations that define them; all in float64."""
 
-from __future__ import annotations
-
 import cmath
 import math
 
@@ -14,20 +12,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.special import j0, struve
 
-from autdtorch.analytic.green import (
-    free_space_matrix,
-    green,
-    piston_directivity,
-    piston_field,
-    piston_on_axis,
-)
-from autdtorch.scene.arrays import TransducerArray
-from autdtorch.scene.drive import drive_from_phases, focus_phases
+import autdtorch as at
+from autdtorch.analytic.green import free_space_matrix, piston_directivity, piston_field, piston_on_axis
 from autdtorch.utils.spatial import distances
 
 PISTON = 5e-3
 points = hnp.arrays(float, (5, 3), elements=st.floats(-0.1, 0.1))
-ARRAY = TransducerArray.grid((4, 4), pitch=10e-3, center=(1e-3, 50e-3, 50e-3), source_strength=0.7)
+ARRAY = at.TransducerArray.grid((4, 4), pitch=10e-3, center=(1e-3, 50e-3, 50e-3), source_strength=0.7)
 
 
 @pytest.mark.parametrize("target", [(17e-3, 0.0, 0.0), (10e-3, -20e-3, 30e-3), (-60e-3, 40e-3, 1e-3)])
@@ -39,7 +30,7 @@ def test_green_solves_the_helmholtz_equation_away_from_the_source(target):
     """
     h = WAVELENGTH / 400
     steps = torch.cat([torch.zeros(1, 3), torch.eye(3), -torch.eye(3)]).double()
-    values = green(torch.tensor(target, dtype=torch.float64) + h * steps, [[0.0, 0.0, 0.0]], K)[:, 0]
+    values = at.green(torch.tensor(target, dtype=torch.float64) + h * steps, [[0.0, 0.0, 0.0]], K)[:, 0]
     laplacian = (values[1:].sum() - 6 * values[0]) / h**2
     residual = (laplacian + K**2 * values[0]).abs() / (K**2 * values[0].abs())
     assert residual < 4 / 3 * (K * h) ** 2 / 12
@@ -47,7 +38,7 @@ def test_green_solves_the_helmholtz_equation_away_from_the_source(target):
 
 def test_green_is_outgoing_and_of_unit_strength():
     r = torch.tensor([1e-6, 1e-3, 1e-3 + WAVELENGTH / 4], dtype=torch.float64)
-    values = green(torch.stack([r, 0 * r, 0 * r], dim=1), [[0.0, 0.0, 0.0]], K)[:, 0]
+    values = at.green(torch.stack([r, 0 * r, 0 * r], dim=1), [[0.0, 0.0, 0.0]], K)[:, 0]
     # Near the source g is 1/(4 pi r), up to k r = 7e-4.
     assert abs(4 * math.pi * r[0] * values[0] - 1) < 1e-3
     # With e^{-i w t}, a quarter of a wavelength outwards turns the phase by +90 degrees.
@@ -58,7 +49,7 @@ def test_green_is_outgoing_and_of_unit_strength():
 def test_green_is_reciprocal(here, there):
     assume(distances(torch.from_numpy(here), torch.from_numpy(there)).min() > 1e-6)
     # The two distances are sums of the same squares: equal to the last bit.
-    assert torch.equal(green(here, there, K), green(there, here, K).T)
+    assert torch.equal(at.green(here, there, K), at.green(there, here, K).T)
 
 
 def test_matrix_is_equation_2_term_by_term():
@@ -83,7 +74,7 @@ def test_absorption_lets_every_contribution_fall_by_its_path():
 def test_far_field_of_a_disc_has_the_directivity_of_a_piston(ka):
     """S e^{ikr}/r 2 J1(ka sin t)/(ka sin t) at all angles up to 90 degrees, and the same behind."""
     radius, distance = ka / K, 1e5
-    disc = TransducerArray([[0, 0, 0]], (0, 0, 1), source_strength=0.7, radius=radius)
+    disc = at.TransducerArray([[0, 0, 0]], (0, 0, 1), source_strength=0.7, radius=radius)
     angle = torch.linspace(1e-3, math.pi - 1e-3, 91, dtype=torch.float64)
     turn = 2.4 * torch.arange(91, dtype=torch.float64)  # around the axis, everywhere
     across = torch.sin(angle)
@@ -98,7 +89,7 @@ def test_far_field_of_a_disc_has_the_directivity_of_a_piston(ka):
 def test_disc_near_by_is_a_piston(height, tolerance):
     """On its axis and off it; the tolerances are the accuracy that `TransducerArray.nodes` states."""
     radius = 6.0 / K
-    disc = TransducerArray([[0, 0, 0]], (0, 0, 1), source_strength=0.7, radius=radius)
+    disc = at.TransducerArray([[0, 0, 0]], (0, 0, 1), source_strength=0.7, radius=radius)
     along = torch.linspace(0, 2 * radius, 21, dtype=torch.float64)
     points = torch.stack([0.8 * along, 0.6 * along, 0 * along + height * radius], dim=1)
     exact = 4 * math.pi * 0.7 * piston_field(points, [[0, 0, 0]], K, radius, (0, 0, 1))
@@ -113,11 +104,11 @@ def test_disc_near_by_is_a_piston(height, tolerance):
 def test_equation_3_puts_every_contribution_in_phase_at_the_focus(focus, phases):
     row = free_space_matrix(focus[None], ARRAY, K)[0]
     limit = (0.7 / distances(torch.from_numpy(focus[None]), ARRAY.positions)).sum()
-    focused = row @ drive_from_phases(focus_phases(ARRAY.positions, focus, K))
+    focused = row @ at.drive_from_phases(at.focus_phases(ARRAY.positions, focus, K))
     # Phases reach k r = 130 rad: 3e-14 of rounding; the sum of S/r is real, so the phase of p is zero too.
     torch.testing.assert_close(focused, limit.to(torch.complex128), rtol=1e-13, atol=0)
     # No other phases do better.
-    assert (row @ drive_from_phases(phases)).abs() <= limit * (1 + 1e-13)
+    assert (row @ at.drive_from_phases(phases)).abs() <= limit * (1 + 1e-13)
 
 
 def test_piston_on_its_axis_is_the_closed_form_near_and_far():
@@ -131,7 +122,7 @@ def test_piston_on_its_axis_is_the_closed_form_near_and_far():
     # The difference of two waves loses digits far away, as 1 / z.
     assert torch.allclose(exact[:4], (difference / (2j * math.pi * K * PISTON**2))[:4], rtol=1e-10, atol=0)
     # Fresnel's phase k a^2 / 4z = 5e-6 is left at 1 km.
-    assert abs(field[-1] / green(points[-1:], [[0.0, 0.0, 0.0]], K) - 1) < 1e-5
+    assert abs(field[-1] / at.green(points[-1:], [[0.0, 0.0, 0.0]], K) - 1) < 1e-5
 
 
 @pytest.mark.parametrize("reach", [0.1, 3.7, 30.0])
@@ -142,7 +133,7 @@ def test_piston_far_away_is_its_directivity(reach):
     angle = torch.linspace(1e-3, math.pi / 2, 9, dtype=torch.float64)
     points = distance * torch.stack([torch.sin(angle), 0 * angle, torch.cos(angle)], dim=1)
     field = piston_field(points, [[0.0, 0.0, 0.0]], K, radius, (0.0, 0.0, 1.0))
-    ratio = (field / green(points, [[0.0, 0.0, 0.0]], K))[:, 0]
+    ratio = (field / at.green(points, [[0.0, 0.0, 0.0]], K))[:, 0]
     assert (ratio - piston_directivity(angle, K, radius)).abs().max() < 1e-4
 
 
@@ -161,7 +152,7 @@ def test_piston_near_is_the_sum_over_its_disc():
     )
     area = torch.tensor(np.repeat(rho * rho_weights, phi.size) * 2 * math.pi / phi.size)
     points = [[0.3 * PISTON, 0.0, PISTON], [0.0, PISTON, -PISTON], [2.5 * PISTON, 0.0, 0.0]]
-    expected = green(points, grid, K) @ area.to(torch.complex128) / (math.pi * PISTON**2)
+    expected = at.green(points, grid, K) @ area.to(torch.complex128) / (math.pi * PISTON**2)
     field = piston_field(points, [[0.0, 0.0, 0.0]], K, PISTON, (0.0, 0.0, 1.0))
     assert torch.allclose(field[:, 0], expected, rtol=1e-10, atol=0)
 

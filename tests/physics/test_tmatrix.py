@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.special import sph_harm_y
 
-from autdtorch.analytic.green import green
+import autdtorch as at
 from autdtorch.analytic.sphere import fluid_sphere, rigid_sphere
 from autdtorch.analytic.spherical_waves import (
     degrees,
@@ -19,20 +19,14 @@ from autdtorch.analytic.spherical_waves import (
     sphere_coefficients,
 )
 from autdtorch.propagators import make_propagator
-from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
-from autdtorch.scene.arrays import TransducerArray
-from autdtorch.scene.geometry import sphere_points
-from autdtorch.scene.medium import Medium
-from autdtorch.scene.obstacles import Box, Sphere
-from autdtorch.scene.scene import Scene
 
-AIR = Medium(density=1.2, sound_speed=340.0)
+AIR = at.Medium(density=1.2, sound_speed=340.0)
 FREQUENCY = 40e3
 WAVENUMBER = 2 * math.pi * FREQUENCY / AIR.sound_speed
-ARRAY = TransducerArray.grid((2, 3), 10e-3, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius=0)
+ARRAY = at.TransducerArray.grid((2, 3), 10e-3, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius=0)
 POINTS = torch.tensor([[60e-3, 0, 0], [50e-3, 12e-3, 5e-3], [30e-3, -4e-3, 15e-3]], dtype=torch.float64)
 CENTER = (30e-3, 2e-3, -1e-3)
-CUBE = Box(center=CENTER, size=(6e-3,) * 3, rigid=True)
+CUBE = at.Box(center=CENTER, size=(6e-3,) * 3, rigid=True)
 
 
 def unit_vectors(count: int) -> torch.Tensor:
@@ -45,8 +39,8 @@ def relative(value: torch.Tensor, exact: torch.Tensor) -> float:
 
 
 @pytest.fixture(scope="module")
-def cube() -> TMatrix:
-    return TMatrix.of(CUBE, AIR, FREQUENCY, spacing=1.5e-3, error=1e-2)
+def cube() -> at.TMatrix:
+    return at.TMatrix.of(CUBE, AIR, FREQUENCY, spacing=1.5e-3, error=1e-2)
 
 
 def test_harmonics_are_those_of_scipy():
@@ -79,8 +73,8 @@ def test_waves_add_up_to_a_point_source(wavenumber):
 
 @pytest.mark.parametrize("material", [{"rigid": True}, {"density": 5.0, "sound_speed": 600.0}])
 def test_a_sphere_in_closed_form_is_the_series(material):
-    sphere = Sphere(center=CENTER, radius=8e-3, **material)
-    operator = TMatrix.of(sphere, AIR, FREQUENCY, error=1e-8)
+    sphere = at.Sphere(center=CENTER, radius=8e-3, **material)
+    operator = at.TMatrix.of(sphere, AIR, FREQUENCY, error=1e-8)
     given = (POINTS, ARRAY.positions, WAVENUMBER, CENTER, 8e-3)
     exact = rigid_sphere(*given) if sphere.rigid else fluid_sphere(*given, 5.0 / 1.2, 600.0 / 340.0)
     # eight digits were asked for at the surface, and all points are outside
@@ -93,9 +87,9 @@ def test_a_sphere_in_closed_form_is_the_series(material):
 
 @pytest.mark.filterwarnings("ignore::autdtorch.OverlapWarning")
 def test_a_simulated_sphere_is_near_the_exact_one():
-    sphere = Sphere(center=CENTER, radius=5e-3, rigid=True)
-    exact = TMatrix.of(sphere, AIR, FREQUENCY, error=1e-2)
-    twice = TMatrix.of([sphere, sphere], AIR, FREQUENCY, spacing=1e-3, error=1e-2)  # is simulated
+    sphere = at.Sphere(center=CENTER, radius=5e-3, rigid=True)
+    exact = at.TMatrix.of(sphere, AIR, FREQUENCY, error=1e-2)
+    twice = at.TMatrix.of([sphere, sphere], AIR, FREQUENCY, spacing=1e-3, error=1e-2)  # is simulated
     assert twice.degree >= exact.degree
     found, wanted = (one.transfer_matrix(ARRAY, POINTS) for one in (twice, exact))
     # 0.7 % was measured at 5 cells a radius
@@ -103,7 +97,7 @@ def test_a_simulated_sphere_is_near_the_exact_one():
 
 
 def test_the_operator_is_the_box_in_a_small_frame(cube):
-    scene = Scene(ARRAY, AIR, frequency=FREQUENCY, control_points=POINTS, obstacles=[CUBE])
+    scene = at.Scene(ARRAY, AIR, frequency=FREQUENCY, control_points=POINTS, obstacles=[CUBE])
     box = make_propagator(scene, "box", 1.5e-3, cache=False).transfer_matrix()
     # two digits of waves; both have the same cells
     assert relative(cube.transfer_matrix(ARRAY, POINTS), box) < 5e-3
@@ -119,7 +113,7 @@ def test_a_moved_body_is_the_array_and_points_moved_back(cube):
     def back(places: torch.Tensor) -> torch.Tensor:
         return (places - center - offset) @ turn + center
 
-    array = TransducerArray(back(ARRAY.positions), ARRAY.normals, ARRAY.source_strength, 0)
+    array = at.TransducerArray(back(ARRAY.positions), ARRAY.normals, ARRAY.source_strength, 0)
     expected = cube.transfer_matrix(array, back(POINTS))
     assert relative(moved.transfer_matrix(ARRAY, POINTS), expected) < 1e-10
     assert relative(cube.transfer_matrix(ARRAY, POINTS), expected) > 0.01  # it did move
@@ -154,13 +148,13 @@ def test_gradients_by_the_pose_are_those_of_finite_differences(cube):
 def test_an_operator_comes_back_from_its_file(cube, tmp_path):
     moved = cube.moved((1e-3, 0, 0), (0, 0.1, 0))
     moved.save(tmp_path / "cube.npz")
-    again = TMatrix.load(tmp_path / "cube.npz")
+    again = at.TMatrix.load(tmp_path / "cube.npz")
     assert torch.equal(again.transfer_matrix(ARRAY, POINTS), moved.transfer_matrix(ARRAY, POINTS))
     cube.moved(torch.zeros(3, dtype=torch.float64, requires_grad=True)).save(tmp_path / "varied.npz")
-    assert torch.equal(TMatrix.load(tmp_path / "varied.npz").center, cube.center)
+    assert torch.equal(at.TMatrix.load(tmp_path / "varied.npz").center, cube.center)
     np.savez(tmp_path / "other.npz", matrix=np.ones((2, 2)))
     with pytest.raises(ValueError, match=r"other.npz: no array center, axes"):
-        TMatrix.load(tmp_path / "other.npz")
+        at.TMatrix.load(tmp_path / "other.npz")
 
 
 def test_bad_input_is_named(cube):
@@ -171,9 +165,9 @@ def test_bad_input_is_named(cube):
     with pytest.raises(ValueError, match=r"offset: shape \(2,\)"):
         cube.moved((0.0, 0.0))
     with pytest.raises(ValueError, match="obstacles"):
-        TMatrix.of([], AIR, FREQUENCY)
+        at.TMatrix.of([], AIR, FREQUENCY)
     with pytest.raises(ValueError, match=r"error: 0; must be in 1e-08 to 0\.1"):
-        TMatrix.of(CUBE, AIR, FREQUENCY, error=0)
+        at.TMatrix.of(CUBE, AIR, FREQUENCY, error=0)
 
 
 def test_coefficients_conserve_energy_and_degrees_suffice():
@@ -189,19 +183,19 @@ def test_coefficients_conserve_energy_and_degrees_suffice():
 
 
 SPHERES = (
-    Sphere(center=(30e-3, 8e-3, -1e-3), radius=6e-3, rigid=True),
-    Sphere(center=(33e-3, -6e-3, 2e-3), radius=5e-3, rigid=True),
-    Sphere(center=(45e-3, 3e-3, -3e-3), radius=6e-3, rigid=True),
+    at.Sphere(center=(30e-3, 8e-3, -1e-3), radius=6e-3, rigid=True),
+    at.Sphere(center=(33e-3, -6e-3, 2e-3), radius=5e-3, rigid=True),
+    at.Sphere(center=(45e-3, 3e-3, -3e-3), radius=6e-3, rigid=True),
 )
 OUTSIDE = torch.tensor([[70e-3, 0, 0], [60e-3, 12e-3, 5e-3], [35e-3, -4e-3, 25e-3]], dtype=torch.float64)
 
 
-def collocated(spheres: tuple[Sphere, ...]) -> torch.Tensor:
+def collocated(spheres: tuple[at.Sphere, ...]) -> torch.Tensor:
     """The transfer matrix at `OUTSIDE` by outgoing waves whose normal velocity vanishes on all rigid spheres.
 
     Least squares over 900 points of each surface: no translation of waves, no coefficient of a sphere.
     """
-    degree, normals = 16, sphere_points((0, 0, 0), 1.0, 900)
+    degree, normals = 16, at.sphere_points((0, 0, 0), 1.0, 900)
     centers = [torch.tensor(sphere.center, dtype=torch.float64) for sphere in spheres]
     sources = ARRAY.positions.as_subclass(torch.Tensor)
 
@@ -223,21 +217,21 @@ def collocated(spheres: tuple[Sphere, ...]) -> torch.Tensor:
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_spheres_scatter_one_another(count):
     spheres = SPHERES[:count]
-    bodies = [TMatrix.of(sphere, AIR, FREQUENCY, error=1e-5) for sphere in spheres]
-    coupled = TMatrixCluster(bodies).transfer_matrix(ARRAY, OUTSIDE)
+    bodies = [at.TMatrix.of(sphere, AIR, FREQUENCY, error=1e-5) for sphere in spheres]
+    coupled = at.TMatrixCluster(bodies).transfer_matrix(ARRAY, OUTSIDE)
     # 3e-8 to 2e-7 were measured
     assert relative(coupled, collocated(spheres)) < 1e-5
     if count > 1:  # each as if alone
         alone = [body.transfer_matrix(ARRAY, OUTSIDE) for body in bodies]
-        direct = 4 * math.pi * ARRAY.source_strength * green(OUTSIDE, ARRAY.positions, WAVENUMBER)
+        direct = 4 * math.pi * ARRAY.source_strength * at.green(OUTSIDE, ARRAY.positions, WAVENUMBER)
         assert relative(sum(alone) - (count - 1) * direct, coupled) > 0.01
 
 
 def test_gradients_by_the_place_of_one_of_several_bodies():
-    first, second = (TMatrix.of(sphere, AIR, FREQUENCY, error=1e-2) for sphere in SPHERES[:2])
+    first, second = (at.TMatrix.of(sphere, AIR, FREQUENCY, error=1e-2) for sphere in SPHERES[:2])
 
     def loudness(offset: torch.Tensor) -> torch.Tensor:
-        return TMatrixCluster([first, second.moved(offset)]).transfer_matrix(ARRAY, OUTSIDE).abs().sum()
+        return at.TMatrixCluster([first, second.moved(offset)]).transfer_matrix(ARRAY, OUTSIDE).abs().sum()
 
     offset = torch.tensor([2e-3, -1e-3, 1e-3], dtype=torch.float64, requires_grad=True)
     (gradient,) = torch.autograd.grad(loudness(offset), offset)
@@ -252,8 +246,8 @@ def test_gradients_by_the_place_of_one_of_several_bodies():
 
 def test_bodies_that_do_not_fit_are_named(cube):
     with pytest.raises(ValueError, match=r"bodies\[1\].center: .* apart.*; must be at least 0.01039 m"):
-        TMatrixCluster([cube, cube.moved((5e-3, 0, 0))])
+        at.TMatrixCluster([cube, cube.moved((5e-3, 0, 0))])
     with pytest.raises(ValueError, match=r"bodies\[1\].wavenumber"):
-        TMatrixCluster([cube, TMatrix.of(SPHERES[2], AIR, 41e3)])
+        at.TMatrixCluster([cube, at.TMatrix.of(SPHERES[2], AIR, 41e3)])
     with pytest.raises(ValueError, match=r"bodies: .*; must have at least one"):
-        TMatrixCluster([])
+        at.TMatrixCluster([])

@@ -1,7 +1,5 @@
 """Air against published tables."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

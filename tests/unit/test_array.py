@@ -6,16 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from autdtorch.hardware.devices.openmpd import OpenMPDBoard
-from autdtorch.io.array_file import load_array
-from autdtorch.io.scene_file import load_scene
-from autdtorch.scene.arrays import (
-    AUTD3_UNIT,
-    OPENMPD_SOURCE_STRENGTH,
-    PAPER_SOURCE_STRENGTH,
-    TransducerArray,
-)
-from autdtorch.scene.geometry import circle_points
+import autdtorch as at
+from autdtorch.scene.arrays import AUTD3_UNIT, OPENMPD_SOURCE_STRENGTH
 from autdtorch.utils.spatial import distances
 
 PITCH = 10.16e-3
@@ -23,7 +15,7 @@ ROUNDING = 1e-12  # of lengths below 1 m in float64, with margin
 
 
 def test_grid_is_row_major_along_the_axes_of_its_plane():
-    array = TransducerArray.grid((2, 3), pitch=10e-3, center=(1e-3, 50e-3, 50e-3))
+    array = at.TransducerArray.grid((2, 3), pitch=10e-3, center=(1e-3, 50e-3, 50e-3))
     expected = [[1, y, z] for y in (45, 55) for z in (40, 50, 60)]  # normal x: u is y, v is z
     # Decimal millimetres are not exact in binary: a few roundings at 0.1 m.
     torch.testing.assert_close(1e3 * array.positions, torch.tensor(expected).double(), rtol=1e-14, atol=0)
@@ -33,16 +25,16 @@ def test_grid_is_row_major_along_the_axes_of_its_plane():
 
 def test_each_transducer_may_point_its_own_way():
     positions = torch.tensor([[0.0, 0, 0], [0, 0.01, 0]], requires_grad=True)
-    array = TransducerArray(positions, [[2, 0, 0], [0, 3, 4]])
+    array = at.TransducerArray(positions, [[2, 0, 0], [0, 3, 4]])
     assert not array.positions.requires_grad
-    assert array.source_strength == PAPER_SOURCE_STRENGTH == 1 / (4 * np.pi)
+    assert array.source_strength == at.PAPER_SOURCE_STRENGTH == 1 / (4 * np.pi)
     assert array.normals.tolist() == [[1.0, 0.0, 0.0], [0.0, 0.6, 0.8]]
 
 
 @pytest.mark.parametrize("convert", [torch.from_numpy, np.asarray], ids=["tensor", "numpy"])
 def test_array_keeps_its_own_copy(convert):
     positions = convert(np.array([[0.0, 0.0, 0.0], [0.0, 0.01, 0.0]]))
-    array = TransducerArray(positions, (1, 0, 0))
+    array = at.TransducerArray(positions, (1, 0, 0))
     positions[1, 1] = 5.0
     assert array.positions.tolist() == [[0.0, 0.0, 0.0], [0.0, 0.01, 0.0]]
     assert array.positions.dtype == torch.float64
@@ -50,7 +42,7 @@ def test_array_keeps_its_own_copy(convert):
 
 def test_a_point_is_one_node_and_a_radius_of_zero_a_point():
     points, zero = (
-        TransducerArray.grid((2, 2), pitch=10e-3, center=(0, 0, 0), radius=radius) for radius in (None, 0)
+        at.TransducerArray.grid((2, 2), pitch=10e-3, center=(0, 0, 0), radius=radius) for radius in (None, 0)
     )
     assert points.radius == zero.radius == 0
     for array in (points, zero):
@@ -63,7 +55,7 @@ def test_a_point_is_one_node_and_a_radius_of_zero_a_point():
 def test_nodes_lie_on_the_discs_and_have_their_moments():
     """Mean of x^2 over a disc of radius a: a^2/4; of x^4: a^4/8; of x^2 y^2: a^4/24; odd powers vanish."""
     normals = torch.tensor([[0, 0, 1], [1, 2, 3]]).double()
-    array = TransducerArray([[0, 0, 0], [0.01, 0, 0]], normals, radius=5e-3)
+    array = at.TransducerArray([[0, 0, 0], [0.01, 0, 0]], normals, radius=5e-3)
     positions, weights = array.nodes
     assert positions.shape == (2, len(weights), 3)
     x, y, z = (positions[0] / 5e-3).unbind(dim=1)
@@ -80,14 +72,14 @@ def test_nodes_lie_on_the_discs_and_have_their_moments():
 
 
 def test_half_extents_are_those_of_a_fine_circle():
-    array = TransducerArray([[0, 0, 0]], (1, 2, 3), radius=5e-3)
-    circle = circle_points((0, 0, 0), 5e-3, 3600, (1, 2, 3))
+    array = at.TransducerArray([[0, 0, 0]], (1, 2, 3), radius=5e-3)
+    circle = at.circle_points((0, 0, 0), 5e-3, 3600, (1, 2, 3))
     # the nearest of 3600 points is at most 1/20 degree off: 4e-7 of the radius
     torch.testing.assert_close(array.half_extents[0], circle.amax(dim=0), rtol=1e-6, atol=0)
 
 
 def test_autd3_counts_row_by_row_and_leaves_out_three():
-    array = TransducerArray.autd3((0, 0, 0), normal=(0, 0, 1))
+    array = at.TransducerArray.autd3((0, 0, 0), normal=(0, 0, 1))
     place = (array.positions[:, :2] - array.positions[0, :2]) / PITCH
     counted = place.round().long().tolist()
     # As autd3-core 0.12 has them: 18 in the first row; (1, 1), (2, 1) and (16, 1) are missing in the second.
@@ -101,8 +93,8 @@ def test_autd3_counts_row_by_row_and_leaves_out_three():
 
 
 def test_units_of_autd3_lie_side_by_side():
-    one = TransducerArray.autd3((1e-3, 50e-3, 50e-3))
-    four = TransducerArray.autd3((1e-3, 50e-3, 50e-3), units=(2, 2))
+    one = at.TransducerArray.autd3((1e-3, 50e-3, 50e-3))
+    four = at.TransducerArray.autd3((1e-3, 50e-3, 50e-3), units=(2, 2))
     assert (len(one), len(four)) == (249, 996)
     assert four.positions.mean(0) == pytest.approx(one.positions.mean(0), abs=ROUNDING)
     extent = four.positions.amax(0) - four.positions.amin(0)
@@ -113,8 +105,8 @@ def test_units_of_autd3_lie_side_by_side():
 
 
 def test_square_boards_begin_at_the_top_left():
-    rows = TransducerArray.sonicsurface((0, 0, 0), normal=(0, 0, 1)).positions * 1e3
-    columns = TransducerArray.openmpd((0, 0, 0), normal=(0, 0, 1)).positions * 1e3
+    rows = at.TransducerArray.sonicsurface((0, 0, 0), normal=(0, 0, 1)).positions * 1e3
+    columns = at.TransducerArray.openmpd((0, 0, 0), normal=(0, 0, 1)).positions * 1e3
     first, right, below, last = [-78.75, 78.75, 0], [-68.25, 78.75, 0], [-78.75, 68.25, 0], [78.75, -78.75, 0]
     for positions, second, seventeenth in ((rows, right, below), (columns, below, right)):
         for index, place in ((0, first), (1, second), (16, seventeenth), (255, last)):
@@ -123,7 +115,7 @@ def test_square_boards_begin_at_the_top_left():
 
 @pytest.mark.parametrize("device", ["autd3", "sonicsurface", "openmpd"])
 def test_devices_go_where_they_are_put(device):
-    make = getattr(TransducerArray, device)
+    make = getattr(at.TransducerArray, device)
     flat = make((0, 0, 0), normal=(0, 0, 1))
     turned = make((0.1, 0.2, 0.3), normal=(0, 2, 0), angle=math.pi / 2)
     # Facing +y, (u, v) is (z, x); turned by a right angle, the device's x is v = x and its y is -u = -z.
@@ -155,7 +147,7 @@ def board(tmp_path):
 
 
 def test_board_is_read_in_full(board):
-    read = OpenMPDBoard.load(board)
+    read = at.OpenMPDBoard.load(board)
     assert (read.name, read.pins) == ("FT123456", (2, 0, 3, 1))
     assert read.positions.tolist() == [[-5e-3, 5e-3, 0], [-5e-3, -5e-3, 0], [5e-3, 5e-3, 0], [5e-3, -5e-3, 0]]
     assert read.phase_offsets.tolist() == pytest.approx([math.pi / 2, -math.pi / 4, 0, math.pi])
@@ -163,7 +155,7 @@ def test_board_is_read_in_full(board):
 
 
 def test_calibrated_drive_takes_off_the_offsets_and_multiplies_by_the_gains(board):
-    sent = OpenMPDBoard.load(board).calibrated([1 + 0j, 1 + 0j, 1j, 1 + 0j])
+    sent = at.OpenMPDBoard.load(board).calibrated([1 + 0j, 1 + 0j, 1j, 1 + 0j])
     # A transducer that is a quarter of a period ahead in arg q is sent a quarter less.
     expected = torch.tensor([-1j, 0.5 * np.exp(0.25j * np.pi), 1j, -1 + 0j], dtype=torch.complex128)
     torch.testing.assert_close(sent, expected, rtol=0, atol=1e-15)
@@ -171,7 +163,7 @@ def test_calibrated_drive_takes_off_the_offsets_and_multiplies_by_the_gains(boar
 
 def test_a_drive_by_pin_has_each_transducer_at_its_pin(board):
     drive = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.complex128)
-    assert OpenMPDBoard.load(board).by_pin(drive).tolist() == [0.2, 0.4, 0.1, 0.3]
+    assert at.OpenMPDBoard.load(board).by_pin(drive).tolist() == [0.2, 0.4, 0.1, 0.3]
 
 
 @pytest.mark.parametrize(
@@ -193,7 +185,7 @@ def test_a_drive_by_pin_has_each_transducer_at_its_pin(board):
 def test_what_is_wrong_with_a_board_is_said_with_its_line(board, change, message):
     board.write_text(BOARD.replace(*change))
     with pytest.raises(ValueError, match=message):
-        OpenMPDBoard.load(board)
+        at.OpenMPDBoard.load(board)
 
 
 def test_board_becomes_the_array_of_a_scene(board):
@@ -203,9 +195,9 @@ medium: {density: 1.2, sound_speed: 343.0}
 array: {type: file, path: board_1.pat, center: [0, 0, 20e-3], normal: [0, 0, -1], radius: 0}
 control_points: {type: points, positions: [[0, 0, -80e-3]]}
 """)
-    array = load_scene(board.parent / "scene.yaml").array
+    array = at.load_scene(board.parent / "scene.yaml").array
     # Facing -z, (u, v) is (x, -y), so that the board is turned over about x.
-    expected = OpenMPDBoard.load(board).positions * torch.tensor([1.0, -1.0, -1.0])
+    expected = at.OpenMPDBoard.load(board).positions * torch.tensor([1.0, -1.0, -1.0])
     expected[:, 2] += 20e-3
     torch.testing.assert_close(array.positions, expected, rtol=0, atol=1e-15)
     assert (array.normals == torch.tensor([0.0, 0.0, -1.0])).all()
@@ -215,7 +207,7 @@ control_points: {type: points, positions: [[0, 0, -80e-3]]}
 def test_csv_is_read_in_its_units_and_pointed_up_by_default(tmp_path):
     path = tmp_path / "array.csv"
     path.write_text("# my array\nz [m], x [mm], y [mm]\n0.5, 10, 20\n\n0.5, -10, 20\n")
-    array = load_array(path, source_strength=2.0)
+    array = at.load_array(path, source_strength=2.0)
     torch.testing.assert_close(
         array.positions, torch.tensor([[10e-3, 20e-3, 0.5], [-10e-3, 20e-3, 0.5]]).double(), rtol=0, atol=1e-9
     )
@@ -228,26 +220,26 @@ def test_csv_is_read_in_its_units_and_pointed_up_by_default(tmp_path):
 )
 def test_semicolons_and_tabs_separate_too(tmp_path, text):
     (tmp_path / "array.csv").write_text(text, "utf-8")
-    positions = load_array(tmp_path / "array.csv").positions
+    positions = at.load_array(tmp_path / "array.csv").positions
     assert positions.tolist() == [[0.0, 0.0, 0.0], [pytest.approx(10.5e-3), 0.0, 0.0]]
 
 
 def test_normals_turn_with_the_array(tmp_path):
     path = tmp_path / "array.csv"
     path.write_text("x [m],y [m],z [m],nx,ny,nz\n0.01,0,0,1,0,0\n0,0,0,0,0,2\n")
-    array = load_array(path, center=(0, 0, 1), normal=(1, 0, 0))
+    array = at.load_array(path, center=(0, 0, 1), normal=(1, 0, 0))
     # Facing +x, the file's x goes to u = y and its z to x.
     assert array.positions.tolist() == [[0, 0.01, 1], [0, 0, 1]]
     assert array.normals.tolist() == [[0, 1, 0], [1, 0, 0]]
 
 
 def test_npz_needs_positions_and_normals_alone(tmp_path):
-    array = TransducerArray.grid((2, 3), 10e-3, (0, 0, 0), radius=4e-3)
+    array = at.TransducerArray.grid((2, 3), 10e-3, (0, 0, 0), radius=4e-3)
     np.savez(tmp_path / "array.npz", positions=array.positions, normals=array.normals)
-    read = load_array(tmp_path / "array.npz")
+    read = at.load_array(tmp_path / "array.npz")
     assert torch.equal(read.positions, array.positions)
     assert torch.equal(read.normals, array.normals)
-    assert (read.source_strength, read.radius) == (PAPER_SOURCE_STRENGTH, 0)
+    assert (read.source_strength, read.radius) == (at.PAPER_SOURCE_STRENGTH, 0)
 
 
 @pytest.mark.parametrize(
@@ -269,4 +261,4 @@ def test_npz_needs_positions_and_normals_alone(tmp_path):
 def test_what_is_wrong_with_a_file_is_said_with_its_line(tmp_path, name, text, message):
     (tmp_path / name).write_text(text)
     with pytest.raises(ValueError, match=message):
-        load_array(tmp_path / name)
+        at.load_array(tmp_path / name)

@@ -1,7 +1,5 @@
 """Bad arguments of public functions end in one line that names the field, the value and what is accepted."""
 
-from __future__ import annotations
-
 import warnings
 from collections import UserList, deque
 from collections.abc import Callable
@@ -202,7 +200,7 @@ OUT_OF_RANGE: dict[Callable[..., Any] | str, list[tuple[dict[str, Any], str]]] =
         ({"drive": [1j, 0], "transducers": 16}, "drive: shape (2,); must be (..., 16)"),
     ],
     normalise: [
-        ({"drive": torch.tensor([[1j, 0], [0, 0]])}, "drive: 0 for every transducer; at least one amplitude"),
+        ({"drive": torch.tensor([[1j, 0], [0, 0]])}, "drive: 0 for every transducer; at least one amplitude")
     ],
     "focus_phases": [
         ({"focus": (1, 2)}, "focus: (1, 2); must be 3 real numbers [m]"),

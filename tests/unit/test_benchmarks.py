@@ -1,7 +1,5 @@
 """Cases, errors and reports of the benchmarks and studies in `scripts/`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -185,8 +185,7 @@ def test_rows_of_openmpd_in_degrees_are_told_as_the_file_has_them(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("load", "text"),
-    [(load_array, IN_MM), (load_drive, "0.5\n1.5\n"), (load_drive, "0.5,1\n1.5,1\n")],
+    ("load", "text"), [(load_array, IN_MM), (load_drive, "0.5\n1.5\n"), (load_drive, "0.5,1\n1.5,1\n")]
 )
 def test_a_guess_is_told_once_with_the_file_at_the_line_that_reads_it(tmp_path, load, text):
     with pytest.warns(ScaleWarning, match=r"a.csv: ") as caught:

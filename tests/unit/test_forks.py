@@ -1,7 +1,5 @@
 """A process forked while another thread holds a lock does not wait for that thread."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

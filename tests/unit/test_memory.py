@@ -1,7 +1,5 @@
 """Arguments that need more memory than available are refused; control groups limit it."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Perturbations: quantisation, failed transducers, drift and noise around an objective."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -11,20 +9,9 @@ from hypothesis import strategies as st
 from scipy.stats import kstest, rice
 from small_scenes import small_scene
 
-from autdtorch.methods.base import Problem
-from autdtorch.methods.functions import gabs
-from autdtorch.objectives.perturbations import (
-    Drift,
-    FailedTransducers,
-    Noise,
-    Perturbation,
-    Quantised,
-    quantised,
-    true_pressure,
-)
-from autdtorch.objectives.simulated import SimulatedObjective
+import autdtorch as at
+from autdtorch.objectives.perturbations import Perturbation, quantised
 from autdtorch.propagators import FreeSpacePropagator
-from autdtorch.scene.drive import drive_from_phases, phases_of
 
 SCENE = small_scene()  # 4 transducers, 3 control points
 
@@ -51,12 +38,12 @@ class Recorder:
 
 @pytest.fixture
 def simulated():
-    return SimulatedObjective(SCENE, FreeSpacePropagator(SCENE))
+    return at.SimulatedObjective(SCENE, FreeSpacePropagator(SCENE))
 
 
 def random_drive(rows, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    return drive_from_phases(6.28 * torch.rand(rows, 4, dtype=torch.float64, generator=generator))
+    return at.drive_from_phases(6.28 * torch.rand(rows, 4, dtype=torch.float64, generator=generator))
 
 
 def fully_on(rows):
@@ -66,7 +53,7 @@ def fully_on(rows):
 @pytest.mark.parametrize("snr", [20.0, 6.0, 0.0, -10.0])
 def test_readings_are_rice_distributed(snr):
     count = 20000
-    noise = Noise(Recorder(), snr, seed=3, reference=1.0)
+    noise = at.Noise(Recorder(), snr, seed=3, reference=1.0)
     readings = noise(fully_on(count))[:, 1].numpy()
     part = 10 ** (-snr / 20) / math.sqrt(2)  # deviation of the real and of the imaginary part
     expected = rice(1 / part, scale=part)
@@ -76,7 +63,7 @@ def test_readings_are_rice_distributed(snr):
 
 
 def test_noise_at_control_points_and_rows_is_independent():
-    readings = Noise(Recorder(), 20, reference=1.0)(fully_on(20000))
+    readings = at.Noise(Recorder(), 20, reference=1.0)(fully_on(20000))
     # Deviation of an estimated correlation: 1 / sqrt(samples); 4 of them.
     points = torch.corrcoef(readings.T) - torch.eye(3)
     rows = torch.corrcoef(torch.stack([readings[:-1, 0], readings[1:, 0]]))[0, 1]
@@ -85,7 +72,7 @@ def test_noise_at_control_points_and_rows_is_independent():
 
 
 def test_default_reference_is_the_rms_pressure_under_random_phases(simulated):
-    sigma = Noise(Quantised(FailedTransducers(simulated, [0]), 4), snr=20).sigma
+    sigma = at.Noise(at.Quantised(at.FailedTransducers(simulated, [0]), 4), snr=20).sigma
     squares = simulated(random_drive(20000)).square().mean(dim=1)
     # 4 standard errors of the mean square, halved by the root.
     error = 2 * (squares.std() / squares.mean()).item() / math.sqrt(20000)
@@ -93,19 +80,19 @@ def test_default_reference_is_the_rms_pressure_under_random_phases(simulated):
 
 
 def test_reference_must_be_given_where_nothing_tells_it(simulated):
-    replayed = SimulatedObjective(SCENE, FreeSpacePropagator(SCENE), mode="replay")
-    for objective in (replayed, Recorder(), FailedTransducers(replayed, [1])):
+    replayed = at.SimulatedObjective(SCENE, FreeSpacePropagator(SCENE), mode="replay")
+    for objective in (replayed, Recorder(), at.FailedTransducers(replayed, [1])):
         with pytest.raises(ValueError, match="reference: None Pa; must be given where the objective has no"):
-            Noise(objective, 20)
-        assert Noise(objective, 20, reference=2.0).sigma == pytest.approx(0.2)
+            at.Noise(objective, 20)
+        assert at.Noise(objective, 20, reference=2.0).sigma == pytest.approx(0.2)
 
 
 def test_reads_are_averaged_and_counted():
     recorder = Recorder()
-    noise = Noise(recorder, 20, reads=25, reference=1.0)
+    noise = at.Noise(recorder, 20, reads=25, reference=1.0)
     assert noise(fully_on(2000)).shape == (2000, 3)
     assert noise.evaluations == recorder.evaluations == 50000
-    one, many = Noise(Recorder(), 20, reference=1.0)(fully_on(2000)), noise(fully_on(2000))
+    one, many = at.Noise(Recorder(), 20, reference=1.0)(fully_on(2000)), noise(fully_on(2000))
     # A deviation of n samples is known to 1 / sqrt(2 n): 4 of that, for each of the two.
     assert (one.std() / many.std()).item() == pytest.approx(5, rel=8 / math.sqrt(2 * 6000))
 
@@ -113,9 +100,9 @@ def test_reads_are_averaged_and_counted():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda inner, seed: Noise(inner, 20, seed=seed, reference=1.0),
-        lambda inner, seed: Noise(inner, 20, reads=3, seed=seed, reference=1.0),
-        lambda inner, seed: Drift(inner, phase=0.3, loss=0.2, sensor=0.1, seed=seed),
+        lambda inner, seed: at.Noise(inner, 20, seed=seed, reference=1.0),
+        lambda inner, seed: at.Noise(inner, 20, reads=3, seed=seed, reference=1.0),
+        lambda inner, seed: at.Drift(inner, phase=0.3, loss=0.2, sensor=0.1, seed=seed),
     ],
     ids=["noise", "reads", "drift"],
 )
@@ -133,12 +120,12 @@ def test_randomness_follows_from_the_seed_however_the_rows_are_divided(make, sim
 
 
 NESTED = {
-    "noise": lambda inner: Noise(inner, 20, reads=2, seed=5, reference=1.0),
-    "drift": lambda inner: Drift(inner, phase=0.3, loss=0.2, sensor=0.1, seed=5),
-    "quantised": lambda inner: Quantised(inner, 8),
-    "failed": lambda inner: FailedTransducers(inner, [2]),
-    "all": lambda inner: Noise(
-        Quantised(Drift(FailedTransducers(inner, [2]), phase=0.3, seed=5), 8), 20, reference=1.0
+    "noise": lambda inner: at.Noise(inner, 20, reads=2, seed=5, reference=1.0),
+    "drift": lambda inner: at.Drift(inner, phase=0.3, loss=0.2, sensor=0.1, seed=5),
+    "quantised": lambda inner: at.Quantised(inner, 8),
+    "failed": lambda inner: at.FailedTransducers(inner, [2]),
+    "all": lambda inner: at.Noise(
+        at.Quantised(at.Drift(at.FailedTransducers(inner, [2]), phase=0.3, seed=5), 8), 20, reference=1.0
     ),
 }
 
@@ -146,10 +133,10 @@ NESTED = {
 @pytest.mark.parametrize("make", NESTED.values(), ids=NESTED)
 @given(leading=st.lists(st.integers(1, 3), max_size=3))
 def test_drives_of_any_leading_dimensions_are_those_in_a_row(make, leading):
-    simulated = SimulatedObjective(SCENE, FreeSpacePropagator(SCENE))
+    simulated = at.SimulatedObjective(SCENE, FreeSpacePropagator(SCENE))
     flat, shaped = make(simulated), make(simulated)
     drives = random_drive(math.prod(leading))
-    for observe in (lambda one, drive: one(drive), true_pressure, lambda one, drive: one(drive)):
+    for observe in (lambda one, drive: one(drive), at.true_pressure, lambda one, drive: one(drive)):
         expected = observe(flat, drives).reshape(*leading, 3)
         assert torch.equal(observe(shaped, drives.reshape(*leading, 4)), expected)
     assert shaped.evaluations == flat.evaluations
@@ -157,33 +144,33 @@ def test_drives_of_any_leading_dimensions_are_those_in_a_row(make, leading):
 
 @pytest.mark.parametrize("make", NESTED.values(), ids=NESTED)
 def test_a_problem_has_the_matrix_of_the_simulation_inside(make, simulated):
-    assert torch.equal(Problem.of(make(simulated)).transfer_matrix, simulated.transfer_matrix)
-    assert Problem.of(make(Recorder())).transfer_matrix is None
+    assert torch.equal(at.Problem.of(make(simulated)).transfer_matrix, simulated.transfer_matrix)
+    assert at.Problem.of(make(Recorder())).transfer_matrix is None
 
 
 def test_an_objective_of_a_user_gets_batches():
     recorder = Recorder()
-    wrapped = Noise(FailedTransducers(recorder, [2]), 20, reference=1.0)
-    assert wrapped(random_drive(1)[0]).shape == true_pressure(wrapped, random_drive(1)[0]).shape == (3,)
+    wrapped = at.Noise(at.FailedTransducers(recorder, [2]), 20, reference=1.0)
+    assert wrapped(random_drive(1)[0]).shape == at.true_pressure(wrapped, random_drive(1)[0]).shape == (3,)
     assert wrapped(random_drive(6).reshape(2, 3, 4)).shape == (2, 3, 3)
     assert [tuple(drives.shape) for drives in recorder.drives] == [(1, 4), (1, 4), (6, 4)]
 
 
 def test_noise_and_drift_of_one_seed_are_unrelated():
     recorder = Recorder()
-    Drift(recorder, phase=1.0, seed=4)(fully_on(3000))
+    at.Drift(recorder, phase=1.0, seed=4)(fully_on(3000))
     steps = torch.diff(recorder.played()[:, 0].angle())
-    readings = Noise(Recorder(), 40, seed=4, reference=1.0)(fully_on(3000))[1:, 0]
+    readings = at.Noise(Recorder(), 40, seed=4, reference=1.0)(fully_on(3000))[1:, 0]
     # 4 / sqrt(samples), as above.
     assert abs(torch.corrcoef(torch.stack([steps, readings]))[0, 1]) < 4 / math.sqrt(3000)
 
 
 @given(phases=phases, amplitudes=amplitudes, levels=st.integers(2, 256), on_off=st.booleans())
 def test_quantised_is_the_nearest_and_stays(phases, amplitudes, levels, on_off):
-    device = Quantised(Recorder(), levels, on_off)
-    drive = drive_from_phases([phases], [amplitudes])
+    device = at.Quantised(Recorder(), levels, on_off)
+    drive = at.drive_from_phases([phases], [amplitudes])
     played = device.emitted(drive)
-    steps = phases_of(played) * levels / (2 * math.pi)
+    steps = at.phases_of(played) * levels / (2 * math.pi)
     torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-9)
     sounding = (played != 0) & (drive != 0)
     assert ((played / drive)[sounding].angle().abs() <= math.pi / levels + 1e-12).all()
@@ -193,8 +180,8 @@ def test_quantised_is_the_nearest_and_stays(phases, amplitudes, levels, on_off):
 
 
 def test_levels_that_are_the_devices_are_played_as_they_are(simulated):
-    plain = gabs(simulated, levels=16, trials=3)
-    device = gabs(Quantised(simulated, 32, on_off=True), levels=16, trials=3)
+    plain = at.gabs(simulated, levels=16, trials=3)
+    device = at.gabs(at.Quantised(simulated, 32, on_off=True), levels=16, trials=3)
     # Phases that differ in their last digit only.
     torch.testing.assert_close(device.drive, plain.drive, rtol=0, atol=1e-14)
     torch.testing.assert_close(device.history, plain.history, rtol=1e-13, atol=0)
@@ -202,7 +189,7 @@ def test_levels_that_are_the_devices_are_played_as_they_are(simulated):
 
 def test_failed_transducers_are_silent_and_nobody_is_told():
     recorder = Recorder()
-    broken = FailedTransducers(recorder, [0, 2])
+    broken = at.FailedTransducers(recorder, [0, 2])
     drive = random_drive(3)
     broken(drive)
     assert torch.equal(recorder.played()[:, [0, 2]], torch.zeros(3, 2, dtype=torch.complex128))
@@ -214,7 +201,7 @@ def test_drift_has_the_stated_rms_after_1000_evaluations():
     ends = []
     for seed in range(100):
         recorder = Recorder()
-        readings = Drift(recorder, phase=0.2, loss=0.1, sensor=0.05, seed=seed)(fully_on(1000))
+        readings = at.Drift(recorder, phase=0.2, loss=0.1, sensor=0.05, seed=seed)(fully_on(1000))
         ends.append((recorder.played()[-1], readings[-1]))
     drives, readings = (torch.stack(part) for part in zip(*ends, strict=True))
     # Deviations of 400 and of 100 samples, each known to 1 / sqrt(2 n); 4 of that.
@@ -227,17 +214,17 @@ def test_drift_has_the_stated_rms_after_1000_evaluations():
 
 
 def test_true_pressure_keeps_the_device_and_drops_the_sensor(simulated):
-    drift = Drift(FailedTransducers(simulated, [1]), phase=0.5, loss=0.2, sensor=0.5, seed=1)
-    objective = Noise(Quantised(drift, 8), 10, reads=2, seed=1)
+    drift = at.Drift(at.FailedTransducers(simulated, [1]), phase=0.5, loss=0.2, sensor=0.5, seed=1)
+    objective = at.Noise(at.Quantised(drift, 8), 10, reads=2, seed=1)
     drive = random_drive(50)
     objective(drive)
     counts = [objective.evaluations, drift.evaluations]
-    emitted = drift.emitted(Quantised(Recorder(), 8).emitted(drive)) * torch.tensor([1.0, 0, 1, 1])
-    true = true_pressure(objective, drive)
+    emitted = drift.emitted(at.Quantised(Recorder(), 8).emitted(drive)) * torch.tensor([1.0, 0, 1, 1])
+    true = at.true_pressure(objective, drive)
     # Other roundings of the same factors.
     torch.testing.assert_close(true, simulated(emitted), rtol=1e-12, atol=0)
     assert [objective.evaluations, drift.evaluations] == counts == [100, 100]
-    assert torch.equal(true_pressure(simulated, drive), simulated(drive))
+    assert torch.equal(at.true_pressure(simulated, drive), simulated(drive))
     assert not torch.allclose(true, simulated(drive), rtol=1e-2)
 
 
@@ -245,10 +232,10 @@ def test_true_pressure_keeps_the_device_and_drops_the_sensor(simulated):
     "make",
     [
         Perturbation,
-        lambda inner: Noise(inner, 20, reads=2),
-        lambda inner: Quantised(inner, 4),
-        lambda inner: FailedTransducers(inner, [0]),
-        lambda inner: Drift(inner, phase=0.1),
+        lambda inner: at.Noise(inner, 20, reads=2),
+        lambda inner: at.Quantised(inner, 4),
+        lambda inner: at.FailedTransducers(inner, [0]),
+        lambda inner: at.Drift(inner, phase=0.1),
     ],
     ids=["none", "noise", "quantised", "failed", "drift"],
 )
@@ -258,7 +245,7 @@ def test_a_drive_that_no_array_can_play_is_refused_and_not_counted(make, simulat
         with pytest.raises(ValueError, match="drive"):
             objective(wrong)
         with pytest.raises(ValueError, match="drive"):
-            true_pressure(objective, wrong)
+            at.true_pressure(objective, wrong)
     assert objective.evaluations == simulated.evaluations == 0
     assert objective.scene is SCENE
 
@@ -266,19 +253,19 @@ def test_a_drive_that_no_array_can_play_is_refused_and_not_counted(make, simulat
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda o: Noise(o, math.inf), "snr: inf dB; must be finite"),
-        (lambda o: Noise(o, 20, reads=0), "reads: 0; must be an integer >= 1"),
-        (lambda o: Noise(o, 20, seed=-1), "seed: -1; must be an integer >= 0"),
-        (lambda o: Noise(o, 20, reference=0.0), r"reference: 0\.0 Pa; must be finite and > 0"),
-        (lambda o: Quantised(o, 1), "levels: 1; must be an integer >= 2"),
-        (lambda o: Quantised(o, 4, on_off=1), "on_off: 1; must be true or false"),
-        (lambda o: FailedTransducers(o, []), r"transducers: \(\); must be indices from 0 to 3, each once"),
-        (lambda o: FailedTransducers(o, [4]), r"transducers: \(4,\); must be indices from 0 to 3"),
-        (lambda o: FailedTransducers(o, [-1]), r"transducers\[0\]: -1; must be an integer >= 0"),
-        (lambda o: FailedTransducers(o, 2), "transducers: 2; must be indices"),
-        (lambda o: Drift(o, phase=-0.1), r"phase: -0\.1 rad; must be finite and >= 0"),
-        (lambda o: Drift(o, sensor="much"), "sensor: 'much'; must be a real number"),
-        (lambda o: Drift(o, seed=0.5), r"seed: 0\.5; must be an integer >= 0"),
+        (lambda o: at.Noise(o, math.inf), "snr: inf dB; must be finite"),
+        (lambda o: at.Noise(o, 20, reads=0), "reads: 0; must be an integer >= 1"),
+        (lambda o: at.Noise(o, 20, seed=-1), "seed: -1; must be an integer >= 0"),
+        (lambda o: at.Noise(o, 20, reference=0.0), r"reference: 0\.0 Pa; must be finite and > 0"),
+        (lambda o: at.Quantised(o, 1), "levels: 1; must be an integer >= 2"),
+        (lambda o: at.Quantised(o, 4, on_off=1), "on_off: 1; must be true or false"),
+        (lambda o: at.FailedTransducers(o, []), r"transducers: \(\); must be indices from 0 to 3, each once"),
+        (lambda o: at.FailedTransducers(o, [4]), r"transducers: \(4,\); must be indices from 0 to 3"),
+        (lambda o: at.FailedTransducers(o, [-1]), r"transducers\[0\]: -1; must be an integer >= 0"),
+        (lambda o: at.FailedTransducers(o, 2), "transducers: 2; must be indices"),
+        (lambda o: at.Drift(o, phase=-0.1), r"phase: -0\.1 rad; must be finite and >= 0"),
+        (lambda o: at.Drift(o, sensor="much"), "sensor: 'much'; must be a real number"),
+        (lambda o: at.Drift(o, seed=0.5), r"seed: 0\.5; must be an integer >= 0"),
     ],
 )
 def test_bad_arguments_are_named(make, message, simulated):

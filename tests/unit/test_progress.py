@@ -1,7 +1,5 @@
 """Long work has a forecast."""
 
-from __future__ import annotations
-
 import functools
 import io
 import itertools

@@ -227,11 +227,7 @@ FLAT = {"type": "box", "center": [0, 0, 0], "size": [1, 1, 0], "rigid": True}
         ("array.pich", 1, "array: unknown key 'pich' (did you mean 'pitch'?); allowed keys: shape, pitch"),
         ("medium", ..., "scene mapping: missing key 'medium'; allowed keys"),
         ("array.pitch", ..., "scene mapping: array: missing key 'pitch'"),
-        (
-            "control_points.type",
-            ...,
-            "type: None; must be one of circle, sphere, plane, points",
-        ),
+        ("control_points.type", ..., "type: None; must be one of circle, sphere, plane, points"),
         ("array.type", "gird", "array: type: 'gird'; must be one of grid, positions, autd3"),
         ("array.type", ["grid"], "array: type: ('grid',); must be one of"),
         ("medium", 340.0, "medium: 340.0; must be a mapping of keys to"),

@@ -1,7 +1,5 @@
 """The commands of `scripts/`, and their blocks in the documentation."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

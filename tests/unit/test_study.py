@@ -9,34 +9,22 @@ import pytest
 import torch
 from small_scenes import AIR, CUBE, small_scene
 
+import autdtorch as at
 import autdtorch.study.run
-from autdtorch.analytic.green import green
 from autdtorch.io.goal_section import load_goal
-from autdtorch.methods.functions import gabs, lssg
-from autdtorch.methods.gabs import GABS
-from autdtorch.methods.gradient import GradientAscent
-from autdtorch.methods.identify import Identify
-from autdtorch.methods.lssg import LSSG
-from autdtorch.methods.prior import Prior
-from autdtorch.objectives.goals import Goal, MeanPressure, TargetPressures
-from autdtorch.objectives.quiet import Contrast, QuietPoints
-from autdtorch.propagators import FreeSpacePropagator, Run, SteadyStateWarning
+from autdtorch.propagators import FreeSpacePropagator, Run
 from autdtorch.propagators.full import DomainSimulation
-from autdtorch.scene.geometry import Plane
-from autdtorch.scene.obstacles import Box
-from autdtorch.scene.scene import Scene
-from autdtorch.study.results_file import load_results
 from autdtorch.study.run import _for_poses, run_study
 from autdtorch.study.trial_file import TRIALS_FILE
 
-PLANE = Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 16e-3))
-METHODS = {"lssg": LSSG(levels=4), "gabs": GABS(levels=4)}
+PLANE = at.Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 16e-3))
+METHODS = {"lssg": at.LSSG(levels=4), "gabs": at.GABS(levels=4)}
 FREE_SPACE = {"method": "free_space"}
 
 
 def scene(plane=PLANE, obstacles=()):
     plain = small_scene()
-    return Scene(plain.array, AIR, 40e3, plain.control_points, obstacles, plane, plain.domain)
+    return at.Scene(plain.array, AIR, 40e3, plain.control_points, obstacles, plane, plain.domain)
 
 
 @pytest.fixture
@@ -98,12 +86,12 @@ def test_the_runs_of_a_simulation_are_recorded(tmp_path, monkeypatch):
     def simulate(self, sources, strength, receivers, stepped):
         rows, places = [], receivers.positions[:, 0]
         for nodes, own in zip(sources, strength, strict=True):
-            rows.append(green(places, nodes.positions[:, 0], self.plan.scene.wavenumber) @ own)
+            rows.append(at.green(places, nodes.positions[:, 0], self.plan.scene.wavenumber) @ own)
         return 4 * math.pi * torch.stack(rows), [Run(7, 0.1, len(rows) == 3, 0.5)] * len(rows)
 
     monkeypatch.setattr(DomainSimulation, "_simulate", simulate)
     solver = {"method": "full", "spacing": 2e-3, "tolerance": 0.2, "kernel": "reference"}
-    with pytest.warns(SteadyStateWarning):
+    with pytest.warns(at.SteadyStateWarning):
         result = run_study({"a": scene()}, METHODS, tmp_path, solver=solver).scenes["a"]
     simulation = result.simulation
     assert (simulation.method, simulation.spacing, simulation.tolerance) == ("full", 2e-3, 0.2)
@@ -143,21 +131,21 @@ def test_a_study_goes_on_after_the_scenes_that_were_finished(scenes, count_runs,
     objectives = []
 
     def interrupted(objective):
-        solution = lssg(objective)
+        solution = at.lssg(objective)
         objectives.append(objective)
         if len(objectives) == 2:
             raise KeyboardInterrupt
         return solution
 
-    interrupted.__module__ = lssg.__module__  # results of others' methods are not re-used
+    interrupted.__module__ = at.lssg.__module__  # results of others' methods are not re-used
     study = functools.partial(run_study, scenes, solver=FREE_SPACE, folder=tmp_path, config="a: 1")
     with pytest.raises(KeyboardInterrupt):
         study({"lssg": interrupted})
-    assert list(load_results(tmp_path).scenes) == ["second"]
-    results = study({"lssg": lssg})
+    assert list(at.load_results(tmp_path).scenes) == ["second"]
+    results = study({"lssg": at.lssg})
     assert count_runs == ["second", "first", "first"]
     assert list(results.scenes) == ["second", "first"]
-    assert list(load_results(tmp_path).scenes) == ["second", "first"]
+    assert list(at.load_results(tmp_path).scenes) == ["second", "first"]
 
 
 @pytest.mark.parametrize(
@@ -167,7 +155,7 @@ def test_a_study_goes_on_after_the_scenes_that_were_finished(scenes, count_runs,
         ({"methods": {}}, "methods: empty"),
         ({"scenes": {"a/b": scene()}}, r"scenes: 'a/b'; .*letters, digits"),
         ({"scenes": {3: scene()}}, "scenes: 3; a name must be text"),
-        ({"methods": {3: gabs}}, "methods: 3; a name must be text"),
+        ({"methods": {3: at.gabs}}, "methods: 3; a name must be text"),
         ({"trials": 0}, "trials: 0; must be an integer >= 1"),
         ({"trials": {"gabs": -1}}, r"trials\.gabs: -1"),
         ({"trials": {"gabs": 1, "lssg": 2}}, "trials: unknown random method 'lssg'; allowed .*: gabs"),
@@ -176,8 +164,8 @@ def test_a_study_goes_on_after_the_scenes_that_were_finished(scenes, count_runs,
         ({"plane_spacing": float("nan")}, "plane_spacing: nan m"),
         ({"solver": {"spacing": -1.0}}, r"solver: spacing: -1\.0 m"),
         ({"goal": "mean_pressure"}, "goal: 'mean_pressure'; must be a Goal"),
-        ({"goal": TargetPressures([3, 4])}, r"goal: targets: \(3\.0, 4\.0\); must be 3 numbers"),
-        ({"methods": {"gabs": GABS(first=16)}}, "method gabs: first: 16; must be an integer from 0 to"),
+        ({"goal": at.TargetPressures([3, 4])}, r"goal: targets: \(3\.0, 4\.0\); must be 3 numbers"),
+        ({"methods": {"gabs": at.GABS(first=16)}}, "method gabs: first: 16; must be an integer from 0 to"),
     ],
 )
 def test_settings_are_checked_before_anything_is_simulated(changes, message, tmp_path, monkeypatch):
@@ -193,25 +181,30 @@ def test_another_study_is_kept_and_a_refused_one_moves_nothing(study, tmp_path):
         with pytest.raises(ValueError, match="solver: dtype"):
             study(solver=FREE_SPACE | {"dtype": "int"}, config="a: 4")
     kept = [tmp_path / folder for folder in ("previous-1", "previous-2", ".")]
-    assert [load_results(folder).provenance.config for folder in kept] == ["a: 1", "a: 2", "a: 3"]
+    assert [at.load_results(folder).provenance.config for folder in kept] == ["a: 1", "a: 2", "a: 3"]
 
 
 def test_the_matrix_of_the_study_is_a_prior(tmp_path):
-    methods = {"identify": Identify(evaluations=3, prior=Prior()), "climb": GradientAscent()}
+    methods = {"identify": at.Identify(evaluations=3, prior=at.Prior()), "climb": at.GradientAscent()}
     found = run_study({"a": scene(None)}, methods, tmp_path, solver=FREE_SPACE).scenes["a"].methods
     # 1e-4 is what either climb leaves.
     assert found["identify"].solution.score > 0.999 * found["climb"].solution.score
 
 
-GOALS = [MeanPressure(), TargetPressures([9, 6, 9]), QuietPoints(MeanPressure(), [1], 0.1), Contrast([1])]
+GOALS = [
+    at.MeanPressure(),
+    at.TargetPressures([9, 6, 9]),
+    at.QuietPoints(at.MeanPressure(), [1], 0.1),
+    at.Contrast([1]),
+]
 
 
 @pytest.mark.parametrize("goal", GOALS, ids=lambda goal: goal.name)
 def test_methods_and_functions_maximise_the_goal_of_the_study(goal, tmp_path):
-    methods = {"climb": GradientAscent(), "gabs": functools.partial(gabs, levels=4)}
+    methods = {"climb": at.GradientAscent(), "gabs": functools.partial(at.gabs, levels=4)}
     scene_result = run_study({"a": scene(None)}, methods, tmp_path, solver=FREE_SPACE, goal=goal).scenes["a"]
     assert scene_result.bound == goal.bound(scene_result.transfer_matrix)
-    assert load_goal("goal", load_results(tmp_path).scenes["a"].goal) == goal
+    assert load_goal("goal", at.load_results(tmp_path).scenes["a"].goal) == goal
     for method in scene_result.methods.values():
         assert torch.equal(method.solution.score, goal(method.solution.pressure))
     climbed = scene_result.methods["climb"].solution.score
@@ -219,7 +212,7 @@ def test_methods_and_functions_maximise_the_goal_of_the_study(goal, tmp_path):
 
 
 @dataclass(frozen=True)
-class Loudest(Goal):
+class Loudest(at.Goal):
     def __call__(self, pressure):
         return pressure.amax(dim=-1)
 
@@ -229,7 +222,7 @@ def test_a_goal_of_ones_own_has_no_bound_and_is_computed_again(study, count_runs
         results = study(config="a: 1", goal=Loudest())
     assert count_runs == ["second", "first"] * 2
     found = results.scenes["first"]
-    assert found.bound == load_results(tmp_path).scenes["first"].bound == math.inf
+    assert found.bound == at.load_results(tmp_path).scenes["first"].bound == math.inf
     assert found.score_label == "Loudest [Pa]"
     solution = found.methods["gabs"].solution
     assert torch.equal(solution.score, solution.pressure.amax(dim=1))
@@ -237,16 +230,16 @@ def test_a_goal_of_ones_own_has_no_bound_and_is_computed_again(study, count_runs
 
 def test_a_function_that_takes_no_score_is_refused_for_another_goal(tmp_path):
     def weakest(objective):
-        return lssg(objective)
+        return at.lssg(objective)
 
     with pytest.raises(ValueError, match="method own: 'weakest'; must have a parameter `goal`"):
-        run_study({"a": scene()}, {"own": weakest}, tmp_path, solver=FREE_SPACE, goal=MeanPressure())
+        run_study({"a": scene()}, {"own": weakest}, tmp_path, solver=FREE_SPACE, goal=at.MeanPressure())
 
 
 @pytest.mark.parametrize("returned", [1, 3])
 def test_a_method_returns_the_trials_it_is_asked_for(returned, tmp_path):
     def method(objective, trials, seed):
-        return gabs(objective, levels=4, trials=returned, seed=seed)
+        return at.gabs(objective, levels=4, trials=returned, seed=seed)
 
     with pytest.raises(ValueError, match=rf"method own: {returned} trials; must be the trials \[0, 1\]"):
         run_study({"a": scene(None)}, {"own": method}, tmp_path, solver=FREE_SPACE, trials=2)
@@ -255,7 +248,7 @@ def test_a_method_returns_the_trials_it_is_asked_for(returned, tmp_path):
 def test_poses_start_at_the_drives_of_the_scene_before(tmp_path):
     scenes = {str(step): scene(None, (CUBE,)).moved((0, 1e-3 * step, 0)) for step in range(3)}
     settings = {"method": "box", "spacing": 2e-3, "tolerance": 0.1}
-    method = GABS(levels=4, order="given")
+    method = at.GABS(levels=4, order="given")
     results = run_study(scenes, {"gabs": method}, tmp_path / "poses", solver=settings, poses=True, trials=2)
     found = [each.methods["gabs"].solution for each in results.scenes.values()]
     # all transducers are on from the second pose on: one observation, then four phases of each
@@ -266,7 +259,7 @@ def test_poses_start_at_the_drives_of_the_scene_before(tmp_path):
 
 
 def test_poses_are_simulated_by_tmatrices_where_these_are_fewer_runs():
-    cube = Box((12e-3,) * 3, (3e-3,) * 3, rigid=True)
+    cube = at.Box((12e-3,) * 3, (3e-3,) * 3, rigid=True)
     scenes = {f"{step}": scene(None, (cube,)).moved((0, 1e-5 * step, 0)) for step in range(60)}
     solver = {"spacing": 2e-3, "tolerance": 0.1}
     assert _for_poses(scenes, solver) == solver | {"method": "tmatrix"}

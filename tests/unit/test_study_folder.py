@@ -1,7 +1,5 @@
 """The folder of a study: what is used again or moved aside, also after the process was killed."""
 
-from __future__ import annotations
-
 import functools
 import logging
 import os

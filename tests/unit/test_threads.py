@@ -1,7 +1,5 @@
 """Threads of PyTorch and NumPy, kept to one each by several threads at once and across a fork."""
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Iterator

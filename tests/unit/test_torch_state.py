@@ -1,7 +1,5 @@
 """PyTorch's global settings change no result: default dtype and device, inference mode, threads."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Calls that newcomers get wrong: each is told in one line with the field and the fix, or is right."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import pickle
