@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -201,7 +202,8 @@ WEAKEST_FOCUS = WeakestFocus()
 
 def goal_of(function: GoalFunction) -> GoalFunction:
     """Return the `Goal` that is a function, where there is one, or the function."""
-    return WEAKEST_FOCUS if function is weakest_focus else function
+    # the name in the package is decorated when it is first used, which may be after this import
+    return WEAKEST_FOCUS if inspect.unwrap(function) is inspect.unwrap(weakest_focus) else function
 
 
 def scores_of(goal: GoalFunction, pressure: torch.Tensor) -> torch.Tensor:

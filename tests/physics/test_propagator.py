@@ -51,7 +51,7 @@ def test_absorption_is_exact_to_the_grid(absorption, spacing, tolerance):
     # no worse than without loss: 0.03 % at 1 mm, 0.4 % at 2 mm
     assert relative_error(simulated, free_space(scene)) < tolerance
     # The loss alone, in nepers, has only the part of the grid's error that varies with the wavenumber: 1 % is
-    # the variation of the symbol's slope with direction at 2 mm (test_stencil.py).
+    # the variation of the symbol's slope with direction at 2 mm (test_scheme.py).
     loss, exact_loss = (simulated / without).log(), (free_space(scene) / free_space(lossless)).log()
     assert relative_error(loss, exact_loss) < 1e-2
 

@@ -55,7 +55,7 @@ def test_auto_takes_what_is_known_of_a_sphere():
     found, box = make_propagator(scene, cache=False), make_propagator(scene, "box", 0.6e-3, cache=False)
     assert found.method == "tmatrix"
     assert (estimate(scene).runs, estimate(scene).spacing) == (0, None)
-    # of the box, as in test_sphere.py
+    # of the box, as in test_shapes.py
     assert relative_error(box.transfer_matrix(), found.transfer_matrix()) < 0.01
     assert found.transfer_matrix(return_error=True)[1] <= 2e-3
     assert make_propagator(scene_of(SMALL), cache=False).method == "box"
@@ -231,7 +231,7 @@ def test_a_picture_through_a_sphere_is_one_run():
     assert len(propagator.runs) == 1
     box = make_propagator(scene_of(BALL), "box", 1.4e-3, cache=False).field(drive, plane)
     served = propagator.serves(plane)
-    # the box differs by its own error at 1.4 mm: 2 % in some runs of test_sphere.py
+    # the box differs by its own error at 1.4 mm: 2 % in some runs of test_shapes.py
     assert relative_error(field[served], box[served]) < 0.05
     # a box converges where it is read
     assert relative_error(field[~served], box[~served]) < 0.02

@@ -1,10 +1,15 @@
+"""Fields in the whole domain and in files, whose folders are made."""
+
 import math
 
 import h5py
 import numpy as np
 import pytest
 import torch
+from small_scenes import CUBE, small_scene
 
+import autdtorch as at
+from autdtorch import hardware
 from autdtorch.io.field_file import save_field
 from autdtorch.scene.geometry import Plane
 
@@ -106,3 +111,78 @@ def test_what_is_no_field_on_a_grid_is_refused(tmp_path, changes, message):
     field |= changes
     with pytest.raises(ValueError, match=message):
         save_field(tmp_path / field.pop("path"), **field)
+
+
+def test_a_volume_is_the_field_outside_obstacles_and_away_from_transducers():
+    ball = at.Sphere((40e-3, 40e-3, 40e-3), 9e-3, rigid=True)
+    scene = small_scene((ball,), extent=80e-3)
+    propagator = at.make_propagator(scene, method="free_space")
+    drive = at.drive_from_phases(torch.linspace(0, 3, 4))
+    volume = at.volume_field(propagator, drive, spacing=5e-3)
+    assert volume.shape == (16, 16, 16)
+
+    centre = torch.tensor(scene.domain[0], dtype=torch.float64) + 5e-3 * (torch.tensor([12, 3, 7]) + 0.5)
+    wanted = propagator.field(drive, centre[None])[0]
+    torch.testing.assert_close(volume[12, 3, 7], wanted)
+
+    centres = np.stack(np.meshgrid(*[2.5e-3 + 5e-3 * np.arange(16)] * 3, indexing="ij"), axis=-1)
+    near = torch.cdist(torch.from_numpy(centres).reshape(-1, 3), scene.array.positions).amin(dim=1)
+    left_out = (near <= scene.wavelength / 2).reshape(16, 16, 16) | ball.contains(centres)
+    assert left_out.any()
+    assert torch.equal(volume.isnan(), left_out)
+
+
+def test_a_volume_refuses_several_drives_and_too_many_cells():
+    propagator = at.make_propagator(small_scene(extent=80e-3))
+    drive = at.drive_from_phases(torch.zeros(4))
+    with pytest.raises(ValueError, match=r"drive: shape .* a single drive"):
+        at.volume_field(propagator, drive.expand(2, -1))
+    with pytest.raises(ValueError, match=r"spacing: 0\.0001 m; gives \[800, 800, 800\] cells"):
+        at.volume_field(propagator, drive, spacing=1e-4)
+
+
+SCENE = small_scene((CUBE,))
+DRIVE = torch.ones(4, dtype=torch.complex128)
+PLANE = at.Plane((20e-3, 12e-3, 12e-3), (1, 0, 0), (4e-3, 4e-3))
+
+
+def save_state(path):
+    method = at.GABS()
+    at.save_state(path, method, method.start(at.Problem(transducers=4, foci=1)))
+
+
+def save_operator(path):
+    matrix = torch.diag(torch.ones(4, dtype=torch.complex128))
+    at.TMatrix(matrix, 700.0 + 0j, 1e-3, torch.zeros(3).double(), torch.eye(3).double()).save(path)
+
+
+def log(path):
+    hardware.EvaluationLog(path, {}, 4, 1).append(DRIVE, torch.ones(1, dtype=torch.float64), 1.0)
+
+
+SAVERS = {
+    "scene.yaml": lambda path: at.save_scene(path, SCENE),
+    "drive.csv": lambda path: at.save_drive(path, DRIVE, SCENE.array),
+    "drive.npz": lambda path: at.save_drive(path, DRIVE, SCENE.array),
+    "field.vti": lambda path: at.save_field(path, torch.ones((2, 2)) + 0j, PLANE.points(2e-3), frequency=4e4),
+    "field.h5": lambda path: at.save_field(path, torch.ones((2, 2)) + 0j, PLANE.points(2e-3), frequency=4e4),
+    "scene.png": lambda path: at.plot_scene(SCENE).savefig(path),
+    "view.png": lambda path: at.view3d(SCENE, save=path).close(),
+    "view.gltf": lambda path: at.view3d(SCENE, save=path).close(),
+    "state.npz": save_state,
+    "operator.npz": save_operator,
+    "log.jsonl": log,
+}
+
+
+@pytest.mark.parametrize("name", SAVERS)
+def test_the_folder_of_a_file_is_made(tmp_path, name):
+    path = tmp_path / "new" / "one" / name
+    SAVERS[name](path)
+    assert path.stat().st_size > 0
+
+
+def test_a_file_in_the_place_of_a_folder_is_named(tmp_path):
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(OSError, match="taken"):
+        at.save_scene(tmp_path / "taken" / "scene.yaml", SCENE)

@@ -1,23 +1,27 @@
-"""Situations of a live view: bodies that are moved and turned, planes, and what is undone."""
+"""Live views: bodies that are moved, planes, what is undone; calculations, and what ends them."""
 
 import math
+import queue
+import time
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from small_scenes import AIR, small_scene
+from small_scenes import AIR, CUBE, small_scene
 
 import autdtorch as at
+from autdtorch.plot.explore import calculation
 from autdtorch.plot.explore import situation as situation_module
+from autdtorch.plot.explore.calculation import Calculator, Finished, Request, Result
 from autdtorch.plot.explore.display import offered
 from autdtorch.plot.explore.picture import followed
-from autdtorch.plot.explore.situation import SCENE_PLANE, Body, History, Situation
+from autdtorch.plot.explore.situation import SCENE_PLANE, Body, History, Situation, in_phase
 
 PLACE = st.tuples(*[st.floats(-0.1, 0.1)] * 3)
 ANGLES = st.tuples(*[st.floats(-math.pi, math.pi)] * 3)
-CUBE = at.Box((10e-3, 20e-3, 5e-3), (3e-3, 4e-3, 5e-3), (0.3, -0.2, 0.5), rigid=True)
+BRICK = at.Box((10e-3, 20e-3, 5e-3), (3e-3, 4e-3, 5e-3), (0.3, -0.2, 0.5), rigid=True)
 PEG = at.Cylinder((10e-3, 20e-3, 5e-3), 2e-3, 7e-3, (1, 2, 3), rigid=True)
 WEDGE = at.Mesh.from_surface(
     ([[0, 0, 0], [5e-3, 0, 0], [0, 6e-3, 0], [0, 0, 7e-3]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
@@ -32,7 +36,7 @@ def oblique_scene():
     return at.Scene(scene.array, AIR, scene.frequency, scene.control_points, (), plane, scene.domain)
 
 
-@given(st.sampled_from([CUBE, PEG, WEDGE]), PLACE, ANGLES)
+@given(st.sampled_from([BRICK, PEG, WEDGE]), PLACE, ANGLES)
 def test_the_pose_of_a_picture_is_that_of_the_obstacle(obstacle, center, angles):
     body = Body(obstacle, center, angles)
     turn, pivot, offset = body.pose
@@ -47,9 +51,9 @@ def test_the_pose_of_a_picture_is_that_of_the_obstacle(obstacle, center, angles)
 
 def test_bodies_stand_for_their_obstacles():
     ball = at.Sphere((0, 0, 0), 1e-3, rigid=True)
-    for obstacle in (CUBE, PEG, WEDGE, ball):
+    for obstacle in (BRICK, PEG, WEDGE, ball):
         assert Body.of(obstacle).obstacle is obstacle
-    turned = Body(CUBE, CUBE.center, (0.0, 0.0, 0.7)).obstacle
+    turned = Body(BRICK, BRICK.center, (0.0, 0.0, 0.7)).obstacle
     assert turned.rotation == pytest.approx((0, 0, 0.7), abs=1e-9)
     body = Body(ball, (1e-3, 0, 0), (1.0, 0, 0))
     assert body.obstacle.center == (1e-3, 0, 0)
@@ -168,3 +172,56 @@ def test_what_is_dragged_stays_at_its_height_or_on_its_vertical(sight, place, of
         beside = place + np.array([[0, 0, 1e-4], [0, 0, -1e-4]]) + point - place
         others = np.linalg.norm(np.cross(beside - near, sight), axis=1) / np.linalg.norm(sight)
         assert away <= others.min() + 1e-9  # no other height is nearer to it
+
+
+PATIENCE = 60  # s; the machine may be busy
+
+
+@pytest.fixture
+def calculator():
+    """A calculator of small cells, and the queue of what it reports."""
+    reports = queue.SimpleQueue()
+    made = Calculator(2e-3, reports.put)
+    yield made, reports
+    made.close()
+
+
+def until_finished(reports, number):
+    """Results of a request, up to its end."""
+    results = []
+    while True:
+        report = reports.get(timeout=PATIENCE)
+        if isinstance(report, Finished) and report.request.number == number:
+            return results
+        if isinstance(report, Result):
+            results.append(report)
+
+
+def test_a_plane_that_takes_long_is_shown_coarse_before_the_error_and_sharp_after(calculator, monkeypatch):
+    monkeypatch.setattr(calculation, "_MOST_PAIRS", 2e4)
+    monkeypatch.setattr(calculation, "_REST", 0.01)
+    made, reports = calculator
+    scene = small_scene((CUBE,))
+    made.ask(Request(1, Situation.of(scene, in_phase(scene))))
+    first, second, last = until_finished(reports, 1)
+    assert (first.error, second.error, last.error) == (None, last.error, pytest.approx(second.error))
+    assert first.field.shape == second.field.shape
+    assert last.field.size > 2 * first.field.size
+    assert torch.equal(second.pressure, last.pressure)  # the picture alone is sharper
+    largest = [np.nanmax(np.abs(one.field)) for one in (first, last)]
+    assert largest[0] == pytest.approx(largest[1], rel=0.3)  # a cell apart
+
+
+def test_a_newer_request_and_the_end_stop_what_is_calculated():
+    reports = queue.SimpleQueue()
+    made = Calculator(0.35e-3, reports.put)  # takes ten times as long as what is waited for
+    scene = at.load_scene("configs/scene/two_cubes.yaml")
+    made.ask(Request(1, Situation.of(scene, in_phase(scene))))
+    time.sleep(0.1)
+    made.ask(Request(2, Situation.of(scene, in_phase(scene)), fine=False))
+    assert [one.request.number for one in until_finished(reports, 2)] == [2]
+    made.ask(Request(3, Situation.of(scene, in_phase(scene))))
+    time.sleep(0.2)
+    made.close()
+    while not reports.empty():
+        assert not isinstance(reports.get(), Result)
