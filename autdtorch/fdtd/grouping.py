@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, permutations
 
@@ -125,9 +125,7 @@ def choose_grids(
     """Return the method and its grids; for "auto" the cheapest of "box" and "full" that is accurate."""
     if method in ("box", "tmatrix"):
         return method, cheapest_boxes(region, spacing, tolerance, runs)
-    axes, extent = np.eye(3), domain_extent(region, spacing)
-    aligned = bool(region.bodies) and all(flat_faces(shape).all_aligned(axes) for shape in region.shapes)
-    domain = _boxes(region, [_Outline(tuple(range(len(region.bodies))), axes, extent, aligned)], spacing, 1)
+    domain = _grids(region, spacing, [_Outline.of_domain(region, spacing)])
     if method == "full":
         return method, domain
     boxes = cheapest_boxes(region, spacing, tolerance, runs)
@@ -146,7 +144,8 @@ def choose_grids(
 
 def one_box(region: Region, spacing: float) -> Grouping:
     """Return one box of `spacing` [m] for all obstacles."""
-    return _one_box(region, spacing, list(map(flat_faces, region.shapes)))
+    surfaces = list(map(flat_faces, region.shapes))
+    return _grids(region, spacing, [_Outline.around(region, range(len(surfaces)), surfaces)])
 
 
 def cheapest_boxes(region: Region, spacing: float, tolerance: float, runs: int) -> Grouping:
@@ -154,21 +153,27 @@ def cheapest_boxes(region: Region, spacing: float, tolerance: float, runs: int) 
 
     The interiors of boxes, with the air around their obstacles, do not overlap.
     """
+    choices = [
+        _grids(region, spacing, boxes, passes) for boxes, passes in _partitions(region, spacing, tolerance)
+    ]
+    return min(choices, key=lambda grouping: grouping.box_cost(runs))
+
+
+def _partitions(region: Region, spacing: float, tolerance: float) -> Iterator[tuple[Sequence[_Outline], int]]:
+    """Yield one box and those apart, with the passes of the iteration between them."""
     surfaces = list(map(flat_faces, region.shapes))
-    best = _one_box(region, spacing, surfaces)
-    if len(region.bodies) > _MOST_OBSTACLES:
-        return best
-    boxes = [_Outline.around(region, [index], surfaces) for index in range(len(region.bodies))]
+    numbers = range(len(surfaces))
+    yield [_Outline.around(region, numbers, surfaces)], 1
+    if len(surfaces) > _MOST_OBSTACLES:
+        return
+    boxes = [_Outline.around(region, [index], surfaces) for index in numbers]
     while len(boxes) > 1:
         gaps = _gaps(boxes, spacing)
         if gaps.min() > 0 and (passes := _expected_passes(boxes, tolerance)) <= MOST_PASSES:
-            best = min(
-                best, _boxes(region, boxes, spacing, passes), key=lambda grouping: grouping.box_cost(runs)
-            )
+            yield list(boxes), passes
         first, second = sorted(map(int, np.unravel_index(gaps.argmin(), gaps.shape)))
         both = sorted((*boxes[first].group, *boxes.pop(second).group))
         boxes[first] = _Outline.around(region, both, surfaces)
-    return best
 
 
 @dataclass(frozen=True)
@@ -185,11 +190,19 @@ class _Outline:
 
     @classmethod
     def around(cls, region: Region, group: Sequence[int], surfaces: Sequence[FlatFaces]) -> _Outline:
+        """Return the outline of the box of a group, turned along its faces."""
         faces = [surfaces[index] for index in group]
         axes = axes_along(faces)
         shapes = [turned_shape(region.bodies[index].shape, axes) for index in group]
         aligned = all(each.all_aligned(axes) for each in faces)
         return cls(tuple(group), axes, bodies_extent(shapes, region.wavelength), aligned)
+
+    @classmethod
+    def of_domain(cls, region: Region, spacing: float) -> _Outline:
+        """Return the outline of the whole domain, which follows the axes of the scene."""
+        axes, shapes = np.eye(3), region.shapes
+        aligned = bool(shapes) and all(flat_faces(shape).all_aligned(axes) for shape in shapes)
+        return cls(tuple(range(len(shapes))), axes, domain_extent(region, spacing), aligned)
 
     @property
     def middle(self) -> Array:
@@ -202,11 +215,7 @@ class _Outline:
         return np.asarray(np.subtract(self.extent.upper, self.extent.lower) / 2)
 
 
-def _one_box(region: Region, spacing: float, surfaces: Sequence[FlatFaces]) -> Grouping:
-    return _boxes(region, [_Outline.around(region, range(len(surfaces)), surfaces)], spacing, 1)
-
-
-def _boxes(region: Region, boxes: Sequence[_Outline], spacing: float, passes: int) -> Grouping:
+def _grids(region: Region, spacing: float, boxes: Sequence[_Outline], passes: int = 1) -> Grouping:
     grids = tuple(grid_cost(region, box.extent, spacing) for box in boxes)
     groups, axes = tuple(box.group for box in boxes), tuple(box.axes for box in boxes)
     return Grouping(groups, axes, grids, passes, all(box.aligned for box in boxes))

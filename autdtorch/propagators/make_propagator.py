@@ -88,20 +88,23 @@ def make_propagator(
     store = store_in(cache)
     if planned.method == "free_space":
         return FreeSpacePropagator(scene)
-    propagator: TMatrixPropagator | SimulatedPropagator
-    if planned.method == "tmatrix":
-        make_box = None
+
+    @functools.cache  # T-matrices need it for some points only
+    def simulated() -> SimulatedPropagator:
+        on_grids = planned.on_grids
         if spacing is None:
-            make_box = functools.cache(lambda: refined(planned.by_box, Budget(seconds, memory), store))
-            planned = planned.at(make_box().spacing, tolerance, time_step) if planned.runs else planned
-        propagator = TMatrixPropagator(planned, store, make_box)
-        if not planned.runs:
-            return propagator
-    elif spacing is None:
-        propagator = refined(planned, Budget(seconds, memory), store)
+            return refined(on_grids, Budget(seconds, memory), store)
+        on_grids.require_feasible()
+        return SimulatedPropagator(on_grids, store)
+
+    propagator: TMatrixPropagator | SimulatedPropagator
+    if planned.method == "tmatrix" and not planned.runs:
+        return TMatrixPropagator(planned, store, simulated)
+    if planned.method == "tmatrix":
+        settled = planned if spacing else planned.at(simulated().spacing, tolerance, time_step)
+        propagator = TMatrixPropagator(settled, store, simulated)
     else:
-        planned.require_feasible()
-        propagator = SimulatedPropagator(planned, store)
+        propagator = simulated()
     if time_step is not None:
         logger.debug("time step %.4g us", 1e6 * propagator.time_step)  # refuses one that is not stable
     warn_of_scene(propagator.plan)

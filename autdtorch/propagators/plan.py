@@ -19,7 +19,7 @@ from autdtorch.fdtd.kernels.choice import available_kernel, precision_of
 from autdtorch.fdtd.region import Region
 from autdtorch.propagators.scene_region import region_of, with_rigid
 from autdtorch.propagators.store import key_of
-from autdtorch.propagators.tmatrix.bodies import fewer_waves, waves_to_simulate
+from autdtorch.propagators.tmatrix.bodies import waves_to_simulate
 from autdtorch.scene.arrays import apertures_of
 from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.scene import Scene
@@ -98,8 +98,10 @@ class Plan:
         return Law(self.region.shortest_wavelength, self.grouping.aligned)
 
     @property
-    def by_box(self) -> Self:
-        """The plan of the box that serves where T-matrices do not."""
+    def on_grids(self) -> Self:
+        """The plan of what is simulated as a whole: of method "tmatrix", the box of points near bodies."""
+        if self.method != "tmatrix":
+            return self
         return replace(self, method="box", runs=min(len(self.scene.control_points), len(self.scene.array)))
 
     @property
@@ -187,22 +189,18 @@ def plan(
     require_one_of("method", method, ("auto", "free_space", "box", "full", "tmatrix"))
     if method in ("box", "tmatrix") and not scene.obstacles:
         raise invalid("method", method, "needs a scene with obstacles; take free_space")
-    runs, grouping = min(len(scene.control_points), len(scene.array)), Grouping((), (), (), 0, aligned=False)
     if method == "auto" and not scene.obstacles:
         logger.debug("method auto: free_space (no obstacles)")
         method = "free_space"
+    runs, grouping = min(len(scene.control_points), len(scene.array)), Grouping((), (), (), 0, aligned=False)
     if method != "free_space":
         require_spacing(region, spacing)
-        chosen, grouping = choose_grids(region, method, spacing, tolerance, runs)
-        if method == "tmatrix":
-            runs = waves_to_simulate(scene, tolerance)
-        elif method == "auto":
-            walls = any(body.continued for body in region.bodies)
-            waves = None if walls else fewer_waves(scene, tolerance, runs)
-            if waves is not None:
-                logger.debug("method auto: tmatrix; %d waves, where %s takes %d runs", waves, chosen, runs)
-                chosen, runs = "tmatrix", waves
-        method = chosen
+        by_waves, (chosen, grouping) = None, choose_grids(region, method, spacing, tolerance, runs)
+        if method == "tmatrix" or (method == "auto" and not any(body.continued for body in region.bodies)):
+            by_waves = waves_to_simulate(scene, tolerance, runs if method == "auto" else None)
+        if method == "auto" and by_waves is not None:
+            logger.debug("method auto: tmatrix; %d waves, where %s takes %d runs", by_waves, chosen, runs)
+        method, runs = (chosen, runs) if by_waves is None else ("tmatrix", by_waves)
     return Plan(
         scene, region, method, spacing, tolerance, kernel, precision, max_periods, time_step, grouping, runs
     )

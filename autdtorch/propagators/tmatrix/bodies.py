@@ -49,28 +49,32 @@ def has_closed_form(obstacles: Sequence[Obstacle], medium: Medium) -> bool:
     return len(obstacles) == 1 and type(obstacles[0]) is Sphere and medium.absorption == 0
 
 
-def waves_to_simulate(scene: Scene, error: float) -> int:
-    """Return the number of waves, up to a relative error, of the bodies that have no closed form."""
-    simulated = [body for body in bodies_of(scene.obstacles) if not _has_closed_form(scene, body)]
-    return sum(_waves(scene, body.radius, error) for body in simulated)
+def waves_to_simulate(scene: Scene, error: float, most: int | None = None) -> int | None:
+    """Return the number of waves, up to a relative error, of the bodies that have no closed form.
 
-
-def fewer_waves(scene: Scene, error: float, runs: int) -> int | None:
-    """Return `waves_to_simulate` if T-matrices take fewer simulations than so many runs, or else None.
-
-    Points and transducers must be outside of all bodies, and bodies and waves few: more are slower.
+    With `most` it is None where T-matrices are not the quickest: for more waves than that, for points or
+    transducers inside a body's sphere, for more than a few bodies or waves.
     """
-    unknown = [obstacle for obstacle in scene.obstacles if not has_closed_form([obstacle], scene.medium)]
-    edges = [max(np.subtract(obstacle.upper, obstacle.lower)) for obstacle in unknown]
-    if any(_waves(scene, edge / 2, error) > runs for edge in edges):  # without its circumscribed sphere
-        return None
-    bodies = bodies_of(scene.obstacles)
+
+    def waves(radius: float) -> int:
+        return int((enough_degrees(scene.wavenumber * radius, error) + 1) ** 2)
+
+    obstacles = scene.obstacles
+    if most is not None:  # without circumscribed spheres, which take time
+        unknown = [obstacle for obstacle in obstacles if not has_closed_form([obstacle], scene.medium)]
+        if any(waves(max(np.subtract(one.upper, one.lower)) / 2) > most for one in unknown):
+            return None
+    bodies = bodies_of(obstacles)
+    counts = [waves(body.radius) for body in bodies]
+    closed = [
+        has_closed_form([obstacles[index] for index in body.obstacles], scene.medium) for body in bodies
+    ]
+    simulated = sum(count for count, known in zip(counts, closed, strict=True) if not known)
+    if most is None:
+        return simulated
     places = torch.cat([scene.control_points, scene.array.nodes.positions.reshape(-1, 3)])
-    many = (
-        len(bodies) > _MOST_BODIES or sum(_waves(scene, body.radius, error) for body in bodies) > _MOST_WAVES
-    )
-    waves = sum(_waves(scene, body.radius, error) for body in bodies if not _has_closed_form(scene, body))
-    return None if many or waves > runs or not are_outside(places, bodies).all() else waves
+    few = len(bodies) <= _MOST_BODIES and sum(counts) <= _MOST_WAVES and simulated <= most
+    return simulated if few and are_outside(places, bodies).all() else None
 
 
 def are_outside(points: torch.Tensor, bodies: Sequence[ObstacleGroup]) -> torch.Tensor:
@@ -85,12 +89,3 @@ def _body(obstacles: Sequence[Obstacle], chosen: tuple[int, ...]) -> ObstacleGro
 
 def _overlap(one: ObstacleGroup, other: ObstacleGroup) -> bool:
     return float((one.center - other.center).norm()) <= one.radius + other.radius + LENGTH_TOLERANCE
-
-
-def _has_closed_form(scene: Scene, body: ObstacleGroup) -> bool:
-    return has_closed_form([scene.obstacles[index] for index in body.obstacles], scene.medium)
-
-
-def _waves(scene: Scene, radius: float, error: float) -> int:
-    """Return the number of waves around a sphere, up to a relative error."""
-    return int((enough_degrees(scene.wavenumber * radius, error) + 1) ** 2)

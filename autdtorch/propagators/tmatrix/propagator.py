@@ -65,7 +65,7 @@ class TMatrixPropagator:
         self.scene, self.method, self.spacing = plan.scene, plan.method, plan.spacing
         self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
         self.plan, self._store = plan, store or Store()
-        self._make_box = make_box or functools.partial(SimulatedPropagator, plan.by_box, self._store)
+        self._make_box = make_box or functools.partial(SimulatedPropagator, plan.on_grids, self._store)
 
     def __repr__(self) -> str:
         """Scene, settings and number of bodies."""
