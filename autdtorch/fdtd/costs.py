@@ -139,7 +139,7 @@ class Costs:
             cells += beside
             meshed += beside if is_mesh else 0.0
             assembled += beside * (_ALIKE if self.grouping.aligned else _FORCES if body.fluid else 1)
-            if body.fluid and body.fluid.sound_speed != region.fluid.sound_speed:
+            if body.fluid and (body.fluid.is_lossy or body.fluid.sound_speed != region.fluid.sound_speed):
                 box = np.clip([body.shape.lower, body.shape.upper], *inner)
                 cells += _SHARE_INSIDE * float(np.prod(box[1] - box[0])) / spacing**3
         return Heterogeneity(cut, cells, columns, meshed, assembled)

@@ -83,7 +83,7 @@ def grid_cost(region: Region, extent: Extent, spacing: float) -> GridCost:
     rim = extent.layer_cells(kappa) + 1
     stencil = tuned_stencil(kappa, region.attenuation * spacing)
     periods = fewest_periods(extent.crossings * crossing_time(interior, kappa))
-    fastest = max(region.sound_speeds.values()) / region.fluid.sound_speed
+    fastest = max(region.sound_speeds.values()) / region.fluid.phase_speed
     steps_per_period = fewest_steps(stencil, stencil.largest_symbol * fastest**2)
     shape = x + 2 * rim, y + 2 * rim, z + 2 * rim
     return GridCost(interior, shape, math.ceil(periods * steps_per_period), steps_per_period)

@@ -79,7 +79,7 @@ def _faces(region: Region, surfaces: list[tuple[Array, Array]], axis: int, origi
         double = np.linalg.norm(normal, axis=1)
         aligned = np.abs(normal[:, axis]) > ALIGNED * double
         place, outward = corner[aligned, axis], np.sign(normal[aligned, axis])
-        heavier = body.fluid is None or body.fluid.density >= region.fluid.density
+        heavier = body.fluid is None or body.fluid.inertia >= region.fluid.inertia
         inside = (place > low) & (place < high)
         first = -outward if heavier else outward
         parts.append(np.stack((place - origin, first, double[aligned] / 2))[:, inside])

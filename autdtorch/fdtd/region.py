@@ -15,10 +15,28 @@ from autdtorch.utils.validation import Vector
 
 
 class Fluid(NamedTuple):
-    """Density [kg/m^3] and sound speed [m/s] of a fluid."""
+    """Density [kg/m^3] and sound speed [m/s] of a fluid, complex where it absorbs.
 
-    density: float
-    sound_speed: float
+    Time factor e^{-i w t}: Im(density) >= 0 and Im(1 / bulk modulus) >= 0 are passive.
+    """
+
+    density: complex
+    sound_speed: complex
+
+    @property
+    def is_lossy(self) -> bool:
+        """Whether it absorbs."""
+        return self.density.imag != 0 or self.sound_speed.imag != 0
+
+    @property
+    def inertia(self) -> float:
+        """Ratio of a pressure gradient to the acceleration in phase with it [kg/m^3]."""
+        return self.density.real if self.density.imag == 0 else 1 / (1 / self.density).real
+
+    @property
+    def phase_speed(self) -> float:
+        """Speed of wave fronts [m/s]."""
+        return self.sound_speed.real if self.sound_speed.imag == 0 else 1 / (1 / self.sound_speed).real
 
 
 class Shape(Protocol):
@@ -50,10 +68,12 @@ class Body:
     """A shape of one material."""
 
     shape: Shape
-    fluid: Fluid | None  # its material, None if it is rigid
+    fluid: Fluid | None  # its material, None if it is rigid or has an impedance
     continued: bool = False  # whether it continues through the boundary layers instead of ending before them
     uncertainty: float = 0.0  # distance [m] by which its surface may be off (rms)
     rigid_error: float = 0.0  # relative difference of the field in front of it, of a body taken as rigid
+    # impedance of its surface, locally reacting, over that of air (density times sound speed); None if rigid
+    impedance: complex | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +92,12 @@ class Region:
     @property
     def wavenumber(self) -> float:
         """Wavenumber in air [rad/m]."""
-        return 2 * math.pi * self.frequency / self.fluid.sound_speed
+        return 2 * math.pi * self.frequency / self.fluid.phase_speed
 
     @property
     def wavelength(self) -> float:
         """Wavelength in air [m]."""
-        return self.fluid.sound_speed / self.frequency
+        return self.fluid.phase_speed / self.frequency
 
     @property
     def shortest_wavelength(self) -> float:
@@ -91,7 +111,7 @@ class Region:
 
     @property
     def walls(self) -> list[Shape]:
-        """Shapes of the rigid bodies."""
+        """Shapes of the bodies that no sound enters."""
         return [body.shape for body in self.bodies if body.fluid is None]
 
     @property
@@ -99,4 +119,4 @@ class Region:
         """Sound speeds [m/s] by place, for messages."""
         fluids = {f"obstacle {index}": body.fluid for index, body in enumerate(self.bodies)}
         everywhere = {"the medium": self.fluid} | fluids
-        return {where: fluid.sound_speed for where, fluid in everywhere.items() if fluid}
+        return {where: fluid.phase_speed for where, fluid in everywhere.items() if fluid}

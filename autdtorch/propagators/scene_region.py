@@ -73,8 +73,8 @@ def difference_from_rigid(body: Body, region: Region) -> float:
     thickness.
     """
     assert body.fluid is not None
-    heavier = body.fluid.density / region.fluid.density
-    stiffer = body.fluid.sound_speed / region.fluid.sound_speed
+    heavier = body.fluid.inertia / region.fluid.inertia
+    stiffer = body.fluid.phase_speed / region.fluid.phase_speed
     if heavier <= 1 or stiffer < _STIFF:
         return math.inf
     thickness = mean_thickness(*(part.numpy() for part in body.shape.surface()))

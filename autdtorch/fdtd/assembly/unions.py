@@ -119,7 +119,7 @@ def unions_of(region: Region, grid: Grid, stencil: Stencil) -> tuple[list[Union]
             body.continued,
             aligned,
             body.fluid is None,
-            not aligned and (body.fluid is None or body.fluid.density > air.density),
+            not aligned and (body.fluid is None or body.fluid.inertia > air.inertia),
         )
         if unions and union == replace(unions[-1], shapes=union.shapes):
             unions[-1] = replace(union, shapes=(*unions[-1].shapes, *union.shapes))
@@ -129,8 +129,8 @@ def unions_of(region: Region, grid: Grid, stencil: Stencil) -> tuple[list[Union]
     factor, slowness = np.ones(len(fluids)), np.ones(len(fluids))
     for number, fluid in enumerate(fluids):
         if fluid is not None:
-            ratio = fluid.sound_speed / air.sound_speed
-            density[number] = fluid.density / air.density / flow_factor(stencil.kappa, ratio)
+            ratio = fluid.phase_speed / air.phase_speed
+            density[number] = fluid.inertia / air.inertia / flow_factor(stencil.kappa, ratio)
             factor[number], slowness[number] = speed_factor(stencil, ratio), 1 / ratio
     rigid = np.array([fluid is None for fluid in fluids])
     return unions, Materials(density, 1 / (density * factor), slowness, rigid)
