@@ -4,11 +4,10 @@ from .hardware.devices.openmpd import OpenMPDBoard
 from .io.array_file import load_array
 from .io.drive_file import load_drive, save_drive
 from .io.field_file import save_field
-from .io.scene_file import load_scene
-from .io.scene_writer import save_scene
+from .io.scene_file import load_scene, save_scene
 from .methods.base import Method, Problem, State
 from .methods.bayes.focus_problem import FocusProblem
-from .methods.bayes.kernels import PhasorKernel
+from .methods.bayes.gaussian_process import PhasorKernel
 from .methods.bayes_opt import BayesOpt
 from .methods.functions import bayes_opt, gabs, gradient_ascent, identify, lss, lssg, random_search
 from .methods.gabs import GABS
@@ -25,10 +24,9 @@ from .methods.state_file import load_state, save_state
 from .objectives.bound import focus_bound
 from .objectives.goals import Goal, MeanPressure, TargetPressures, WeakestFocus
 from .objectives.metrics import FocusMetrics, focus_metrics
-from .objectives.objective import Objective, weakest_focus
+from .objectives.objective import Objective, SimulatedObjective, weakest_focus
 from .objectives.perturbations import Drift, FailedTransducers, Noise, Quantised, true_pressure
 from .objectives.quiet import Contrast, QuietPoints
-from .objectives.simulated import SimulatedObjective
 from .plot.costs import plot_pareto, plot_scaling
 from .plot.explore import explore
 from .plot.pressure_maps import plot_plane, plot_planes

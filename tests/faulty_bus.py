@@ -4,7 +4,7 @@ from array import array
 from collections.abc import Callable, Sequence
 
 from autdtorch.hardware import EmulatedBench, EmulatedSensor
-from autdtorch.hardware.emulator.bus import EmulatedBus, EmulatedDevice, stall, time_out, unplugged
+from autdtorch.hardware.emulator.bench import EmulatedBus, EmulatedDevice, stall, time_out, unplugged
 
 #: "time-out" and "short write": a transfer ends in mid-frame, with an error or without, and the chip takes
 #: nothing until it is reset; "stall": the endpoint refuses until its halt is cleared; "unplug": the chip is

@@ -17,7 +17,7 @@ from small_scenes import AIR, CORNER, CUBE, small_scene
 
 import autdtorch as at
 from autdtorch import hardware, propagators
-from autdtorch.hardware.emulator.bus import EmulatedBus
+from autdtorch.hardware.emulator.bench import EmulatedBus
 from autdtorch.hardware.emulator.emulated_scope import EmulatedInstrument
 
 PLANE = at.Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(8e-3, 8e-3))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from small_scenes import CUBE, small_scene
 
-import autdtorch.study.run
+import autdtorch.study.run_study
 from autdtorch.methods.functions import gabs
 from autdtorch.scene.geometry import Plane
 
@@ -24,7 +24,7 @@ def slow_gabs(objective, trials=1, seed=0):
 def main():
     """Run the study into the folder that the command line names."""
     slow_gabs.__module__ = gabs.__module__  # results of others' methods are not used again
-    autdtorch.study.run.BLOCK = 1
+    autdtorch.study.run_study.BLOCK = 1
     scenes = {
         "empty": dataclasses.replace(small_scene(), observation_plane=PLANE),
         "cube": dataclasses.replace(small_scene((CUBE,)), observation_plane=PLANE),
@@ -32,7 +32,7 @@ def main():
     print("ready", flush=True)
     solver = SOLVER | {"cache": Path(sys.argv[1]) / "matrices"}
     settings = {"trials": 6, "plane_spacing": 4e-3, "folder": Path(sys.argv[1]), "config": "a"}
-    autdtorch.study.run.run_study(scenes, {"gabs": slow_gabs}, solver=solver, **settings)
+    autdtorch.study.run_study.run_study(scenes, {"gabs": slow_gabs}, solver=solver, **settings)
 
 
 if __name__ == "__main__":

@@ -25,12 +25,12 @@ from autdtorch.io.drive_file import save_drive
 from autdtorch.io.goal_section import goal_section, load_goal, score_label
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
+from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.objectives.perturbations import simulated_matrix
-from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.propagators import make_propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.study.report.hardware_report import write_hardware_report
-from autdtorch.study.run import check_goal, name_of, solve
+from autdtorch.study.run_study import check_goal, name_of, solve
 from autdtorch.utils.progress import Progress, show_progress
 from autdtorch.utils.validation import boolean, indices, invalid, require_known, require_one_of
 

@@ -36,6 +36,8 @@ from autdtorch.cli.errors import AGAIN, FULL_ERROR, FailedJob, in_one_line, stop
 logger = logging.getLogger(__name__)
 
 _LONGEST_NAME = 150  # of a job's folder; file systems allow 255 bytes
+_EXPLORE_KEYS = ("port", "browser", "drive")
+_EXPLORE_SETTINGS = re.compile(r"\+*(scene|modules|explore|hydra)\b|\+*solver\.spacing=")
 
 
 class _Carrier(BaseException):
@@ -118,7 +120,6 @@ def _run(config: DictConfig) -> None:
 
 @hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")
 def _explore(config: DictConfig) -> None:
-    from autdtorch.cli.explore_command import explore_scene
     from autdtorch.cli.settings import settings_of
 
     try:
@@ -128,6 +129,42 @@ def _explore(config: DictConfig) -> None:
         explore_scene(settings, modules)
     except Exception as error:
         raise _Carrier from error
+
+
+def explore_scene(settings: dict[str, Any], modules: list[Any]) -> None:
+    """Show the scene of the settings until Ctrl+C or SIGTERM, which a job in the background gets, ends it.
+
+    Raises:
+        ValueError: a setting of `explore` that is unknown or out of range, or one that has no effect here.
+    """
+    from autdtorch.cli.settings import is_given, scene_of, section_of, solver_of
+    from autdtorch.io.drive_file import load_drive
+    from autdtorch.plot.explore import explore
+    from autdtorch.utils.process import signals_restored
+    from autdtorch.utils.validation import invalid, path_of, require_known, within
+
+    for override in HydraConfig.get().overrides.task:
+        if not _EXPLORE_SETTINGS.match(override):
+            accepted = "has no effect on explore; give scene, modules, solver.spacing or explore.KEY"
+            raise ValueError(f"{override}: {accepted}")
+    section = section_of(settings, "explore")
+    require_known("explore", section, _EXPLORE_KEYS)
+    drive = None
+    if (file := section.get("drive")) is not None:
+        if not is_given("explore.drive"):
+            raise invalid("explore.drive", file, "must be given on the command line")
+        with within("explore.drive"):
+            drive = load_drive(path_of("drive", file))
+    scene = scene_of("scene", section_of(settings, "scene"), modules)
+    spacing, port, browser = solver_of(settings)["spacing"], section["port"], section["browser"]
+    with signals_restored():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        explorer = explore(scene, drive, spacing=spacing, port=port, open_browser=browser)
+        try:
+            print(f"The live view is at {explorer.address}\nCtrl+C ends it.", flush=True)
+            explorer.wait()
+        except KeyboardInterrupt:
+            explorer.close()
 
 
 def _log_warning(message: Warning | str, *_: Any, **__: Any) -> None:

@@ -18,7 +18,7 @@ from autdtorch.methods.base import Method
 from autdtorch.methods.catalogue import METHODS
 from autdtorch.propagators import make_propagator
 from autdtorch.scene.scene import Scene
-from autdtorch.study.run import StudyMethod
+from autdtorch.study.run_study import StudyMethod
 from autdtorch.utils.validation import require_known
 
 _SETTINGS = (

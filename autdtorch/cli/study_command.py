@@ -26,9 +26,9 @@ from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.moving import angles_of
 from autdtorch.scene.scene import Scene
 from autdtorch.study.results import StudyResult, summary_rows
-from autdtorch.study.run import StudyMethod, name_of, run_study
+from autdtorch.study.run_study import StudyMethod, name_of, run_study
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.display import counted
+from autdtorch.utils.text import counted
 from autdtorch.utils.units import angles
 from autdtorch.utils.validation import (
     finite_vector,

@@ -1,16 +1,19 @@
-"""Safety of a bench: limits on amplitudes and times, and outputs off however a trial ends."""
+"""Safety of a bench: limits on amplitudes and times, outputs off however a trial ends, a check before it."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
 import logging
+import math
 import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
@@ -19,6 +22,7 @@ import torch
 from autdtorch.hardware.link import Link
 from autdtorch.hardware.played import AmplitudeScale
 from autdtorch.hardware.sensors.sensor import Sensor, SensorError, checked_reading
+from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.process import send_again
 from autdtorch.utils.validation import (
     integer_at_least,
@@ -26,6 +30,7 @@ from autdtorch.utils.validation import (
     not_negative,
     number_between,
     positive,
+    require_callable,
     require_kind,
 )
 
@@ -284,3 +289,105 @@ class LimitedLink:
     def _raise_failure(self) -> None:
         if self._failure is not None:
             raise self._failure
+
+
+_DEVIATIONS = 6.0  # threshold above the noise, in standard deviations of its mean power
+_WEAK = 0.1  # threshold below the median of all transducers: 20 dB, as some sensors round silence to 0
+
+_MOST_READINGS = 10_000
+
+
+@dataclass(frozen=True, eq=False)
+class Preflight:
+    """The pressure of each transducer alone, and of silence.
+
+    Attributes:
+        pressure: of each transducer (M,) [Pa], rms over readings and control points.
+        silence: with the outputs off [Pa].
+        threshold: pressure that a working transducer exceeds [Pa].
+    """
+
+    pressure: torch.Tensor
+    silence: float
+    threshold: float
+
+    @property
+    def failed(self) -> list[int]:
+        """The failed transducers, whose pressure is not above the threshold."""
+        return torch.nonzero(self.pressure <= self.threshold)[:, 0].tolist()
+
+    @property
+    def dead(self) -> list[int]:
+        """The former name of `failed`."""
+        warnings.warn("Preflight.dead is now Preflight.failed", DeprecationWarning, stacklevel=2)
+        return self.failed
+
+
+def check_transducers(
+    link: LimitedLink,
+    sensor: Sensor,
+    points: int,
+    readings: int = 4,
+    background: int = 32,
+    watch: Callable[[str], object] | None = None,
+) -> Preflight:
+    """Play every transducer alone, after silence, and switch the outputs off, however it ends.
+
+    The power of circular Gaussian noise, averaged over n readings, deviates by 1/sqrt(n) of its mean. The
+    threshold is six deviations above that mean, or 20 dB below the median of all transducers if that is more.
+
+    Args:
+        link: plays the transducers.
+        sensor: reads their pressure.
+        points: number of control points P.
+        readings: number of readings of every transducer, 1 to 10,000.
+        background: number of readings of the silence, 1 to 10,000.
+        watch: takes the name of each reading: "silence, outputs off", then "transducer 1 of 16" and so on.
+
+    Raises:
+        ValueError: the link is not limited, there is no sensor or it does not give P finite magnitudes, or
+            another number of readings.
+        LimitError: the time limit of the outputs is reached.
+        LinkError: the device does not take the bytes.
+    """
+    require_kind("link", link, LimitedLink)
+    require_kind("sensor", sensor, Sensor)
+    watch = (lambda _: None) if watch is None else watch
+    require_callable("watch", watch)
+    points = integer_at_least("points", points, 1)
+    readings = _count("readings", readings)
+    background = _count("background", background)
+    watch("silence, outputs off")
+    silence = _power(partial(checked_reading, sensor, points), background)
+    count = len(link.link.transducers)
+    powers = []
+    try:
+        for number, alone in enumerate(torch.eye(count, **COMPLEX), start=1):
+            watch(f"transducer {number} of {count}")
+            link.play(alone)
+            powers.append(_power(partial(link.reading, sensor, points), readings))
+    finally:
+        link.off()
+    pressure = torch.tensor(powers, **REAL).sqrt()
+    above_noise = math.sqrt(silence * (1 + _DEVIATIONS / math.sqrt(readings * points)))
+    return Preflight(pressure, math.sqrt(silence), max(above_noise, _WEAK * float(pressure.median())))
+
+
+def hears_silence(sensor: Sensor, check: Preflight, points: int, readings: int = 4) -> bool:
+    """Return True if a sensor of P points reads no more than at the `check` before, with the outputs off.
+
+    `ValueError` if the sensor does not give P finite magnitudes, or for another number of readings.
+    """
+    require_kind("sensor", sensor, Sensor)
+    require_kind("check", check, Preflight)
+    points = integer_at_least("points", points, 1)
+    readings = _count("readings", readings)
+    return math.sqrt(_power(partial(checked_reading, sensor, points), readings)) <= check.threshold
+
+
+def _count(name: str, value: object) -> int:
+    return int(number_between(name, integer_at_least(name, value, 1), 1, _MOST_READINGS))
+
+
+def _power(read: Callable[[], torch.Tensor], readings: int) -> float:
+    return float(torch.stack([read() for _ in range(readings)]).square().mean())

@@ -25,7 +25,7 @@ from autdtorch.utils.validation import integer_at_least, invalid, number_between
 
 if TYPE_CHECKING:
     from autdtorch.methods.bayes.acquisition import Acquisition
-    from autdtorch.methods.bayes.processes import Fit, Rows
+    from autdtorch.methods.bayes.gaussian_process import Fit, Rows
 
 NOISE = 1e-4
 """Noise variance that the process of the score assumes, relative to its signal variance. A fitted one would
@@ -214,7 +214,7 @@ class BayesOpt(Method):
         generators: Sequence[torch.Generator],
     ) -> tuple[Fit, Rows | None]:
         """Return hyperparameters and rows; `search` gets the tensors that the next fit begins with."""
-        from autdtorch.methods.bayes.processes import Fit, fitted
+        from autdtorch.methods.bayes.gaussian_process import Fit, fitted
 
         count = search["values"].shape[1]
         if self.model == "foci" and (self.prior is not None or count >= 3 * problem.transducers - 1):
@@ -229,7 +229,7 @@ class BayesOpt(Method):
         self, problem: Problem, search: dict[str, torch.Tensor], generators: Sequence[torch.Generator]
     ) -> tuple[Fit, Rows]:
         """Return the noise, and rows of the matrix that is fitted to all readings, or of a sample of it."""
-        from autdtorch.methods.bayes.processes import Fit, Rows, mean_intensity
+        from autdtorch.methods.bayes.gaussian_process import Fit, Rows, mean_intensity
 
         observed = search["values"]
         drives = problem.quantise(self._drives(search["points"]))
@@ -254,7 +254,7 @@ class BayesOpt(Method):
         self, goal: GoalFunction, values: torch.Tensor, points: torch.Tensor, fit: Fit, rows: Rows | None
     ) -> Acquisition:
         from autdtorch.methods.bayes.acquisition import FocusAcquisition, ScoreAcquisition
-        from autdtorch.methods.bayes.processes import Processes
+        from autdtorch.methods.bayes.gaussian_process import Processes
 
         processes = Processes(self.kernel, points, values, fit, rows)
         if self.model == "weakest":

@@ -8,8 +8,17 @@ from typing import ClassVar, Literal
 
 import torch
 
-from autdtorch.methods import coordinates
 from autdtorch.methods.base import NEAR_TIE, Method, Problem, State, Step, starts_of, whole
+from autdtorch.methods.lssg import (
+    Search,
+    ascend,
+    at_levels,
+    begin_ascent,
+    candidates,
+    indices_of,
+    order_setting,
+    require_all,
+)
 from autdtorch.methods.seeds import generators_of
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.validation import invalid
@@ -43,7 +52,7 @@ class GABS(Method):
     label: ClassVar[str] = "GABS"
 
     levels: int = whole(16, least=2)
-    order: Literal["random", "given", "strength"] | Sequence[int] = coordinates.order(
+    order: Literal["random", "given", "strength"] | Sequence[int] = order_setting(
         "random", "given", "strength"
     )
     first: int | None = whole(None, least=0)
@@ -51,7 +60,7 @@ class GABS(Method):
 
     def check(self, problem: Problem) -> None:
         """Check order and first transducer against the number of transducers."""
-        coordinates.require_all(self.order, problem.transducers)
+        require_all(self.order, problem.transducers)
         if self.first is not None and self.first >= problem.transducers:
             raise invalid("first", self.first, f"must be an integer from 0 to {problem.transducers - 1}")
 
@@ -70,7 +79,7 @@ class GABS(Method):
         if self.order == "strength":
             alone = torch.eye(count, **COMPLEX)
             return Step(alone.expand(len(seeds), -1, -1), {})
-        orders = coordinates.indices_of(self.order, count).expand(len(seeds), -1)
+        orders = indices_of(self.order, count).expand(len(seeds), -1)
         if self.order == "random":
             shuffled = [
                 torch.randperm(count, generator=draws, device="cpu") for draws in generators_of(seeds)
@@ -86,10 +95,10 @@ class GABS(Method):
         done = (state.best.history.shape[1] - self._alone(problem)) // self.levels
         step = done + self._skipped(problem)
         if done > 0:
-            search, goes_on = coordinates.ascend(search, step - 1, score)
+            search, goes_on = ascend(search, step - 1, score)
         if step == self.passes * problem.transducers:
             return Step(state.drives[:, :0], search)
-        return Step(coordinates.candidates(search, self.levels, step), search, goes_on)
+        return Step(candidates(search, self.levels, step), search, goes_on)
 
     def _skipped(self, problem: Problem) -> int:
         """Return 1 where the first transducer is on alone, whose phase changes nothing."""
@@ -99,7 +108,7 @@ class GABS(Method):
         """Return the number of transducers observed alone."""
         return problem.transducers if self.order == "strength" else 1
 
-    def _begun(self, problem: Problem, orders: torch.Tensor) -> coordinates.Search:
+    def _begun(self, problem: Problem, orders: torch.Tensor) -> Search:
         """Return the state of an ascent in `orders` (T, M), after `first`.
 
         One transducer is on, or all that are on in the drives to start from.
@@ -108,9 +117,9 @@ class GABS(Method):
             others = orders[orders != self.first].reshape(len(orders), -1)
             orders = torch.cat([orders.new_full((len(orders), 1), self.first), others], dim=1)
         if (starts := starts_of(problem, len(orders))) is not None:
-            return coordinates.begin_ascent(coordinates.at_levels(starts, self.levels), orders)
+            return begin_ascent(at_levels(starts, self.levels), orders)
         alone = torch.eye(orders.shape[1], **COMPLEX)
-        return coordinates.begin_ascent(alone[orders[:, 0]], orders)
+        return begin_ascent(alone[orders[:, 0]], orders)
 
 
 def _best_first(score: torch.Tensor) -> torch.Tensor:

@@ -1,18 +1,100 @@
-"""LSS, the linear synthesis scheme, and LSSG, which searches its offsets: the paper's baseline."""
+"""LSS, the linear synthesis scheme, and LSSG, the coordinate ascent over its offsets (paper's baseline)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 
-from autdtorch.methods import coordinates
-from autdtorch.methods.base import Method, Problem, State, Step, whole
-from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise
-from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.validation import invalid
+from autdtorch.methods.base import Method, Problem, State, Step, first_of_best, setting, whole
+from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise, phases_of
+from autdtorch.utils.array_types import COMPLEX, REAL
+from autdtorch.utils.validation import integers, invalid
+
+Search = Mapping[str, torch.Tensor]
+"""The state of the ascent of L trials over N weights:
+
+- ``weights`` (L, N), complex128: e^{-i phi}, or 0 for what is off; ``before``: as they were before this pass.
+- ``order`` (L, K): indices of the weights to go through in a pass.
+"""
+
+
+def order_setting(*names: str) -> Any:
+    """Return the field of a setting that is one of these names, the first by default, or indices."""
+    return setting(names[0], functools.partial(_checked_order, names=names))
+
+
+def _checked_order(name: str, order: str | Sequence[int], names: Sequence[str]) -> str | tuple[int, ...]:
+    if isinstance(order, str) and order in names:
+        return order
+    quoted = ", ".join(f'"{name}"' for name in names)
+    accepted = f"must be {quoted} or the indices of all, each once"
+    chosen = tuple(integers(name, order, 0, accepted))
+    if sorted(chosen) != list(range(len(chosen))):
+        raise invalid(name, order, accepted)
+    return chosen
+
+
+def require_all(order: str | Sequence[int], count: int) -> None:
+    """Check that an order by indices has `count` of them."""
+    if not isinstance(order, str) and len(order) != count:
+        raise invalid("order", order, f"must be the indices 0 to {count - 1}, each once")
+
+
+def indices_of(order: str | Sequence[int], count: int) -> torch.Tensor:
+    """Return the indices (count,) of an order; ascending where the order is a name."""
+    return torch.tensor(range(count) if isinstance(order, str) else order, dtype=torch.int64, device="cpu")
+
+
+def at_levels(drive: torch.Tensor, levels: int) -> torch.Tensor:
+    """Return drives (L, N) with the nearest of the phases, and amplitudes 1 where they are on."""
+    nearest = (phases_of(drive) * levels / (2 * math.pi)).round().to(torch.int64) % levels
+    return torch.where(drive == 0, 0, _phases(levels)[nearest])
+
+
+def begin_ascent(weights: torch.Tensor, order: torch.Tensor) -> Search:
+    """Return the state of an ascent from weights (L, N)."""
+    return {"weights": weights, "before": weights, "order": order}
+
+
+def candidates(search: Search, levels: int, step: int) -> torch.Tensor:
+    """Return the weights (L, levels, N) to compare in a step: all phases of its weight.
+
+    The present phase is among them, so that a choice is made among observations of one time: a lucky reading,
+    or the drift since, does not hold a phase for ever.
+    """
+    weights, order = search["weights"][:, None], search["order"]
+    index = order[:, step % order.shape[1], None, None].expand(-1, levels, 1)
+    phases = _phases(levels)[:, None].expand(len(order), -1, 1)
+    return weights.expand(-1, levels, -1).scatter(2, index, phases)
+
+
+def ascend(search: Search, step: int, score: torch.Tensor) -> tuple[Search, torch.Tensor | None]:
+    """Take the best of the `candidates` of a step by their scores (L, levels); of near ties the first.
+
+    Returns:
+        The state, and which of the L trials go on (L,), None for all. A trial ends after a pass that changed
+        none of its weights.
+    """
+    order = search["order"]
+    index = order[:, step % order.shape[1], None]
+    phases = _phases(score.shape[1])[first_of_best(score)]
+    weights = search["weights"].scatter(1, index, phases[:, None])
+    if (step + 1) % order.shape[1]:
+        return {**search, "weights": weights}, None
+    goes_on = (weights != search["before"]).any(dim=1)
+    return {**search, **begin_ascent(weights[goes_on], order[goes_on])}, goes_on
+
+
+@functools.lru_cache(maxsize=8)
+def _phases(levels: int) -> torch.Tensor:
+    """Return e^{-i phi} (levels,) of the phases to compare."""
+    turns = torch.arange(levels, **REAL)
+    return drive_from_phases(2 * math.pi * turns / levels)
 
 
 @dataclass(frozen=True)
@@ -52,12 +134,12 @@ class LSSG(Method):
     random: ClassVar[bool] = False
 
     levels: int = whole(16, least=2)
-    order: Literal["given"] | Sequence[int] = coordinates.order("given")
+    order: Literal["given"] | Sequence[int] = order_setting("given")
     passes: int = whole(1, least=1)
 
     def check(self, problem: Problem) -> None:
         """Check the order against the number of foci."""
-        coordinates.require_all(self.order, problem.foci)
+        require_all(self.order, problem.foci)
 
     def most_evaluations(self, problem: Problem) -> int:
         """Return the evaluations of all passes."""
@@ -71,17 +153,17 @@ class LSSG(Method):
         """Compare the offsets of the first focus."""
         foci = _focus_drives(problem)
         start = torch.ones(1, problem.foci, **COMPLEX)
-        order = coordinates.indices_of(self.order, problem.foci)[None]
-        search = {**coordinates.begin_ascent(start, order), "foci": foci}
-        return Step(normalise(coordinates.candidates(search, self.levels, 0) @ foci), search)
+        order = indices_of(self.order, problem.foci)[None]
+        search = {**begin_ascent(start, order), "foci": foci}
+        return Step(normalise(candidates(search, self.levels, 0) @ foci), search)
 
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
         """Compare the offsets of the next focus."""
         step = state.best.history.shape[1] // self.levels
-        search, goes_on = coordinates.ascend(state.search, step - 1, score)
+        search, goes_on = ascend(state.search, step - 1, score)
         if step == self.passes * state.problem.foci:
             return Step(state.drives[:, :0], search)
-        weights = coordinates.candidates(search, self.levels, step)
+        weights = candidates(search, self.levels, step)
         return Step(normalise(weights @ search["foci"]), search, goes_on)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from autdtorch.scene.drive import amplitudes_of, phases_of
-from autdtorch.utils.display import html_facts
+from autdtorch.utils.text import html_facts
 
 
 @dataclass(frozen=True, eq=False)

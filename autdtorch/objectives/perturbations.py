@@ -15,10 +15,9 @@ import numpy as np
 import torch
 
 from autdtorch.objectives.objective import Objective, observe_drives, require_objective, validate_drives
-from autdtorch.scene.drive import drive_from_phases, validate_drive
-from autdtorch.scene.phase_levels import PhaseLevels
+from autdtorch.scene.drive import PhaseLevels, drive_from_phases, validate_drive
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.display import counted
+from autdtorch.utils.text import counted
 from autdtorch.utils.validation import (
     boolean,
     indices,

@@ -19,8 +19,8 @@ from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
-from autdtorch.utils.display import counted
 from autdtorch.utils.process import available_memory
+from autdtorch.utils.text import counted
 from autdtorch.utils.validation import positive
 
 _MEASURED_STEPS, _MEASURED_CELLS = 80, (300_000, 1_000_000)

@@ -11,7 +11,7 @@ import torch
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.display import counted
+from autdtorch.utils.text import counted
 from autdtorch.utils.validation import ArrayLike, boolean, points_grid, require_kind
 
 logger = logging.getLogger(__name__)

@@ -14,7 +14,7 @@ from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.scene_region import warn_of_ending_walls, warn_of_near_points
 from autdtorch.propagators.simulation import PressureMap, Run, Simulation
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.display import counted
+from autdtorch.utils.text import counted
 from autdtorch.utils.units import warn_user
 
 logger = logging.getLogger(__name__)

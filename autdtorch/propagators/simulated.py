@@ -21,8 +21,8 @@ from autdtorch.propagators.store import Store
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.display import counted
 from autdtorch.utils.process import cached_property, one_library_thread, require_memory
+from autdtorch.utils.text import counted
 from autdtorch.utils.validation import ArrayLike, boolean, points_grid
 
 _LONGER = 1.5

@@ -24,9 +24,9 @@ from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.display import counted
 from autdtorch.utils.process import cached_property
 from autdtorch.utils.progress import show_progress
+from autdtorch.utils.text import counted
 from autdtorch.utils.validation import ArrayLike, invalid, points_tensor
 
 logger = logging.getLogger(__name__)

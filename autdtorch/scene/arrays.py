@@ -14,10 +14,10 @@ from autdtorch.scene.geometry import Coordinates, in_plane, plane_basis
 from autdtorch.scene.transducer_values import disc_radius, for_each, unit_normals
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.display import counted
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.process import require_memory
 from autdtorch.utils.spatial import require_distinct
+from autdtorch.utils.text import counted
 from autdtorch.utils.validation import (
     ArrayLike,
     points_tensor,

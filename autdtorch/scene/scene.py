@@ -18,9 +18,9 @@ from autdtorch.scene.obstacles.base import overlap, shared_box
 from autdtorch.scene.obstacles.moving import moved
 from autdtorch.scene.plausibility import extent_of, unit_hint, warn_of_implausible
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.display import counted, html_facts
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.spatial import nearest, require_distinct
+from autdtorch.utils.text import counted, html_facts
 from autdtorch.utils.units import ScaleWarning as ScaleWarning
 from autdtorch.utils.units import angles, warn_user
 from autdtorch.utils.validation import (

@@ -22,9 +22,9 @@ import autdtorch
 from autdtorch.io.goal_section import GOALS, PAPERS_GOAL, load_goal, require_score
 from autdtorch.objectives.metrics import FocusMetrics
 from autdtorch.propagators import Run
-from autdtorch.study.provenance import Provenance
 from autdtorch.study.results import (
     MethodResult,
+    Provenance,
     SceneResult,
     Simulation,
     StudyResult,

@@ -20,8 +20,7 @@ from autdtorch.methods.solution import joined
 from autdtorch.objectives.metrics import FocusMetrics
 from autdtorch.scene.scene import Scene
 from autdtorch.study.folder import PREVIOUS
-from autdtorch.study.provenance import PROVENANCE_FILE
-from autdtorch.study.results import MethodResult, SceneResult, StudyResult, median_trial
+from autdtorch.study.results import PROVENANCE_FILE, MethodResult, SceneResult, StudyResult, median_trial
 from autdtorch.study.results_file import RESULTS_FILE, load_results
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.validation import members, path_of

@@ -24,7 +24,7 @@ from filelock import FileLock, Timeout
 from numpy.lib import format as npy
 
 from autdtorch.utils.array_types import AnyArray
-from autdtorch.utils.display import within
+from autdtorch.utils.text import within
 
 logger = logging.getLogger(__name__)
 

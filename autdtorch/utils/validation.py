@@ -20,11 +20,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from autdtorch.utils.display import DEEPEST, SHOWN_ENTRIES, is_plain
-from autdtorch.utils.display import invalid as invalid
-from autdtorch.utils.display import is_dense as is_dense
-from autdtorch.utils.display import within as within
 from autdtorch.utils.hints import did_you_mean
+from autdtorch.utils.text import DEEPEST, SHOWN_ENTRIES, is_plain
+from autdtorch.utils.text import invalid as invalid
+from autdtorch.utils.text import is_dense as is_dense
+from autdtorch.utils.text import within as within
 
 ArrayLike: TypeAlias = torch.Tensor | npt.ArrayLike
 Vector: TypeAlias = tuple[float, float, float]

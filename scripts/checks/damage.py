@@ -25,11 +25,10 @@ import torch
 import autdtorch as at
 from autdtorch import hardware
 from autdtorch.methods.solution import Solution
-from autdtorch.study.folder import PREVIOUS
-from autdtorch.study.provenance import PROVENANCE_FILE
+from autdtorch.study.folder import PREVIOUS, TRIALS_FILE
+from autdtorch.study.results import PROVENANCE_FILE
 from autdtorch.study.results_file import RESULTS_FILE
-from autdtorch.study.run import run_study
-from autdtorch.study.trial_file import TRIALS_FILE
+from autdtorch.study.run_study import run_study
 from autdtorch.utils.files import SET_ASIDE
 
 LOG_FILE = "trial.jsonl"

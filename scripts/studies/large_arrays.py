@@ -14,7 +14,7 @@ from shared.scenes import MIDDLE, autd3_array, objective_of, paper_scene, with_a
 from shared.timing import timed
 
 import autdtorch as at
-from autdtorch.utils.display import in_digits
+from autdtorch.utils.text import in_digits
 
 DOCUMENT = "methods.md"
 

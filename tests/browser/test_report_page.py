@@ -13,7 +13,7 @@ from autdtorch.scene.geometry import Plane
 from autdtorch.scene.scene import Scene
 from autdtorch.study.report.study_report import write_report
 from autdtorch.study.results import StudyResult
-from autdtorch.study.run import run_study
+from autdtorch.study.run_study import run_study
 
 METHODS = {
     "lssg": functools.partial(lssg, levels=4),

@@ -15,7 +15,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import autdtorch.cli.arguments
-import autdtorch.study.run
+import autdtorch.study.run_study
 from autdtorch.cli.config_files import CONFIGS
 from autdtorch.cli.settings import load_method
 from autdtorch.hardware import DEVICES, Limits
@@ -181,7 +181,9 @@ WRONG = {
 
 @pytest.mark.parametrize("words", WRONG)
 def test_a_wrong_command_gets_one_line(words, refused, write, monkeypatch):
-    monkeypatch.setattr(autdtorch.study.run, "_run_scene", lambda *_: pytest.fail("simulated too early"))
+    monkeypatch.setattr(
+        autdtorch.study.run_study, "_run_scene", lambda *_: pytest.fail("simulated too early")
+    )
     write("file", "")
     line = refused(*words.split("  "))
     assert re.match(rf"autdtorch: {WRONG[words]}", line), line
@@ -308,7 +310,7 @@ def test_one_scene_and_one_method_are_computed_once(run, tmp_path, capsys, monke
     assert end == f"The results are in {Path('outputs', 'homogeneous_gabs')}"
     assert captured.err.startswith("homogeneous: free space, ")
 
-    monkeypatch.setattr(autdtorch.study.run, "_run_scene", lambda *_: pytest.fail("computed again"))
+    monkeypatch.setattr(autdtorch.study.run_study, "_run_scene", lambda *_: pytest.fail("computed again"))
     assert run(*command, f"solver.cache={tmp_path / 'two'}") == 0  # changes no result
     captured = capsys.readouterr()
     assert captured.out.splitlines() == table
@@ -375,7 +377,9 @@ def test_an_experiment_ends_with_its_report(run, tmp_path, capsys, monkeypatch):
 
 def test_ctrl_c_ends_with_one_line_and_its_status(run, capsys, monkeypatch):
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
-    monkeypatch.setattr(autdtorch.study.run, "_run_scene", lambda *_: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(
+        autdtorch.study.run_study, "_run_scene", lambda *_: signal.raise_signal(signal.SIGINT)
+    )
     try:
         assert run("solver.method=free_space") == 130
     finally:
@@ -488,7 +492,7 @@ def test_explore_shows_the_scene_and_drive_of_the_settings(run, write, monkeypat
         shown.update(settings, scene=scene, drive=drive)
         return Live()
 
-    monkeypatch.setattr("autdtorch.cli.explore_command.explore", explore)
+    monkeypatch.setattr("autdtorch.plot.explore.explore", explore)
     drive = np.linspace(0.1, 1, 16) * 1j
     array = load_scene(CONFIGS / "scene" / "sphere.yaml").array
     save_drive("drive.npz", drive, array)

@@ -35,7 +35,7 @@ from autdtorch.io.scene_file import load_scene
 from autdtorch.objectives.goals import TargetPressures, WeakestFocus
 from autdtorch.objectives.quiet import QuietPoints
 from autdtorch.scene.arrays import TransducerArray
-from autdtorch.scene.phase_levels import PhaseLevels
+from autdtorch.scene.drive import PhaseLevels
 from autdtorch.study.report.hardware_report import compare
 from autdtorch.utils.validation import integer_at_least
 
@@ -369,7 +369,7 @@ def test_the_settings_of_an_oscilloscope_reach_it(write, tmp_path, monkeypatch, 
     instrument = mock.MagicMock(spec=Oscilloscope)
     instrument.__enter__.return_value = instrument
     opened = mock.Mock(return_value=instrument)
-    monkeypatch.setattr("autdtorch.hardware.sensors.scope_sensor.open_scope", opened)
+    monkeypatch.setattr("autdtorch.hardware.sensors.scope_microphones.open_scope", opened)
     with Bench(section, load_scene(tmp_path / "two.yaml"), 0).sensor() as found:
         assert isinstance(found, MovedMicrophone if moved else ScopeSensor)
     assert opened.call_args.args[0] == (0x2A8D, 0x1770)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from autdtorch import hardware as hw
-from autdtorch.objectives.simulated import SimulatedObjective
+from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.propagators import make_propagator
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.scene import Medium, Scene

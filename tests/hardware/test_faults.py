@@ -12,7 +12,7 @@ import torch
 from faulty_bus import FAULTS, Disturbed, FaultyBus
 
 from autdtorch import hardware as hw
-from autdtorch.hardware.emulator.bus import EmulatedBus
+from autdtorch.hardware.emulator.bench import EmulatedBus
 from autdtorch.methods.functions import gabs
 from autdtorch.methods.solution import Solution
 

@@ -12,7 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from autdtorch import hardware as hw
-from autdtorch.hardware.emulator.bus import EmulatedBus, stall, time_out
+from autdtorch.hardware.emulator.bench import EmulatedBus, stall, time_out
 from autdtorch.hardware.emulator.emulated_scope import EmulatedInstrument
 from autdtorch.methods.functions import gabs
 from autdtorch.objectives.perturbations import random_rms
@@ -158,7 +158,9 @@ def test_silence_is_a_warning_that_names_input_and_noise(caplog):
     bench = Bench([0.1, 0.0], noise=0.1 * SENSITIVITY, seed=0)
     with caplog.at_level(logging.WARNING):
         bench.sensor(captures=10).read()
-    warnings = [record.getMessage() for record in caplog.records if record.name.endswith(".scope_sensor")]
+    warnings = [
+        record.getMessage() for record in caplog.records if record.name.endswith(".scope_microphones")
+    ]
     assert [text[:8] for text in warnings] == ["input 2:"]
     assert "the noise of 0.0078 Pa" in warnings[0]  # sqrt(6 / N) of the noise of a sample
 
@@ -214,7 +216,7 @@ def test_a_fault_that_a_clear_mends_costs_a_warning_and_no_reading(fault, messag
     bench.instrument.answer, bench.instrument.fault = mended, fault
     # Each errs by 2 / pi codes of 28 at most, a quarter of the screen.
     torch.testing.assert_close(sensor.read(), before, rtol=2 * 2 / math.pi / 28, atol=0)
-    (warning,) = [record.getMessage() for record in caplog.records if record.name.endswith(".oscilloscope")]
+    (warning,) = [record.getMessage() for record in caplog.records if record.name.endswith(".scpi_scope")]
     assert re.search(f"{message}.*; it is cleared, and captures once more", warning)
     # The scales are sent again, as they may have been lost.
     assert sum("SCALe" in line for line in lines) == 2

@@ -16,7 +16,7 @@ from autdtorch.hardware import FileSensor, ManualSensor, MovedMicrophone, Sensor
 from autdtorch.hardware.safety import Signalled, ended_by_signals
 from autdtorch.hardware.sensors import reading_file
 from autdtorch.hardware.sensors.by_hand import typed
-from autdtorch.hardware.sensors.scope_sensor import LockIn
+from autdtorch.hardware.sensors.scope_microphones import LockIn
 
 POINTS = [(0.08, 0.01, 0.0), (0.08, -0.02, 5e-3)]
 

@@ -10,7 +10,7 @@ import torch
 from usb.core import USBError, USBTimeoutError
 
 from autdtorch.hardware import OPENMPD, SONICSURFACE, ULTRAINO, Device, EmulatedBench, LinkError
-from autdtorch.hardware.emulator.bus import (
+from autdtorch.hardware.emulator.bench import (
     CHIPS,
     EmulatedBus,
     EmulatedCdc,

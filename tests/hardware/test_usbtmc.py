@@ -6,9 +6,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from autdtorch.hardware import LinkError
-from autdtorch.hardware.emulator.bus import EmulatedBus
+from autdtorch.hardware.emulator.bench import EmulatedBus
 from autdtorch.hardware.emulator.emulated_scope import EmulatedInstrument
-from autdtorch.hardware.sensors.oscilloscope import KEYSIGHT, RIGOL
+from autdtorch.hardware.sensors.scpi_scope import KEYSIGHT, RIGOL
 from autdtorch.hardware.transport.usb import find_device
 from autdtorch.hardware.transport.usbtmc import END, TELL, UsbtmcPort, announced, block, message
 

@@ -3,7 +3,7 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from autdtorch.objectives.simulated import SimulatedObjective
+from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.scene import Medium, Scene
 

@@ -6,8 +6,15 @@ from botorch.acquisition.analytic import ExpectedImprovement, LogExpectedImprove
 
 import autdtorch as at
 from autdtorch.methods.bayes.acquisition import ScoreAcquisition
-from autdtorch.methods.bayes.kernels import PhasorKernel, on_circle, phasors
-from autdtorch.methods.bayes.processes import Fit, Processes, Rows, fitted
+from autdtorch.methods.bayes.gaussian_process import (
+    Fit,
+    PhasorKernel,
+    Processes,
+    Rows,
+    fitted,
+    on_circle,
+    phasors,
+)
 from autdtorch.objectives.objective import weakest_focus
 from autdtorch.scene.drive import drive_from_phases
 

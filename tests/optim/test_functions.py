@@ -14,7 +14,7 @@ import autdtorch as at
 from autdtorch.io.goal_section import GOALS, goal_section, load_goal
 from autdtorch.methods import functions
 from autdtorch.methods.catalogue import METHODS, VARIANTS
-from autdtorch.study.run import run_study
+from autdtorch.study.run_study import run_study
 
 STUB = Path(functions.__file__).with_suffix(".pyi")
 CONFIGS = Path(__file__).parents[2] / "configs/method"

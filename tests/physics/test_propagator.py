@@ -8,7 +8,7 @@ import torch
 from small_scenes import AIR, CUBE, relative_error, small_scene
 
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.objectives.simulated import SimulatedObjective
+from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.propagators import FreeSpacePropagator, make_propagator
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import drive_from_phases

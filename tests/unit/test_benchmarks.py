@@ -18,7 +18,7 @@ from studies.conditions import CONDITIONS, Method, outcome
 
 import autdtorch as at
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.objectives.simulated import SimulatedObjective
+from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.plot.costs import fit_power
 from autdtorch.propagators import FreeSpacePropagator
 

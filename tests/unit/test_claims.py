@@ -8,9 +8,8 @@ import torch
 
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.metrics import FocusMetrics
-from autdtorch.study.provenance import Provenance
 from autdtorch.study.report.claims import CLAIMS, judge_claims
-from autdtorch.study.results import MethodResult, SceneResult, Simulation, StudyResult
+from autdtorch.study.results import MethodResult, Provenance, SceneResult, Simulation, StudyResult
 from autdtorch.study.statistics import FEWEST_TRIALS
 
 SIMULATION = Simulation("free_space", 8.5e-3, None, None, (), 0.0, 0.0)

@@ -10,7 +10,7 @@ from autdtorch.io.scene_file import load_scene
 from autdtorch.methods.functions import gabs, lssg
 from autdtorch.study.report.tables import save_summary
 from autdtorch.study.results_file import RESULTS_FILE
-from autdtorch.study.run import run_study
+from autdtorch.study.run_study import run_study
 from autdtorch.study.sweeps import collect_results
 
 Study = Callable[..., None]

@@ -9,12 +9,11 @@ from small_scenes import CUBE, small_scene
 
 from autdtorch.methods.functions import gabs
 from autdtorch.objectives.metrics import focus_metrics
+from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.objectives.perturbations import Noise
-from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.plot.style import ShownFigure
 from autdtorch.propagators import make_propagator
-from autdtorch.study.provenance import Provenance
-from autdtorch.study.results import MethodResult, SceneResult, Simulation, StudyResult
+from autdtorch.study.results import MethodResult, Provenance, SceneResult, Simulation, StudyResult
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from small_scenes import CUBE, small_scene
 
 import autdtorch as at
 from autdtorch.propagators import Propagator
-from autdtorch.study.run import run_study
+from autdtorch.study.run_study import run_study
 from autdtorch.utils import process
 
 AIR = small_scene()

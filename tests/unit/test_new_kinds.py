@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import autdtorch as at
-from autdtorch.io.scene_writer import scene_lines
+from autdtorch.io.scene_file import scene_lines
 from autdtorch.scene.arrays import FORMS, flat_array
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles import KINDS

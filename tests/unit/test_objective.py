@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from small_scenes import AIR, small_scene
 
 from autdtorch.objectives.metrics import focus_metrics
-from autdtorch.objectives.objective import _log_lost_gradient, weakest_focus
-from autdtorch.objectives.simulated import SimulatedObjective
+from autdtorch.objectives.objective import SimulatedObjective, _log_lost_gradient, weakest_focus
 from autdtorch.propagators import FreeSpacePropagator, make_propagator
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import drive_from_phases

@@ -30,7 +30,7 @@ from autdtorch.study.report.findings import findings
 from autdtorch.study.report.study_report import HTML_FILE, write_report
 from autdtorch.study.report.tables import gap_rows, simulation_rows
 from autdtorch.study.results import summary_rows
-from autdtorch.study.run import run_study
+from autdtorch.study.run_study import run_study
 
 PLANE = Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 20e-3))
 # The report knows methods by name: GABS as "bayes_opt" is faster than BO.

@@ -17,9 +17,16 @@ from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, TargetPressures
 from autdtorch.objectives.metrics import focus_metrics
 from autdtorch.propagators import Run
-from autdtorch.study import provenance as origins
-from autdtorch.study.provenance import PROVENANCE_FILE, Provenance, load_provenance
-from autdtorch.study.results import MethodResult, SceneResult, Simulation, StudyResult
+from autdtorch.study import results as origins
+from autdtorch.study.results import (
+    PROVENANCE_FILE,
+    MethodResult,
+    Provenance,
+    SceneResult,
+    Simulation,
+    StudyResult,
+    load_provenance,
+)
 from autdtorch.study.results_file import RESULTS_FILE, load_results, save_results
 from autdtorch.utils.files import line_of
 

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import autdtorch as at
-from autdtorch.io.scene_writer import scene_lines, write_files
+from autdtorch.io.scene_file import scene_lines, write_files
 from autdtorch.scene.arrays import radii_of, recipes_of, strengths_of
 
 COORDINATE = st.floats(0.02, 0.06)

@@ -15,7 +15,7 @@ from autdtorch.objectives.metrics import FocusMetrics
 from autdtorch.study import statistics
 from autdtorch.study.results import MethodResult
 from autdtorch.study.statistics import CONFIDENCE, FEWEST_TRIALS, Interval, bootstrap, bound_gap
-from autdtorch.utils.display import decimals_of, in_digits
+from autdtorch.utils.text import decimals_of, in_digits
 
 DRAWS = 200
 # Each draw covers the truth with 95 %; fewer or more of 200 draws do so in 1 of 1000 cases.

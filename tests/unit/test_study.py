@@ -10,12 +10,12 @@ import torch
 from small_scenes import AIR, CUBE, small_scene
 
 import autdtorch as at
-import autdtorch.study.run
+import autdtorch.study.run_study
 from autdtorch.io.goal_section import load_goal
 from autdtorch.propagators import FreeSpacePropagator, Run
 from autdtorch.propagators.full import DomainSimulation
-from autdtorch.study.run import _for_poses, run_study
-from autdtorch.study.trial_file import TRIALS_FILE
+from autdtorch.study.folder import TRIALS_FILE
+from autdtorch.study.run_study import _for_poses, run_study
 
 PLANE = at.Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 16e-3))
 METHODS = {"lssg": at.LSSG(levels=4), "gabs": at.GABS(levels=4)}
@@ -36,13 +36,13 @@ def scenes():
 def count_runs(monkeypatch):
     """Names of the scenes that are computed, in order."""
     computed = []
-    run_scene = autdtorch.study.run._run_scene
+    run_scene = autdtorch.study.run_study._run_scene
 
     def counted(name, *rest):
         computed.append(name)
         return run_scene(name, *rest)
 
-    monkeypatch.setattr(autdtorch.study.run, "_run_scene", counted)
+    monkeypatch.setattr(autdtorch.study.run_study, "_run_scene", counted)
     return computed
 
 
@@ -122,7 +122,7 @@ def test_finished_scenes_of_the_same_settings_and_source_are_used_again(
     assert torch.equal(*drives)
     study(config="a: 2")
     study()
-    monkeypatch.setattr("autdtorch.study.provenance.source_digest", lambda: "changed")
+    monkeypatch.setattr("autdtorch.study.results.source_digest", lambda: "changed")
     study(config="a: 2")
     assert count_runs == ["second", "first"] * 4
 
@@ -169,7 +169,9 @@ def test_a_study_goes_on_after_the_scenes_that_were_finished(scenes, count_runs,
     ],
 )
 def test_settings_are_checked_before_anything_is_simulated(changes, message, tmp_path, monkeypatch):
-    monkeypatch.setattr(autdtorch.study.run, "_run_scene", lambda *_: pytest.fail("simulated too early"))
+    monkeypatch.setattr(
+        autdtorch.study.run_study, "_run_scene", lambda *_: pytest.fail("simulated too early")
+    )
     with pytest.raises(ValueError, match=message) as caught:
         run_study(**{"scenes": {"a": scene()}, "methods": METHODS, "folder": tmp_path} | changes)
     assert "\n" not in str(caught.value)

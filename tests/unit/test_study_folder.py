@@ -16,11 +16,10 @@ from small_scenes import CUBE, small_scene
 from autdtorch.methods.functions import gabs
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.scene import Scene
-from autdtorch.study.folder import PREVIOUS
-from autdtorch.study.provenance import PROVENANCE_FILE, load_provenance
+from autdtorch.study.folder import PREVIOUS, TRIALS_FILE
+from autdtorch.study.results import PROVENANCE_FILE, load_provenance
 from autdtorch.study.results_file import RESULTS_FILE, load_results
-from autdtorch.study.run import run_study
-from autdtorch.study.trial_file import TRIALS_FILE
+from autdtorch.study.run_study import run_study
 from autdtorch.utils.files import SET_ASIDE
 
 FILES = (RESULTS_FILE, TRIALS_FILE, PROVENANCE_FILE)
@@ -213,7 +212,7 @@ def test_killed_again_and_again_a_study_ends_with_the_same_numbers(tmp_path, mon
         """Run the study in this process, which has imported PyTorch; it need not be slow."""
         with monkeypatch.context() as patched:
             patched.setattr("sys.argv", ["slow_study.py", str(folder / "out")])
-            patched.setattr("autdtorch.study.run.BLOCK", 1)  # the study sets it, too
+            patched.setattr("autdtorch.study.run_study.BLOCK", 1)  # the study sets it, too
             patched.setattr("slow_study.time", Mock())
             slow_study.main()
 

@@ -7,7 +7,7 @@ import torch
 
 from autdtorch.methods.base import NEAR_TIE
 from autdtorch.methods.solution import Solution
-from autdtorch.study.trial_file import TRIALS_FILE, TrialFile
+from autdtorch.study.folder import TRIALS_FILE, TrialFile
 from autdtorch.utils.files import SET_ASIDE, line_of, row_of
 
 ORIGIN = "the study's"

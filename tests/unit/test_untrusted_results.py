@@ -19,7 +19,7 @@ from autdtorch.study.report.document import as_page, code, fenced, table
 from autdtorch.study.report.study_report import write_report
 from autdtorch.study.report.tables import SUMMARY_FILE, save_summary
 from autdtorch.study.results_file import load_results, save_results
-from autdtorch.study.run import run_study
+from autdtorch.study.run_study import run_study
 from autdtorch.study.sweeps import collect_results
 
 SCENE = {

@@ -16,7 +16,7 @@ import torch
 from autdtorch.hardware.devices.device import Device, Firmware
 from autdtorch.hardware.transport.port import LinkError, Port, closed_on_error
 from autdtorch.scene.arrays import AUTD3_TRANSDUCERS
-from autdtorch.scene.phase_levels import PhaseLevels
+from autdtorch.scene.drive import PhaseLevels
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.hints import with_extra
 from autdtorch.utils.validation import invalid

@@ -13,8 +13,7 @@ import torch
 from autdtorch.hardware.transport.port import Port, SerialPort, SharedPort, closed_on_error
 from autdtorch.hardware.transport.serial_chips import Adapter
 from autdtorch.hardware.transport.usb import find_device
-from autdtorch.scene.drive import drive_tensor, validate_drive
-from autdtorch.scene.phase_levels import PhaseLevels
+from autdtorch.scene.drive import PhaseLevels, drive_tensor, validate_drive
 from autdtorch.utils.validation import ArrayLike, integer_at_least, invalid
 
 if TYPE_CHECKING:

@@ -21,9 +21,8 @@ import torch
 from autdtorch.hardware.devices.device import Device, Firmware
 from autdtorch.hardware.transport.serial_chips import FT232H
 from autdtorch.scene.arrays import OPENMPD_SOURCE_STRENGTH, TRANSDUCER_RADIUS, TransducerArray
-from autdtorch.scene.drive import validate_drive
+from autdtorch.scene.drive import PhaseLevels, validate_drive
 from autdtorch.scene.geometry import in_plane
-from autdtorch.scene.phase_levels import PhaseLevels
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid, members, path_of, real_tensor

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from autdtorch.hardware.devices.device import Device, Firmware
 from autdtorch.hardware.transport.serial_chips import ft232r
-from autdtorch.scene.phase_levels import PhaseLevels
+from autdtorch.scene.drive import PhaseLevels
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.validation import ArrayLike
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from autdtorch.hardware.devices.device import Device, Firmware
 from autdtorch.hardware.transport.serial_chips import arduino_mega
-from autdtorch.scene.phase_levels import PhaseLevels
+from autdtorch.scene.drive import PhaseLevels
 
 _BOARD, _BAUD = 64, 115_200
 _TENTHS, _PORTS = 10, 10  # of a period; of 8 pins

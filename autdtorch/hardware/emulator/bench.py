@@ -1,19 +1,262 @@
-"""A bench without hardware: a device behind its USB chip or port, and the pressure that it makes."""
+"""A bench without hardware: an emulated USB bus, a device behind its chip or port, and the pressure it makes.
+
+The bus is a backend of pyusb in place of libusb. Its chips decode requests and pass bytes on to a firmware.
+They follow Linux drivers and data sheets, not `serial_chips`, so that one checks the other.
+"""
 
 from __future__ import annotations
 
+import errno
+import time
+from array import array
 from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import ClassVar
 
 import torch
+from usb.backend import IBackend
+from usb.core import USBError, USBTimeoutError
 
-from autdtorch.hardware.devices.device import Device
-from autdtorch.hardware.emulator.bus import CHIPS, EmulatedBus, EmulatedDevice
+from autdtorch.hardware.devices.device import Device, Firmware
 from autdtorch.hardware.played import Wiring
 from autdtorch.hardware.transport.port import Port
 from autdtorch.scene.drive import amplitudes_of, phases_of
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.hints import renamed_keywords
 from autdtorch.utils.validation import complex_tensor, indices, integers
+
+_GET_DESCRIPTOR, _STRING, _ENGLISH = 0x06, 0x03, 0x0409
+_FROM_DEVICE, _STANDARD_FROM_DEVICE = 0x80, 0x80
+_PACKET = 64
+
+_VENDOR_DEVICE, _CLASS_INTERFACE, _VENDOR_QUESTION = 0x40, 0x21, 0xC0
+_READ_SECONDS = 0.01
+_BAUD_TOLERANCE = 0.03  # beyond it a UART loses the last of its ten bits
+
+
+class EmulatedDevice:
+    """An emulated USB device; `present` while it is plugged in."""
+
+    #: Class, subclass and protocol of each interface, and its bulk endpoints.
+    interfaces: ClassVar[tuple[tuple[tuple[int, int, int], tuple[int, ...]], ...]]
+
+    def __init__(self, vendor: int, product: int, serial: str) -> None:
+        """Plug the device in, with idVendor, idProduct and serial number."""
+        self.vendor, self.product = vendor, product
+        self.strings = ("", "autdtorch", "emulated device", serial)  # by index
+        self.present = True
+
+    def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
+        """Take a request with its data; False for an unknown one, which stalls."""
+        return False
+
+    def answer(self, kind: int, request: int) -> bytes | None:
+        """Answer a request; None for an unknown one, which stalls."""
+        return None
+
+    def write(self, data: bytes) -> None:
+        """Take a bulk transfer."""
+        raise NotImplementedError
+
+    def read(self, most: int) -> bytes:
+        """Return a bulk transfer of at most so many bytes."""
+        raise NotImplementedError
+
+
+class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
+    """A backend of pyusb with emulated devices, numbered by their place; `IBackend` describes its methods."""
+
+    def __init__(self, chips: Sequence[EmulatedDevice]) -> None:
+        """Plug the devices in."""
+        super().__init__()
+        self.chips = list(chips)  # plugged in or not
+        self.slept = 0.0  # [s]
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass on the bench, without waiting."""
+        self.slept += seconds
+
+    def enumerate_devices(self) -> list[int]:
+        return [address for address, chip in enumerate(self.chips) if chip.present]
+
+    def get_device_descriptor(self, dev: int) -> SimpleNamespace:
+        chip = self.chips[dev]
+        return SimpleNamespace(
+            bLength=18, bDescriptorType=1, bcdUSB=0x0200, bDeviceClass=0, bDeviceSubClass=0,
+            bDeviceProtocol=0, bMaxPacketSize0=8, idVendor=chip.vendor, idProduct=chip.product,
+            bcdDevice=0x0600, iManufacturer=1, iProduct=2, iSerialNumber=3, bNumConfigurations=1,
+            address=dev, bus=1, port_number=None, port_numbers=None, speed=None,
+        )  # fmt: skip
+
+    def get_configuration_descriptor(self, dev: int, config: int) -> SimpleNamespace:
+        return SimpleNamespace(
+            bLength=9, bDescriptorType=2, wTotalLength=32, bNumInterfaces=len(self.chips[dev].interfaces),
+            bConfigurationValue=1, iConfiguration=0, bmAttributes=0x80, bMaxPower=45, extra_descriptors=[],
+        )  # fmt: skip
+
+    def get_interface_descriptor(self, dev: int, intf: int, alt: int, config: int) -> SimpleNamespace:
+        if alt:
+            raise IndexError  # the end of pyusb's enumeration
+        (kind, subclass, protocol), endpoints = self.chips[dev].interfaces[intf]
+        return SimpleNamespace(
+            bLength=9, bDescriptorType=4, bInterfaceNumber=intf, bAlternateSetting=0,
+            bNumEndpoints=len(endpoints), bInterfaceClass=kind, bInterfaceSubClass=subclass,
+            bInterfaceProtocol=protocol, iInterface=0, extra_descriptors=[],
+        )  # fmt: skip
+
+    def get_endpoint_descriptor(self, dev: int, ep: int, intf: int, alt: int, config: int) -> SimpleNamespace:
+        return SimpleNamespace(
+            bLength=7, bDescriptorType=5, bEndpointAddress=self.chips[dev].interfaces[intf][1][ep],
+            bmAttributes=2, wMaxPacketSize=_PACKET, bInterval=0, bRefresh=0, bSynchAddress=0,
+            extra_descriptors=[],
+        )  # fmt: skip
+
+    def open_device(self, dev: int) -> int:
+        self._chip(dev)
+        return dev
+
+    def close_device(self, dev_handle: int) -> None: ...
+
+    def set_configuration(self, dev_handle: int, config_value: int) -> None:
+        self._chip(dev_handle)
+
+    def get_configuration(self, dev_handle: int) -> int:
+        return 1
+
+    def claim_interface(self, dev_handle: int, intf: int) -> None:
+        self._chip(dev_handle)
+
+    def release_interface(self, dev_handle: int, intf: int) -> None: ...
+
+    def clear_halt(self, dev_handle: int, ep: int) -> None:
+        self._chip(dev_handle)
+
+    def is_kernel_driver_active(self, dev_handle: int, intf: int) -> bool:
+        return False
+
+    def ctrl_transfer(
+        self, dev_handle: int, kind: int, request: int, value: int, index: int, data: array[int], timeout: int
+    ) -> int:
+        chip = self._chip(dev_handle)
+        if not kind & _FROM_DEVICE:
+            if chip.control(kind, request, value, index, data.tobytes()):
+                return len(data)
+            raise stall()
+        if kind == _STANDARD_FROM_DEVICE and (request, value >> 8) == (_GET_DESCRIPTOR, _STRING):
+            answer: bytes | None = _string_descriptor(chip.strings, value & 0xFF)
+        else:
+            answer = chip.answer(kind, request)
+        if answer is None:
+            raise stall()
+        return _fill(data, answer[: len(data)])
+
+    def bulk_write(self, dev_handle: int, ep: int, intf: int, data: array[int], timeout: int) -> int:
+        self._chip(dev_handle).write(data.tobytes())
+        return len(data)
+
+    def bulk_read(self, dev_handle: int, ep: int, intf: int, buff: array[int], timeout: int) -> int:
+        return _fill(buff, self._chip(dev_handle).read(len(buff)))
+
+    def _chip(self, dev: int) -> EmulatedDevice:
+        chip = self.chips[dev]
+        if not chip.present:
+            raise unplugged()
+        return chip
+
+
+def stall() -> USBError:
+    """Return the error of a request that a device refuses."""
+    return USBError("Pipe error", errno=errno.EPIPE)
+
+
+def unplugged() -> USBError:
+    """Return the error of a request to a device that is gone."""
+    return USBError("No such device (it may have been disconnected)", errno=errno.ENODEV)
+
+
+def time_out() -> USBError:
+    """Return the error of a transfer that does not end."""
+    return USBTimeoutError("Operation timed out", errno=errno.ETIMEDOUT)
+
+
+def _fill(buffer: array[int], data: bytes) -> int:
+    buffer[: len(data)] = array("B", data)
+    return len(data)
+
+
+def _string_descriptor(strings: Sequence[str], index: int) -> bytes:
+    text = _ENGLISH.to_bytes(2, "little") if index == 0 else strings[index].encode("utf-16-le")
+    return bytes([len(text) + 2, _STRING]) + text
+
+
+class EmulatedChip(EmulatedDevice):
+    """A USB chip with a serial port, at `baud` [bits/s] and perhaps `eight_n_one`, in front of a firmware."""
+
+    def __init__(self, vendor: int, product: int, serial: str, firmware: Firmware) -> None:
+        """Plug the chip in, with settings of an earlier user."""
+        super().__init__(vendor, product, serial)
+        self.firmware = firmware
+        self.baud, self.eight_n_one = 9600.0, False
+
+    def write(self, data: bytes) -> None:
+        """Send bytes on to the firmware, which loses them at a wrong rate or in a wrong format."""
+        wanted = self.firmware.baud
+        if wanted is None or (self.eight_n_one and abs(self.baud / wanted - 1) <= _BAUD_TOLERANCE):
+            self.firmware.receive(data)
+
+
+class EmulatedFtdi(EmulatedChip):
+    """An FT232R, or an FT232H as a FIFO."""
+
+    interfaces = (((0xFF, 0xFF, 0xFF), (0x81, 0x02)),)
+
+    _BAUD, _FORMAT, _STATUS, _OTHERS = 0x03, 0x04, 0x05, (0x00, 0x01, 0x02, 0x09)
+    _IDLE = b"\x01\x60"
+    _EIGHTHS: ClassVar[dict[int, int]] = {0: 0, 3: 1, 2: 2, 4: 3, 1: 4, 5: 5, 6: 6, 7: 7}
+
+    def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
+        """Set the baud rate by its divisor of 3 MHz, and the data format."""
+        if request == self._BAUD:
+            self.baud = 3e6 / ((value & 0x3FFF) + self._EIGHTHS[value >> 14 | (index & 1) << 2] / 8)
+        elif request == self._FORMAT:
+            self.eight_n_one = value == 8
+        return kind == _VENDOR_DEVICE and request in (self._BAUD, self._FORMAT, *self._OTHERS)
+
+    def answer(self, kind: int, request: int) -> bytes | None:
+        """Return the status of modem and line: all bytes have been sent."""
+        return self._IDLE if (kind, request) == (_VENDOR_QUESTION, self._STATUS) else None
+
+    def read(self, most: int) -> bytes:
+        """Return an IN packet: the status alone."""
+        return self._IDLE
+
+
+class EmulatedCdc(EmulatedChip):
+    """A serial port of the USB class CDC: one interface for control, one for data."""
+
+    interfaces = (((0x02, 0x02, 0x01), ()), ((0x0A, 0x00, 0x00), (0x04, 0x83)))
+
+    _LINE_CODING, _LINE_STATE = 0x20, 0x22
+
+    def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
+        """Set the line coding: baud rate, stop bits, parity, bits."""
+        if request == self._LINE_CODING:
+            self.baud = float(int.from_bytes(data[:4], "little"))
+            self.eight_n_one = data[4:] == bytes([0, 0, 8])
+        return kind == _CLASS_INTERFACE and request in (self._LINE_CODING, self._LINE_STATE)
+
+    def read(self, most: int) -> bytes:
+        """Return an IN packet: none comes within a while."""
+        time.sleep(_READ_SECONDS)
+        return b""
+
+
+#: Chips by idVendor and idProduct.
+CHIPS: dict[tuple[int, int], type[EmulatedChip]] = {
+    (0x0403, 0x6001): EmulatedFtdi,
+    (0x0403, 0x6014): EmulatedFtdi,
+    (0x2341, 0x0042): EmulatedCdc,
+}
 
 
 class EmulatedBench:

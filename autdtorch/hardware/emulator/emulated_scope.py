@@ -1,6 +1,6 @@
 """An oscilloscope without hardware: USBTMC, its commands, and the waveforms of microphones on a bench.
 
-Written from the makers' programming guides and the specification of USBTMC, not from `oscilloscope` and
+Written from the makers' programming guides and the specification of USBTMC, not from `scpi_scope` and
 `usbtmc`, so that one checks the other.
 """
 
@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from autdtorch.hardware.emulator.bench import EmulatedBench
-from autdtorch.hardware.emulator.bus import EmulatedDevice, stall, time_out
-from autdtorch.hardware.sensors.scope_sensor import FREQUENCIES, SENSITIVITIES
+from autdtorch.hardware.emulator.bench import EmulatedBench, EmulatedDevice, stall, time_out
+from autdtorch.hardware.sensors.scope_microphones import FREQUENCIES, SENSITIVITIES
 from autdtorch.utils.validation import (
     integer_at_least,
     integers,

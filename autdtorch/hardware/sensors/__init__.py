@@ -5,7 +5,7 @@ A sensor is a class and the class of its config, in a module, and a line in `SEN
 
 from autdtorch.hardware.sensors.by_hand import ManualConfig
 from autdtorch.hardware.sensors.reading_file import FileConfig
-from autdtorch.hardware.sensors.scope_sensor import ScopeConfig
+from autdtorch.hardware.sensors.scope_microphones import ScopeConfig
 from autdtorch.hardware.sensors.sensor import EmulatedConfig, SensorConfig
 
 __all__ = ["SENSORS"]

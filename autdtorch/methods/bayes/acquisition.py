@@ -10,7 +10,7 @@ import torch
 from botorch.utils.probability.utils import log_phi, ndtr, phi
 from botorch.utils.safe_math import fatmin, log1mexp, log_fatplus, logmeanexp
 
-from autdtorch.methods.bayes.processes import Processes
+from autdtorch.methods.bayes.gaussian_process import Processes
 from autdtorch.methods.seeds import uniform
 from autdtorch.objectives.goals import WeakestFocus, differentiable_scores
 from autdtorch.objectives.objective import GoalFunction

@@ -20,7 +20,7 @@ from autdtorch.methods.base import Method, Problem, State
 from autdtorch.methods.gradient import GradientAscent
 from autdtorch.methods.run import observed
 from autdtorch.objectives.bound import focus_bound
-from autdtorch.objectives.simulated import SimulatedObjective
+from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.plot.explore.situation import Situation
 from autdtorch.propagators import (
     FreeSpacePropagator,

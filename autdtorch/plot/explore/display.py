@@ -13,10 +13,9 @@ from autdtorch.methods.base import Method
 from autdtorch.methods.catalogue import METHODS, VARIANTS, label_of
 from autdtorch.plot import colours
 from autdtorch.plot.data import in_decibels
-from autdtorch.plot.explore import saving
 from autdtorch.plot.explore.calculation import Result
 from autdtorch.plot.explore.picture import Picture, Scale
-from autdtorch.plot.explore.situation import SCENE_PLANE, History, Situation
+from autdtorch.plot.explore.situation import SCENE_PLANE, History, Situation, devices_of, free_folder
 from autdtorch.plot.view3d.meshes import map_colours
 from autdtorch.scene.drive import amplitudes_of, phases_of
 
@@ -135,7 +134,7 @@ def first_state(situation: Situation, methods: dict[str, Method]) -> dict[str, A
         "units": [("dB", "dB"), ("Pa", "Pa")], "unit": "dB", "reference": 1.0,
         "volume": False, "surface": _FIRST_SURFACE, "dark": False, "scale_low": "", "scale_high": "",
         "scale_style": _gradient(colours.PRESSURE_MAP), "phase_style": _gradient(colours.PHASE_MAP),
-        "folder": saving.free_folder(), "shown": -1, "wanted": 0, "settled": 0,
+        "folder": free_folder(), "shown": -1, "wanted": 0, "settled": 0,
     }  # fmt: skip
 
 
@@ -143,7 +142,7 @@ def _scene_state(situation: Situation) -> dict[str, Any]:
     """Return the part of the state that stays while obstacles and foci move."""
     scene = situation.scene
     bodies = [(index, f"{index}: {body.name}") for index, body in enumerate(situation.bodies)]
-    devices = [("", "no device"), *((name, name) for name in saving.devices_of(situation))]
+    devices = [("", "no device"), *((name, name) for name in devices_of(situation))]
     planes = [(name, "as in the scene" if name == SCENE_PLANE else name) for name in situation.planes]
     ranges = {
         f"range_{axis}": [in_mm(low), in_mm(high)]

@@ -15,11 +15,17 @@ import numpy as np
 import torch
 
 from autdtorch.plot.data import largest
-from autdtorch.plot.explore import saving
 from autdtorch.plot.explore.calculation import Calculator, Finished, Report, Request, Result
 from autdtorch.plot.explore.display import MM, Display, offered, refusal
 from autdtorch.plot.explore.picture import Grip
-from autdtorch.plot.explore.situation import History, Situation, in_phase, same_array
+from autdtorch.plot.explore.situation import (
+    History,
+    Situation,
+    in_phase,
+    python_of,
+    same_array,
+    save_situation,
+)
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.moving import angles_of
 from autdtorch.scene.scene import Scene
@@ -237,7 +243,7 @@ class Session:
     def write_python(self) -> None:
         """Write scene and drive as Python."""
         try:
-            self._state.python = saving.python_of(self.now, str(self._state.folder))
+            self._state.python = python_of(self.now, str(self._state.folder))
         except ValueError as error:
             self.refuse(error)
 
@@ -245,7 +251,7 @@ class Session:
         """Write scene and drive to files."""
         folder = str(self._state.folder)
         try:
-            path = saving.save(self.now, folder, str(self._state.device), folder in self._saved)
+            path = save_situation(self.now, folder, str(self._state.device), folder in self._saved)
         except (ValueError, OSError) as error:
             self._state.update({"saved": "", "message": str(error)})
         else:

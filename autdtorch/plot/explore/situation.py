@@ -1,11 +1,16 @@
-"""The situation that a live view shows (bodies, foci, drive, plane of the field), and its history."""
+"""The situation that a live view shows (bodies, foci, drive, plane of the field), its history and files."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import torch
 
+from autdtorch.hardware.devices import DEVICES
+from autdtorch.io.drive_file import save_drive
+from autdtorch.io.scene_file import save_scene, scene_lines
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import drive_from_phases, validate_single_drive
 from autdtorch.scene.geometry import Plane, rotation_matrix
@@ -13,6 +18,7 @@ from autdtorch.scene.obstacles import Mesh, Obstacle
 from autdtorch.scene.obstacles.moving import is_movable, is_turnable, shifted, turned
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
+from autdtorch.utils.files import replace_file
 from autdtorch.utils.process import cached_property
 from autdtorch.utils.validation import ArrayLike, Vector, finite_vector, require_one_of
 
@@ -301,3 +307,60 @@ def _most_steps(situation: Situation) -> int:
     """Return the number of steps in a history."""
     size = sum(one.vertices.nbytes for one in situation.scene.obstacles if isinstance(one, Mesh))
     return max(1, min(_MOST_STEPS, _MOST_BYTES // max(size, 1)))
+
+
+SCENE = "scene"
+"""Name of the scene file and, with a number, of meshes beside it."""
+
+_FOLDER = Path("outputs/explore")
+
+
+def free_folder() -> str:
+    """Return the name of a folder that does not exist yet."""
+    names = (f"{_FOLDER}_{number}" if number > 1 else str(_FOLDER) for number in itertools.count(1))
+    return next(name for name in names if not Path(name).exists())
+
+
+def python_of(situation: Situation, folder: str) -> str:
+    """Return the lines of Python that make scene and drive; meshes are read from files saved in a folder.
+
+    Raises:
+        ValueError: an obstacle of a user's class.
+    """
+    return scene_lines(situation.scene, situation.drive, str(Path(folder) / SCENE))
+
+
+def devices_of(situation: Situation) -> list[str]:
+    """Return the names of the devices whose boards have the number of transducers."""
+    count = len(situation.drive)
+    return [name for name, device in DEVICES.items() if count % device.board == 0]
+
+
+def save_situation(situation: Situation, folder: str, device: str, replaces: bool) -> Path:
+    """Write scene.yaml, drive.npz, scene.py and, for a device, its levels; return the folder.
+
+    Args:
+        situation: scene and drive.
+        folder: to write into, below the working directory; it is made.
+        device: a name in `devices_of`, or "".
+        replaces: whether files in the folder are replaced.
+
+    Raises:
+        ValueError: a folder elsewhere, one that is not empty and not to be replaced, or another device.
+        OSError: the files cannot be written.
+    """
+    path, here = Path(folder), Path.cwd().resolve()
+    if not folder.strip() or path.is_absolute() or not (here / path).resolve().is_relative_to(here):
+        raise ValueError(f"folder: {folder!r}; must be below the working directory")
+    if device and device not in devices_of(situation):
+        raise ValueError(f"device: {device!r}; must be one of {devices_of(situation)}")
+    if not replaces and path.exists() and any(path.iterdir()):
+        raise ValueError(f"folder: {folder!r} has other files; must be new or empty")
+    path.mkdir(parents=True, exist_ok=True)
+    save_scene(path / f"{SCENE}.yaml", situation.scene)
+    save_drive(path / "drive.npz", situation.drive, situation.scene.array)
+    if device:
+        save_drive(path / f"drive_{device}.csv", situation.drive, situation.scene.array, device)
+    lines = scene_lines(situation.scene, situation.drive, SCENE, beside=True)
+    replace_file(path / f"{SCENE}.py", lines.encode())
+    return path

@@ -14,7 +14,7 @@ from autdtorch.methods.solution import Solution
 from autdtorch.study.report.findings import MOST_NAMED
 from autdtorch.study.report.tables import competitors, median_score
 from autdtorch.study.results import SceneResult
-from autdtorch.utils.display import counted
+from autdtorch.utils.text import counted
 
 Spread = Mapping[str, Mapping[str, torch.Tensor]]
 """Values by scene and method."""

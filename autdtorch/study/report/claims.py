@@ -19,7 +19,7 @@ from autdtorch.methods.catalogue import label_of
 from autdtorch.methods.solution import Solution
 from autdtorch.study.results import SceneResult, StudyResult
 from autdtorch.study.statistics import Interval, bootstrap, share_interval
-from autdtorch.utils.display import decimals_of
+from autdtorch.utils.text import decimals_of
 
 Comparison: TypeAlias = tuple[str, list[Interval]]
 """Our numbers in one scene as text, and margins that are all positive if the claim holds there."""

@@ -13,7 +13,7 @@ import torch
 
 import autdtorch
 from autdtorch.hardware.log import EvaluationLog
-from autdtorch.hardware.preflight import Preflight
+from autdtorch.hardware.safety import Preflight
 from autdtorch.io.goal_section import score_label
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import Goal
@@ -22,8 +22,8 @@ from autdtorch.plot.trials import plot_convergence
 from autdtorch.study.report import alt_texts
 from autdtorch.study.report.document import code, picture, rendered
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.display import in_digits
 from autdtorch.utils.files import naming, replace_file
+from autdtorch.utils.text import in_digits
 
 REPORT_FILE = "report.md"
 _FIGURE = "convergence.png"

@@ -19,6 +19,7 @@ from autdtorch.plot.scene_figure import plot_scene
 from autdtorch.plot.trials import plot_convergence, plot_trials
 from autdtorch.plot.view3d import rendering_problem, view3d
 from autdtorch.scene.scene import Scene
+from autdtorch.study.folder import TRIALS_FILE
 from autdtorch.study.report import alt_texts, tables
 from autdtorch.study.report.claims import BO, GABS, judge_claims
 from autdtorch.study.report.document import as_page, picture, rendered
@@ -26,7 +27,6 @@ from autdtorch.study.report.findings import LEVEL, findings, gaps
 from autdtorch.study.results import MethodResult, SceneResult, StudyResult, summary_rows
 from autdtorch.study.results_file import RESULTS_FILE
 from autdtorch.study.statistics import FEWEST_TRIALS, NEAR_BOUND, has_shares
-from autdtorch.study.trial_file import TRIALS_FILE
 
 REPORT_FILE = "report.md"
 HTML_FILE = "report.html"

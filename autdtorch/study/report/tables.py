@@ -16,8 +16,8 @@ from autdtorch.study.report.claims import Claim, Verdict
 from autdtorch.study.results import MethodResult, SceneResult, StudyResult, column_decimals
 from autdtorch.study.statistics import NEAR_BOUND, Interval, bound_gap, has_shares
 from autdtorch.study.sweeps import Sweep
-from autdtorch.utils.display import counted, in_digits
 from autdtorch.utils.files import replacing
+from autdtorch.utils.text import counted, in_digits
 
 SUMMARY_FILE = "summary.csv"
 BASELINE = "gradient_ascent"  # not a competitor: it knows the transfer matrix

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 
 from autdtorch.hardware.sensors.by_hand import MovedMicrophone
-from autdtorch.hardware.sensors.oscilloscope import (
+from autdtorch.hardware.sensors.scpi_scope import (
     COARSEST,
     FINEST,
     KEYSIGHT,

@@ -22,23 +22,27 @@ from autdtorch.methods.seeds import TRIAL_BYTES, Trials
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.objectives.metrics import focus_metrics
-from autdtorch.objectives.objective import Objective
+from autdtorch.objectives.objective import Objective, SimulatedObjective
 from autdtorch.objectives.quiet import QuietPoints
-from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.propagators import Propagator, SimulatedPropagator, TMatrixPropagator, make_propagator
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.tmatrix.propagator import placed_bodies
 from autdtorch.scene.obstacles.moving import is_movable
 from autdtorch.scene.scene import Scene
-from autdtorch.study.folder import open_folder
-from autdtorch.study.provenance import provenance_now
-from autdtorch.study.results import MethodResult, SceneResult, Simulation, StudyResult, median_trial
-from autdtorch.study.trial_file import TrialFile
+from autdtorch.study.folder import TrialFile, open_folder
+from autdtorch.study.results import (
+    MethodResult,
+    SceneResult,
+    Simulation,
+    StudyResult,
+    median_trial,
+    provenance_now,
+)
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.display import counted
 from autdtorch.utils.process import require_memory
 from autdtorch.utils.progress import Progress, show_progress
 from autdtorch.utils.spatial import nearest
+from autdtorch.utils.text import counted
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     integer_at_least,
