@@ -1,4 +1,4 @@
-"""This process: its signals, forks, threads and available memory.
+"""Signals, forks, threads and available memory of this process.
 
 Threads live for one call, so that none spins while it waits and none is missing after a fork.
 

@@ -15,7 +15,6 @@ from wrong_values import WRONG, Wrong, spoiled
 
 import autdtorch as at
 from autdtorch.plot import explore
-from autdtorch.plot.view3d import views
 from autdtorch.scene.drive import normalise, validate_drive
 from autdtorch.scene.geometry import plane_basis
 
@@ -50,7 +49,7 @@ def nothing_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     def stop() -> None:
         raise Accepted
 
-    monkeypatch.setattr(views, "require_rendering", stop)
+    monkeypatch.setattr("autdtorch.plot.view3d.require_rendering", stop)
     monkeypatch.setattr(explore, "require_rendering", stop)
 
 

@@ -15,8 +15,8 @@ import torch
 from small_scenes import scene_of_all_kinds, small_scene
 
 import autdtorch as at
+from autdtorch.plot.meshes3d import STILL_AXES
 from autdtorch.plot.view3d import animate3d, rendering_problem, view3d
-from autdtorch.plot.view3d.meshes import STILL_AXES
 
 SPACING = 5e-3  # m, cells of the plane in the pictures
 
@@ -68,7 +68,7 @@ def test_a_failed_check_is_a_reason_not_to_render(
     scene: at.Scene, broken_pyvista: Callable[[str], None], monkeypatch, code: str, cause: str
 ) -> None:
     if "sleep" in code:
-        monkeypatch.setattr(sys.modules["autdtorch.plot.view3d.views"], "_PROBE_TIMEOUT", 0.5)
+        monkeypatch.setattr(sys.modules["autdtorch.plot.view3d"], "_PROBE_TIMEOUT", 0.5)
     broken_pyvista(code)
     assert cause in str(rendering_problem())
     with pytest.raises(RuntimeError, match=cause):

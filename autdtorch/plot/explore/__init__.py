@@ -8,7 +8,7 @@ import webbrowser
 from typing import TYPE_CHECKING
 
 from autdtorch.plot.explore.situation import checked_drive
-from autdtorch.plot.view3d.views import require_rendering
+from autdtorch.plot.view3d import require_rendering
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.hints import with_extra
 from autdtorch.utils.validation import ArrayLike, boolean, integer_at_least, invalid, positive, require_kind

@@ -16,7 +16,7 @@ from autdtorch.plot.data import in_decibels
 from autdtorch.plot.explore.calculation import Result
 from autdtorch.plot.explore.picture import Picture, Scale
 from autdtorch.plot.explore.situation import SCENE_PLANE, History, Situation, devices_of, free_folder
-from autdtorch.plot.view3d.meshes import map_colours
+from autdtorch.plot.meshes3d import map_colours
 from autdtorch.scene.drive import amplitudes_of, phases_of
 
 MM = 1e-3

@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from autdtorch.plot import colours
+from autdtorch.plot import colours, meshes3d
 from autdtorch.plot.data import MM, in_decibels
 from autdtorch.plot.explore.situation import Situation
-from autdtorch.plot.view3d import meshes
 from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.geometry import Plane
 from autdtorch.utils.array_types import Array
@@ -71,7 +70,7 @@ class Picture:
 
     def __init__(self, situation: Situation) -> None:
         """Draw a situation, as yet without a field."""
-        self.plotter = meshes.empty_plotter(situation.scene.domain, off_screen=True)
+        self.plotter = meshes3d.empty_plotter(situation.scene.domain, off_screen=True)
         self._dark = False
         self._domain: Any = None  # that the camera looks at
         self.draw(situation)
@@ -88,20 +87,20 @@ class Picture:
         """Draw another situation, as yet without a field. The camera stays if the domain is equal."""
         scene, self._situation = situation.scene, situation
         self.plotter.clear_actors()
-        self._bodies = [meshes.add_obstacle(self.plotter, body.original) for body in situation.bodies]
+        self._bodies = [meshes3d.add_obstacle(self.plotter, body.original) for body in situation.bodies]
         self._foci: list[Any] = []
-        self._faces = meshes.add_transducers(
-            self.plotter, scene, meshes.emitted_phases(situation.drive, len(scene.array)), bar=False
+        self._faces = meshes3d.add_transducers(
+            self.plotter, scene, meshes3d.emitted_phases(situation.drive, len(scene.array)), bar=False
         )
         self._ringed, self._ring = 0, self._around(0)
-        self.plotter.add_mesh(self._ring, color=meshes.POINT_COLOUR, lighting=False, reset_camera=False)
-        self._sheet = meshes.plane_mesh(situation.sheet, np.full((1, 1), math.nan))
-        self._actor = meshes.add_sheet(self.plotter, self._sheet, colours.PRESSURE_MAP, (0.0, 1.0))
+        self.plotter.add_mesh(self._ring, color=meshes3d.POINT_COLOUR, lighting=False, reset_camera=False)
+        self._sheet = meshes3d.plane_mesh(situation.sheet, np.full((1, 1), math.nan))
+        self._actor = meshes3d.add_sheet(self.plotter, self._sheet, colours.PRESSURE_MAP, (0.0, 1.0))
         self.set_dark(self._dark)
         self.place(situation, 0, 0)
         if scene.domain != self._domain:
             self._domain = scene.domain
-            meshes.look_at(self.plotter, scene.domain)
+            meshes3d.look_at(self.plotter, scene.domain)
             self._fitted = self.plotter.camera.parallel_scale
             self._first = self.plotter.camera_position
             self._fit()
@@ -133,8 +132,8 @@ class Picture:
         self._dark = dark
         ink, paper = _INK[dark]
         self.plotter.set_background(paper)
-        meshes.add_axes(self.plotter, self._situation.scene.domain, ink, _LETTERS)
-        self.plotter.actors[meshes.ARROWS].prop.color = ink
+        meshes3d.add_axes(self.plotter, self._situation.scene.domain, ink, _LETTERS)
+        self.plotter.actors[meshes3d.ARROWS].prop.color = ink
 
     def place(self, situation: Situation, focus: int, transducer: int) -> None:
         """Move bodies and foci; mark the chosen focus and transducer by their indices."""
@@ -147,8 +146,8 @@ class Picture:
             self.plotter.remove_actor(self._foci.pop(), reset_camera=False, render=False)
         while len(self._foci) < len(points):
             radius, wire = (MM * share * situation.scene.wavelength for share in (_MARK, _WIRE))
-            look = {"color": meshes.POINT_COLOUR, "ambient": 0.5, "reset_camera": False}
-            self._foci.append(self.plotter.add_mesh(meshes.torus_mesh(radius, wire), **look))
+            look = {"color": meshes3d.POINT_COLOUR, "ambient": 0.5, "reset_camera": False}
+            self._foci.append(self.plotter.add_mesh(meshes3d.torus_mesh(radius, wire), **look))
         across = np.stack([axis.numpy() for axis in situation.sheet.basis])
         axes = np.vstack([across, np.cross(*across)]).T  # rings lie in the plane of the field
         for index, (point, ring) in enumerate(zip(points, self._foci, strict=True)):
@@ -167,7 +166,7 @@ class Picture:
         center, normal = MM * array.positions[transducer].numpy(), array.normals[transducer].tolist()
         disc = self._faces.points.reshape(len(array), -1, 3)[transducer]
         inner, outer = (share * float(np.linalg.norm(disc - center, axis=1).max()) for share in _RING)
-        return meshes.ring_mesh(center, normal, inner, outer)
+        return meshes3d.ring_mesh(center, normal, inner, outer)
 
     def smooth(self, fine: bool) -> None:
         """Render with smooth edges, which takes four times as long, or without while something is dragged."""
@@ -175,12 +174,12 @@ class Picture:
 
     def show_drive(self, drive: torch.Tensor) -> None:
         """Colour the transducers by the phases of a drive (M,)."""
-        phases = meshes.emitted_phases(drive, len(drive))
+        phases = meshes3d.emitted_phases(drive, len(drive))
         self._faces["phase"] = np.repeat(phases / math.pi, self._faces.n_points // len(drive))
 
     def show_field(self, plane: Plane, magnitude: Array, scale: Scale) -> None:
         """Colour a plane by |p| (Nu, Nv) [Pa]; grey where it is NaN."""
-        self._sheet.copy_from(meshes.plane_mesh(plane, scale.values(magnitude)))
+        self._sheet.copy_from(meshes3d.plane_mesh(plane, scale.values(magnitude)))
         self._actor.mapper.scalar_range = scale.limits
 
     def show_volume(self, volume: torch.Tensor | None, scale: Scale, height: float) -> bool:
@@ -192,7 +191,7 @@ class Picture:
         if volume is None:
             return True
         level = in_decibels(volume.abs().numpy(), scale.reference)
-        return meshes.add_isosurface(self.plotter, self._situation.scene, level, height, name=_SURFACE_NAME)
+        return meshes3d.add_isosurface(self.plotter, self._situation.scene, level, height, name=_SURFACE_NAME)
 
     def grip(self, x: float, y: float) -> Grip | None:
         """Return a hold on the object at a point of the window [pixels from its lower left corner]."""

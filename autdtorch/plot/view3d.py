@@ -1,4 +1,7 @@
-"""Views of a scene and its field: rendered, exported to files, and animated over one period."""
+"""Scenes and fields in 3D with PyVista (optional extra ``viz``): rendered off-screen, exported and animated.
+
+Lengths are in mm.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageColor
 
+from autdtorch.plot import meshes3d
 from autdtorch.plot.colours import FLOOR, WAVE_MAP
 from autdtorch.plot.data import MM, in_decibels, largest, pressure_text, pressure_unit, zero_level
-from autdtorch.plot.view3d import meshes
-from autdtorch.plot.view3d.meshes import STILL_AXES
+from autdtorch.plot.meshes3d import STILL_AXES
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.files import in_folder
 from autdtorch.utils.hints import with_extra
@@ -141,24 +144,24 @@ def view3d(
     """
     require_kind("scene", scene, Scene)
     off_screen = boolean("off_screen", off_screen)
-    phases = None if drive is None else meshes.emitted_phases(drive, len(scene.array))
-    on_plane = None if field is None else meshes.plane_pressure(scene, field)[1]
-    in_domain = None if volume is None else meshes.volume_magnitude(scene, volume)
+    phases = None if drive is None else meshes3d.emitted_phases(drive, len(scene.array))
+    on_plane = None if field is None else meshes3d.plane_pressure(scene, field)[1]
+    in_domain = None if volume is None else meshes3d.volume_magnitude(scene, volume)
     height = number_between("isosurface", isosurface, FLOOR, 0.0, "dB")
     name, shown = ("volume", in_domain) if on_plane is None else ("field", on_plane)
     zero = zero_level(reference, name, np.ones(1) if shown is None else shown)
     path = None if save is None else _export_path("save", save)
     require_rendering()
-    plotter = meshes.new_plotter(scene, off_screen, (drive is not None, shown is not None))
-    meshes.add_transducers(plotter, scene, phases)
+    plotter = meshes3d.new_plotter(scene, off_screen, (drive is not None, shown is not None))
+    meshes3d.add_transducers(plotter, scene, phases)
     if scene.observation_plane is not None:
         level = None if on_plane is None else in_decibels(on_plane, zero)
-        meshes.add_plane(plotter, scene.observation_plane, level)
+        meshes3d.add_plane(plotter, scene.observation_plane, level)
     caption = [] if on_plane is None and in_domain is None else [f"0 dB = {pressure_text(zero)}"]
     if in_domain is not None:
-        meshes.add_isosurface(plotter, scene, in_decibels(in_domain, zero), height)
+        meshes3d.add_isosurface(plotter, scene, in_decibels(in_domain, zero), height)
         caption.append(f"surface: {height:g} dB")
-    meshes.add_caption(plotter, *caption)
+    meshes3d.add_caption(plotter, *caption)
     if path is not None:
         _write(plotter, path, scene, caption)
     return plotter
@@ -185,8 +188,8 @@ def animate3d(
             suffix, or `frames` is less than 2.
     """
     require_kind("scene", scene, Scene)
-    phases = meshes.emitted_phases(drive, len(scene.array))
-    plane, magnitude = meshes.plane_pressure(scene, field)
+    phases = meshes3d.emitted_phases(drive, len(scene.array))
+    plane, magnitude = meshes3d.plane_pressure(scene, field)
     pressure = complex_tensor("field", field).detach().cpu().numpy()
     unit, size = pressure_unit(largest(magnitude))
     pressure[np.isnan(magnitude)] = math.nan
@@ -194,20 +197,20 @@ def animate3d(
     frames = integer_at_least("frames", frames, 2)
     path = path_of("path", path, suffixes=(".gif",))
     require_rendering()
-    plotter = meshes.new_plotter(scene, off_screen=True, bars=(True, True))
-    discs = meshes.add_transducers(plotter, scene, phases)
-    sheet = meshes.plane_mesh(plane, pressure.real)
+    plotter = meshes3d.new_plotter(scene, off_screen=True, bars=(True, True))
+    discs = meshes3d.add_transducers(plotter, scene, phases)
+    sheet = meshes3d.plane_mesh(plane, pressure.real)
     peak = largest(magnitude) / size
     digit = 10.0 ** math.floor(math.log10(peak)) if peak else 1.0
     limit = digit * max(1, math.ceil(peak / digit))  # of one digit, for round numbers on the colour bar
-    actor = meshes.add_sheet(plotter, sheet, WAVE_MAP, (-limit, limit))
-    meshes.add_bar(plotter, actor, f"p(t) [{unit}]", position=meshes.FIELD_BAR, labels=5, fmt="%.3g")
-    meshes.add_caption(plotter, f"one period: {1e6 / scene.frequency:.3g} µs")
+    actor = meshes3d.add_sheet(plotter, sheet, WAVE_MAP, (-limit, limit))
+    meshes3d.add_bar(plotter, actor, f"p(t) [{unit}]", position=meshes3d.FIELD_BAR, labels=5, fmt="%.3g")
+    meshes3d.add_caption(plotter, f"one period: {1e6 / scene.frequency:.3g} µs")
     emitted = discs["phase"].copy()
     pictures = []
     for turn in np.arange(frames) / frames:
         discs["phase"] = (emitted + 2 * turn) % 2
-        sheet.copy_from(meshes.plane_mesh(plane, (pressure * np.exp(-2j * math.pi * turn)).real))
+        sheet.copy_from(meshes3d.plane_mesh(plane, (pressure * np.exp(-2j * math.pi * turn)).real))
         plotter.render()
         pictures.append(Image.fromarray(plotter.screenshot(return_img=True)))
     colours = _colours(plotter)
@@ -222,7 +225,7 @@ def _colours(plotter: pyvista.Plotter) -> NDArray[np.uint8]:
     """Return one palette (256, 3) for all frames: with different palettes, static parts would flicker."""
     tables = [np.asarray(bar.lookup_table.values)[:, :3] for bar in plotter.scalar_bars.values()]
     greys = np.linspace(0, 255, _GREYS)[:, None] * np.ones(3)
-    shades = np.linspace(0.3, 1.0, _SHADES)[:, None] * np.array(ImageColor.getrgb(meshes.POINT_COLOUR))
+    shades = np.linspace(0.3, 1.0, _SHADES)[:, None] * np.array(ImageColor.getrgb(meshes3d.POINT_COLOUR))
     each = (256 - _GREYS - _SHADES) // len(tables)
     maps = [table[np.linspace(0, len(table) - 1, each).astype(int)] for table in tables]
     return np.concatenate([greys, shades, *maps]).astype(np.uint8)
@@ -248,7 +251,7 @@ def _write(plotter: pyvista.Plotter, path: Path, scene: Scene, caption: Sequence
     if path.suffix.lower() == ".gltf":
         _write_gltf(plotter, path)
     else:
-        meshes.add_axes(plotter, scene.domain)
+        meshes3d.add_axes(plotter, scene.domain)
         _write_html(plotter, path, caption)
         plotter.remove_bounds_axes()
     for actor in still:
