@@ -8,6 +8,8 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 # Imports compile what they use: a minute less than compiling every file of every package here.
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet --no-compile -c constraints.txt -e
+# They write that to disk: images for containers often forbid it, and each process then takes seconds longer.
+export PYTHONDONTWRITEBYTECODE :=
 
 # "make paper trials=50" passes trials=50 to Hydra, and so every variable of the command line except PYTHON and ARGS.
 OVERRIDES = $(strip $(foreach name,$(filter-out PYTHON ARGS,$(.VARIABLES)),$(if \

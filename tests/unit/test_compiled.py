@@ -1,62 +1,13 @@
-"""Compiled kernels: equal from memory and disk, of the present source; damaged files are compiled again."""
+"""Compiled kernels: of the present source; damaged files are compiled again. Cold and warm: test_forks.py."""
 
 import importlib.util
 import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
 
-import autdtorch as at
 from autdtorch.fdtd.kernels import compiled
-
-TESTS = Path(__file__).parents[1]
-
-SCRIPT = """
-import hashlib, logging, sys
-sys.path.insert(0, sys.argv[1])
-from small_scenes import CUBE, small_scene
-import autdtorch as at
-from autdtorch.fdtd.kernels.compiled import _entries
-logging.disable()
-scene = small_scene((CUBE,))
-propagator = at.make_propagator(scene, "box", 2e-3, cache=False)
-objective = at.SimulatedObjective(scene, propagator)
-results = [propagator.transfer_matrix()]
-for solution in (at.gabs(objective, trials=3), at.identify(objective, 20)):
-    results += [solution.drive, solution.pressure, solution.history]
-print(hashlib.sha256(b"".join(one.numpy().tobytes() for one in results)).hexdigest())
-print(sum(sum(one.stats.cache_misses.values()) for one in _entries))
-"""
-
-
-def run(cache):
-    """Run `SCRIPT` in a new process; return the digest of its results and the number of kernels compiled."""
-    command = [sys.executable, "-c", SCRIPT, str(TESTS)]
-    process = subprocess.run(
-        command,
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
-        env=os.environ | {"NUMBA_CACHE_DIR": str(cache)},
-    )
-    digest, compiled_now = process.stdout.split()
-    return digest, int(compiled_now)
-
-
-def test_cold_and_warm_caches_give_the_same_results(tmp_path):
-    cold, compiled_first = run(tmp_path)
-    warm, compiled_again = run(tmp_path)
-    assert compiled_first > 0
-    assert compiled_again == 0
-    assert warm == cold
-    names = [path.name for path in tmp_path.rglob("*.nbi")]
-    digest = compiled._digest(Path(at.__file__).parent / "fdtd" / "kernels")
-    assert all(digest in name for name in names)
-    assert names
 
 
 def test_any_change_of_the_kernels_changes_the_digest(tmp_path):
