@@ -1,6 +1,7 @@
 """Values that a user could give by mistake or in bad faith, of every kind."""
 
 import datetime
+import functools
 import math
 import warnings
 from collections import UserList, deque
@@ -88,60 +89,66 @@ def quantised() -> torch.Tensor:
 
 RECORDS = np.zeros(3, [("x", float)])
 
-WRONG = [
-    Wrong("None", None),
-    *(Wrong(repr(text), text) for text in ("text", "", "two\nlines", "nul\0", b"bytes")),
-    Wrong("a dict", {"key": 1}),
-    Wrong("an object", object(), never=True),
-    Wrong("a function", math.sin),
-    Wrong("a class", int),
-    *(Wrong(str(number), number) for number in (math.nan, math.inf, -math.inf, 0, -1, -0.5, 1.5, 1 + 2j)),
-    *(Wrong(str(truth), truth) for truth in (True, False, np.True_)),
-    *(Wrong(f"10^{power}", 10**power) for power in (400, 5000)),
-    Wrong("-10^400", -(10**400)),
-    Wrong("a fraction", Fraction(3, 2)),
-    Wrong("a fraction of 10^400", Fraction(10**400, 3)),
-    *(Wrong(f"Decimal {number}", Decimal(number), never=True) for number in ("1.5", "nan", "1e999")),
-    Wrong("1e400", np.longdouble("1e400"), never=True),
-    Wrong("[]", []),
-    Wrong("[[]]", [[]]),
-    Wrong("a ragged list", [[1.0, 2.0], [3.0]], never=True),
-    Wrong("a list of text", ["a", "b"]),
-    Wrong("a list in itself", holding_itself(1), never=True),
-    *(  # which keep NumPy busy for ever
-        Wrong(f"a {kind.__name__} twice in itself", holding_itself(2, kind), never=True)
-        for kind in (list, UserList, deque, OwnList)
-    ),
-    Wrong("lists that share", sharing(UserList), never=True),
-    Wrong("a list that cannot be read", Broken(), never=True),
-    Wrong("an array that cannot be read", BrokenArray(), never=True),
-    Wrong("a deep list", deep(100_000), never=True),
-    Wrong("masked", np.ma.masked, never=True),
-    Wrong("a masked number", np.ma.array(1.0, mask=True), never=True),
-    Wrong("a masked array", np.ma.array([0, 1, 2], mask=[False, True, False]), never=True),
-    Wrong("masked records", np.ma.array(RECORDS, mask=[True, False, False]), never=True),
-    Wrong("masked in a list", [1.0, np.ma.masked, 2.0], never=True),
-    Wrong("records", RECORDS, never=True),
-    Wrong("an array of objects", np.array([1, None, "a"], object), never=True),
-    Wrong("a number as an array", np.array(1.5)),
-    Wrong("an integer as an array", np.array(2)),
-    Wrong("an empty array", np.zeros((0, 3))),
-    Wrong("an array of text", np.array(["a", "b"])),
-    Wrong("an array of 40 axes", np.zeros((1,) * 40), never=True),
-    Wrong("dates", np.array(["2020-01-01"], "datetime64[D]"), never=True),
-    Wrong("a date", datetime.date(2020, 1, 1), never=True),
-    Wrong("a time", np.timedelta64(1, "s"), never=True),
-    Wrong("a meta tensor", torch.zeros(3, device="meta"), never=True),
-    Wrong("a number as a meta tensor", torch.zeros((), device="meta"), never=True),
-    Wrong("a sparse tensor", torch.eye(3).to_sparse()),
-    Wrong("a quantised tensor", quantised(), never=True),
-    Wrong("a nested tensor", torch.nested.nested_tensor([torch.ones(2), torch.ones(3)], layout=torch.jagged)),
-    Wrong("a tensor of booleans", torch.ones(3, dtype=torch.bool)),
-    Wrong("a tensor of 8 bits", torch.ones(3).to(torch.float8_e5m2)),
-    Wrong("a tensor of unsigned integers", torch.ones(3, dtype=torch.uint64)),
-    Wrong("a tensor with gradient", torch.ones(3, requires_grad=True)),
-    Wrong("a list of meta tensors", [torch.zeros((), device="meta")] * 3, never=True),
-]
+
+@functools.cache
+def wrong_values() -> list[Wrong]:
+    """Return values of all kinds; some make PyTorch import more of itself, which takes a second."""
+    return [
+        Wrong("None", None),
+        *(Wrong(repr(text), text) for text in ("text", "", "two\nlines", "nul\0", b"bytes")),
+        Wrong("a dict", {"key": 1}),
+        Wrong("an object", object(), never=True),
+        Wrong("a function", math.sin),
+        Wrong("a class", int),
+        *(Wrong(str(number), number) for number in (math.nan, math.inf, -math.inf, 0, -1, -0.5, 1.5, 1 + 2j)),
+        *(Wrong(str(truth), truth) for truth in (True, False, np.True_)),
+        *(Wrong(f"10^{power}", 10**power) for power in (400, 5000)),
+        Wrong("-10^400", -(10**400)),
+        Wrong("a fraction", Fraction(3, 2)),
+        Wrong("a fraction of 10^400", Fraction(10**400, 3)),
+        *(Wrong(f"Decimal {number}", Decimal(number), never=True) for number in ("1.5", "nan", "1e999")),
+        Wrong("1e400", np.longdouble("1e400"), never=True),
+        Wrong("[]", []),
+        Wrong("[[]]", [[]]),
+        Wrong("a ragged list", [[1.0, 2.0], [3.0]], never=True),
+        Wrong("a list of text", ["a", "b"]),
+        Wrong("a list in itself", holding_itself(1), never=True),
+        *(  # which keep NumPy busy for ever
+            Wrong(f"a {kind.__name__} twice in itself", holding_itself(2, kind), never=True)
+            for kind in (list, UserList, deque, OwnList)
+        ),
+        Wrong("lists that share", sharing(UserList), never=True),
+        Wrong("a list that cannot be read", Broken(), never=True),
+        Wrong("an array that cannot be read", BrokenArray(), never=True),
+        Wrong("a deep list", deep(100_000), never=True),
+        Wrong("masked", np.ma.masked, never=True),
+        Wrong("a masked number", np.ma.array(1.0, mask=True), never=True),
+        Wrong("a masked array", np.ma.array([0, 1, 2], mask=[False, True, False]), never=True),
+        Wrong("masked records", np.ma.array(RECORDS, mask=[True, False, False]), never=True),
+        Wrong("masked in a list", [1.0, np.ma.masked, 2.0], never=True),
+        Wrong("records", RECORDS, never=True),
+        Wrong("an array of objects", np.array([1, None, "a"], object), never=True),
+        Wrong("a number as an array", np.array(1.5)),
+        Wrong("an integer as an array", np.array(2)),
+        Wrong("an empty array", np.zeros((0, 3))),
+        Wrong("an array of text", np.array(["a", "b"])),
+        Wrong("an array of 40 axes", np.zeros((1,) * 40), never=True),
+        Wrong("dates", np.array(["2020-01-01"], "datetime64[D]"), never=True),
+        Wrong("a date", datetime.date(2020, 1, 1), never=True),
+        Wrong("a time", np.timedelta64(1, "s"), never=True),
+        Wrong("a meta tensor", torch.zeros(3, device="meta"), never=True),
+        Wrong("a number as a meta tensor", torch.zeros((), device="meta"), never=True),
+        Wrong("a sparse tensor", torch.eye(3).to_sparse()),
+        Wrong("a quantised tensor", quantised(), never=True),
+        Wrong(
+            "a nested tensor", torch.nested.nested_tensor([torch.ones(2), torch.ones(3)], layout=torch.jagged)
+        ),
+        Wrong("a tensor of booleans", torch.ones(3, dtype=torch.bool)),
+        Wrong("a tensor of 8 bits", torch.ones(3).to(torch.float8_e5m2)),
+        Wrong("a tensor of unsigned integers", torch.ones(3, dtype=torch.uint64)),
+        Wrong("a tensor with gradient", torch.ones(3, requires_grad=True)),
+        Wrong("a list of meta tensors", [torch.zeros((), device="meta")] * 3, never=True),
+    ]
 
 
 def spoiled(valid: object) -> Iterator[Wrong]:

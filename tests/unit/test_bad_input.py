@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from public_calls import Call, public_calls
-from wrong_values import WRONG, Wrong, spoiled
+from wrong_values import Wrong, spoiled, wrong_values
 
 import autdtorch as at
 from autdtorch.plot import explore
@@ -91,7 +91,7 @@ def test_a_value_of_a_wrong_kind_is_refused_in_a_line_that_names_the_field(call,
     complaints = []
     for parameter, annotation in call.parameters.items():
         valid = call.argument(parameter, tmp_path)
-        for wrong in (*WRONG, *spoiled(valid)):
+        for wrong in (*wrong_values(), *spoiled(valid)):
             if annotation == "Any" or (callable(valid) and callable(wrong.value)):
                 continue  # errors of a function show where it is called
             error = refusal(function, call.arguments(tmp_path, **{parameter: wrong.value}))
