@@ -42,7 +42,12 @@ $(INSTALLED)-%: pyproject.toml constraints.txt | $(BIN)/python
 paper: $(INSTALLED)
 	$(BIN)/autdtorch experiment=paper $(OVERRIDES)
 
-test: $(INSTALLED)-dev
+# Once for all processes of the tests, which would each take 30 s
+$(VENV)/.kernels: $(wildcard autdtorch/fdtd/kernels/*.py autdtorch/methods/holography/*.py) | $(INSTALLED)-dev
+	for dtype in float32 float64; do $(BIN)/python tests/compile_kernels.py $$dtype & done; wait
+	@touch $@
+
+test: $(INSTALLED)-dev $(VENV)/.kernels
 	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist worksteal $(ARGS)
 
 lint: $(INSTALLED)-dev
