@@ -54,6 +54,14 @@ def no_timer_left_running() -> Iterator[None]:
             thread.cancel()
 
 
+@pytest.fixture
+def set_threads() -> Iterator[Any]:
+    """Set the number of PyTorch's threads, which afterwards is what it was."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         item.add_marker(item.path.relative_to(TESTS).parts[0])

@@ -16,13 +16,11 @@ SOLVER = {"method": "auto", "spacing": 2e-3, "tolerance": 0.1, "kernel": "refere
 
 
 def slow_gabs(objective, trials=1, seed=0):
-    """GABS that takes a while."""
     time.sleep(0.15)
     return gabs(objective, levels=4, trials=trials, seed=seed)
 
 
 def main():
-    """Run the study into the folder that the command line names."""
     slow_gabs.__module__ = gabs.__module__  # results of others' methods are not used again
     autdtorch.study.run_study.BLOCK = 1
     scenes = {

@@ -8,7 +8,6 @@ from autdtorch.scene.obstacles import Box
 
 
 def box(lower, upper):
-    """Vertices and triangles of a cuboid."""
     lower, upper = np.array(lower, float), np.array(upper, float)
     vertices, faces = Box((lower + upper) / 2, upper - lower, rigid=True).surface()
     return vertices.numpy(), faces.numpy()

@@ -1,5 +1,6 @@
 """Small scenes that several tests share: a 2 x 2 array in front of an obstacle, 24 mm across."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,13 @@ from autdtorch.scene.scene import Medium, Scene
 AIR = Medium(density=1.293, sound_speed=340.0)
 CUBE = Box(center=(12e-3, 12e-3, 12e-3), size=(6e-3, 8e-3, 4e-3), density=100.0, sound_speed=340.0)
 CORNER = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"  # a mesh
+#: A scene as a file has it.
+SECTION = {
+    "frequency": 40e3,
+    "medium": {"density": 1.2, "sound_speed": 340.0},
+    "array": {"type": "grid", "shape": [2, 2], "pitch": 10e-3, "center": [0, 0, 0]},
+    "control_points": {"type": "points", "positions": [[0.05, 0, 0], [0.05, 0.01, 0]]},
+}
 NO_SOURCES = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((0, 2), dtype=torch.float64))
 NO_RECEIVERS = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=torch.float64))
 
@@ -64,6 +72,18 @@ def assembled_parts(scene: Scene, spacing: float, dtype: torch.dtype) -> tuple[A
 def all_tensors(state: WaveState, recorded: torch.Tensor) -> list[torch.Tensor]:
     """All results of a run: pressure, record, and the memory of layers and columns."""
     return [state.now, state.before, recorded, *(part for layer in state.memory for part in layer)]
+
+
+def assert_slopes(
+    function: Callable[[torch.Tensor], torch.Tensor], place: torch.Tensor, steps: list[float]
+) -> None:
+    """Check the gradient at a place (n,) against central differences, which err by the steps squared."""
+    place = place.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(function(place), place)
+    for entry, step, aside in zip(gradient, steps, torch.eye(len(steps), dtype=torch.float64), strict=True):
+        ends = (float(function(place.detach() + sign * step * aside)) for sign in (1, -1))
+        slope = (next(ends) - next(ends)) / (2 * step)
+        assert abs(float(entry) - slope) <= 1e-4 * max(abs(slope), float(gradient.abs().max()))
 
 
 def relative_error(value: torch.Tensor, reference: torch.Tensor) -> float:

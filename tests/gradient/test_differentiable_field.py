@@ -25,7 +25,6 @@ EXACT = {"spacing": 2e-3, "periods": 3, "kernel": "cpu", "dtype": "float64"}
 
 
 def materials(*obstacles):
-    """Density and sound speed (K,), ones for rigid obstacles."""
     values = [[getattr(one, name) or 1.0 for one in obstacles] for name in ("density", "sound_speed")]
     return [torch.tensor(each, dtype=torch.float64, requires_grad=True) for each in values]
 

@@ -1,13 +1,9 @@
-from collections.abc import Callable
-
 import pytest
 import torch
 
 from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.scene import Medium, Scene
-
-MakeObjective = Callable[[torch.Tensor], SimulatedObjective]
 
 
 class MatrixPropagator:
@@ -50,6 +46,11 @@ def random_matrix():
         return torch.randn(points, transducers, dtype=torch.complex128, generator=generator)
 
     return make
+
+
+@pytest.fixture
+def objective(make_objective, random_matrix):
+    return make_objective(random_matrix(3, 5, 0))
 
 
 @pytest.fixture(scope="session")

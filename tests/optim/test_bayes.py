@@ -81,16 +81,13 @@ def test_foci_that_nothing_reaches(make_objective, random_matrix, dark, with_pri
     assert solution.score.tolist() == [0.0]
 
 
-def test_foci_find_the_maximum(make_objective, random_matrix):
+def test_foci_find_the_maximum_and_reach_the_goal_of_a_user(make_objective, random_matrix):
     objective = make_objective(random_matrix(3, 6, 4))
     best = at.gradient_ascent(objective).score
     solution = at.bayes_opt(objective, evaluations=30, initial=6, fixed_transducer=0, trials=2, **FOCI)
     # Amplitudes below 1, which gradient ascent may use, and other local maxima are within a few per cent.
     assert (solution.score > 0.9 * best).all()
-
-
-def test_goal_of_a_user_is_reached_by_the_foci(make_objective, random_matrix):
-    """A goal is improved by its samples, without the smooth minimum: the pressure at the first focus."""
+    # A goal is improved by its samples, without the smooth minimum: the pressure at the first focus.
     matrix = random_matrix(2, 4, 3)
     highest = matrix[0].abs().sum()
     options = dict(evaluations=24, initial=6, fixed_transducer=0, goal=lambda p: p[..., 0], **FOCI)

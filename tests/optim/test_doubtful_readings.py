@@ -29,8 +29,6 @@ class Faulty:
 
 
 def times(factor, numbers, points=slice(None)):
-    """Multiply the readings of some evaluations at some control points."""
-
     def change(number, pressure):
         pressure[points] *= factor if number in numbers else 1
         return pressure
@@ -47,12 +45,10 @@ def replaced(point, reading):
 
 
 def in_steps(step, most=math.inf):
-    """Read in steps, up to the end of the range."""
     return lambda number, pressure: (pressure.clamp(max=most) / step).round() * step
 
 
 def noisy(level, seed=0):
-    """Add noise to pressures, of this rms."""
     generator = torch.Generator().manual_seed(seed)
 
     def change(number, pressure):
@@ -216,7 +212,7 @@ def test_scores_are_compared_once_at_the_end(make_objective, random_matrix, monk
     assert len(compared) == 3  # one for each trial, not for each step, which would take half of the time
 
 
-def test_the_end_of_a_range_needs_different_drives():
+def test_ends_of_ranges_fine_readings_and_gross_outliers():
     generator = torch.Generator().manual_seed(0)
     drives = random_drives(20, 6, generator)
     magnitudes = (drives @ random_drives(2, 6, generator).T).abs()
@@ -225,17 +221,11 @@ def test_the_end_of_a_range_needs_different_drives():
     assert range_ends(drives, 0 * magnitudes).isinf().all()
     again = drives[:1] * torch.polar(torch.ones(20).double(), torch.linspace(0, 6, 20).double())[:, None]
     assert range_ends(again, torch.ones(20, 1).double()).isinf().all()  # one drive, at 20 common phases
-
-
-def test_a_sensor_reads_finely_where_enough_lower_readings_differ():
     readings = 5 * torch.rand(20, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     end = torch.tensor([4.0], dtype=torch.float64)
     assert reads_finely(readings, end).all()
     assert not reads_finely(readings[:6], end).any()
     assert not reads_finely(readings.round(decimals=0), end).any()
-
-
-def test_gross_outliers_are_far_from_the_median():
     drives = random_drives(300, 16, torch.Generator().manual_seed(0))
     magnitudes = drives.sum(dim=1, keepdim=True).abs()
     assert not gross_outliers(magnitudes).any()

@@ -1,15 +1,25 @@
-"""Goals: scores by their definition, slopes by finite differences, and bounds that no drive exceeds."""
+"""Goals: scores, slopes and bounds; one that is new. Functions of methods: stub, old keywords, settings."""
 
+import ast
+import inspect
 import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
 
 import pytest
 import torch
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import autdtorch as at
+from autdtorch.io.goal_section import GOALS, goal_section, load_goal
+from autdtorch.methods import functions
+from autdtorch.methods.catalogue import METHODS, VARIANTS
 from autdtorch.methods.gradient import climb, random_drives
 from autdtorch.objectives.goals import derivative, goal_of
+from autdtorch.study.run_study import run_study
 
 PRESSURE = torch.tensor([[4.0, 2.0, 0.3, 1.0], [1.0, 8.0, 0.1, 4.0]], dtype=torch.float64)
 DB30 = 10 ** (-30 / 20)
@@ -81,9 +91,6 @@ def test_bounds_are_met_where_the_best_drive_is_known():
     assert at.MeanPressure().bound(matrix) == pytest.approx(math.sqrt(8), rel=1e-5)
     assert at.TargetPressures([8]).bound(matrix[:1]) == pytest.approx(0, abs=1e-9)
     assert at.TargetPressures([16]).bound(matrix[:1]) == pytest.approx(-0.5, rel=1e-5)
-
-
-def test_a_quiet_point_like_its_focus_costs_all_that_the_penalty_leaves():
     matrix = torch.polar(torch.ones(1, 5).double(), torch.arange(5).double()[None]).expand(2, -1)
     # |p| is alike at both: the excess is 1 / ratio, and the best drive takes the penalty
     for ratio in (0.8, 0.65):
@@ -131,9 +138,10 @@ def test_the_bound_of_contrast_is_the_best_drive_for_one_focus(random_matrix):
     assert math.isinf(at.Contrast(range(1, 6)).bound(matrix[:6]))
 
 
-def test_contrast_of_silence_is_finite():
+def test_contrast_of_silence_and_gradients_where_targets_are_met_are_finite():
     goal = at.Contrast([1])
     assert goal(torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]).double()).tolist() == [0, 1e10, 0]
+    assert derivative(at.TargetPressures([1.0, 2.0]), torch.tensor([1.0, 2.0]).double()).tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("number", range(10))
@@ -152,10 +160,6 @@ def test_a_failed_transducer_changes_no_bound(random_matrix):
     silent = torch.cat([matrix, torch.zeros(8, 1, dtype=matrix.dtype)], dim=1)
     for goal in goals_for(8, unit=2.0):
         assert goal.bound(silent) == pytest.approx(goal.bound(matrix), rel=1e-3)
-
-
-def test_the_gradient_is_finite_where_targets_are_met():
-    assert derivative(at.TargetPressures([1.0, 2.0]), torch.tensor([1.0, 2.0]).double()).tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("number", range(10))
@@ -220,3 +224,81 @@ BAD_GOALS = [
 def test_bad_goals_are_named(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+STUB = Path(functions.__file__).with_suffix(".pyi")
+CONFIGS = Path(__file__).parents[2] / "configs/method"
+FUNCTIONS = {
+    node.name: node for node in ast.parse(STUB.read_text()).body if isinstance(node, ast.FunctionDef)
+}
+
+
+def test_the_stub_has_the_parameters_of_the_functions():
+    assert set(FUNCTIONS) == set(METHODS) - {"holography"}
+    for name, node in FUNCTIONS.items():
+        parameters = inspect.signature(getattr(functions, name)).parameters.values()
+        by_position = [one.name for one in parameters if one.kind is inspect.Parameter.POSITIONAL_OR_KEYWORD]
+        assert [one.arg for one in node.args.args] == by_position
+        listed = {one.arg: ast.unparse(one.annotation) for one in node.args.args + node.args.kwonlyargs}
+        assert listed == {one.name: one.annotation for one in parameters}
+        defaults = [*node.args.defaults, *(one for one in node.args.kw_defaults if one)]
+        shown = [ast.literal_eval(one) for one in defaults]
+        expected = [... if one.name == "goal" else one.default for one in parameters]
+        assert shown == expected[len(expected) - len(shown) :]
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_the_old_keyword_of_the_goal_is_taken_with_a_warning(objective, name):
+    function = getattr(at, name)
+    few = {"evaluations": 20, "levels": 4, "steps": 5}
+    settings = {key: few[key] for key in few.keys() & inspect.signature(function).parameters.keys()}
+    if name == "random_search":
+        del settings["levels"]
+    with pytest.warns(DeprecationWarning, match="score= is now goal=") as caught:
+        found = function(objective, score=at.MeanPressure(), **settings)
+    assert caught[0].filename == __file__
+    assert torch.equal(found.drive, function(objective, goal=at.MeanPressure(), **settings).drive)
+    with pytest.raises(TypeError, match="score: has the new name goal"):
+        function(objective, score=at.MeanPressure(), goal=at.MeanPressure())
+
+
+def test_old_names_of_the_goal_elsewhere(objective):
+    with pytest.warns(DeprecationWarning, match="score= is now goal="):
+        at.run(at.LSS(), objective, score=at.MeanPressure())
+    with pytest.warns(DeprecationWarning, match="score= is now goal="):
+        problem = at.FocusProblem(objective, score=at.MeanPressure())
+    with pytest.warns(DeprecationWarning, match=r"FocusProblem\.goal"):
+        assert problem.score is problem.goal
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_configs_have_the_settings_of_a_class_or_a_variant(path):
+    settings = yaml.safe_load(path.read_text(encoding="utf-8"))
+    kind = METHODS[settings.pop("_target_").removeprefix("autdtorch.")]
+    settings = {key: float(value) if value == "1e-4" else value for key, value in settings.items()}
+    assert kind(**settings) == VARIANTS.get(path.stem, kind())
+
+
+@dataclass(frozen=True)
+class LoudestFocus(at.Goal):
+    """A goal of one file: its class."""
+
+    name: ClassVar[str] = "loudest_focus"
+
+    share: float = 1.0
+
+    def __call__(self, pressure):
+        return self.share * self.checked(pressure).amax(dim=-1)
+
+
+def test_a_new_goal_needs_its_class_and_one_entry(objective, monkeypatch, tmp_path):
+    monkeypatch.setitem(GOALS, LoudestFocus.name, LoudestFocus)  # the entry
+    goal = load_goal("goal", {"name": "loudest_focus", "share": 0.5})
+    assert goal == LoudestFocus(0.5) == load_goal("goal", goal_section(goal))
+    for method in (at.GABS(levels=4), at.Identify(20), at.GradientAscent(2, 20), at.Holography()):
+        solution = at.run(method, objective, goal=goal)
+        assert torch.equal(solution.score, 0.5 * solution.pressure.amax(dim=1))
+    scenes, solver = {"scene": objective.scene}, {"method": "free_space"}
+    study = run_study(scenes, {"lss": at.LSS()}, tmp_path, solver=solver, goal=goal)
+    again = at.load_results(tmp_path)
+    assert again.scenes["scene"].score_label == study.scenes["scene"].score_label == "loudest focus [Pa]"

@@ -38,7 +38,7 @@ def test_one_point_gets_all_transducers_in_phase(random_matrix, algorithm):
     assert torch.allclose(drive.abs(), torch.ones(20).double())
 
 
-def test_weighted_and_descent_reach_proportions_and_pressures(random_matrix):
+def test_weighted_descent_and_free_amplitudes_reach_proportions_and_pressures(random_matrix):
     matrix, wanted = random_matrix(4, 40, 1), torch.tensor([6.0, 9.0, 6.0, 8.0]).double()
     share = pressures(matrix, holography(matrix, wanted, "wgs")) / wanted
     # 200 iterations leave 1e-4; back-propagation alone leaves a third
@@ -48,9 +48,6 @@ def test_weighted_and_descent_reach_proportions_and_pressures(random_matrix):
         # within reach: all foci could have about twice their targets
         assert (pressures(matrix, drive) / wanted - 1).abs().max() < 1e-2
         assert drive.abs().max() <= 1 + 1e-12
-
-
-def test_free_amplitudes_give_the_wanted_level(random_matrix):
     matrix, wanted = random_matrix(3, 30, 2), torch.tensor([2.0, 1.0, 3.0]).double()
     drive = holography(matrix, wanted, "wgs", free_amplitudes=True)
     assert (pressures(matrix, drive) / wanted - 1).abs().max() < 1e-3
@@ -215,31 +212,25 @@ def test_frames_of_one_level_within_the_limit(foci, closed):
     assert weakest[0] > 0.7 * free.min()
 
 
-def test_a_limit_above_the_steps_of_the_path_costs_nothing():
+def test_foci_are_not_lost_on_the_way_and_a_wide_limit_costs_nothing():
     # 200 frames move a focus by 0.3 mm, which takes steps of 0.11 rad at most
     matrix = circling(200, 1)
     drives = drive_sequence(matrix, None, 0.2, closed=True, even=False)
     assert torch.allclose(drives.abs(), torch.ones(200, 100).double())
     best = matrix.abs().sum(dim=-1)[:, 0]  # of one focus: all transducers in phase
     assert (pressures(matrix, drives)[:, 0] / best).min() > 0.995
-
-
-def test_foci_are_not_lost_on_the_way():
     # weights that overshoot leave 0.55 of the mean in some frames; 0.95 was measured
     weakest = pressures(circling(200), drive_sequence(circling(200), even=False)).amin(dim=1)
     assert weakest.min() > 0.9 * weakest.mean()
 
 
-def test_targets_hold_along_the_path():
+def test_targets_hold_along_the_path_and_a_frame_alone_is_near_the_bound():
     matrix = circling(60)
     reached = pressures(matrix, drive_sequence(matrix, [2.0, 1.0], 0.5))
     # the best weakest focus of ten iterations leaves 9 % for the other at most
     assert (reached[:, 0] / reached[:, 1] / 2 - 1).abs().max() < 0.2
     other = torch.tensor([2.0, 1.0]).double().expand(60, 2)
     assert torch.equal(drive_sequence(matrix, other, 0.5), drive_sequence(matrix, [2.0, 1.0], 0.5))
-
-
-def test_a_frame_alone_is_near_the_bound():
     # "wgs" from a drive of equal phases leaves half of the bound for two opposite foci; 0.93 was measured
     matrix = circling(1)
     drive = drive_sequence(matrix)

@@ -101,25 +101,19 @@ def test_from_the_fewest_evaluations(make_objective, random_matrix, points, tran
     assert solution.score.max() <= focus_bound(objective.transfer_matrix)
 
 
-def test_fewer_readings_than_three_for_each_transducer(make_objective, random_matrix):
+def test_few_and_many_transducers(make_objective, random_matrix):
     """Magnitudes determine a row from about two readings a transducer on; then the search takes longer."""
     objective = make_objective(random_matrix(2, 20, 0))
     assert identify(objective, evaluations=47).score > 0.98 * gradient_ascent(objective).score
-
-
-def test_a_large_array(make_objective, random_matrix):
     objective = make_objective(random_matrix(2, 64, 0))
     score = identify(objective, evaluations=256).score
     assert score > 0.97 * gradient_ascent(objective).score
 
 
-def test_a_focus_that_nothing_reaches(make_objective, random_matrix):
+def test_units_and_foci_that_nothing_reaches(make_objective, random_matrix):
     matrix = random_matrix(3, 5, 0)
     matrix[1] = 0
     assert identify(make_objective(matrix)).score.tolist() == [0.0]
-
-
-def test_units_do_not_matter(make_objective, random_matrix):
     matrix = random_matrix(3, 5, 0)
     score, scaled = (identify(make_objective(unit * matrix)).score.item() for unit in (1.0, 1e-9))
     assert math.isclose(score, scaled * 1e9, rel_tol=1e-3)

@@ -37,11 +37,6 @@ def each(methods):
     return pytest.mark.parametrize("method", methods, ids=lambda method: repr(method)[:25])
 
 
-@pytest.fixture
-def objective(make_objective, random_matrix):
-    return make_objective(random_matrix(3, 5, 0))
-
-
 @dataclass(frozen=True)
 class OneByOne(at.Method):
     """A user's method: one random drive after the other."""
@@ -207,33 +202,27 @@ def test_a_trial_depends_on_its_seed_and_not_on_the_trials_beside_it(objective, 
 
 
 @each([method for method in METHODS if isinstance(method, at.BayesOpt)])
-def test_a_block_of_bayes_opt_is_the_same_on_any_number_of_threads(objective, method):
-    threads = torch.get_num_threads()
-    try:
-        solutions = []
-        for count in (1, 3):
-            torch.set_num_threads(count)
-            solutions.append(at.run(method, objective, trials=3, seed=3))
-    finally:
-        torch.set_num_threads(threads)
+def test_a_block_of_bayes_opt_is_the_same_on_any_number_of_threads(objective, method, set_threads):
+    solutions = []
+    for count in (1, 3):
+        set_threads(count)
+        solutions.append(at.run(method, objective, trials=3, seed=3))
     assert torch.equal(solutions[0].drive, solutions[1].drive)
     assert torch.equal(solutions[0].history, solutions[1].history)
 
 
 @pytest.mark.parametrize("method", [at.identify, at.gradient_ascent])
-def test_a_method_of_small_steps_takes_one_thread_and_gives_the_others_back(objective, method, monkeypatch):
+def test_a_method_of_small_steps_takes_one_thread_and_gives_the_others_back(
+    objective, method, monkeypatch, set_threads
+):
     used = set()
     monkeypatch.setattr(
         "autdtorch.methods.gradient._pressure",
         lambda matrix, drive: used.add(torch.get_num_threads()) or (drive[:, None] * matrix).sum(dim=-1),
     )
-    threads = torch.get_num_threads()
-    try:
-        torch.set_num_threads(2)
-        method(objective)
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(threads)
+    set_threads(2)
+    method(objective)
+    assert torch.get_num_threads() == 2
     assert used == {1}
 
 

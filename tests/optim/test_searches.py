@@ -220,13 +220,10 @@ def test_near_ties_do_not_hang_on_the_last_digit(make_objective, paper_objective
         assert torch.equal(solution.score, solution.history[:, -1])
 
 
-def test_longer_search_begins_with_the_shorter(make_objective, random_matrix):
+def test_random_searches_have_uniform_phases_and_begin_with_shorter_ones(make_objective, random_matrix):
     objective = make_objective(random_matrix(3, 5, 0))
     long, short = (random_search(objective, evaluations=count, trials=3) for count in (200, 64))
     assert torch.equal(long.history[:, :64], short.history)
-
-
-def test_scores_are_those_of_uniform_phases(make_objective, random_matrix):
     objective = make_objective(random_matrix(2, 4, 0))
     best = random_search(objective, evaluations=8, trials=400).score
     phases = 2 * math.pi * torch.rand(400, 8, 4, generator=torch.Generator().manual_seed(5)).double()

@@ -109,15 +109,12 @@ def test_a_header_that_was_changed_is_refused(states, tmp_path, data):
         at.load_state(tmp_path / "state.npz", method, problem)
 
 
-def test_a_file_of_an_older_version_is_refused(states, tmp_path):
+def test_files_of_older_versions_and_fields_that_nobody_saved_are_refused(states, tmp_path):
     method, problem, arrays = states[0]
     older = {name: array for name, array in arrays.items() if name != "header"}
     np.savez(tmp_path / "state.npz", origin=np.array("[]"), **older)
     with pytest.raises(ValueError, match=r"header: missing; must be .* of this version"):
         at.load_state(tmp_path / "state.npz", method, problem)
-
-
-def test_fields_that_nobody_saved_are_refused(states, tmp_path):
     method, problem, arrays = states[0]
     np.savez(tmp_path / "state.npz", **{**arrays, "search.more": np.zeros(2)})
     with pytest.raises(ValueError, match=r"search\.more: changed"):

@@ -31,7 +31,6 @@ def boxes(scene, spacing=SPACING, grouping=None):
 
 
 def together(scene, spacing=SPACING):
-    """A propagator with all obstacles in one box."""
     return boxes(scene, spacing, one_box(region_of(scene), spacing))
 
 
@@ -95,10 +94,7 @@ def test_boxes_whose_iteration_does_not_converge_are_joined(monkeypatch):
     apart, one = boxes(spheres()), together(spheres())
     assert torch.equal(apart.transfer_matrix(), one.transfer_matrix())
     assert [run.periods for run in apart.runs] == [run.periods for run in one.runs]
-
-
-def test_points_between_boxes_whose_iteration_does_not_converge_are_read_from_the_one(monkeypatch):
-    """More points than transducers: runs from these, whose one box holds the points."""
+    # More points than transducers: runs from these, whose one box holds the points.
     monkeypatch.setattr("autdtorch.propagators.multiple_scattering.MOST_PASSES", 1)
     between = torch.tensor(NEAR) + torch.linspace(0.4, 0.6, 5)[:, None] * (
         torch.tensor(FAR) - torch.tensor(NEAR)
@@ -107,7 +103,7 @@ def test_points_between_boxes_whose_iteration_does_not_converge_are_read_from_th
     assert relative_error(matrix, whole) < 2 * TOLERANCE
 
 
-def test_near_obstacles_share_a_box_and_far_ones_where_that_is_cheaper():
+def test_obstacles_share_a_box_where_that_is_cheaper():
     near = Sphere((NEAR[0], NEAR[1], NEAR[2] + 9e-3), 3e-3, rigid=True)
     scene = far_apart(Sphere(NEAR, 4e-3, rigid=True), Sphere(FAR, 4e-3, rigid=True), near)
     grouping = cheapest(scene, 1e-3)
@@ -115,6 +111,12 @@ def test_near_obstacles_share_a_box_and_far_ones_where_that_is_cheaper():
     assert grouping.box_cost(1) < one_box(region_of(scene), 1e-3).box_cost(1)
     # on coarse cells boundary layers fill each box: one is cheaper
     assert len(cheapest(scene, 2.8e-3).groups) == 1
+    # Steps alone would favour two boxes, 0.8 to 1; the sums between them take as long once more.
+    assert [len(cheapest(cubes(36e-3, gap), 2e-3).groups) for gap in (180e-3, 360e-3)] == [1, 2]
+    # Multiple reflections between them would need too many passes.
+    plate = Box((12e-3, 32e-3, 32e-3), (2e-3, 50e-3, 50e-3), rigid=True)
+    other = dataclasses.replace(plate, center=(42e-3, 32e-3, 32e-3))
+    assert len(cheapest(far_apart(plate, other), 1e-3).groups) == 1
 
 
 def cheapest(scene, spacing):
@@ -122,21 +124,8 @@ def cheapest(scene, spacing):
 
 
 def cubes(edge, gap):
-    """Two rigid cubes in a row."""
     first = (20e-3 + edge / 2,) * 3
     second = (first[0] + edge + gap, *first[1:])
     obstacles = [Box(center, (edge,) * 3, rigid=True) for center in (first, second)]
     array = TransducerArray([(1e-3, 32e-3, 32e-3)], (1, 0, 0))
     return Scene(array, AIR, 40e3, [(second[0] + edge + 10e-3, 35e-3, 37e-3)], obstacles)
-
-
-def test_large_boxes_whose_coupling_costs_more_than_the_air_between_are_joined():
-    """Steps alone would favour two boxes, 0.8 to 1; the sums between them take as long once more."""
-    assert [len(cheapest(cubes(36e-3, gap), 2e-3).groups) for gap in (180e-3, 360e-3)] == [1, 2]
-
-
-def test_plates_that_face_each_other_share_a_box():
-    """Multiple reflections between them would need too many passes."""
-    plate = Box((12e-3, 32e-3, 32e-3), (2e-3, 50e-3, 50e-3), rigid=True)
-    other = dataclasses.replace(plate, center=(42e-3, 32e-3, 32e-3))
-    assert len(cheapest(far_apart(plate, other), 1e-3).groups) == 1

@@ -28,7 +28,6 @@ def hollow_ball(wall: float) -> Mesh:
 
 
 def room(wall: float, half: float = 4e-3) -> list[Box]:
-    """Six walls around a cube of air."""
     walls = []
     for axis, sign in itertools.product(range(3), (-1, 1)):
         size, place = [2 * (half + wall)] * 3, list(CENTER)

@@ -51,9 +51,14 @@ def test_the_estimate_is_honest_in_free_space():
     assert relative_error(matrix, free) / 3 < error < 0.02
 
 
-def test_exact_fields_have_no_error_and_ignored_obstacles_an_unknown_one():
+def test_estimates_of_exact_fields_silent_rows_and_grids_that_agree_by_chance():
     assert FreeSpacePropagator(EMPTY).transfer_matrix(return_error=True)[1] == 0
     assert FreeSpacePropagator(small_scene((RIGID,))).transfer_matrix(return_error=True)[1] == math.inf
+    one = torch.ones(2, 3, dtype=torch.complex128)
+    others = [(one * (1 + 1e-7), 0.2), (one * 1.01, 0.13)]
+    assert (errors_by_grids(one, one, 0.1, others, LAW) > 1e-5).all()
+    quiet, free = torch.full((1, 3), 1e-9), torch.ones(1, 3)
+    assert grid_errors(quiet, free, 1.0, [(0 * quiet, 2.0)], Law(8.0, aligned=True)).item() < 1e-4
 
 
 @pytest.mark.parametrize("method", ["full", "box"])
@@ -105,13 +110,10 @@ def test_the_error_of_each_point():
     assert (errors < 20 * true).all()
 
 
-def test_a_spacing_is_chosen_also_where_nothing_scatters():
+@pytest.mark.filterwarnings("ignore:no steady state")
+def test_a_spacing_is_chosen_where_nothing_scatters_and_none_without_an_estimate():
     scene = small_scene((Sphere(CENTER, RADIUS, density=AIR.density, sound_speed=AIR.sound_speed),))
     assert make_propagator(scene, "box", None, tolerance=0.1).spacing < coarsest_spacing(region_of(scene))
-
-
-@pytest.mark.filterwarnings("ignore:no steady state")
-def test_without_an_estimate_no_spacing_is_chosen():
     with pytest.raises(ValueError, match=r"^max_periods: 1; "):
         make_propagator(small_scene((RIGID,)), "box", None, tolerance=0.1, max_periods=1)
 
@@ -142,12 +144,6 @@ def test_estimates_lean_towards_the_usual_error(spacing, scattered, logarithm):
     assert agreed == pytest.approx(0.37 * usual)
 
 
-def test_a_grid_that_agrees_by_chance_is_outvoted_by_another():
-    one = torch.ones(2, 3, dtype=torch.complex128)
-    others = [(one * (1 + 1e-7), 0.2), (one * 1.01, 0.13)]
-    assert (errors_by_grids(one, one, 0.1, others, LAW) > 1e-5).all()
-
-
 @pytest.mark.parametrize("ratio", [0.5, 1.0])
 def test_bodies_of_slow_fluids_start_on_a_finer_grid(ratio):
     """Loose enough for two grids, the second 1.6 times as fine as the first."""
@@ -172,11 +168,6 @@ def test_a_choice_ends_where_voxels_are_too_coarse(caplog):
 def test_a_spacing_has_its_growth(spacing, aligned):
     law = Law(8.5e-3, aligned)
     assert law.spacing_of(law.growth(spacing)) == pytest.approx(spacing)
-
-
-def test_rows_where_nothing_arrives_have_an_error_relative_to_free_space():
-    quiet, free = torch.full((1, 3), 1e-9), torch.ones(1, 3)
-    assert grid_errors(quiet, free, 1.0, [(0 * quiet, 2.0)], Law(8.0, aligned=True)).item() < 1e-4
 
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-5])
@@ -268,14 +259,11 @@ def test_memory_and_time_grow_with_the_cells(monkeypatch):
     assert 1.3 < double.memory / coarse.memory < 2  # less than twice: what is recorded is in double anyway
 
 
-def test_free_space_takes_no_cells():
+def test_free_space_takes_no_cells_and_infeasible_simulations_are_estimated():
     assert isinstance(at.make_propagator(small_scene()), FreeSpacePropagator)
     cost = at.estimate(small_scene())
     assert (cost.method, cost.spacing, cost.cells, cost.runs) == ("free_space", None, 0, 0)
     assert 0 < cost.seconds < 1e-3
-
-
-def test_infeasible_simulations_are_estimated_too():
     cost = at.estimate(small_scene((CUBE,), extent=0.1), 1.8e-5, method="full")
     assert cost.memory > 50e9
     assert cost.seconds > 3600

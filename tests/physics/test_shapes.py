@@ -32,7 +32,6 @@ def exact(scene, scattered):
 
 
 def scattered_error(scene, spacing):
-    """Return the error of the transfer matrix, relative to the scattered part."""
     simulated = make_propagator(scene, "full", spacing, tolerance=1e-4).transfer_matrix()
     whole = exact(scene, scattered=False)
     size = float(exact(scene, scattered=True).norm() / whole.norm())

@@ -74,9 +74,12 @@ def test_largest_eigenvalue_is_never_below_the_truth_and_close_to_it(seed, contr
     assert truth * (1 - 1e-9) <= bound <= truth * max(stability.MARGIN, stability.CLOSE)
 
 
-def test_of_uniform_air_it_is_that_of_the_shortest_wave():
+def test_eigenvalue_and_steps_of_uniform_air_are_those_of_the_shortest_wave_and_of_leapfrog():
     nothing = np.zeros(0, np.int64), np.zeros((0, 27))
     assert largest_eigenvalue(*nothing, STENCIL, SHAPE) == STENCIL.largest_symbol
+    steps = fewest_steps(STENCIL, largest=9.0)
+    assert STENCIL.time_factor(steps) * 9.0 == pytest.approx(4, rel=1e-12)
+    assert all(a < b for a, b in itertools.pairwise(fewest_steps(STENCIL, value) for value in (7, 8, 9)))
 
 
 def test_many_cells_get_the_bound(monkeypatch, caplog):
@@ -96,12 +99,6 @@ def test_steps_are_whole_in_the_shortest_block_that_is_long_enough(fewest):
         assert math.ceil(periods * fewest) * stability.LONG_ENOUGH > periods * fewest
     # a block of q periods loses less than 1 / (q fewest)
     assert steps.denominator <= 1 + stability.LONG_ENOUGH / (1 - stability.LONG_ENOUGH) / fewest
-
-
-def test_fewest_steps_are_those_of_leapfrog():
-    steps = fewest_steps(STENCIL, largest=9.0)
-    assert STENCIL.time_factor(steps) * 9.0 == pytest.approx(4, rel=1e-12)
-    assert all(a < b for a, b in itertools.pairwise(fewest_steps(STENCIL, value) for value in (7, 8, 9)))
 
 
 SCENES = range(12)

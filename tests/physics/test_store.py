@@ -89,13 +89,10 @@ def test_points_beyond_the_boxes_take_no_runs_once_the_transducers_ran():
     assert runs == [3, 4, 0]
 
 
-def test_one_transducer_serves_its_images():
+def test_one_transducer_serves_its_images_and_a_drive_a_second_plane():
     propagator = box((CUBE,))
     propagator.transfer_matrix(PLANE)
     assert len(propagator.runs) == 1
-
-
-def test_a_second_plane_of_a_drive_takes_no_run():
     propagator, other = box((ASIDE,)), PLANE + 1e-3
     propagator.field(DRIVE, PLANE)
     assert len(propagator.runs) == 1

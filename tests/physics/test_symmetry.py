@@ -104,11 +104,8 @@ def test_changes_break_symmetries(left, changed):
     assert count(changed) == left
 
 
-def test_the_domain_has_an_effect_where_it_is_simulated():
+def test_the_simulated_domain_and_the_order_of_overlapping_obstacles_have_an_effect():
     assert [count(scene(CUBE, extent=27e-3), method) for method in ("full", "box")] == [2, 8]
-
-
-def test_the_order_of_overlapping_obstacles_has_an_effect():
     left, right = (Box((12e-3, 12e-3, z), (4e-3, 4e-3, 4e-3), **HEAVY) for z in (9.5e-3, 14.5e-3))
     between = Box(MIDDLE, (4e-3, 4e-3, 3e-3), density=2.0, sound_speed=340.0)
     for order, left_over in (((left, right, between), 4), ((left, between, right), 2)):

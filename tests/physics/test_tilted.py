@@ -185,14 +185,11 @@ def test_no_cell_of_a_tilted_plate_belongs_to_the_air_on_both_sides(thickness, r
     assert len(np.unique(part[used])) == 2
 
 
-def test_edges_between_touching_bodies_are_none():
+def test_edges_are_those_of_the_shape_and_none_between_touching_bodies():
     half = {axis: Box((x, 0, 0), (1e-2,) * 3, rigid=True) for axis, x in (("left", -5e-3), ("right", 5e-3))}
     edges = edges_of(half["left"], [half["right"]])
     assert len(edges) == 8
     assert all(edge.end[0] < -1e-6 or edge.begin[0] < -1e-6 for edge in edges)
-
-
-def test_edges_are_those_of_the_shape():
     cuboid = Box((0, 0, 0), (1e-2, 2e-2, 3e-2), (0.3, 0.2, 0.1), rigid=True)
     edges = edges_of(cuboid)
     assert len(edges) == 12

@@ -38,7 +38,6 @@ SCENES = {
 
 
 def scaled(c, ratio):
-    """Return coefficients with another time factor."""
     names = ("face", "edge", "corner", "heterogeneous_weight")
     return replace(c, center=2 - ratio * (2 - c.center), **{name: ratio * getattr(c, name) for name in names})
 

@@ -25,7 +25,6 @@ def simulated(scene, method, spacing, **settings):
 
 
 def of_two_speeds(extent):
-    """A rigid sphere and, in the opposite corner, a slow one around another of another material."""
     near, far = (14e-3,) * 3, (extent - 14e-3,) * 3
     obstacles = (
         Sphere(near, 4e-3, rigid=True),

@@ -17,7 +17,7 @@ from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Sphere
-from autdtorch.scene.scene import Medium, OverlapWarning, Scene
+from autdtorch.scene.scene import Medium, Scene
 
 AIR = Medium(density=1.293, sound_speed=340.0)
 STENCIL = tuned_stencil(2 * math.pi / 8.5)
@@ -54,12 +54,6 @@ def assembled(*obstacles):
     return elements, heterogeneous_cells(elements, STENCIL)
 
 
-def element_centers():
-    """Centres of all elements [mm]."""
-    axis = 1e3 * (GRID.centers[0][:-1] + GRID.spacing / 2)
-    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-
-
 def mass_of_all(elements, cells):
     """Mass of every cell; unlisted cells have 1 at a surface, else the mass of their material."""
     mass = elements.materials.mass[np.pad(elements.material, ((1, 0),) * 3, mode="edge")].ravel()
@@ -78,20 +72,6 @@ def test_speed_of_a_material_is_tuned_to_its_own_wavenumber():
     assert speed_factor(STENCIL, 4.0) == pytest.approx(16, rel=0.05)
 
 
-def test_of_two_overlapping_obstacles_the_later_counts():
-    wide, core = box((2, 2, 2), (8, 8, 8), ratio=10.0), box((4, 4, 4), (6, 6, 6), ratio=50.0)
-    with pytest.warns(OverlapWarning):
-        elements, _ = assembled(wide, core)
-    off = np.abs(element_centers() - 5).max(axis=-1)
-    assert (elements.material[off < 0.9] == 2).all()
-    assert (elements.material[(off > 1.1) & (off < 2.9)] == 1).all()
-    assert (elements.material[off > 3.1] == 0).all()
-    with pytest.warns(OverlapWarning):
-        covered, _ = assembled(core, wide)
-    assert not (covered.material == 1).any()
-    assert not (covered.interface.material == 1).any()
-
-
 @pytest.mark.parametrize("speed", [1.0, 2.0])
 def test_mass_of_elements_is_that_of_the_volume(speed):
     """Interface elements and uniform ones together; surfaces are moved by the mean thickness of a face."""
@@ -108,23 +88,6 @@ def test_mass_of_elements_is_that_of_the_volume(speed):
 
 
 CENTERS = st.tuples(*[st.floats(4.5, 5.5)] * 3)
-OBSTACLES = st.one_of(
-    st.builds(
-        sphere,
-        CENTERS,
-        st.floats(1, 2.5),
-        st.one_of(st.none(), st.floats(-3, 5).map(lambda exponent: 10**exponent)),
-        st.sampled_from([0.5, 1.0, 3.0]),
-    ),
-    st.builds(
-        lambda center, ratio, turn: box(
-            tuple(np.array(center) - 1.5), tuple(np.array(center) + 1.7), ratio, rotation=turn
-        ),
-        CENTERS,
-        st.sampled_from([None, 1e-3, 77.0, 1e5]),
-        st.tuples(*[st.floats(0, 1)] * 3),
-    ),
-)
 
 
 @settings(max_examples=10)

@@ -218,7 +218,7 @@ def test_the_edges_of_overlapping_parts_are_those_of_their_union():
         assert sum(np.linalg.norm(edge.end - edge.begin) for edge in edges) == pytest.approx(length)
 
 
-def test_parts_that_touch_at_edges_keep_their_insides():
+def test_parts_that_touch_at_edges_and_sharp_edges_keep_their_insides():
     # A face of voxels is one of four at an edge, which belong together in two ways.
     for seed in range(8):
         mask = np.random.default_rng(seed).random((4, 4, 4)) < 0.5
@@ -226,9 +226,6 @@ def test_parts_that_touch_at_edges_keep_their_insides():
         mesh = Mesh.from_surface(voxels.surface(), rigid=True)
         points = points_around(mesh, 1000)
         assert torch.equal(mesh.contains(points), voxels.contains(points))
-
-
-def test_a_sharp_edge_has_its_outside_on_all_sides():
     # Pseudonormals of its four triangles take some of these points for inside.
     for seed in range(40):
         random = np.random.default_rng(seed)
@@ -295,18 +292,6 @@ def test_a_moved_mesh_is_as_far_as_the_body_itself(offset, rotation, scale, seed
     body = Box(offset, CUBOID.size, rotation, rigid=True)
     # both are exact; rounding of coordinates up to 10
     assert torch.allclose(mesh.signed_distance(points), body.signed_distance(points), rtol=0, atol=1e-12)
-
-
-def test_parts_that_touch_at_an_edge_know_their_insides():
-    vertices, faces = (part.numpy() for part in CUBOID.surface())
-    beside = vertices + np.array([2.0, 3.0, 0.0])
-    mesh = Mesh.from_surface(
-        (np.concatenate((vertices, beside)), np.concatenate((faces, faces + 8))), rigid=True
-    )
-    points = np.random.default_rng(1).uniform(-3, 6, (2000, 3))
-    bodies = [CUBOID, replace(CUBOID, center=(2.0, 3.0, 0.0))]
-    nearest = torch.stack([body.signed_distance(points) for body in bodies]).amin(dim=0)
-    assert torch.allclose(mesh.signed_distance(points), nearest, rtol=0, atol=1e-12)
 
 
 BODIES = {

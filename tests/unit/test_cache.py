@@ -22,6 +22,7 @@ from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import ABANDONED, PARTIAL
 
 SPACING = 2.5e-3
+UNEQUAL = 1 + np.eye(4)  # strengths or radii of four transducers, of which one differs
 
 WRITER = """
 import sys, time, numpy as np
@@ -136,6 +137,8 @@ def test_everything_that_affects_a_matrix_affects_its_key(tmp_path):
         *(of(frequency=above(40e3, 41e3)), of(domain=((0, 0, 0), (24e-3, 24e-3, above(24e-3, 1))))),
         *(of(array=array(normals=(1, 0.1, 0))), of(array=array(plain.array.positions, (1, 0, 0), 2.0))),
         *(of(array=array(radius=1e-3)), of(array=array(plain.array.positions.flip(0)))),
+        *(of(array=array(plain.array.positions, (1, 0, 0), each)) for each in UNEQUAL),
+        *(of(array=array(radius=each)) for each in 1e-3 * UNEQUAL),
         *(key(method="full"), key(spacing=above(SPACING, 1)), key(tolerance=1e-3), key(dtype="float64")),
         *(key(kernel="reference"), key(max_periods=599), key(time_step=5e-6)),
         of(control_points=plain.control_points.flip(0)),  # they judge when a run has converged
@@ -155,13 +158,20 @@ def test_another_version_of_the_code_or_of_a_package_has_another_key(monkeypatch
     assert len(keys) == 3
 
 
-def test_values_are_not_confused():
+def test_digests_of_values_and_of_code_are_not_confused(tmp_path, monkeypatch):
     values = [1, 1.0, True, "1", None, (1,), ((1,),), (1, 1), ("1", "1"), ("11",), ("1 1",), {"1": 1}]
     values += [np.ones(1), np.ones(2), np.ones((1, 2)), np.ones(2, np.float32), torch.ones(2).cfloat()]
     assert len({digest_of(value) for value in values}) == len(values)
     assert digest_of(1, 2) != digest_of((1, 2), ())
     with pytest.raises(TypeError, match="object: has no digest"):
         digest_of(object())
+    monkeypatch.syspath_prepend(tmp_path)
+    code = "from dataclasses import dataclass\n@dataclass(frozen=True)\nclass Own:\n    size: float\n"
+    digests = []
+    for name, more in (("a", ""), ("b", ""), ("c", "    def twice(self): return 2 * self.size\n")):
+        (tmp_path / f"own_{name}.py").write_text(code + more, encoding="utf-8")
+        digests.append(digest_of(importlib.import_module(f"own_{name}").Own(1.0)))
+    assert digests[0] == digests[1] != digests[2]
 
 
 def test_what_has_not_settled_is_not_kept(tmp_path):
@@ -255,13 +265,3 @@ def test_a_writer_killed_before_it_is_done_leaves_nothing_that_is_read(tmp_path)
     cache.save("shared", np.ones(200_000), 0.0)
     assert not left.exists()
     assert cache.load("shared", (200_000,), 1) is not None
-
-
-def test_an_obstacle_of_ones_own_has_the_digest_of_its_code(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(tmp_path)
-    code = "from dataclasses import dataclass\n@dataclass(frozen=True)\nclass Own:\n    size: float\n"
-    digests = []
-    for name, more in (("a", ""), ("b", ""), ("c", "    def twice(self): return 2 * self.size\n")):
-        (tmp_path / f"own_{name}.py").write_text(code + more, encoding="utf-8")
-        digests.append(digest_of(importlib.import_module(f"own_{name}").Own(1.0)))
-    assert digests[0] == digests[1] != digests[2]

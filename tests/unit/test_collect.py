@@ -1,10 +1,10 @@
 """Studies of a sweep, merged: which become one, and the names of the others."""
 
-from collections.abc import Callable
 from functools import partial
 
 import pytest
 import yaml
+from small_scenes import SECTION as SCENE
 
 from autdtorch.io.scene_file import load_scene
 from autdtorch.methods.functions import gabs, lssg
@@ -13,14 +13,6 @@ from autdtorch.study.results_file import RESULTS_FILE
 from autdtorch.study.run_study import run_study
 from autdtorch.study.sweeps import collect_results
 
-Study = Callable[..., None]
-
-SCENE = {
-    "frequency": 40e3,
-    "medium": {"density": 1.2, "sound_speed": 340.0},
-    "array": {"type": "grid", "shape": [2, 2], "pitch": 10e-3, "center": [0, 0, 0]},
-    "control_points": {"type": "points", "positions": [[0.05, 0, 0], [0.05, 0.01, 0]]},
-}
 GRID = SCENE["array"]
 METHODS = {"gabs": partial(gabs, levels=2), "lssg": lssg}
 

@@ -50,14 +50,6 @@ def hits(dispatcher):
     return sum(dispatcher.stats.cache_hits.values())
 
 
-def test_what_is_whole_is_loaded(kernel):
-    made, _ = kernel
-    assert made()(3) == 6
-    again = made()
-    assert again(3) == 6
-    assert hits(again) == 1
-
-
 @pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
 def test_what_is_damaged_is_compiled_again(kernel, suffix, caplog):
     made, folder = kernel

@@ -44,16 +44,13 @@ def test_reprs_are_short_and_hold_no_tensors(objective: SimulatedObjective, resu
     assert repr(box) == "SimulatedPropagator(scene 'scene', box, spacing 2 mm, steady to 0.002, 0 runs)"
 
 
-def test_tables_tell_what_was_reached_and_escape_names(results: StudyResult) -> None:
+def test_tables_tell_what_was_reached_and_figures_show_themselves(results: StudyResult) -> None:
     solution = results.scenes["a<b"].methods["gabs"].solution
     assert f"best {solution.score.max():.4g} Pa" in solution._repr_html_()
     table = ElementTree.fromstring(results._repr_html_())  # refuses what is not escaped
     assert [cell.text for cell in table.iter("td")][:3] == ["a<b", "GABS", "3"]
     scene = replace(small_scene((CUBE,)), name="<b>")
     assert "<b>" in "".join(ElementTree.fromstring(scene._repr_html_()).itertext())
-
-
-def test_a_notebook_shows_figures_by_itself() -> None:
     picture, shown = ShownFigure(figsize=(2.0, 1.0))._repr_png_()
     assert picture.startswith(b"\x89PNG")
     assert shown == {"width": 2 * 96}  # CSS pixels in an inch

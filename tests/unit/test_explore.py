@@ -187,7 +187,6 @@ def calculator():
 
 
 def until_finished(reports, number):
-    """Results of a request, up to its end."""
     results = []
     while True:
         report = reports.get(timeout=PATIENCE)

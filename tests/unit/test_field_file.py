@@ -23,7 +23,6 @@ def box_points():
 
 
 def wave(points):
-    """Return a field with a different value at every point."""
     return torch.polar(1 + points[..., 0], 300 * points @ torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
 
 

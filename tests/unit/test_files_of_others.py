@@ -94,9 +94,18 @@ def test_a_unit_that_is_not_stated_is_inferred_and_told(tmp_path, names, unit, f
         ("0,0,0\n1,0\n", r"line 2: 2 cells; must be 3 as in the first row"),
         ("0,0,0\n1,0,nan\n", r"line 2, column 3: 'nan'; must be a finite number"),
         ("x [mm],y [mm],z [in]\n0,0,0\n", r"line 1: column 'z \[in\]'; must be z \[m\] or z \[mm\]"),
+        ("x,y [m],z [m]\n", r"a.csv, line 1: column 'x'; must be x \[m\] or x \[mm\]"),
+        ("x [m],y [m],zz [m]\n", r"a.csv, line 1: unknown column 'zz'.*; allowed columns: x, y"),
+        ("x [m],x [mm]\n", r"line 1: columns x, x; every name must occur once"),
+        ("x [m],y [m]\n1,2\n", r"a.csv: no column z; must have x, y, z"),
+        ("x [m],y [m],z [m]\n1,2,3\n1,2\n", r"line 3: 2 cells; must be 3 as in the header"),
+        ("x [m],y [m],z [m]\n\n1,2,a\n", r"line 3, z: 'a'; must be a finite number"),
+        ("x [m],y [m],z [m]\n", r"a.csv: no row under the header"),
+        ("", r"a.csv: empty"),
+        ("x [m],y [m],z [m]\n0,0,0\n0,0,0\n", r"a.csv: TransducerArray.positions: points 0 and 1"),
     ],
 )
-def test_what_is_ambiguous_is_refused_with_what_to_write(tmp_path, text, message):
+def test_what_is_ambiguous_or_wrong_is_refused_with_its_line_and_what_to_write(tmp_path, text, message):
     with pytest.raises(ValueError, match=message):
         load_array(written(tmp_path, text))
 
@@ -162,9 +171,16 @@ def test_phases_are_read_as_they_come(tmp_path, text, told):
         ("1,2,3\n3,4,5\n", r"3 columns without names"),
         ("2,4\n0,1,2,3\n", r"1 rows of 4 phases; must be 2 of 4, as in the first line"),
         ("2,4\n0,1,2,3\n0,1,2\n", r"line 3: 3 cells; must be 4"),
+        ("transducer,amplitude\n0,1\n", r"a.csv: no column phase; must have phase"),
+        ("phase [rad],amplitude\n0,2\n", r"a.csv: amplitudes: from 2 to 2"),
+        ("unit,transducer,autd3 phase\n0,0,1\n", r"a.csv: no autd3 intensity; must have autd3 phase, "),
+        ("frame,phase [rad],amplitude\n0,1,1\n0,1,1\n1,1,1\n", r"a.csv: column frame; must count"),
+        ("frame,phase [rad],amplitude\n1,1,1\n2,1,1\n", r"a.csv: column frame; must count"),
+        ("autd3 phase,autd3 intensity\n256,0\n", r"a.csv: AUTD3 phase: .*0 to 255"),
+        ("autd3 phase,autd3 intensity\n1.5,0\n", r"a.csv: AUTD3 phase: .*0 to 255"),
     ],
 )
-def test_phases_that_could_be_something_else_are_refused(tmp_path, text, message):
+def test_phases_that_are_wrong_or_could_be_something_else_are_refused(tmp_path, text, message):
     with pytest.raises(ValueError, match=message):
         load_drive(written(tmp_path, text))
 
@@ -178,14 +194,14 @@ def test_rows_of_openmpd_are_frames_of_arg_q(tmp_path_factory, frames):
     torch.testing.assert_close(load_drive(path), expected, rtol=0, atol=1e-12)
 
 
-def test_rows_of_openmpd_in_degrees_are_told_as_the_file_has_them(tmp_path):
-    with pytest.warns(ScaleWarning, match=r"a.csv: phases: whole numbers from -90 to 180 rad") as caught:
-        load_drive(written(tmp_path, "1,3\n0,-90,180\n"))
-    assert {one.filename for one in caught} == {__file__}
-
-
 @pytest.mark.parametrize(
-    ("load", "text"), [(load_array, IN_MM), (load_drive, "0.5\n1.5\n"), (load_drive, "0.5,1\n1.5,1\n")]
+    ("load", "text"),
+    [
+        (load_array, IN_MM),
+        (load_drive, "0.5\n1.5\n"),
+        (load_drive, "0.5,1\n1.5,1\n"),
+        (load_drive, "1,3\n0,-90,180\n"),  # degrees as rows of OpenMPD
+    ],
 )
 def test_a_guess_is_told_once_with_the_file_at_the_line_that_reads_it(tmp_path, load, text):
     with pytest.warns(ScaleWarning, match=r"a.csv: ") as caught:
@@ -306,15 +322,12 @@ def test_a_simulation_of_ultraino_is_an_array_and_a_drive(tmp_path_factory, rows
     assert load_array(path, radius=0.0).radius == 0
 
 
-def test_what_ultraino_leaves_out_has_its_default(tmp_path):
+def test_what_ultraino_leaves_out_has_its_default_and_huge_values_are_not_repeated(tmp_path):
     path = packed(tmp_path, simulation([transducer(0, (0, 0, 0), (1, 0, 0, 0), {"phase": 0.5})], [0]))
     array = load_array(path)
     assert (array.source_strength, array.radius, array.normals.tolist()) == (2.53, 4.5e-3, [[0, 0, 1]])
     with pytest.warns(ScaleWarning, match="all amplitudes are 0"):
         assert load_drive(path)[0] == pytest.approx(1j)
-
-
-def test_a_huge_value_of_ultraino_is_not_repeated(tmp_path):
     huge = transducer(0, (0, 0, 0), (1, 0, 0, 0), {"phase": 0.5}).replace(
         "<float>0.5</float>", f"<string>{'x' * 100_000}</string>"
     )

@@ -80,7 +80,7 @@ def test_a_child_computes_the_property_that_another_thread_was_computing() -> No
         assert status_of_child(lambda: Slow(lambda: 1).value) == 0
 
 
-def test_a_cached_property_is_computed_once_and_can_be_forgotten() -> None:
+def test_a_cached_property_is_computed_once_also_by_threads_and_can_be_forgotten() -> None:
     calls = []
     slow = Slow(lambda: calls.append(1) or object())
     first = slow.value
@@ -89,9 +89,6 @@ def test_a_cached_property_is_computed_once_and_can_be_forgotten() -> None:
     assert slow.value is not first
     assert len(calls) == 2
     assert Slow.value.__doc__ == "A docstring."
-
-
-def test_threads_that_compute_a_property_at_once_get_the_same_value() -> None:
     barrier = threading.Barrier(2, timeout=PATIENCE)
     slow = Slow(lambda: (barrier.wait(), object()))
     found: list[object] = []

@@ -80,13 +80,16 @@ def test_circle_goes_from_u_towards_v():
     torch.testing.assert_close(quarter, points.roll(-1, dims=0), rtol=0, atol=ROUNDING)
 
 
-def test_plane_points_are_the_centres_of_its_cells():
+def test_plane_points_are_the_centres_of_its_cells_and_corners_span_its_size():
     plane = Plane(center=(80e-3, 50e-3, 50e-3), normal=(1, 0, 0), size=(40e-3, 20e-3))
     points = 1e3 * plane.points(spacing=10e-3)
     assert points.shape == (4, 2, 3)
     torch.testing.assert_close(points[:, 0, 1], torch.tensor([35, 45, 55, 65]).double(), rtol=1e-14, atol=0)
     torch.testing.assert_close(points[0, :, 2], torch.tensor([45, 55]).double(), rtol=1e-14, atol=0)
     assert (points[..., 0] == 80).all()
+    corners = Plane(center=(0.5, 0.5, 0.0), normal=(0, 0, 2), size=(1.0, 0.5)).corners
+    assert corners.tolist() == [[0.0, 0.25, 0.0], [0.0, 0.75, 0.0], [1.0, 0.25, 0.0], [1.0, 0.75, 0.0]]
+    assert Plane([0, 0, 0], [2, 0, 0], [1, 1]) == Plane((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0))
 
 
 @given(normal=normals(), center=vectors, spacing=st.floats(0.03, 1))
@@ -99,11 +102,6 @@ def test_plane_points_fill_the_plane_symmetrically(normal, center, spacing):
     offsets = points - torch.from_numpy(center)
     assert (offsets @ u).abs().max() < 0.15
     assert (offsets @ v).abs().max() < 0.05
-
-
-def test_plane_corners_span_its_size():
-    corners = Plane(center=(0.5, 0.5, 0.0), normal=(0, 0, 2), size=(1.0, 0.5)).corners
-    assert corners.tolist() == [[0.0, 0.25, 0.0], [0.0, 0.75, 0.0], [1.0, 0.25, 0.0], [1.0, 0.75, 0.0]]
 
 
 @pytest.mark.parametrize("name", ["positions", "normals", "control_points"])
@@ -132,10 +130,6 @@ def stored(tensor):
     torch.save(tensor, file)
     file.seek(0)
     return torch.load(file)
-
-
-def test_equal_planes_are_equal():
-    assert Plane([0, 0, 0], [2, 0, 0], [1, 1]) == Plane((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0))
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 200])

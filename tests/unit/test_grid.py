@@ -67,14 +67,11 @@ def test_a_face_that_cannot_lie_half_way_lies_closer_to_the_lighter_side(density
     assert max(behind) < 0.5
 
 
-def test_only_axis_aligned_faces_move_the_grid():
+def test_only_axis_aligned_faces_move_the_grid_which_covers_the_domain():
     sphere = Sphere((12.3e-3, 10.2e-3, 9.9e-3), 5e-3, rigid=True)
     tilted = Box((20e-3, 20e-3, 20e-3), (3e-3, 4e-3, 5e-3), (0.3, 0.2, 0.1), rigid=True)
     assert grid_offset(region_of(scene(sphere, tilted)), SPACING, *CORNERS) == (0.0, 0.0, 0.0)
     assert grid_offset(region_of(scene()), SPACING, *CORNERS) == (0.0, 0.0, 0.0)
-
-
-def test_the_grid_covers_the_domain_wherever_it_lies():
     grid = make_grid(region_of(scene(box((5.3, 6.7, 7.9), (8, 9, 10)))), SPACING)
     margin = interpolation_width(grid.kappa) // 2 - 1  # cells that points beside the rim of the domain need
     for centers, first, last in zip(grid.centers, grid.first, grid.last, strict=True):

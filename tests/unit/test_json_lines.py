@@ -158,7 +158,9 @@ def test_lines_are_set_aside_on_disk_before_they_leave_the_file(path, monkeypatc
     assert read(path, head=HEAD)[1] == ROWS
 
 
-def test_nothing_follows_half_a_line(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_follows_half_a_line_or_is_lost_on_a_full_disk(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     content = written(path)
     lines, _ = read(path)
     with monkeypatch.context() as context:
@@ -168,6 +170,17 @@ def test_nothing_follows_half_a_line(path: Path, monkeypatch: pytest.MonkeyPatch
     assert path.read_bytes() == content
     lines.append(ROWS[0])
     assert read(path)[1] == [*ROWS, ROWS[0]]
+    path.unlink()
+    damaged = b"damaged\n" + written(path)
+    path.write_bytes(damaged)
+    lines, _ = read(path)
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match=r"No space left on device: '.*rows\.jsonl"):
+        lines.mend()
+    assert path.read_bytes() == damaged
+    monkeypatch.undo()
+    read(path)[0].mend()
+    assert read(path)[1] == ROWS
 
 
 def test_a_row_that_its_reader_refuses_is_set_aside_with_the_reason(path, caplog):
@@ -181,32 +194,16 @@ def test_a_row_that_its_reader_refuses_is_set_aside_with_the_reason(path, caplog
     assert read(path)[1] == [ROWS[0], ROWS[2]]
 
 
-def test_a_file_that_was_removed_meanwhile_is_not_begun_anew_by_its_next_line(path: Path) -> None:
-    lines = read(path)[0]
-    lines.append(ROWS[0])
-    path.unlink()
-    with pytest.raises(FileNotFoundError, match=r"rows\.jsonl"):
-        lines.append(ROWS[1])
-    assert not path.exists()
-
-
-def test_nothing_is_lost_where_lines_cannot_be_set_aside(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    damaged = b"damaged\n" + written(path)
-    path.write_bytes(damaged)
-    lines, _ = read(path)
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match=r"No space left on device: '.*rows\.jsonl"):
-        lines.mend()
-    assert path.read_bytes() == damaged
-    monkeypatch.undo()
-    read(path)[0].mend()
-    assert read(path)[1] == ROWS
-
-
-def test_a_file_that_another_has_written_to_meanwhile_is_left_alone(path: Path) -> None:
+def test_a_file_that_was_removed_or_changed_meanwhile_is_left_alone(path: Path) -> None:
     lines, other = read(path)[0], read(path)[0]
     other.append(ROWS[0])
     content = path.read_bytes()
     with pytest.raises(ValueError, match=r"rows\.jsonl: has changed meanwhile"):
         lines.append(ROWS[1])
     assert path.read_bytes() == content
+    lines = read(path)[0]
+    lines.append(ROWS[0])
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match=r"rows\.jsonl"):
+        lines.append(ROWS[1])
+    assert not path.exists()

@@ -113,7 +113,7 @@ def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_the_tightest_of_nested_groups_counts(groups: Path) -> None:
+def test_the_tightest_of_nested_groups_of_either_version_counts(groups: Path) -> None:
     assert process.available_memory() > 10_000_000  # without groups, the machine's
     (groups / "cgroup").write_text("0::/job/step\n", encoding="utf-8")
     group(groups / "fs/job", most=5_000_000, used=4_000_000, inactive=500_000)
@@ -121,9 +121,6 @@ def test_the_tightest_of_nested_groups_counts(groups: Path) -> None:
     assert process.available_memory() == 1_500_000  # what is cached of files can be dropped
     group(groups / "fs/job", most=1_000_000, used=2_000_000, inactive=0)
     assert process.available_memory() == 0
-
-
-def test_groups_of_the_first_version_count(groups: Path) -> None:
     (groups / "cgroup").write_text("5:cpu:/\n4:memory:/job\n", encoding="utf-8")
     own = groups / "fs/memory/job"
     own.mkdir(parents=True)

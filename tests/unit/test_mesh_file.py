@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_meshes import volume
 
 from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.obstacles.mesh_file import read_mesh
@@ -41,11 +42,6 @@ def prism(first: int) -> tuple[list[tuple[float, float, float]], list[list[int]]
     ring = OUTLINE[first:] + OUTLINE[:first]
     sides = [[i, (i + 1) % 6, (i + 1) % 6 + 6, i + 6] for i in range(6)]
     return [(x, y, z) for z in (0.0, HEIGHT) for x, y in ring], [[5, 4, 3, 2, 1, 0], [*range(6, 12)], *sides]
-
-
-def volume(mesh: Mesh) -> float:
-    vertices, faces = mesh.surface()
-    return float(vertices[faces].det().sum()) / 6
 
 
 @pytest.mark.parametrize("first", range(6))
@@ -130,11 +126,35 @@ NO_MESH = {
 }  # fmt: skip
 
 
+def declaring(kind: str, vertices: int, faces: int, rows: str = "") -> bytes:
+    """Return a PLY file; readers of libigl end the process or take all memory where it declares too much."""
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat {kind} 1.0\nelement vertex {vertices}\n{axes}element face {faces}\n"
+    rows = f"0 0 0\n1 0 0\n0 1 0\n0 0 1\n{rows}" if kind == "ascii" else ""
+    return (head + "property list uchar int vertex_indices\nend_header\n" + rows).encode("ascii")
+
+
+THREE = "3 0 1 3\n3 0 3 2\n"
+NO_MESH |= {
+    "large.ply": (declaring("binary_little_endian", 4_000_000_000, 4_000_000_000), ""),
+    "large text.ply": (declaring("ascii", 10**12, 10**12), ""),
+    "beyond integers.ply": (declaring("binary_little_endian", 10**30, 1), ""),
+    "less than nothing.ply": (declaring("binary_little_endian", -1, 0), ""),
+    "quads.ply": (declaring("ascii", 4, 4, f"3 0 2 1\n{THREE}4 1 2 3 0\n"), ""),
+    "halves.ply": (declaring("ascii", 4, 4, f"3 0 2.5 1\n{THREE}3 1 2 3\n"), ""),
+    "no numbers.ply": (declaring("ascii", 4, 4, f"3 0 nan 1\n{THREE}3 1 2 3\n"), ""),
+    "nothing.ply": (b"ply\nformat ascii 1.0\nend_header\n", ""),
+    "one corner.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1\n", ""),
+    "beyond integers.obj": (f"v 0 0 0\nf 1 1 {10**30}\n".encode(), ""),
+    "large.stl": (b"\0" * 80 + b"\x7f" * 4 + b"\0" * 50, ""),
+}
+
+
 @pytest.mark.parametrize("name", NO_MESH)
 def test_what_is_no_mesh_is_named(tmp_path: Path, name: str) -> None:
     content, reason = NO_MESH[name]
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(ValueError, match=r"^Mesh\.path: ") as caught:
+    with pytest.raises(ValueError, match=rf"^Mesh\.path: .*{name}") as caught:
         Mesh(tmp_path / name, rigid=True)
     assert reason in str(caught.value)
     assert "\n" not in str(caught.value)

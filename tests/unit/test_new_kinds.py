@@ -73,7 +73,6 @@ class Cone(at.Obstacle):
 
 
 def ring(count, width, center, normal=(1.0, 0.0, 0.0), angle=0.0, source_strength=1.0, radius=None):
-    """Return transducers on a circle of this width."""
     turns = 2 * math.pi * torch.arange(count, dtype=torch.float64) / count
     places = width / 2 * torch.stack((turns.cos(), turns.sin()), dim=1)
     return flat_array(

@@ -333,13 +333,10 @@ def test_a_surface_has_the_voxels_on_their_sides_or_says_so(kind, size, more, se
     assert surface.lost <= (mask ^ body).sum()
 
 
-def test_a_body_at_the_end_of_grey_values_reaches_to_its_voxels_faces_in_any_unit():
+def test_voxels_that_vanish_when_smoothed_stay_cubes_and_full_masks_reach_to_their_faces(caplog):
     for unit in (1e-3, 1.0, 1e3):
         voxels = VoxelMask(unit * np.ones((6, 5, 4)), 1e-3, level=0.5 * unit, rigid=True)
         assert (*voxels.lower, *voxels.upper) == pytest.approx((0, 0, 0, 6e-3, 5e-3, 4e-3))
-
-
-def test_voxels_that_vanish_when_smoothed_stay_cubes(caplog):
     mask = np.zeros((3, 3, 3), bool)
     mask[1, 1, 1] = True
     voxels = VoxelMask(mask, (1e-3, 2e-3, 1e-3), rigid=True)

@@ -70,12 +70,9 @@ def test_an_older_python_is_told_the_version_it_needs(monkeypatch: pytest.Monkey
     assert f"sys.version_info < ({major}, {minor})" in (ROOT / "Makefile").read_text(encoding="utf-8")
 
 
-def test_no_public_name_is_that_of_a_module() -> None:
+def test_public_names_are_listed_once_sorted_and_of_no_module() -> None:
     """Otherwise lazy_loader would replace the package's type, and pickle in joblib's workers would fail."""
     assert type(at) is types.ModuleType
-
-
-def test_public_names_are_listed_once_and_sorted() -> None:
     stub = (ROOT / "autdtorch/__init__.pyi").read_text(encoding="utf-8")
     listed = stub.split("__all__ = [")[1].split("]")[0].replace('"', "").replace(",", "").split()
     assert sorted(listed) == sorted(set(listed)) == sorted(at.__all__)

@@ -62,13 +62,19 @@ def test_readings_are_rice_distributed(snr):
     assert kstest(readings, expected.cdf).statistic < 1.95 / math.sqrt(count)
 
 
-def test_noise_at_control_points_and_rows_is_independent():
+def test_noise_at_control_points_and_rows_and_drift_are_independent():
     readings = at.Noise(Recorder(), 20, reference=1.0)(fully_on(20000))
     # Deviation of an estimated correlation: 1 / sqrt(samples); 4 of them.
     points = torch.corrcoef(readings.T) - torch.eye(3)
     rows = torch.corrcoef(torch.stack([readings[:-1, 0], readings[1:, 0]]))[0, 1]
     assert points.abs().max() < 4 / math.sqrt(20000)
     assert abs(rows) < 4 / math.sqrt(20000)
+    recorder = Recorder()
+    at.Drift(recorder, phase=1.0, seed=4)(fully_on(3000))
+    steps = torch.diff(recorder.played()[:, 0].angle())
+    readings = at.Noise(Recorder(), 40, seed=4, reference=1.0)(fully_on(3000))[1:, 0]
+    # 4 / sqrt(samples), as above.
+    assert abs(torch.corrcoef(torch.stack([steps, readings]))[0, 1]) < 4 / math.sqrt(3000)
 
 
 def test_default_reference_is_the_rms_pressure_under_random_phases(simulated):
@@ -156,15 +162,6 @@ def test_an_objective_of_a_user_gets_batches():
     assert [tuple(drives.shape) for drives in recorder.drives] == [(1, 4), (1, 4), (6, 4)]
 
 
-def test_noise_and_drift_of_one_seed_are_unrelated():
-    recorder = Recorder()
-    at.Drift(recorder, phase=1.0, seed=4)(fully_on(3000))
-    steps = torch.diff(recorder.played()[:, 0].angle())
-    readings = at.Noise(Recorder(), 40, seed=4, reference=1.0)(fully_on(3000))[1:, 0]
-    # 4 / sqrt(samples), as above.
-    assert abs(torch.corrcoef(torch.stack([steps, readings]))[0, 1]) < 4 / math.sqrt(3000)
-
-
 @given(phases=phases, amplitudes=amplitudes, levels=st.integers(2, 256), on_off=st.booleans())
 def test_quantised_is_the_nearest_and_stays(phases, amplitudes, levels, on_off):
     device = at.Quantised(Recorder(), levels, on_off)
@@ -231,17 +228,19 @@ def test_true_pressure_keeps_the_device_and_drops_the_sensor(simulated):
 @pytest.mark.parametrize(
     "make",
     [
+        lambda inner: inner,
         Perturbation,
         lambda inner: at.Noise(inner, 20, reads=2),
         lambda inner: at.Quantised(inner, 4),
         lambda inner: at.FailedTransducers(inner, [0]),
         lambda inner: at.Drift(inner, phase=0.1),
     ],
-    ids=["none", "noise", "quantised", "failed", "drift"],
+    ids=["objective", "none", "noise", "quantised", "failed", "drift"],
 )
 def test_a_drive_that_no_array_can_play_is_refused_and_not_counted(make, simulated):
     objective = make(simulated)
-    for wrong in (random_drive(2)[:, :3], random_drive(0), 2 * random_drive(2), random_drive(2).real):
+    good = random_drive(2)
+    for wrong in (good[:, :3], good[:0], 2 * good, good.real, torch.nan * good):
         with pytest.raises(ValueError, match="drive"):
             objective(wrong)
         with pytest.raises(ValueError, match="drive"):

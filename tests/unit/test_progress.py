@@ -40,7 +40,6 @@ def told(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 
 def lines_of(clock, caplog, steps, work):
-    """Return the log of work in pieces of (seconds, steps)."""
     caplog.set_level(logging.INFO)
     with progress.show_progress(steps, "simulating") as shown:
         for seconds, done in work:

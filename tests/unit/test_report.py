@@ -16,14 +16,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from PIL import Image
-from small_scenes import AIR, CUBE, small_scene
+from small_scenes import CUBE, small_scene
 
 import autdtorch.study.report.study_report
 from autdtorch.methods.functions import gabs, lssg
 from autdtorch.objectives.bound import focus_bound
 from autdtorch.objectives.goals import TargetPressures
 from autdtorch.scene.geometry import Plane
-from autdtorch.scene.scene import Scene
 from autdtorch.study.report.claims import judge_claims
 from autdtorch.study.report.document import as_page, code
 from autdtorch.study.report.findings import findings
@@ -42,8 +41,7 @@ METHODS = {
 
 
 def scene(plane=PLANE, obstacles=()):
-    plain = small_scene()
-    return Scene(plain.array, AIR, 40e3, plain.control_points, obstacles, plane, plain.domain)
+    return replace(small_scene(obstacles), observation_plane=plane)
 
 
 @pytest.fixture
@@ -90,7 +88,7 @@ def of_seven_trials():
 BOTH = {"homogeneous": scene(), "three_cubes": scene(obstacles=(CUBE,))}
 
 
-def test_all_figures_and_tables_are_there_and_no_number_is_missing(tmp_path, pictures):
+def test_all_figures_tables_and_findings_are_there_and_no_number_is_missing(tmp_path, pictures):
     results, report = reported(BOTH, tmp_path / "new", trials=3, config="trials: 3\n")
     shown = figures(report)
     scenes = ["fig1_homogeneous.png", "fig1_three_cubes.png"]
@@ -121,6 +119,21 @@ def test_all_figures_and_tables_are_there_and_no_number_is_missing(tmp_path, pic
         "no driver",
     )
     assert all(text in report for text in texts)
+    title, first, second, *_ = re.findall(r"^#+ .*", report, flags=re.MULTILINE)
+    assert title.startswith("# ")
+    assert first == "## Findings"
+    assert report.index(first) < report.index(second) < report.index("| scene |") < report.index("![")
+    texts = {file: text for text, file in re.findall(r"!\[([^]]*)\]\(([^)]+)\)", report)}
+    metrics = results.scenes["three_cubes"].methods
+    means = sorted(float(method.metrics.mean.median()) for method in metrics.values())
+    for number in (means[0], means[-1]):
+        assert f"{number:.3g}" in texts["fig3abc.png"]
+    plane = max(float(method.plane_pressure.abs().max()) for method in metrics.values())
+    assert f"{plane:.3g} Pa" in texts["fig2.png"]
+    bound = results.scenes["three_cubes"].bound
+    assert f"bound {bound:.3g} Pa" in texts["fig3d.png"]
+    assert "4 transducers, 1 obstacle, 3 control points" in texts["fig1_three_cubes.png"]
+    assert re.search(r"fastest .* in \S+ s", texts["fig4.png"])
 
 
 def test_the_table_gives_the_mean_over_the_trials():
@@ -139,7 +152,6 @@ def test_the_table_gives_the_mean_over_the_trials():
 
 
 def decimals(cell):
-    """The decimals of each number in a cell."""
     return [len(digits) for digits in re.findall(r"\d+\.?(\d*)", cell)]
 
 
@@ -295,7 +307,6 @@ def test_matrices_that_were_kept_are_no_runs_and_not_exact(tmp_path):
 
 
 def scored(results, scores, bound=10.0):
-    """Give each method in each scene the score of its name, in every trial."""
     scenes = {}
     for name, result in results.scenes.items():
         methods = {
@@ -328,16 +339,13 @@ def test_the_findings_name_the_best_method_its_share_of_the_bound_and_what_obsta
     assert "by BO and GABS" in findings(scored(results, scores), [])[0]
 
 
-def test_findings_of_one_method_in_one_scene_are_no_comparison():
+def test_findings_of_one_method_are_no_comparison_and_of_many_scenes_count_them():
     results = scored(studied({"a": scene(obstacles=(CUBE,))}), {"a": {"gabs": 4.0}})
     winners, nearness, cost = findings(results, judge_claims(results))
     assert "4 Pa in a" in winners
     assert "best" not in winners
     assert "40\N{NO-BREAK SPACE}%" in nearness
     assert "not known" in cost
-
-
-def test_findings_of_many_scenes_count_them():
     results = studied({"a": scene()})
     scenes = {f"scene_{number}": results.scenes["a"] for number in range(20)}
     scores = {name: {"gabs": 4.0} for name in scenes}
@@ -362,25 +370,6 @@ def test_what_is_missing_is_named(tmp_path):
     assert "LSSG in other" in report
     assert code("multirun/a=`1`") in report
     assert "`multirun/b: lab`" in report
-
-
-def test_the_findings_come_first_and_each_figure_says_its_result_in_numbers(tmp_path):
-    results, report = reported(BOTH, tmp_path, trials=3)
-    title, first, second, *_ = re.findall(r"^#+ .*", report, flags=re.MULTILINE)
-    assert title.startswith("# ")
-    assert first == "## Findings"
-    assert report.index(first) < report.index(second) < report.index("| scene |") < report.index("![")
-    texts = {file: text for text, file in re.findall(r"!\[([^]]*)\]\(([^)]+)\)", report)}
-    metrics = results.scenes["three_cubes"].methods
-    means = sorted(float(method.metrics.mean.median()) for method in metrics.values())
-    for number in (means[0], means[-1]):
-        assert f"{number:.3g}" in texts["fig3abc.png"]
-    plane = max(float(method.plane_pressure.abs().max()) for method in metrics.values())
-    assert f"{plane:.3g} Pa" in texts["fig2.png"]
-    bound = results.scenes["three_cubes"].bound
-    assert f"bound {bound:.3g} Pa" in texts["fig3d.png"]
-    assert "4 transducers, 1 obstacle, 3 control points" in texts["fig1_three_cubes.png"]
-    assert re.search(r"fastest .* in \S+ s", texts["fig4.png"])
 
 
 def test_a_single_trial_has_no_figures_of_one_point(tmp_path, monkeypatch):

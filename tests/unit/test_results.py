@@ -156,7 +156,6 @@ def saved(results, folder):
 
 
 def changed(path, change):
-    """Change a file, and its checksum."""
     with h5py.File(path, "r+") as file:
         change(file)
     body = path.read_bytes()[512:]

@@ -87,7 +87,6 @@ BOARDS = st.one_of(
 
 
 def kinds_in(path):
-    """The types of the arrays in a scene file."""
     section = yaml.safe_load(path.read_text("utf-8"))["array"]
     return [board["type"] for board in (section if isinstance(section, list) else [section])]
 

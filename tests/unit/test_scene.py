@@ -57,12 +57,17 @@ def test_box_is_half_open():
     assert (box.lower, box.upper) == ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 
 
-def test_obstacles_may_touch_by_edge_or_by_face():
+def test_obstacles_may_touch_and_those_of_one_material_overlap():
     stepped = (cube(41, 60, 40, 10), cube(41, 50, 50, 10), cube(41, 40, 60, 10))
     assert paper_scene(obstacles=stepped).obstacles == stepped
     for rounding in (0.0, 1e-9, -1e-9):  # mm
         in_a_row = (cube(41, 50, 50, 16), cube(30 + rounding, 50, 50, 6))
         assert paper_scene(obstacles=in_a_row).obstacles == in_a_row
+    paper_scene(obstacles=[ball(40, 8, 100.0), ball(45, 8, 100.0)])
+    paper_scene(obstacles=[ball(40, 5, 100.0), ball(50, 5, 50.0)])
+    # 0.4 mm apart, though the bounding boxes overlap
+    diagonal = Sphere((46e-3, 56e-3, 56e-3), 5e-3, rigid=True)
+    paper_scene(obstacles=[ball(40, 5, 100.0), diagonal])
 
 
 def ball(x, radius, density):
@@ -89,14 +94,6 @@ def test_a_mesh_in_millimetres_is_told_how_to_scale_it():
             paper_scene(obstacles=[Mesh.from_surface(surface, 1.0, offset, rigid=True)], domain=domain)
 
 
-def test_obstacles_of_one_material_may_overlap_and_those_of_two_may_touch():
-    paper_scene(obstacles=[ball(40, 8, 100.0), ball(45, 8, 100.0)])
-    paper_scene(obstacles=[ball(40, 5, 100.0), ball(50, 5, 50.0)])
-    # 0.4 mm apart, though the bounding boxes overlap
-    diagonal = Sphere((46e-3, 56e-3, 56e-3), 5e-3, rigid=True)
-    paper_scene(obstacles=[ball(40, 5, 100.0), diagonal])
-
-
 def test_obstacles_may_reach_beyond_the_domain():
     domain = ((0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
     wall = Box((90e-3, 50e-3, 50e-3), (10e-3, 1.0, 1.0), rigid=True)
@@ -105,7 +102,7 @@ def test_obstacles_may_reach_beyond_the_domain():
     assert (lower[1], upper[2]) == pytest.approx((-0.45 - 17e-3, 0.55 + 17e-3))
 
 
-def test_default_domain_holds_everything_and_two_wavelengths_more():
+def test_the_domain_holds_everything_and_may_be_given():
     plane = Plane(center=(80e-3, 50e-3, 50e-3), normal=(1, 0, 0), size=(200e-3, 20e-3))
     array = TransducerArray.grid((4, 8), pitch=10e-3, center=(1e-3, 50e-3, 50e-3), radius=5e-3)
     scene = paper_scene(array=array, obstacles=[cube(120, 50, 50, 10)], observation_plane=plane)
@@ -114,24 +111,18 @@ def test_default_domain_holds_everything_and_two_wavelengths_more():
     assert lower == pytest.approx((1e-3 - margin, -50e-3 - margin, 10e-3 - margin), rel=1e-12)
     assert upper == pytest.approx((125e-3 + margin, 150e-3 + margin, 90e-3 + margin), rel=1e-12)
     assert all(type(entry) is float for entry in lower + upper)
-
-
-def test_given_domain_is_kept_and_may_be_touched():
     domain = ((1e-3, 0.0, 0.0), (80e-3, 100e-3, 100e-3))  # array and control points lie on its faces
     assert paper_scene(domain=domain).domain == domain
     assert paper_scene(domain=np.array(domain)).domain == domain
 
 
-def test_a_scene_is_frozen_and_its_changed_copy_is_checked():
+def test_a_scene_is_frozen_with_its_own_copies_checked_when_changed_and_pickled():
     scene = paper_scene(obstacles=[cube(41, 50, 50, 10)])
     with pytest.raises(dataclasses.FrozenInstanceError):
         scene.frequency = 20e3
     assert dataclasses.replace(scene, frequency=20e3).wavelength == pytest.approx(17e-3, rel=1e-15)
     with pytest.raises(ValueError, match="in or on obstacle 0"):
         dataclasses.replace(scene, control_points=[(41e-3, 50e-3, 50e-3)])
-
-
-def test_scene_keeps_its_own_copies_and_survives_pickling():
     plane = Plane(center=(80e-3, 50e-3, 50e-3), normal=(1, 0, 0), size=(0.1, 0.1))
     points = torch.tensor([[80e-3, 50e-3, 50e-3]], dtype=torch.float64)
     array = TransducerArray.grid((4, 4), 10e-3, (1e-3, 50e-3, 50e-3), (1, 2, 3), 2.0, 4e-3)
@@ -193,7 +184,7 @@ def test_far_above_the_relaxations_absorption_is_classical() -> None:
         assert 0 < relaxing < 1e-4 * classical
 
 
-def test_density_and_sound_speed() -> None:
+def test_density_sound_speed_vapour_and_absorption_of_data_sheets() -> None:
     # measured: 331.45 m/s with 0.03 % of CO2 (Cramer 1993), of which a real gas makes 0.13 m/s
     assert Medium.air(0, 0).sound_speed == pytest.approx(331.45, rel=5e-4)
     # ISO 9613-1 and every handbook: 343.2 m/s and 1.204 kg/m^3 at 20 deg C
@@ -202,14 +193,8 @@ def test_density_and_sound_speed() -> None:
     # the zero-frequency formula of Cramer 1993, a real gas with 0.04 % of CO2
     for humidity, speed in ((50, 343.987), (0, 343.359)):
         assert Medium.air(20, humidity).sound_speed == pytest.approx(speed, rel=5e-4)
-
-
-def test_vapour() -> None:
     # saturation pressures of handbooks, which the fit of ISO 9613-1 meets to 0.2 %
     for temperature, saturation in ((0, 611), (20, 2339), (50, 12350)):
         found = ATMOSPHERE * vapour_fraction(temperature, 100, ATMOSPHERE)
         assert found == pytest.approx(saturation, rel=2e-3)
-
-
-def test_absorption_at_40_khz_is_that_of_data_sheets() -> None:
     assert Medium.air().absorption == pytest.approx(1.3, abs=0.05)

@@ -57,22 +57,14 @@ def test_plane_wave_falls_by_its_attenuation(cells, bound):
 
 
 @given(KAPPAS)
-def test_no_loss_no_damping(kappa):
+def test_no_loss_no_damping_and_long_waves_see_the_laplacian(kappa):
     assert tuned_stencil(kappa).damping(12) == 0
     # The term D (p_new - p_old) lets a wave fall by D a step: eta / kappa of the turn.
     assert tuned_stencil(kappa, 1e-3 * kappa).damping(200) == pytest.approx(1e-3 * math.pi / 100, rel=0.5)
-
-
-@given(KAPPAS)
-def test_long_waves_see_the_laplacian(kappa):
     stencil = tuned_stencil(kappa)
     assert stencil.weights.sum() == pytest.approx(stencil.total)
     # the next term of the expansion is of relative size 1e-6
     assert np.allclose(symbol_at(stencil, 1e-3 * directions(20)), 1e-6, rtol=1e-5)
-
-
-@given(KAPPAS)
-def test_largest_symbol_bounds_every_wave_and_is_reached(kappa):
     stencil = tuned_stencil(kappa)
     axis = np.linspace(0, math.pi, 9)
     waves = np.stack(np.meshgrid(axis, axis, axis), axis=-1)
@@ -129,7 +121,7 @@ def test_a_tuned_layer_reflects_little_at_the_drive_frequency(
         assert max(-wave.imag.min() for wave in waves) < energy
 
 
-def test_layer_absorbs_other_frequencies_too():
+def test_a_layer_absorbs_other_frequencies_and_its_echo_is_measured():
     # waves of half and of 1.5 times the frequency, which the switch-on excites, at normal incidence
     kappa, steps = 2 * math.pi / 8.5, 13
     profile = tuned_profile(kappa, steps, FINE_LAYER_CELLS)
@@ -137,9 +129,6 @@ def test_layer_absorbs_other_frequencies_too():
     scale = math.sin(math.pi / steps) / math.sin(kappa / 2)
     turn = 2 * np.arcsin(scale * np.sin(along / 2))
     assert (20 * np.log10(np.abs(reflection(profile, along, turn))) < -40).all()
-
-
-def test_echo_of_a_layer():
     # required: -70 dB from 0 to 60 degrees and -45 dB at 75, in at most 10 cells at 8.5 cells per wavelength;
     # the other layers are a wavelength off, so that the grid's edges and corners are in it
     angles, echo = measured_reflection(8.5, FINE_LAYER_CELLS, np.array((0.0, 30.0, 60.0, 75.0)), 5, aside=9)

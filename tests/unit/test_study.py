@@ -3,11 +3,11 @@
 import functools
 import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
-from small_scenes import AIR, CUBE, small_scene
+from small_scenes import CUBE, small_scene
 
 import autdtorch as at
 import autdtorch.study.run_study
@@ -23,8 +23,7 @@ FREE_SPACE = {"method": "free_space"}
 
 
 def scene(plane=PLANE, obstacles=()):
-    plain = small_scene()
-    return at.Scene(plain.array, AIR, 40e3, plain.control_points, obstacles, plane, plain.domain)
+    return replace(small_scene(obstacles), observation_plane=plane)
 
 
 @pytest.fixture
@@ -34,7 +33,6 @@ def scenes():
 
 @pytest.fixture
 def count_runs(monkeypatch):
-    """Names of the scenes that are computed, in order."""
     computed = []
     run_scene = autdtorch.study.run_study._run_scene
 
@@ -105,7 +103,6 @@ def test_the_runs_of_a_simulation_are_recorded(tmp_path, monkeypatch):
 
 @pytest.fixture
 def study(scenes, tmp_path):
-    """Runs the same study in a folder, with other arguments where given."""
     return functools.partial(run_study, scenes, METHODS, solver=FREE_SPACE, folder=tmp_path)
 
 

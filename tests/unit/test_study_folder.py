@@ -48,8 +48,6 @@ def contents(folder):
 
 @pytest.fixture
 def warnings(caplog):
-    """Returns the warnings since the last call."""
-
     def since():
         messages = [one.getMessage() for one in caplog.records if one.levelno >= logging.WARNING]
         caplog.clear()
@@ -209,7 +207,6 @@ def test_killed_again_and_again_a_study_ends_with_the_same_numbers(tmp_path, mon
         folder.mkdir()
 
     def finish(folder):
-        """Run the study in this process, which has imported PyTorch; it need not be slow."""
         with monkeypatch.context() as patched:
             patched.setattr("sys.argv", ["slow_study.py", str(folder / "out")])
             patched.setattr("autdtorch.study.run_study.BLOCK", 1)  # the study sets it, too

@@ -2,7 +2,6 @@
 
 import os
 import threading
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -12,12 +11,9 @@ from autdtorch.utils import process
 
 
 @pytest.fixture(autouse=True)
-def four_threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def four_threads(monkeypatch, set_threads):
     monkeypatch.setattr(process, "_processors", lambda: 8)
-    before = torch.get_num_threads()
-    torch.set_num_threads(4)
-    yield
-    torch.set_num_threads(before)
+    set_threads(4)
 
 
 def in_new_thread() -> int:
@@ -28,7 +24,7 @@ def in_new_thread() -> int:
     return found[0]
 
 
-def test_it_is_one_inside_and_what_it_was_outside() -> None:
+def test_torch_and_numpy_have_one_thread_inside_and_what_they_had_outside() -> None:
     with process.one_library_thread():
         assert torch.get_num_threads() == 1
         assert process.thread_count() == 4
@@ -37,8 +33,6 @@ def test_it_is_one_inside_and_what_it_was_outside() -> None:
         assert torch.get_num_threads() == 1
     assert torch.get_num_threads() == in_new_thread() == 4
 
-
-def test_numpy_has_one_thread_inside_and_what_it_had_outside() -> None:
     def counts() -> list[int]:
         return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
 

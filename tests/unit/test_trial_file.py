@@ -78,26 +78,8 @@ def test_a_line_a_trial_with_its_figures(path):
     assert row["score"] == row["history"][-1]
 
 
-def test_whatever_is_cut_off_costs_no_earlier_trial(path, caplog):
-    file = opened(path)
-    for trial in range(3):
-        file.append("a", "gabs", [trial], found(1, 2, seed=trial), 1.0)
-    content = path.read_bytes()
-    first, second = (content.index(b"\n") + 1, content.rindex(b"\n", 0, -1) + 1)
-    for length in (first, first + 1, (first + second) // 2, second - 1, second, len(content) - 1):
-        path.write_bytes(content[:length])
-        complete = content[: length + 1].count(b"\n")  # the end of a line may be missing
-        file = opened(path)
-        assert file.missing("a", "gabs", 3) == list(range(complete, 3))
-        for trial in file.missing("a", "gabs", 3):
-            file.append("a", "gabs", [trial], found(1, 2, seed=trial), 1.0)
-        assert path.read_bytes() == content
-    assert "the last line broke off" in caplog.text
-
-
 @pytest.fixture
 def lines(path):
-    """Lines of three trials, in the file."""
     opened(path).append("a", "gabs", range(3), found(3, 4), 3.0)
     return path.read_bytes().splitlines()
 
@@ -129,23 +111,6 @@ def test_a_row_that_no_method_can_have_written_does_not_count(path, lines, chang
     assert file.missing("a", "gabs", 3) == [1]
     assert len(file) == 2
     assert path.with_name(path.name + SET_ASIDE).read_bytes() == lines[1] + b"\n"
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda line: b"[" * 10**6,
-        lambda line: line.replace(b'"trial": 1', b'"trial": 1' + b"0" * 10_000),
-        lambda line: line.replace(b'"trial": 1', b'"trial": NaN'),
-        lambda line: line.replace(b'"trial": 1', b'"trial": 1, "trial": 7'),
-        lambda line: line.replace(b"gabs", b"g\xffbs"),
-        lambda line: line.replace(b"gabs", b"g\0bs"),
-        lambda line: b"",
-    ],
-)
-def test_a_line_that_was_not_written_so_does_not_count(path, lines, damage):
-    path.write_bytes(b"\n".join([lines[0], damage(lines[1]), lines[2], b""]))
-    assert opened(path).missing("a", "gabs", 3) == [1]
 
 
 def test_the_trials_of_another_study_or_scene_do_not_count(path, lines, caplog):

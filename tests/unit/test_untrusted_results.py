@@ -12,6 +12,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt
+from small_scenes import SECTION as SCENE
 
 from autdtorch.io.scene_file import load_scene
 from autdtorch.methods.functions import gabs
@@ -22,12 +23,6 @@ from autdtorch.study.results_file import load_results, save_results
 from autdtorch.study.run_study import run_study
 from autdtorch.study.sweeps import collect_results
 
-SCENE = {
-    "frequency": 40e3,
-    "medium": {"density": 1.2, "sound_speed": 340.0},
-    "array": {"type": "grid", "shape": [2, 2], "pitch": 10e-3, "center": [0, 0, 0]},
-    "control_points": {"type": "points", "positions": [[0.05, 0, 0], [0.05, 0.01, 0]]},
-}
 HTML = "<img src=x onerror=alert(1)>\n\n<script>alert(1)</script>\n\na ` <b onclick=alert(1)>b</b>"
 MARKDOWN = "![a](https://evil.example/a.png) [b](https://evil.example) <https://evil.example> `` ``` ~~~"
 HOSTILE = f"{HTML}\n{MARKDOWN}\n\n</details>\n```\n{HTML}\n[x]: https://evil.example\n[x]"
@@ -75,7 +70,6 @@ def with_origin(results, **changes):
 
 
 def left(folder, *studies):
-    """Save a sweep of these studies in a subfolder."""
     sweep = folder / "sweep"
     for number, results in enumerate(studies):
         save_results(results, sweep / str(number))
@@ -83,7 +77,6 @@ def left(folder, *studies):
 
 
 def collect(sweep):
-    """Do what `autdtorch collect` does; return the page."""
     found = collect_results(sweep)
     save_summary(found, sweep / SUMMARY_FILE)
     page = write_report(found.results, found.scenes, sweep, "autdtorch collect", found.seeds)
@@ -98,14 +91,11 @@ def test_the_names_of_what_was_swept_stay_in_the_folder(tmp_path):
     assert "<b>" not in page
 
 
-def test_settings_that_expand_are_refused(tmp_path):
+def test_settings_that_expand_or_read_a_variable_are_refused(tmp_path, monkeypatch):
     tens = (f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 11))
     config = "scene: &a0 [lol, lol]\n" + "".join(tens)
     with pytest.raises(ValueError, match=r"results\.h5.*line"):
         collect_results(left(tmp_path, with_origin(study(), config=config)))
-
-
-def test_the_scene_of_results_reads_no_variable(tmp_path, monkeypatch):
     monkeypatch.setenv("SECRET", "hunter2")
     config = yaml.safe_dump({"scene": {**SCENE, "name": "${oc.env:SECRET}"}, "method": {}})
     with pytest.raises(ValueError, match=r"name: '\$\{oc\.env:SECRET\}'"):
@@ -136,27 +126,11 @@ class Tags(HTMLParser):
         self.found += [(tag, "", ""), *((tag, name, value or "") for name, value in attributes)]
 
 
-OURS = {"html", "head", "meta", "title", "style", "body", "h1", "h2", "p", "br", "em", "strong", "code"}
-OURS |= {
-    "main",
-    "nav",
-    "a",
-    "figure",
-    "figcaption",
-    "pre",
-    "img",
-    "div",
-    "table",
-    "thead",
-    "tbody",
-    "tr",
-    "th",
-    "td",
-    "ul",
-    "li",
-    "details",
-    "summary",
-}
+OURS = {
+    "html", "head", "meta", "title", "style", "body", "h1", "h2", "p", "br", "em", "strong", "code",
+    "main", "nav", "a", "figure", "figcaption", "pre", "img", "div", "table", "thead", "tbody", "tr",
+    "th", "td", "ul", "li", "details", "summary",
+}  # fmt: skip
 ATTRIBUTES = {"lang", "charset", "name", "content", "class", "src", "alt", "href", "id", "scope", "role"}
 ATTRIBUTES |= {"aria-label", "tabindex", "width"}
 

@@ -1,4 +1,4 @@
-"""A scene that somebody sent, and the files it names, read no variable, run nothing and stay small."""
+"""A scene that somebody sent, and the arrays it names, read no variable, run nothing and stay small."""
 
 import io
 import pickle
@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
+from wrong_values import holding_itself, sharing
 
 from autdtorch.io.array_file import load_array
 from autdtorch.io.drive_file import load_drive
 from autdtorch.io.scene_file import load_scene
 from autdtorch.io.yaml_file import parse_yaml
-from autdtorch.scene.obstacles import Mesh, VoxelMask
+from autdtorch.scene.obstacles import VoxelMask
 
 SCENE = """
 frequency: 40e3
@@ -90,20 +91,7 @@ def one_line(error: Exception) -> str:
     return text
 
 
-def shared(value: object) -> object:
-    """Ten levels of lists, each of which holds the one below ten times: small in memory, large if copied."""
-    for _ in range(10):
-        value = [value] * 10
-    return value
-
-
-def itself() -> list[object]:
-    value: list[object] = []
-    value.append(value)
-    return value
-
-
-@pytest.mark.parametrize("value", [shared("lol"), itself()], ids=["shared", "itself"])
+@pytest.mark.parametrize("value", [sharing(list), holding_itself(1)], ids=["shared", "itself"])
 def test_a_mapping_that_expands_is_refused(value: object) -> None:
     with pytest.raises(ValueError, match=r"scene mapping: domain\.\d") as caught:
         load_scene({**scene(), "domain": value})
@@ -243,35 +231,3 @@ def test_a_small_file_of_many_zeros_is_not_unpacked(tmp_path: Path, monkeypatch:
     np.savez_compressed(tmp_path / "zeros.npz", mask=np.ones((100, 100, 101), bool))
     with pytest.raises(ValueError, match=r"zeros\.npz.*1010128 bytes"):
         VoxelMask.load(tmp_path / "zeros.npz", 1e-3, rigid=True)
-
-
-HEAD = (
-    "ply\nformat {kind} 1.0\nelement vertex {vertices}\nproperty float x\nproperty float y\n"
-    "property float z\nelement face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
-)
-FOUR = HEAD.format(kind="ascii", vertices=4, faces=4)
-BINARY = "binary_little_endian"
-CORNERS = "0 0 0\n1 0 0\n0 1 0\n0 0 1\n"
-MESHES = {
-    "ply": HEAD.format(kind=BINARY, vertices=4_000_000_000, faces=4_000_000_000),
-    "ply in text": HEAD.format(kind="ascii", vertices=10**12, faces=10**12) + CORNERS,
-    "ply beyond integers": HEAD.format(kind=BINARY, vertices=10**30, faces=1),
-    "ply of quads": f"{FOUR}{CORNERS}3 0 2 1\n3 0 1 3\n3 0 3 2\n4 1 2 3 0\n",
-    "ply of nothing": "ply\nformat ascii 1.0\nend_header\n",
-    "ply of less than nothing": HEAD.format(kind=BINARY, vertices=-1, faces=0),
-    "ply of halves": f"{FOUR}{CORNERS}3 0 2.5 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n",
-    "ply of no numbers": f"{FOUR}{CORNERS}3 0 nan 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n",
-    "obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1\n",
-    "obj beyond integers": f"v 0 0 0\nf 1 1 {10**30}\n",
-    "stl": "\0" * 80 + "\x7f" * 4 + "\0" * 50,
-}
-
-
-@pytest.mark.parametrize("name", MESHES)
-def test_a_mesh_file_that_does_not_hold_what_it_declares_is_refused(tmp_path: Path, name: str) -> None:
-    """libigl's readers end the process, or take all memory, on some of these."""
-    path = tmp_path / f"sent.{name.partition(' ')[0]}"
-    path.write_bytes(MESHES[name].encode("ascii"))
-    with pytest.raises(ValueError, match=r"Mesh\.path: .*sent") as caught:
-        Mesh(path, rigid=True)
-    one_line(caught.value)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import autdtorch as at
 from autdtorch import hardware
-from autdtorch.utils.hints import did_you_mean, suggesting
+from autdtorch.utils.hints import did_you_mean
 
 FOCI = at.circle_points((80e-3, 50e-3, 50e-3), 30e-3, 4, (1, 0, 0))
 ARRAY = at.TransducerArray.grid((4, 4), 10e-3, (1e-3, 50e-3, 50e-3))
@@ -291,9 +291,17 @@ def test_a_wrong_keyword_brings_the_right_one(name, objective):
         call(objective)
 
 
-def test_a_keyword_like_no_other_brings_all():
+def test_a_keyword_like_no_other_brings_all_and_errors_further_in_stay():
     with pytest.raises(TypeError, match=r"'diameter'; keywords: center, radius, .*\brigid\b"):
         at.Sphere(MIDDLE, diameter=1.0, rigid=True)
+
+    def outer(alpha=1):
+        return inner(beta=alpha)
+
+    def inner(gamma=1): ...
+
+    with pytest.raises(TypeError, match=r"inner\(\) got an unexpected keyword argument 'beta'$"):
+        outer(2)
 
 
 @pytest.mark.parametrize("package", [at, hardware])
@@ -304,17 +312,6 @@ def test_every_public_function_answers_a_wrong_keyword(package):
         assert pickle.loads(pickle.dumps(function)) is function
         with pytest.raises(TypeError, match=r"keyword argument 'zzqy'(; keywords: | \(did you mean)"):
             function(zzqy=1)
-
-
-def test_errors_within_a_function_stay_what_they_are():
-    @suggesting
-    def outer(alpha=1):
-        return inner(beta=alpha)
-
-    def inner(gamma=1): ...
-
-    with pytest.raises(TypeError, match=r"inner\(\) got an unexpected keyword argument 'beta'$"):
-        outer(2)
 
 
 @pytest.mark.parametrize(
