@@ -82,7 +82,10 @@ def _new_axes(figure: Figure, domain: tuple[Vector, Vector], right: float) -> Ax
     view, (width, height) = view_from(_TO_VIEWER), _SIZE
     room = width - right - 2 * _MARGIN, height - _LEGEND_ROOM - 2 * _MARGIN
     titles = [f"{name} [mm]" for name in "xyz"]
-    axes = axes_of(lower, upper, view, room, _text_size, titles)
+    height_of_digits = 0.75 * TICK_SIZE / 72  # which have no descenders
+    axes = axes_of(
+        lower, upper, view, room, lambda text: (text_width(text, TICK_SIZE), height_of_digits), titles
+    )
     middle = np.array([(width - right) / 2, (height - _LEGEND_ROOM) / 2]) - (axes.low + axes.high) / 2
 
     ax = cast(Axes3D, figure.add_axes((0.0, 0.0, 1.0, 1.0), projection="3d", computed_zorder=False))
@@ -112,10 +115,6 @@ def _place(ax: Axes3D, point: Array) -> Array:
     projected = proj_transform(*point, ax.get_proj())[:2]
     place: Array = ax.transData.transform(projected) / ax.get_figure().dpi
     return place
-
-
-def _text_size(text: str) -> tuple[float, float]:
-    return text_width(text, TICK_SIZE), 0.75 * TICK_SIZE / 72  # of digits, which have no descenders
 
 
 def _add_obstacle(ax: Axes3D, obstacle: Obstacle, domain: tuple[Vector, Vector]) -> None:

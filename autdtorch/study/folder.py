@@ -194,7 +194,7 @@ class StudyFolder:
                 continue
             scenes = stored.scenes if isinstance(stored, StudyResult) else {}
             provenance = stored.provenance if isinstance(stored, StudyResult) else stored
-            if provenance.same_origin(self.provenance):
+            if provenance.origin == self.provenance.origin:
                 del self._not_used[name]
                 self.provenance = provenance
                 self.scenes |= scenes

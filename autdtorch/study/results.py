@@ -54,10 +54,6 @@ class Provenance:
         """SHA-256 of all fields except the date: equal for studies with equal results."""
         return digest_of(self.config, self.seed, sorted(self.versions.items()), self.source_digest)
 
-    def same_origin(self, other: Provenance) -> bool:
-        """Return whether both studies have equal results: all fields except the date are equal."""
-        return self.origin == other.origin
-
     def __repr__(self) -> str:
         """Return version, seed and date, without the settings."""
         return f"Provenance(autdtorch {self.versions.get('autdtorch')}, seed {self.seed}, begun {self.date})"

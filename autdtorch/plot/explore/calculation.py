@@ -195,7 +195,8 @@ class Calculator:
             drive = request.method.best(state).drive[0]
         elif request.follow:
             drive = _followed(propagator, drive)
-        cells = self._cells(situation, fine) if _has_cells(propagator) else None
+        in_closed_form = isinstance(propagator, FreeSpacePropagator) or not propagator.cells
+        cells = None if in_closed_form else self._cells(situation, fine)
         step = plane_spacing(situation.sheet, situation.scene.wavelength, fine)
         first = step if cells is None else max(step, quick_spacing(situation, cells))
         result = _field(request, propagator, drive, cells, first)
@@ -239,11 +240,6 @@ class Calculator:
             drives = request.method.ask(state)
             state = request.method.tell(state, observed(objective, drives, state.evaluations))
             yield state
-
-
-def _has_cells(propagator: Propagator) -> bool:
-    """Return whether a propagator simulates on a grid; others have a closed form."""
-    return not isinstance(propagator, FreeSpacePropagator) and propagator.cells > 0
 
 
 def _progress(request: Request, state: State) -> Progress:

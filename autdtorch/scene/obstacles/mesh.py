@@ -253,7 +253,9 @@ class MeshDistance:
         if igl.is_edge_manifold(self._faces)[0] and igl.is_vertex_manifold(self._faces).all():
             by_angle = igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE
             uniform = igl.PER_EDGE_NORMALS_WEIGHTING_TYPE_UNIFORM
-            self._face_normals = _unit(doubled_normals(self._vertices[self._faces]))
+            normals = doubled_normals(self._vertices[self._faces])
+            length = np.linalg.norm(normals, axis=1, keepdims=True)
+            self._face_normals = normals / np.where(length > 0, length, 1)
             self._vertex_normals = igl.per_vertex_normals(self._vertices, self._faces, by_angle)
             self._edge_normals, _, self._edge = igl.per_edge_normals(self._vertices, self._faces, uniform)
         else:
@@ -291,9 +293,3 @@ class MeshDistance:
         corner = share[at_vertex].argmax(axis=1)
         normal[at_vertex] = self._vertex_normals[self._faces[face[at_vertex], corner]]
         return np.asarray(normal)
-
-
-def _unit(vectors: Array) -> Array:
-    """Return vectors (n, 3) divided by their length, where it is not zero."""
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.asarray(vectors / np.where(length > 0, length, 1))

@@ -101,7 +101,8 @@ def _oriented(vertices: Array, faces: Index, done: list[str]) -> Index:
     faces = np.where(turned[:, None], faces[:, ::-1], faces)
     for piece in range(number):
         in_piece = label == piece
-        if _signed_volume(vertices, faces[in_piece]) < 0:
+        corners = vertices[faces[in_piece]]
+        if np.linalg.det(corners - corners.mean(axis=(0, 1))).sum() < 0:  # six times the volume
             faces[in_piece], turned[in_piece] = faces[in_piece, ::-1], ~turned[in_piece]
     if turned.any():
         place = place_of(vertices[faces[turned][0]].mean(axis=0))
@@ -190,8 +191,3 @@ def _pieces(faces: Index) -> Index:
     owner = np.tile(np.arange(len(faces)), 3)
     graph = coo_array((np.ones(len(owner)), (owner, edge.reshape(-1))), shape=(len(faces), len(edges)))
     return np.asarray(connected_components(graph @ graph.T, directed=False)[1], np.int64)
-
-
-def _signed_volume(vertices: Array, faces: Index) -> float:
-    corners = vertices[faces] - vertices[faces].mean(axis=(0, 1))
-    return float(np.linalg.det(corners).sum() / 6)
