@@ -17,7 +17,7 @@ from .log import EvaluationLog as EvaluationLog
 from .log import LogError as LogError
 from .log import lock_log as lock_log
 from .objective import HardwareObjective as HardwareObjective
-from .played import Played as Played
+from .objective import Played as Played
 from .safety import LimitedLink as LimitedLink
 from .safety import LimitError as LimitError
 from .safety import Limits as Limits

@@ -1,18 +1,21 @@
-"""The objective of a device and a sensor: measured where `SimulatedObjective` simulates."""
+"""Objectives of a device: measured by a sensor, or simulated for the drives that the device plays."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from autdtorch.hardware.devices.device import Device
+from autdtorch.hardware.link import AmplitudeScale, Wiring
 from autdtorch.hardware.log import Evaluation, EvaluationLog
 from autdtorch.hardware.safety import LimitedLink, LimitError
 from autdtorch.hardware.sensors.sensor import Sensor
-from autdtorch.objectives.objective import observe_drives, validate_matrix
+from autdtorch.objectives.objective import Objective, observe_drives, validate_matrix
+from autdtorch.objectives.perturbations import Perturbation
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.validation import invalid, path_of, require_callable, require_kind
@@ -143,3 +146,43 @@ class HardwareObjective:
         evaluation = self.log.append(drive, pressure, self._link.seconds_on)
         self._watch(evaluation)
         return pressure
+
+
+class Played(Perturbation):
+    """A device that plays the nearest of its levels, as it is calibrated, within the limit of a trial.
+
+    With ``Played(SimulatedObjective(...), device)`` a method finds the same drive as with a
+    `HardwareObjective` without noise. The pressures differ by a factor: |q| = 1 in the trial is the amplitude
+    `largest` of the device, its highest level within the limit.
+    """
+
+    def __init__(
+        self,
+        objective: Objective,
+        device: Device,
+        transducers: Sequence[int] | torch.Tensor | None = None,
+        amplitude: float = 1.0,
+    ) -> None:
+        """Wrap an objective.
+
+        Args:
+            objective: simulates the pressure of the device's drives.
+            device: the device whose levels are used.
+            transducers: the device's transducer for each of the scene's (M,); by default all in order.
+            amplitude: amplitude limit of the trial, as in `Limits`.
+
+        `ValueError` for `transducers` that the device does not have, one twice, or not as many as the scene
+        has; or an `amplitude` out of range or below the device's lowest level.
+        """
+        super().__init__(objective)
+        wiring = Wiring(device, transducers)
+        count = len(self.scene.array)
+        if len(wiring.transducers) != count:
+            accepted = f"must be {count}, as many as the scene has"
+            raise invalid("transducers", len(wiring.transducers), accepted)
+        self._scale = AmplitudeScale(wiring, amplitude)
+        self.largest = self._scale.largest
+
+    def quantised(self, drive: torch.Tensor) -> torch.Tensor:
+        """Return the device's nearest drives to drives (..., M), both in the trial's scale."""
+        return self._scale.quantised(drive)

@@ -19,8 +19,7 @@ from types import FrameType
 
 import torch
 
-from autdtorch.hardware.link import Link
-from autdtorch.hardware.played import AmplitudeScale
+from autdtorch.hardware.link import AmplitudeScale, Link
 from autdtorch.hardware.sensors.sensor import Sensor, SensorError, checked_reading
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.process import send_again

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from autdtorch import hardware as hw
 from autdtorch.hardware.devices.openmpd import OpenMPDBoard
-from autdtorch.hardware.played import Wiring
+from autdtorch.hardware.link import Wiring
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import drive_from_phases
 from autdtorch.scene.scene import Medium, Scene

@@ -18,7 +18,7 @@ from usb.backend import IBackend
 from usb.core import USBError, USBTimeoutError
 
 from autdtorch.hardware.devices.device import Device, Firmware
-from autdtorch.hardware.played import Wiring
+from autdtorch.hardware.link import Wiring
 from autdtorch.hardware.transport.port import Port
 from autdtorch.scene.drive import amplitudes_of, phases_of
 from autdtorch.utils.array_types import REAL
