@@ -22,7 +22,7 @@ class FaultyBus(EmulatedBus):
         self._left = after
         self._halted = False
 
-    def bulk_write(self, dev_handle: int, ep: int, intf: int, data: array[int], timeout: int) -> int:
+    def bulk_write(self, dev_handle: int, ep: int, intf: int, data: "array[int]", timeout: int) -> int:
         if self._halted:
             return self._refuse()
         if self.struck or len(data) <= self._left:
