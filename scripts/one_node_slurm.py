@@ -77,11 +77,7 @@ def missing_programs() -> list[str]:
 
 
 def install() -> None:
-    """Install Slurm.
-
-    Raises:
-        RuntimeError: the installation fails, or this process is not root.
-    """
+    """Install Slurm; RuntimeError if that fails, or if this process is not root."""
     if os.getuid() != 0 or shutil.which("apt-get") is None:
         raise RuntimeError(f"no {', '.join(missing_programs())}; root installs {' '.join(PACKAGES)}")
     for arguments in (["update"], ["install", "--yes", "--no-install-recommends", *PACKAGES]):
@@ -94,13 +90,10 @@ def install() -> None:
 
 @contextlib.contextmanager
 def one_node_slurm() -> Iterator[dict[str, str]]:
-    """Run the cluster within the context; remaining jobs are killed at its end.
+    """Run the cluster within the context, whose end kills remaining jobs; RuntimeError if it does not start.
 
     Yields:
         The environment in which Slurm's commands, such as sbatch, find the cluster.
-
-    Raises:
-        RuntimeError: the cluster does not start.
     """
     with tempfile.TemporaryDirectory(prefix="slurm-") as name, contextlib.ExitStack() as daemons:
         folder = Path(name)  # short: the path of a socket has at most 107 characters

@@ -4,10 +4,6 @@ Writes accuracy.json, accuracy.png and a block of the documentation. Errors are 
 the transfer matrix, for the total field and for its scattered part. Run times include the assembly of the
 scene. The paper's domain is cut to array, obstacles and first focus; symmetry makes the other three foci
 equal. Exits with 1 if an error is above its required limit.
-
-    python scripts/benchmark.py accuracy                     2 to 1 mm
-    python scripts/benchmark.py accuracy --fine              with 0.5 mm
-    python scripts/benchmark.py accuracy --make-reference    the fine grids of the cubes, once
 """
 
 import json
@@ -36,31 +32,21 @@ OPTIONS = {
     "--spacings": {"type": float, "nargs": "+", "default": SPACINGS, "metavar": "MM", "help": "two or more"},
     "--fine": {"action": "store_true", "help": "also 0.5 mm"},
     "--shifts": {"type": int, "default": 5, "help": "positions of the sphere on the grid"},
-    "--make-reference": {"action": "store_true", "help": "only that"},
+    "--make-reference": {"action": "store_true", "help": "only simulate the cubes on the fine grids"},
 }
 
 
 @dataclass(frozen=True)
 class Row:
-    """A measurement.
-
-    Attributes:
-        case: name of the case.
-        treatment: "default" or what else distinguishes rows of a case.
-        spacing: [mm].
-        total: relative error of the field.
-        scattered: relative error of its scattered part; None if there is none.
-        seconds: run time.
-        settled: whether all simulations reached the steady state within the tolerance.
-    """
+    """A measurement of a case; relative errors of the field and of its scattered part."""
 
     case: str
-    treatment: str
-    spacing: float
+    treatment: str  # "default" or what else distinguishes rows of a case
+    spacing: float  # [mm]
     total: float
-    scattered: float | None
+    scattered: float | None  # None without obstacles
     seconds: float
-    settled: bool
+    settled: bool  # whether all simulations reached the steady state within the tolerance
 
 
 LIMITS = {
@@ -120,9 +106,8 @@ def measure(spacings: Sequence[float], shifts: int) -> list[Row]:
 def compare(case: Case, treatment: str, spacing: float, simulation: Simulation) -> Row:
     """Return the errors of a transfer matrix."""
     total, scattered = error_of(case, simulation.matrix)
-    print(
-        f"{case.name}, {treatment}, {spacing:g} mm: {percent(total)}, {simulation.seconds:.1f} s", flush=True
-    )
+    seconds = f"{simulation.seconds:.1f} s"
+    print(f"{case.name}, {treatment}, {spacing:g} mm: {percent(total)}, {seconds}", flush=True)
     return Row(case.name, treatment, spacing, total, scattered, simulation.seconds, simulation.settled)
 
 
@@ -192,11 +177,8 @@ def error_table(rows: Sequence[Row]) -> str:
 
 def figure(rows: Sequence[Row]) -> Figure:
     """Plot the error of the field over the run time, a panel for each case with more than one spacing."""
-    swept = {
-        readable(case): group
-        for (case, name), group in series(rows).items()
-        if name == "default" and len(group) > 1
-    }
+    groups = ((case, group) for (case, name), group in series(rows).items() if name == "default")
+    swept = {readable(case): group for case, group in groups if len(group) > 1}
     plotted = plot_pareto(
         {case: {"autdtorch": [(r.seconds, 100 * r.total) for r in group]} for case, group in swept.items()},
         "run time [s]",

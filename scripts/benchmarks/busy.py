@@ -1,10 +1,7 @@
 """Times of transfer matrices beside busy processes, by default and on one thread.
 
 Each figure is the median over processes that take turns, so that all see the machine in one state. A process
-simulates each scene several times; the median counts.
-
-    python scripts/benchmark.py busy                        about five minutes on 2 cores
-    python scripts/benchmark.py busy --against ../other     another checkout beside this one
+simulates each scene several times; the median counts. Takes about five minutes on 2 cores.
 """
 
 import contextlib

@@ -1,10 +1,8 @@
 """Rates and run times on a GPU, beside those of the CPU kernel on the same machine.
 
-Fills in a block of the documentation. A cell of uniform air in float32 needs 12 bytes a step; the bandwidth
-is measured by a copy within the GPU's memory. Each matrix has a new propagator, preparing included; the
-faster of two counts. Holograms are of random matrices of 256 transducers and 8 points.
-
-    python scripts/benchmark.py cuda              about a minute, with an NVIDIA GPU
+A cell of uniform air in float32 needs 12 bytes a step; the bandwidth is measured by a copy within the GPU's
+memory. Each matrix has a new propagator, preparing included; the faster of two counts. Takes about a
+minute, with an NVIDIA GPU.
 """
 
 import math

@@ -1,9 +1,8 @@
 """The live view: memory, and the time from a slider's move to the new field in a browser.
 
-Fills in a block of the documentation. A headless Chromium on the same machine moves a slider; the time ends
-with the frame of the new field. Then the obstacle is moved many times more, for the memory of the process.
-
-    python scripts/benchmark.py explore         about four minutes on 2 idle cores
+A headless Chromium on the same machine moves a slider; the time ends with the frame of the new field. Then
+the obstacle is moved many times more, for the memory of the process. Takes about four minutes on 2 idle
+cores.
 """
 
 import gc
@@ -72,9 +71,10 @@ def main(page: Page, scene: str, moves: int, more: int) -> None:
         browser.close()
     explorer.close()
     rows = []
-    labels = {False: "dragged, cells of 2 mm", True: "let go, cells of 1 mm"}
-    for let_go, label in labels.items():
-        shares = statistics.quantiles(seconds[let_go], n=20, method="inclusive")
+    for label, spent in zip(
+        ("dragged, cells of 2 mm", "let go, cells of 1 mm"), seconds.values(), strict=True
+    ):
+        shares = statistics.quantiles(spent, n=20, method="inclusive")
         rows.append([label, f"{shares[9]:.2f} s", f"{shares[18]:.2f} s"])
     parts = [
         f"From a slider's move to the frame with the new field, `{scene}`, {moves} moves each:",

@@ -1,10 +1,8 @@
 """Drives a second by the algorithms of holography, beside those of AcousTools on the same matrices.
 
-Needs `pip install 'autdtorch[crosscheck]'`. Fills in a block of the documentation. Matrices are random, in
-single precision, with a row for each point and the 249 transducers of an AUTD3. Each time is the shortest of
-five. The share of the bound is the median over sets of random foci, with the paper's two cubes before them.
-
-    python scripts/benchmark.py holography        about a minute on 2 idle cores
+Needs `pip install 'autdtorch[crosscheck]'`. Matrices are random, in single precision, with a row for each
+point and the 249 transducers of an AUTD3. Each time is the shortest of five. The share of the bound is the
+median over sets of random foci, with the paper's two cubes before them. Takes about a minute on 2 idle cores.
 """
 
 import functools
@@ -12,12 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 
 import torch
-from acoustools.Solvers import (
-    gspat_solver,
-    iterative_backpropagation,
-    naive_solver_batched,
-    wgs_solver_batch,
-)
+from acoustools.Solvers import gspat_solver, iterative_backpropagation, naive_solver_batched, wgs_solver_batch
 from shared.document import Page, printed, table
 from shared.scenes import autd3_array, paper_scene, weakest, with_array
 from shared.timing import shortest

@@ -1,8 +1,6 @@
 """Share of the best weakest focus that identification reaches, by noise.
 
 Prints a Markdown table for the paper's scenes. Shares are those of the true pressure of the drives.
-
-    python scripts/benchmark.py identify
 """
 
 from collections.abc import Iterator
@@ -33,9 +31,5 @@ def rows(trials: int) -> Iterator[list[str]]:
             observed = objective if snr is None else at.Noise(objective, snr, seed=1)
             solution, seconds = timed(lambda o=observed, n=evaluations: at.identify(o, n, trials=trials))
             share = objective(solution.drive).amin(dim=1) / best
-            shares = [
-                f"{share.median():.4f}",
-                f"{share.min():.4f}",
-                f"{int((share > 0.99).sum())} of {trials}",
-            ]
+            shares = f"{share.median():.4f}", f"{share.min():.4f}", f"{int((share > 0.99).sum())} of {trials}"
             yield [name, str(snr or "none"), str(evaluations), *shares, f"{seconds:.1f}"]

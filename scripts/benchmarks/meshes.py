@@ -1,9 +1,7 @@
 """Run times of scenes that users bring: a hand as a mesh, transducers as discs, a moved obstacle, steel.
 
-Fills in a block of the documentation. The hand has a palm, four fingers and a thumb of ellipsoids, 40,000
-triangles in all. Each matrix has four foci. Each time is the shortest of three, with the kernels compiled.
-
-    python scripts/benchmark.py meshes            about two minutes on 2 idle cores
+The hand has a palm, four fingers and a thumb of ellipsoids, 40,000 triangles in all. Each matrix has four
+foci. Each time is the shortest of three, with the kernels compiled. Takes about two minutes on 2 idle cores.
 """
 
 import dataclasses

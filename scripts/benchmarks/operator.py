@@ -1,9 +1,7 @@
 """T-matrices of the paper's cubes: time to build, accuracy after moves, and transfer matrices a second.
 
-Fills in a block of the documentation. Shifts and turns are random, and compared with the box solver at the
-same spacing and at a fine one. Then drives for every pose of a cube on a path.
-
-    python scripts/benchmark.py operator        about ten minutes on 2 idle cores
+Shifts and turns are random, and compared with the box solver at the same spacing and at a fine one. Then
+drives for every pose of a cube on a path. Takes about ten minutes on 2 idle cores.
 """
 
 import math

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from benchmarks.peer_programs.task import Array, Cells
 from numpy.typing import NDArray
+from scipy.fft import next_fast_len
 
 import autdtorch as at
 
@@ -25,21 +26,13 @@ ON_NODE = 1e-6
 
 @dataclass(frozen=True)
 class SceneGrid:
-    """The domain, focus and transducers of a scene on cells.
+    """The domain, focus and transducers of a scene on cells."""
 
-    Attributes:
-        density: harmonic mean over each cell (X, Y, Z) [kg/m^3].
-        source_cells: cells (S, 3) of the focus.
-        source_weights: their weights (S,).
-        receiver_cells: cells (R, 3) of the transducers.
-        receiver_weights: weights for each transducer (M, R).
-    """
-
-    density: Array
-    source_cells: Cells
-    source_weights: Array
-    receiver_cells: Cells
-    receiver_weights: NDArray[np.float64]
+    density: Array  # harmonic mean over each cell (X, Y, Z) [kg/m^3]
+    source_cells: Cells  # of the focus (S, 3)
+    source_weights: Array  # (S,)
+    receiver_cells: Cells  # of the transducers (R, 3)
+    receiver_weights: NDArray[np.float64]  # for each transducer (M, R)
 
 
 def scene_grid(scene: at.Scene, spacing: float, offset: float, layer_cells: int, smooth: bool) -> SceneGrid:
@@ -50,7 +43,7 @@ def scene_grid(scene: at.Scene, spacing: float, offset: float, layer_cells: int,
         spacing: edge of a cell [m].
         offset: of the cell centres from the focus along each axis [cells].
         layer_cells: of the boundary layer that the peer adds.
-        smooth: whether grid and layer get sides without prime factors over 7, for FFTs.
+        smooth: whether grid and layer get sides without prime factors over 5, for FFTs.
     """
     focus = scene.control_points[0].numpy()
     origin = focus + offset * spacing
@@ -117,12 +110,5 @@ def harmonic_density(
 
 
 def next_smooth(number: int) -> int:
-    """Return the smallest number from `number` on without prime factors over 7."""
-    while True:
-        rest = number
-        for prime in (2, 3, 5, 7):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1:
-            return number
-        number += 1
+    """Return the smallest number from `number` on without prime factors over 5."""
+    return int(next_fast_len(number, real=True))

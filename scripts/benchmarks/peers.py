@@ -2,10 +2,7 @@
 
 Makes a virtual environment for each peer in `--venvs`, then writes peers.json, peers.png and a block of the
 documentation. Scenes, receivers and errors are those of `benchmark.py accuracy`: the transfer matrix of one
-focus, simulated from the focus by reciprocity.
-
-    python scripts/benchmark.py peers --coarse     grids of 2 mm alone, as a trial
-    python scripts/benchmark.py peers              all
+focus, simulated from the focus by reciprocity. `--coarse` is a trial.
 """
 
 import logging
@@ -102,25 +99,17 @@ def main(page: Page, coarse: bool, venvs: Path) -> None:
 class Setting:
     """The settings of a peer's run.
 
-    Attributes:
-        peer: its name.
-        spacing: [mm].
-        order: of the differences in space; 0 for spectral.
-        offset: of cell centres from the focus [cells]. At 1 mm and less, 0 puts focus and transducers on cell
-            centres, 1/2 the faces of the cubes between them.
-        steps: time steps per period, in air and with obstacles.
-        layer_cells: of its boundary layer.
-        periods: after which a run with obstacles ends.
-        cases: names of the cases.
+    `offset` is that of cell centres from the focus [cells]. At 1 mm and less, 0 puts focus and transducers on
+    cell centres, 1/2 the faces of the cubes between them.
     """
 
     peer: str
-    spacing: float
-    order: int
+    spacing: float  # [mm]
+    order: int  # of the differences in space; 0 for spectral
     offset: float
-    steps: tuple[int, int]
-    layer_cells: int
-    periods: int
+    steps: tuple[int, int]  # time steps per period, in air and with obstacles
+    layer_cells: int  # of its boundary layer
+    periods: int  # after which a run with obstacles ends
     cases: tuple[str, ...] = tuple(CASES)
 
     def __str__(self) -> str:
@@ -153,27 +142,15 @@ SETTINGS = (
 
 @dataclass(frozen=True)
 class Point:
-    """A measurement.
-
-    Attributes:
-        case: the scene.
-        program: the simulator.
-        setting: how it was run.
-        periods: after which it ended; None if it decided itself.
-        remaining: relative distance to the steady state, or to the end of the run.
-        error: complex relative L2 error of the transfer matrix.
-        seconds: run time, without imports and compilation.
-        rate: cell updates per second; None if not counted.
-    """
+    """A measurement of a scene by a program."""
 
     case: str
     program: str
     setting: str
-    periods: int | None
-    remaining: float
-    error: float
-    seconds: float
-    rate: float | None
+    periods: int | None  # after which the run ended; None if it decided itself
+    remaining: float  # relative distance to the steady state, or to the end of the run
+    error: float  # complex relative L2 error of the transfer matrix
+    seconds: float  # without imports and compilation
 
 
 @dataclass(frozen=True)
@@ -187,11 +164,7 @@ class Refusal:
 
 
 def python_of(peer: str, folder: Path) -> Path:
-    """Return the interpreter of a peer's environment in `folder`, made if it lacks the packages.
-
-    Raises:
-        subprocess.CalledProcessError: it cannot be made.
-    """
+    """Return the interpreter of a peer's environment in `folder`, made if it lacks the packages."""
     environment = folder / peer
     python, done = environment / "bin" / "python", environment / "installed.txt"
     wanted = "\n".join(PACKAGES[peer])
@@ -215,16 +188,14 @@ def task_of(case: Case, setting: Setting) -> tuple[Task, NDArray[np.float64]]:
     # A leapfrog with this step advances a whole period in `steps`; k-space schemes do so by themselves.
     leapfrog = math.sin(math.pi / steps) * steps / math.pi if setting.order else 1.0
     last = min(setting.periods, AIR_PERIODS) if in_air else setting.periods
+    parts = {name: getattr(grid, name) for name in vars(grid) if name != "receiver_weights"}
     task = Task(
-        density=grid.density,
+        **parts,
         sound_speed=scene.medium.sound_speed,
         spacing=spacing,
         frequency=scene.frequency,
         time_step=leapfrog / (steps * scene.frequency),
         steps_per_period=steps,
-        source_cells=grid.source_cells,
-        source_weights=grid.source_weights,
-        receiver_cells=grid.receiver_cells,
         ends=np.array([end for end in ENDS if end <= last]),
         layer_cells=setting.layer_cells,
         order=setting.order,
@@ -233,11 +204,7 @@ def task_of(case: Case, setting: Setting) -> tuple[Task, NDArray[np.float64]]:
 
 
 def answer_of(peer: str, task: Task, venvs: Path) -> Answer:
-    """Return a peer's answer.
-
-    Raises:
-        subprocess.CalledProcessError: it fails.
-    """
+    """Return a peer's answer; subprocess.CalledProcessError if it fails."""
     with tempfile.TemporaryDirectory() as folder:
         asked, answered = Path(folder) / "task.npz", Path(folder) / "answer.npz"
         task.save(asked)
@@ -265,12 +232,11 @@ def peer_points(setting: Setting, venvs: Path) -> Iterator[Point | Refusal]:
         exact, last = case.exact[0].numpy(), matrices[-1]
         if factor is None:
             factor = np.vdot(last, exact) / np.vdot(last, last)
-        rate = answer.updated_cells * task.steps / answer.stepping_seconds
         for end, matrix in zip(task.ends.tolist(), matrices, strict=True):
             seconds = answer.setup_seconds + answer.stepping_seconds * end / task.ends[-1]
             error = float(np.linalg.norm(factor * matrix - exact) / np.linalg.norm(exact))
             left = float(np.linalg.norm(matrix - last) / np.linalg.norm(last))
-            yield Point(name, setting.peer, str(setting), end, left, error, float(seconds), rate)
+            yield Point(name, setting.peer, str(setting), end, left, error, float(seconds))
 
 
 def our_points(name: str) -> Iterator[Point]:
@@ -281,7 +247,7 @@ def our_points(name: str) -> Iterator[Point]:
         runs = [simulate(case, spacing, OUR_TOLERANCE) for _ in range(REPETITIONS)]
         seconds = statistics.median(run.seconds for run in runs)
         error = relative_error(runs[0].matrix, case.exact)
-        yield Point(name, OURS, f"{spacing:g} mm", None, OUR_TOLERANCE, error, seconds, None)
+        yield Point(name, OURS, f"{spacing:g} mm", None, OUR_TOLERANCE, error, seconds)
 
 
 def measure(settings: Sequence[Setting], venvs: Path) -> Iterator[Point | Refusal]:

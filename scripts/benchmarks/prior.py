@@ -1,12 +1,11 @@
 """An inaccurate simulation as the prior of a measurement, behind the two cubes with an AUTD3.
 
 The transducers of the measured array differ in gain and phase, and the obstacle stands elsewhere. Prints the
-weakest focus as a share of the optimum.
-
-    python scripts/benchmark.py prior     15 minutes on an idle core
+weakest focus as a share of the optimum. Takes 15 minutes on an idle core.
 """
 
 import dataclasses
+import functools
 import itertools
 import time
 from collections.abc import Iterator
@@ -23,6 +22,7 @@ from autdtorch.objectives.perturbations import random_rms
 GAIN, PHASE = 0.1, 0.5  # rms deviations of the transducers: of the logarithm of the gain, and [rad]
 SHIFT = 2e-3  # of the obstacle, in any direction [m]
 BUDGETS = (16, 32, 64)
+best_drive = functools.partial(at.gradient_ascent, steps=1000)
 
 OPTIONS = {
     "--trials": {"type": int, "default": 20, "help": "arrays that are measured"},
@@ -69,9 +69,9 @@ def rows(scene: at.Scene, trials: int, snr: float) -> Iterator[list[str]]:
     """Compare the drives of simulations with those that start from one and read."""
     simulated, empty = matrix_of(scene), matrix_of(dataclasses.replace(scene, obstacles=()))
     arrays = [Measured(scene, seed) for seed in range(trials)]
-    best = torch.stack([array.weakest(best_drive(array.matrix)) for array in arrays])
+    best = torch.stack([array.weakest(best_drive(array.matrix).drive) for array in arrays])
     for name, matrix in (("free space", empty), ("simulation", simulated)):
-        drive = best_drive(matrix)
+        drive = best_drive(matrix).drive
         shares = torch.stack([array.weakest(drive) for array in arrays]) / best
         yield [name, "0", quartiles(shares), f"{shares.min():.3f}", ""]
     # The displacement has any direction: along each axis, it has this rms.
@@ -88,15 +88,5 @@ def rows(scene: at.Scene, trials: int, snr: float) -> Iterator[list[str]]:
                 return array.weakest(at.run(method, observed, seed=seed).drive) / best[seed]
 
             shares, seconds = timed(lambda: torch.stack([*map(share, range(trials))]), time.process_time)
-            yield [
-                name + what,
-                str(count),
-                quartiles(shares),
-                f"{shares.min():.3f}",
-                f"{seconds / trials:.1f} s",
-            ]
-
-
-def best_drive(matrix: torch.Tensor) -> torch.Tensor:
-    """Return the best drive (1, M) of a matrix."""
-    return at.gradient_ascent(matrix, steps=1000).drive
+            least, spent = f"{shares.min():.3f}", f"{seconds / trials:.1f} s"
+            yield [name + what, str(count), quartiles(shares), least, spent]

@@ -1,32 +1,22 @@
 """Rigid sphere and cubes against AcousTools' BEM.
 
-Needs `pip install 'autdtorch[crosscheck]'`. Fills in a block of the documentation. The sources are points:
-AcousTools' pistons with radius 0. Scenes and errors are those of `benchmark.py accuracy`, with rigid cubes.
-The reference is the exact series for the sphere, and the limit of our grids for the cubes.
-
-    python scripts/check.py acoustools
+Needs `pip install 'autdtorch[crosscheck]'`. The sources are points: AcousTools' pistons with radius 0. Scenes
+and errors are those of `benchmark.py accuracy`, with rigid cubes. The reference is the exact series for the
+sphere, and the limit of our grids for the cubes.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 
 import torch
 import vedo
 from acoustools.BEM import compute_E
 from acoustools.Mesh import calculate_features, get_CHIEF_points
-from shared.cases import (
-    SPHERE_RADIUS,
-    Case,
-    Simulation,
-    close_scene,
-    cubes_with,
-    simulate,
-    sphere_case,
-)
+from shared.cases import SPHERE_RADIUS, Case, close_scene, cubes_with, simulate, sphere_case
 from shared.document import Page, percent, printed, table
 from shared.scenes import relative_error
-from shared.timing import timed
+from shared.timing import shortest
 
 import autdtorch as at
 
@@ -43,11 +33,7 @@ CHIEF_POINTS, CHIEF_DEPTH = 30, 3e-3
 """Approximate number of inner points with zero field, and their depth [m]."""
 
 REPETITIONS = 3
-"""Repetitions of a run shorter than `SHORT`; the fastest counts."""
-SHORT = 3.0  # [s]
-
-PLANE_SPACING = 1e-3
-"""Spacing of the points behind the obstacles [m]."""
+"""Repetitions of a run; the fastest counts."""
 
 
 def main(page: Page) -> None:
@@ -61,7 +47,6 @@ def main(page: Page) -> None:
     page.write(
         f"{', '.join(f'{name} {version(name)}' for name in PACKAGES)}.",
         table(("scene", "program", "error", "with CHIEF", "run time (CHIEF)"), lines),
-        plane_times(cubes, meshes[-1][1][0], 1.0),
     )
 
 
@@ -99,55 +84,23 @@ def boundary_elements(case: Case, mesh: vedo.Mesh, chief: bool = True) -> torch.
     scene = case.scene
     normals = scene.array.normals.to(torch.complex64)
     inside = get_CHIEF_points(mesh, CHIEF_POINTS, "uniform", scale=CHIEF_DEPTH) if chief else None
+    points, sources = case.points.T[None].to(torch.complex64), scene.array.positions.float()
     matrix = compute_E(
-        mesh,
-        case.points.T[None].to(torch.complex64),
-        scene.array.positions.float(),
-        use_cache_H=False,
-        H_method="LU",
-        p_ref=scene.array.source_strength,
-        norms=normals,
-        k=scene.wavenumber,
-        transducer_radius=0.0,
-        internal_points=inside,
-    )
+        *(mesh, points, sources), use_cache_H=False, H_method="LU", p_ref=scene.array.source_strength,
+        norms=normals, k=scene.wavenumber, transducer_radius=0.0, internal_points=inside,
+    )  # fmt: skip
     return matrix[0].to(torch.complex128)
-
-
-def timed_elements(case: Case, mesh: vedo.Mesh, chief: bool) -> Simulation:
-    """Return AcousTools' matrix and its run time, without the meshing."""
-    return Simulation(*timed(lambda: boundary_elements(case, mesh, chief)))
-
-
-def repeated(measure: Callable[[], Simulation]) -> Simulation:
-    """Return the fastest of several measurements; a long one is not repeated."""
-    runs = [measure()]
-    while runs[0].seconds < SHORT and len(runs) < REPETITIONS:
-        runs.append(measure())
-    return min(runs, key=lambda run: run.seconds)
 
 
 def rows(case: Case, meshes: Sequence[vedo.Mesh]) -> Iterator[list[str]]:
     """Yield the errors and run times of both programs."""
     for mesh in meshes:
-        plain, chief = (repeated(lambda m=mesh, c=c: timed_elements(case, m, c)) for c in (False, True))
-        both = [percent(relative_error(run.matrix, case.exact)) for run in (plain, chief)]
-        yield [case.name, f"AcousTools, {mesh.ncells} triangles", *both, f"{chief.seconds:.3g} s"]
+        plain = boundary_elements(case, mesh, chief=False)
+        chief, seconds = shortest(lambda m=mesh: boundary_elements(case, m), REPETITIONS)
+        both = [percent(relative_error(matrix, case.exact)) for matrix in (plain, chief)]
+        yield [case.name, f"AcousTools, {mesh.ncells} triangles", *both, f"{seconds:.3g} s"]
     simulate(case, SPACINGS[0])  # compiles the kernel
     for spacing in SPACINGS:
-        run = repeated(lambda h=spacing: simulate(case, h))
-        error = percent(relative_error(run.matrix, case.exact))
-        yield [case.name, f"autdtorch, {spacing:g} mm", error, "", f"{run.seconds:.3g} s"]
-
-
-def plane_times(case: Case, mesh: vedo.Mesh, spacing: float) -> str:
-    """Compare the run times for a plane of points behind the obstacles at `spacing` [mm]."""
-    points = at.Plane((80e-3, 50e-3, 50e-3), (1, 0, 0), (60e-3, 60e-3)).points(PLANE_SPACING).reshape(-1, 3)
-    wide = dataclasses.replace(case, points=points)
-    theirs, ours = timed_elements(wide, mesh, True), simulate(wide, spacing)
-    difference = percent(relative_error(ours.matrix, theirs.matrix))
-    return (
-        f"{len(case.scene.array)} transducers to {len(points)} points of a plane behind the {case.name}: "
-        f"AcousTools ({mesh.ncells} triangles, CHIEF) {theirs.seconds:.3g} s, autdtorch ({spacing:g} mm) "
-        f"{ours.seconds:.3g} s. The matrices differ by {difference}."
-    )
+        run, seconds = shortest(lambda h=spacing: simulate(case, h).matrix, REPETITIONS)
+        error = percent(relative_error(run, case.exact))
+        yield [case.name, f"autdtorch, {spacing:g} mm", error, "", f"{seconds:.3g} s"]

@@ -1,11 +1,8 @@
 """Free-space fields of an AUTD3 against the emulator of its SDK.
 
-Needs `pip install 'autdtorch[crosscheck]'`. Fills in a block of the documentation. The emulator has two
-fields. "RMS" is a sum of point sources without directivity or absorption, with the phases and pulse widths of
-the emulated firmware. "Instant" is the pressure over time, of square waves filtered by a model of the
-transducer.
-
-    python scripts/check.py autd3
+Needs `pip install 'autdtorch[crosscheck]'`. The emulator has two fields. "RMS" is a sum of point sources
+without directivity or absorption, with the phases and pulse widths of the emulated firmware. "Instant" is the
+pressure over time, of square waves filtered by a model of the transducer.
 """
 
 import cmath
@@ -23,7 +20,6 @@ from autd3_pattern import IntensityBuffer, PhaseBuffer, focus, wavelength
 from numpy.typing import NDArray
 from shared.document import Page, table
 from shared.scenes import relative_error
-from shared.timing import timed
 
 import autdtorch as at
 from autdtorch.analytic.green import free_space_matrix
@@ -70,23 +66,16 @@ def main(page: Page, resolution: float) -> None:
         f"Transducer positions agree within {1e9 * largest_shift():.0f} nm. The emulator's instant field is "
         f"{abs(factor):.4f} times ours and {late:.1f} degrees late, by its model of a transducer; its "
         f"peak is {peak:.3f} times the RMS field of the emulator, where a sine has the square root of 2.",
-        run_times(grid),
     )
 
 
 @dataclass(frozen=True)
 class Emission:
-    """The output of the emulated device.
-
-    Attributes:
-        record: of the emulator.
-        phases: levels (M,), 256 in a period.
-        pulse_widths: (M,), 512 in a period.
-    """
+    """The output of the emulated device."""
 
     record: Record
-    phases: NDArray[np.int64]
-    pulse_widths: NDArray[np.int64]
+    phases: NDArray[np.int64]  # levels (M,), 256 in a period
+    pulse_widths: NDArray[np.int64]  # (M,), 512 in a period
 
     @property
     def drive(self) -> torch.Tensor:
@@ -188,31 +177,17 @@ def rows(grid: Grid) -> tuple[list[list[str]], complex]:
     instant_points, instant = phasor(focused, grid)
     factor, left = scaled(instant, ours(array, focused.drive, instant_points))
 
-    def difference(field: torch.Tensor, other: torch.Tensor) -> float:
-        return relative_error(field.abs() / math.sqrt(2), other)
+    def difference(
+        other: torch.Tensor, array: at.TransducerArray, drive: torch.Tensor, attenuation: float = 0.0
+    ) -> float:
+        return relative_error(ours(array, drive, points, attenuation).abs() / math.sqrt(2), other)
 
-    same = difference(ours(array, focused.drive, points), theirs)
-    same_random = difference(ours(array, random.drive, points), theirs_random)
-    wide = difference(ours(discs, focused.drive, points), theirs)
-    weak = difference(ours(array, focused.drive, points, attenuation), theirs)
+    weak = difference(theirs, array, focused.drive, attenuation)
     differences = (
-        ("RMS, focus", "drive as recorded", same, "float32"),
-        ("RMS, random", "drive as recorded", same_random, "float32"),
+        ("RMS, focus", "drive as recorded", difference(theirs, array, focused.drive), "float32"),
+        ("RMS, random", "drive as recorded", difference(theirs_random, array, random.drive), "float32"),
         ("instant, focus", "drive as recorded, scaled", left, "waveforms between samples"),
-        ("RMS, focus", "discs of radius 4.5 mm", wide, "directivity"),
+        ("RMS, focus", "discs of radius 4.5 mm", difference(theirs, discs, focused.drive), "directivity"),
         ("RMS, focus", f"air that absorbs {ABSORPTION:g} dB/m", weak, "absorption"),
     )
     return [[theirs, ours, f"{value:.2g}", cause] for theirs, ours, value, cause in differences], factor
-
-
-def run_times(grid: Grid) -> str:
-    """Compare the run times for all points, each of a second call."""
-    array, emission = our_array(), play_focus()
-    points, _ = rms(emission, grid)
-    ours(array, emission.drive, points)
-    _, emulator = timed(lambda: rms(emission, grid))
-    _, here = timed(lambda: ours(array, emission.drive, points))
-    return (
-        f"{len(points)} points take {emulator:.2g} s in the emulator (float32, all cores) and {here:.2g} s "
-        f"here (float64, threads: {torch.get_num_threads()})."
-    )

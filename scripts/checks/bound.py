@@ -3,11 +3,11 @@
 Half of the random scenes have an unstructured transfer matrix, the others one of transducers and control
 points in air; 2 to 32 transducers, 1 to 8 foci. For contrast, 2 to 8 transducers and enough background points
 that it has a bound. Exits with 1 if a score is above its bound.
-
-    python scripts/check.py bound --scenes 1000
 """
 
 from collections import defaultdict
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -34,21 +34,20 @@ def main(scenes: int, seed: int) -> int:
     return int(above + check_random_scenes(scenes, seed) > 0)
 
 
+@dataclass
 class MatrixPropagator:
-    """A propagator with any transfer matrix."""
+    """A propagator with any transfer matrix (P, M)."""
 
-    def __init__(self, scene: at.Scene, matrix: torch.Tensor) -> None:
-        """Take the `matrix` (P, M)."""
-        self.scene = scene
-        self._matrix = matrix
+    scene: at.Scene
+    matrix: torch.Tensor
 
     def transfer_matrix(self, points: torch.Tensor | None = None) -> torch.Tensor:
         """Return the matrix."""
-        return self._matrix
+        return self.matrix
 
     def field(self, drive: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
         """Return the pressure at the control points."""
-        return drive @ self._matrix.T
+        return drive @ self.matrix.T
 
 
 def random_objective(generator: torch.Generator, background: bool = False) -> at.SimulatedObjective:
@@ -79,16 +78,12 @@ def random_objective(generator: torch.Generator, background: bool = False) -> at
 
 def highest_scores(objective: at.SimulatedObjective) -> dict[str, float]:
     """Return the weakest focus [Pa] that each method finds."""
-    transducers = len(objective.scene.array)
-    return {
-        "lss": at.lss(objective).score.item(),
-        "lssg": at.lssg(objective).score.item(),
-        "random_search": at.random_search(objective).score.item(),
-        "gabs": at.gabs(objective).score.item(),
-        "bayes_opt": at.bayes_opt(objective, evaluations=48, fixed_transducer=0).score.item(),
-        "identify": at.identify(objective, evaluations=4 * transducers).score.item(),
-        "gradient_ascent": at.gradient_ascent(objective).score.item(),
+    methods = {
+        each.__name__: each for each in (at.lss, at.lssg, at.random_search, at.gabs, at.gradient_ascent)
     }
+    methods["bayes_opt"] = partial(at.bayes_opt, evaluations=48, fixed_transducer=0)
+    methods["identify"] = partial(at.identify, evaluations=4 * len(objective.scene.array))
+    return {name: method(objective).score.item() for name, method in methods.items()}
 
 
 def check_random_scenes(count: int, seed: int) -> int:
@@ -116,15 +111,15 @@ def random_goals(objective: at.SimulatedObjective, generator: torch.Generator) -
     points = len(objective.scene.control_points)
     weights = (0.5 + torch.rand(points, dtype=torch.float64, generator=generator)).tolist()
     unit = at.focus_bound(objective.transfer_matrix) * float(torch.rand((), generator=generator))
-    targets = [unit * weight for weight in weights]
-    goals: list[at.Goal] = [at.WeakestFocus(weights), at.MeanPressure()]
-    goals += [at.TargetPressures(targets)] if unit > 0 else []
-    if points > 1:
-        ratio = float(10 ** (-2 * torch.rand((), generator=generator)))
-        loud: list[at.Goal] = [at.WeakestFocus(weights[1:]), at.MeanPressure()]
-        loud += [at.TargetPressures(targets[1:])] if unit > 0 else []
-        goals += [at.QuietPoints(goal, [0], ratio) for goal in loud]
-    return goals
+
+    def loud(first: int) -> list[at.Goal]:
+        targets = [at.TargetPressures([unit * weight for weight in weights[first:]])] if unit > 0 else []
+        return [at.WeakestFocus(weights[first:]), at.MeanPressure(), *targets]
+
+    if points == 1:
+        return loud(0)
+    ratio = float(10 ** (-2 * torch.rand((), generator=generator)))
+    return loud(0) + [at.QuietPoints(goal, [0], ratio) for goal in loud(1)]
 
 
 def check_goals(count: int, seed: int) -> int:

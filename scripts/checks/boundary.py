@@ -1,10 +1,9 @@
 """Reflection of the boundary layer, measured against a larger domain.
 
 Prints a Markdown table. A source and receivers lie in a row, all at one distance from a layer. A second run
-has that layer so far away that its echo does not return in time; the difference of the two is the echo. It
-is compared with the wave of the source's mirror image, with the inner face of the layer as the mirror.
-
-    python scripts/check.py boundary        a few seconds on 2 idle cores
+has that layer so far away that its echo does not return in time; the difference of the two is the echo. It is
+compared with the wave of the source's mirror image, with the inner face of the layer as the mirror. Takes a
+few seconds on 2 idle cores.
 """
 
 import math
@@ -49,17 +48,10 @@ def main(cells_per_wavelength: float, distance: int, aside: int) -> None:
 def measured_reflection(
     cells_per_wavelength: float, layer_cells: int, degrees: Array, distance: int, aside: int
 ) -> tuple[Array, Array]:
-    """Return the magnitude of a layer's echo relative to the wave of the mirror image.
+    """Return the angles (n,) [degrees] at whole cells, and a layer's echo (n,) relative to a mirror's.
 
-    Args:
-        cells_per_wavelength: of the grid.
-        layer_cells: thickness of the layer.
-        degrees: angles of incidence (n,), in [0, 90).
-        distance: cells from the layer to the source and the receivers.
-        aside: cells from them to the other layers.
-
-    Returns:
-        The angles (n,) [degrees] at whole cells, and the magnitudes (n,).
+    The source and the receivers, at angles of incidence of about `degrees` (n,), are `distance` cells from
+    the layer, and `aside` cells from the other layers.
     """
     offsets = np.rint(2 * distance * np.tan(np.radians(degrees))).astype(np.int64)
     path = np.hypot(2 * distance, offsets)

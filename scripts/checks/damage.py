@@ -3,8 +3,6 @@
 Damages the files of a study and of an emulated hardware trial at random. Each must end with the numbers of
 the undisturbed run, bit for bit. Every row that the damage left whole and every damaged file must stay on
 disk, and the next start must log no warning.
-
-    python scripts/check.py damage --damages 300
 """
 
 import functools
@@ -16,15 +14,14 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, replace
-from logging.handlers import BufferingHandler
 from pathlib import Path
 from unittest import mock
 
 import torch
+from shared.timing import logged_warnings
 
 import autdtorch as at
 from autdtorch import hardware
-from autdtorch.methods.solution import Solution
 from autdtorch.study.folder import PREVIOUS, TRIALS_FILE
 from autdtorch.study.results import PROVENANCE_FILE
 from autdtorch.study.results_file import RESULTS_FILE
@@ -76,7 +73,7 @@ def study(folder: Path, seed: int = 0) -> list[torch.Tensor]:
     )
     solutions = [result.solution for scene in results.scenes.values() for result in scene.methods.values()]
     matrices = [scene.transfer_matrix for scene in results.scenes.values()]
-    return [*matrices, *(number for solution in solutions for number in _numbers(solution))]
+    return [*matrices, *(number for solution in solutions for number in astuple(solution))]
 
 
 def trial(folder: Path, seed: int = 0) -> list[torch.Tensor]:
@@ -90,13 +87,9 @@ def trial(folder: Path, seed: int = 0) -> list[torch.Tensor]:
         sensor = hardware.EmulatedSensor(bench)
         objective = hardware.HardwareObjective(scene, limited, sensor, folder / LOG_FILE, {"seed": seed})
         try:
-            return _numbers(at.gabs(objective, levels=8, seed=seed))
+            return list(astuple(at.gabs(objective, levels=8, seed=seed)))
         finally:
             objective.log.end(limited.seconds_on)
-
-
-def _numbers(solution: Solution) -> list[torch.Tensor]:
-    return list(astuple(solution))
 
 
 Damage = Callable[[random.Random, bytes, bytes], bytes]
@@ -154,21 +147,15 @@ MOST_LOST = {"byte changed": 1, "end of a line damaged": 0}
 
 @dataclass(frozen=True)
 class Subject:
-    """A program whose files are damaged.
+    """A program whose files are damaged, and the numbers of its undisturbed run."""
 
-    Attributes:
-        journal: name of its file of lines.
-        begin: starts or resumes it in a folder, and returns all its numbers.
-        numbers: of the undisturbed run.
-        states: folders of a finished and of an interrupted run.
-        another: the folder of another run.
-    """
-
-    journal: str
-    begin: Callable[[Path], list[torch.Tensor]]
+    journal: str  # name of its file of lines
+    begin: Callable[
+        [Path], list[torch.Tensor]
+    ]  # starts or resumes it in a folder, and returns all its numbers
     numbers: list[torch.Tensor]
-    states: tuple[Path, Path]
-    another: Path
+    states: tuple[Path, Path]  # folders of a finished and of an interrupted run
+    another: Path  # folder of another run
 
 
 def study_subject(folder: Path) -> Subject:
@@ -220,14 +207,7 @@ def _seconds_on(rows: set[bytes]) -> float:
 
 
 def journal_problems(before: bytes, damaged: bytes, journal: Path, most_lost: int) -> list[str]:
-    """Return the broken promises about a file of lines, after the program was resumed.
-
-    Args:
-        before: its content before the damage.
-        damaged: its content after the damage.
-        journal: its path.
-        most_lost: rows that the damage can cost.
-    """
+    """Return the broken promises about a resumed file of lines; the damage can cost `most_lost` rows."""
     wrong, content = [], _content(journal)
     rows, whole = _rows(content), {row for row in _rows(before) if row in damaged}
     if lost := whole - rows:
@@ -265,22 +245,15 @@ def problems(subject: Subject, state: Path, folder: Path, damaged: bytes, name: 
         wrong.append(f"{again} trials or evaluations made where {missing} were missing")
     if name in (RESULTS_FILE, PROVENANCE_FILE) and (folder / f"{PREVIOUS}1" / name).read_bytes() != damaged:
         wrong.append("the damaged file is lost")
-    warned = BufferingHandler(1000)
-    warned.setLevel(logging.WARNING)
-    logging.getLogger("autdtorch").addHandler(warned)
-    numbers = subject.begin(folder)
-    logging.getLogger("autdtorch").removeHandler(warned)
-    if not all(map(torch.equal, numbers, subject.numbers)) or warned.buffer:
-        wrong.append(f"the next start is not clean: {[record.getMessage() for record in warned.buffer]}")
+    with logged_warnings() as warned:
+        numbers = subject.begin(folder)
+    if not all(map(torch.equal, numbers, subject.numbers)) or warned:
+        wrong.append(f"the next start is not clean: {[record.getMessage() for record in warned]}")
     return wrong
 
 
 def check(damages: int, seed: int, folder: Path) -> tuple[Counter[str], list[str]]:
-    """Damage and resume `damages` times.
-
-    Returns:
-        The number of damages by kind and file, and a line for each broken promise.
-    """
+    """Damage and resume; return the damages by kind and file, and a line for each broken promise."""
     rng = random.Random(seed)
     subjects = [study_subject(folder), trial_subject(folder)]
     counts: Counter[str] = Counter()

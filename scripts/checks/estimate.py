@@ -1,35 +1,23 @@
 """Estimates of `at.estimate` against measured memory and time.
 
-Each scene has a new process, which first simulates a small scene to load the kernels. The memory is
-the peak during the simulation over the memory before (Linux with glibc).
-
-    python scripts/check.py estimate            a minute or two; the machine should be idle otherwise
+Each scene has a new process, which first simulates a small scene to load the kernels. The memory is the peak
+during the simulation over the memory before (Linux with glibc). Takes a minute or two; the machine should be
+idle otherwise.
 """
 
 import ctypes
 import logging
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import pyvista
+from shared.document import printed, table
 from shared.scenes import paper_scene, uncached
 from shared.timing import in_new_process, timed
 
 import autdtorch as at
-
-
-class Cost(NamedTuple):
-    """Estimated and measured memory [byte], time [s] and number of runs."""
-
-    estimated_memory: int
-    memory: int
-    estimated_seconds: float
-    seconds: float
-    estimated_runs: int
-    runs: int
 
 
 def behind(
@@ -65,55 +53,40 @@ AUTD3 = at.TransducerArray.autd3(center=(0, 50e-3, 50e-3), normal=(1, 0, 0))
 TWELVE = [(75e-3 + 1.3e-3 * n, 20e-3 + 5.1e-3 * n, 80e-3 - 4.3e-3 * n) for n in range(12)]
 """Points behind the obstacles, none the image of another [m]."""
 
-Case = tuple[Callable[[], at.Scene], str, float, str]
-"""A maker of a scene, the method, the spacing [mm] and the precision of the fields."""
-
-
-def case(scene: str | Callable[[], at.Scene], method: str, spacing: float, dtype: str = "float32") -> Case:
-    """Return a case of a scene by its maker, or of one of the paper's by name."""
-    return partial(paper_scene, scene) if isinstance(scene, str) else scene, method, spacing, dtype
-
-
-CASES: dict[str, Case] = {
-    "empty domain": case("homogeneous", "full", 1.0),
-    "empty domain, fine": case("homogeneous", "full", 0.7),
-    "two cubes": case("two_cubes", "box", 1.0),
-    "two cubes, fine": case("two_cubes", "box", 0.5),
-    "two cubes, domain": case("two_cubes", "full", 1.0),
-    "two cubes, float64": case("two_cubes", "full", 1.0, "float64"),
-    "three cubes": case("three_cubes", "box", 0.7),
-    "three cubes, domain": case("three_cubes", "full", 1.2),
-    "sphere of the paper": case("sphere", "box", 0.8),
-    "rigid sphere": case(partial(behind, BALL), "box", 0.8),
-    "helium": case(partial(behind, HELIUM), "box", 1.0),
-    "tilted cube": case(partial(behind, TILTED), "box", 0.8),
-    "plate": case(partial(behind, PLATE), "box", 1.0),
-    "wall": case(partial(behind, WALL), "full", 1.5),
-    "spheres apart": case(partial(behind, *APART), "box", 0.7),
-    "rod": case(partial(behind, ROD), "full", 1.2),
-    "AUTD3 with discs": case(partial(behind, array=AUTD3), "box", 1.0),
-    "twelve points": case(partial(behind, points=TWELVE), "box", 0.8),
-    "mesh": case(head, "box", 1.0),
-    "voxels": case(partial(behind, VOXELS), "box", 1.0),
+CASES: dict[str, Any] = {
+    "empty domain": ("homogeneous", "full", 1.0),
+    "empty domain, fine": ("homogeneous", "full", 0.7),
+    "two cubes": ("two_cubes", "box", 1.0),
+    "two cubes, fine": ("two_cubes", "box", 0.5),
+    "two cubes, domain": ("two_cubes", "full", 1.0),
+    "two cubes, float64": ("two_cubes", "full", 1.0, "float64"),
+    "three cubes": ("three_cubes", "box", 0.7),
+    "three cubes, domain": ("three_cubes", "full", 1.2),
+    "sphere of the paper": ("sphere", "box", 0.8),
+    "rigid sphere": (partial(behind, BALL), "box", 0.8),
+    "helium": (partial(behind, HELIUM), "box", 1.0),
+    "tilted cube": (partial(behind, TILTED), "box", 0.8),
+    "plate": (partial(behind, PLATE), "box", 1.0),
+    "wall": (partial(behind, WALL), "full", 1.5),
+    "spheres apart": (partial(behind, *APART), "box", 0.7),
+    "rod": (partial(behind, ROD), "full", 1.2),
+    "AUTD3 with discs": (partial(behind, array=AUTD3), "box", 1.0),
+    "twelve points": (partial(behind, points=TWELVE), "box", 0.8),
+    "mesh": (head, "box", 1.0),
+    "voxels": (partial(behind, VOXELS), "box", 1.0),
 }
+"""Maker of a scene or name of the paper's, method, spacing [mm], and precision if not float32."""
 OPTIONS = {"--scenes": {"nargs": "+", "choices": CASES, "default": list(CASES), "help": "checked scenes"}}
 
 
 def main(scenes: list[str]) -> None:
     """Print estimates, measurements and their ratios."""
-    form = "{:22s}{:>10s}{:>10s}{:>7s}{:>10s}{:>10s}{:>7s}{:>8s}"
-    print(form.format("scene", "memory", "measured", "ratio", "time", "measured", "ratio", "runs"))
-    ratios = []
-    for name in scenes:
-        cost = in_new_process(measure, name)
-        ratios.append((cost.estimated_memory / cost.memory, cost.estimated_seconds / cost.seconds))
-        memory = [f"{bytes / 1e6:.0f} MB" for bytes in (cost.estimated_memory, cost.memory)]
-        seconds = [f"{time:.2f} s" for time in (cost.estimated_seconds, cost.seconds)]
-        both = [f"{ratio:.2f}" for ratio in ratios[-1]]
-        runs = f"{cost.estimated_runs}/{cost.runs}"
-        print(form.format(name, *memory, both[0], *seconds, both[1], runs), flush=True)
-    for what, column in zip(("memory", "time"), zip(*ratios, strict=True), strict=True):
-        print(f"{what}: within a factor of {max(max(ratio, 1 / ratio) for ratio in column):.2f}")
+    rows = printed(in_new_process(row, name) for name in scenes)
+    header = ["scene", *["memory", "measured", "ratio"], *["time", "measured", "ratio"], "runs"]
+    print("", table(header, rows), sep="\n")
+    for what, column in (("memory", 3), ("time", 6)):
+        ratios = [float(cells[column]) for cells in rows]
+        print(f"{what}: within a factor of {max(max(ratio, 1 / ratio) for ratio in ratios):.2f}")
 
 
 def memory_of(entry: str) -> int:
@@ -122,11 +95,12 @@ def memory_of(entry: str) -> int:
     return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(entry))
 
 
-def measure(name: str) -> Cost:
-    """Return estimate and measurement of a case, in a process that has done nothing else."""
+def row(name: str) -> list[str]:
+    """Return estimates, measurements and ratios of a case, in a process that has done nothing else."""
     logging.disable()
-    maker, method, spacing, dtype = CASES[name]
-    scene = maker()
+    maker, method, spacing, *other = CASES[name]
+    scene = paper_scene(maker) if isinstance(maker, str) else maker()
+    (dtype,) = other or ["float32"]
     for kind in ("box", "full"):
         uncached(paper_scene("two_cubes"), kind, 2.5, 2e-3, dtype=dtype).transfer_matrix()
     estimate = at.estimate(scene, 1e-3 * spacing, method=method, dtype=dtype)
@@ -135,6 +109,10 @@ def measure(name: str) -> Cost:
     before = memory_of("VmRSS")
     propagator, making = timed(lambda: uncached(scene, method, spacing, 2e-3, dtype=dtype))
     _, seconds = timed(propagator.transfer_matrix)
-    memory = memory_of("VmHWM") - before
-    runs = propagator.planned_runs
-    return Cost(estimate.memory, memory, estimate.seconds, making + seconds, estimate.runs, runs)
+    cells = [name]
+    for claim, true, unit in (
+        (1e-6 * estimate.memory, 1e-6 * (memory_of("VmHWM") - before), "MB"),
+        (estimate.seconds, making + seconds, "s"),
+    ):
+        cells += [f"{claim:.3g} {unit}", f"{true:.3g} {unit}", f"{claim / true:.2f}"]
+    return [*cells, f"{estimate.runs}/{propagator.planned_runs}"]

@@ -2,8 +2,6 @@
 
 Two threads simulate all the time; at some of the forks they compile the kernels. Each forked process must get
 the numbers of its parent. One that takes too long prints where it waits.
-
-    python scripts/check.py forks --forks 60
 """
 
 import faulthandler

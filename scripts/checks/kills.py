@@ -2,8 +2,6 @@
 
 Uses SIGKILL, also while they start. Each must end with the numbers of the undisturbed run, bit for bit, and
 repeat nothing that was finished.
-
-    python scripts/check.py kills --kills 40
 """
 
 import json
@@ -34,17 +32,11 @@ _LONGEST = 600.0  # [s]
 
 @dataclass(frozen=True)
 class Subject:
-    """A program to kill.
+    """A program to kill."""
 
-    Attributes:
-        command: starts or resumes it in the working directory.
-        journals: pattern of the files to which it appends lines.
-        numbers: reads all its results in a folder.
-    """
-
-    command: tuple[str, ...]
-    journals: str
-    numbers: Callable[[Path], list[torch.Tensor]]
+    command: tuple[str, ...]  # starts or resumes it in the working directory
+    journals: str  # pattern of the files to which it appends lines
+    numbers: Callable[[Path], list[torch.Tensor]]  # reads all its results in a folder
 
     def start(self, folder: Path) -> subprocess.Popen[bytes]:
         """Start it in a folder, with its output in a file there."""
@@ -59,13 +51,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class Calm:
-    """The results of an undisturbed run.
-
-    Attributes:
-        numbers: all results.
-        lines: number of trials or evaluations in its journals.
-        first: time until the first of them [s].
-    """
+    """An undisturbed run: its results, the lines in its journals, and the time until the first [s]."""
 
     numbers: list[torch.Tensor]
     lines: int
@@ -141,11 +127,7 @@ def calm_run(subject: Subject, folder: Path) -> Calm:
 def killed_run(
     subject: Subject, calm: Calm, most: int, rng: random.Random, folder: Path
 ) -> tuple[int, list[str]]:
-    """Kill and resume until a process ends by itself, or was killed `most` times.
-
-    Returns:
-        The number of kills, and a line for each broken promise.
-    """
+    """Kill and resume, at most `most` times; return the kills, and a line for each broken promise."""
     kills = 0
     while kills < most:
         done = subject.lines(folder)
@@ -171,11 +153,7 @@ def killed_run(
 
 
 def check(name: str, kills: int, seed: int, folder: Path) -> tuple[int, list[str]]:
-    """Kill one of `SUBJECTS` `kills` times.
-
-    Returns:
-        The number of finished runs, and a line for each broken promise.
-    """
+    """Kill a subject; return the number of finished runs, and a line for each broken promise."""
     rng = random.Random(seed)
     subject = SUBJECTS[name]
     (folder / "calm").mkdir()
@@ -202,10 +180,6 @@ def wait(condition: Callable[[], bool], process: subprocess.Popen[bytes]) -> Non
 
 
 def finish(process: subprocess.Popen[bytes], folder: Path) -> None:
-    """Wait until a process has ended.
-
-    Raises:
-        RuntimeError: it failed.
-    """
+    """Wait until a process has ended; RuntimeError if it failed."""
     if process.wait(_LONGEST):
         raise RuntimeError((folder / _OUTPUT).read_text(encoding="utf-8"))

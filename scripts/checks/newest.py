@@ -37,9 +37,8 @@ def main(keep: list[str], arguments: list[str]) -> int:
         newest = ["install", "--no-compile", "--upgrade", "--upgrade-strategy", "eager", "-c", constraints]
         subprocess.run([*pip, *newest, "-e", f"{ROOT}[dev]"], check=True)
         frozen = subprocess.run([*pip, "freeze"], capture_output=True, text=True, check=True).stdout
-        newer = [
-            f"{name} {version}" for name, version in pins(frozen).items() if differs(name, version, pinned)
-        ]
+        versions = pins(frozen).items()  # constraints.txt need not name all
+        newer = [f"{name} {version}" for name, version in versions if pinned.get(name, version) != version]
         print(f"Python {sys.version.partition(' ')[0]}; unlike constraints.txt: {', '.join(newer) or 'none'}")
         command = [python, "-m", "pytest", "-q", "-n", "auto", "--maxprocesses", "8", *arguments]
         return subprocess.run(command, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}).returncode
@@ -59,8 +58,3 @@ def pins(text: str) -> dict[str, str]:
     """Return the version of each package from lines NAME==VERSION; a local version such as +cpu is cut."""
     lines = re.findall(r"^([\w.-]+)==([^\s+;]+)", text, re.MULTILINE)
     return {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in lines}
-
-
-def differs(name: str, version: str, pinned: dict[str, str]) -> bool:
-    """Return whether a version is not the one of constraints.txt, which need not name it."""
-    return pinned.get(name, version) != version

@@ -37,23 +37,14 @@ CUBES = ("three_cubes", "two_cubes")
 
 @dataclass(frozen=True)
 class Case:
-    """A scene with its transfer matrix.
-
-    Attributes:
-        name: of the case.
-        scene: the scene.
-        points: where the pressure is compared (P, 3) [m].
-        exact: transfer matrix (P, M) [Pa].
-        scattered: norm of its scattered part; None without obstacles.
-        method: of the propagator.
-    """
+    """A scene, the points (P, 3) [m] where its pressure is compared, and the transfer matrix (P, M) [Pa]."""
 
     name: str
     scene: at.Scene
     points: torch.Tensor
     exact: torch.Tensor
-    scattered: float | None
-    method: str = "box"
+    scattered: float | None  # norm of the scattered part of the matrix; None without obstacles
+    method: str = "box"  # of the propagator
 
 
 @dataclass(frozen=True)
@@ -151,43 +142,28 @@ def cubes_with(name: str, scene: at.Scene, exact: torch.Tensor) -> Case:
     return Case(name, scene, scene.control_points, exact, float(scattered.norm()))
 
 
-def slab_case(
-    thickness: float = 5e-3,
-    density: float = 3.0,
-    speed: float = 1.5,
-    face: float = FACE,
-    air: at.Medium = AIR,
-) -> Case:
-    """Return a point source in front of a slab of ratios to air, with points on both sides."""
-    slab = at.Box(
-        (face + thickness / 2, 20e-3, 20e-3),
-        (thickness, 1.0, 1.0),
-        density=density * air.density,
-        sound_speed=speed * air.sound_speed,
-    )
-    exact = partial(analytic.fluid_slab, thickness=thickness, density_ratio=density, speed_ratio=speed)
-    return _layered_case("slab", slab, (14.1e-3, 34.6e-3), exact, face, air)
+def slab_case() -> Case:
+    """Return a point source in front of a slab of 5 mm, with points on both sides."""
+    material = {"density": 3.0 * AIR.density, "sound_speed": 1.5 * AIR.sound_speed}
+    slab = at.Box((FACE + 2.5e-3, 20e-3, 20e-3), (5e-3, 1.0, 1.0), **material)
+    exact = partial(analytic.fluid_slab, thickness=5e-3, density_ratio=3.0, speed_ratio=1.5)
+    return _layered_case("slab", slab, (14.1e-3, 34.6e-3), exact)
 
 
 def wall_case() -> Case:
     """Return a point source and points in front of a rigid wall."""
     wall = at.Box((FACE + 0.5, 20e-3, 20e-3), (1.0, 1.0, 1.0), rigid=True)
-    return _layered_case("rigid wall", wall, (14.1e-3,), analytic.rigid_plane, FACE, AIR)
+    return _layered_case("rigid wall", wall, (14.1e-3,), analytic.rigid_plane)
 
 
 def _layered_case(
-    name: str,
-    box: at.Box,
-    planes: Sequence[float],
-    exact: Callable[..., torch.Tensor],
-    face: float,
-    air: at.Medium,
+    name: str, box: at.Box, planes: Sequence[float], exact: Callable[..., torch.Tensor]
 ) -> Case:
     """Return a point source before a box that leaves the domain, with points in `planes` along x [m]."""
     array = at.TransducerArray([(8.3e-3, 19.1e-3, 20.7e-3)], (1, 0, 0))
     points = torch.tensor(list(product(planes, (9.4e-3, 21e-3), (11.7e-3, 32.2e-3))), dtype=torch.float64)
-    scene = at.Scene(array, air, 40e3, points, (box,), domain=((0, 0, 0), (40e-3,) * 3))
-    where = (points, array.positions, scene.wavenumber, (face, 0, 0), (-1, 0, 0))
+    scene = at.Scene(array, AIR, 40e3, points, (box,), domain=((0, 0, 0), (40e-3,) * 3))
+    where = (points, array.positions, scene.wavenumber, (FACE, 0, 0), (-1, 0, 0))
     strength = 4 * math.pi * array.source_strength
     total, scattered = (strength * exact(*where, scattered=part) for part in (False, True))
     return Case(name, scene, points, total, float(scattered.norm()), "full")

@@ -4,27 +4,22 @@ import json
 import os
 import shlex
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
+from typing import Any
 
 DOCS = Path(__file__).parents[2] / "docs"
 
 
 @dataclass(frozen=True)
 class Page:
-    """A page of the documentation, of which a command writes a block.
+    """A page of the documentation, of which a command writes a block."""
 
-    Attributes:
-        name: its file in the documentation.
-        command: whose block it is, such as "check.py autd3".
-        folder: where the new page, its figures and data go.
-    """
-
-    name: str
-    command: str
-    folder: Path
+    name: str  # of its file in the documentation
+    command: str  # whose block it is, such as "check.py autd3"
+    folder: Path  # of the new page, its figures and data
 
     def write(self, *parts: str) -> None:
         """Write a copy of the page with the paragraphs as the block, after machine, date and command."""
@@ -54,11 +49,7 @@ class Page:
 
 
 def with_block(text: str, command: str, block: str) -> str:
-    """Replace the text between the two marks of a command.
-
-    Raises:
-        ValueError: `text` does not have exactly one pair of marks.
-    """
+    """Replace the text between the two marks of a command; ValueError without exactly one pair of them."""
     begin, end = (f"<!-- written by scripts/{command}: {which} -->" for which in ("begin", "end"))
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
         raise ValueError(f"text: must have {begin!r} and then {end!r} once each")
@@ -90,11 +81,12 @@ def percent(share: float) -> str:
     return f"{100 * share:.3g} %"
 
 
-def spread(values: object, digits: int = 2) -> str:
-    """Format the mean and the range of a tensor."""
+def spread(values: Any, digits: int = 2, middle: Callable[[Any], Any] | None = None) -> str:
+    """Format the mean, or another middle, and the range of a tensor."""
     if len(values) == 1:
         return f"{values.item():.{digits}f}"
-    return f"{values.mean():.{digits}f} ({values.min():.{digits}f} to {values.max():.{digits}f})"
+    center = middle(values) if middle else values.mean()
+    return f"{center:.{digits}f} ({values.min():.{digits}f} to {values.max():.{digits}f})"
 
 
 def _rounded(row: dict[str, object]) -> dict[str, object]:

@@ -14,6 +14,7 @@ import pyvista
 import torch
 from shared import cases
 from shared.cases import Ratios
+from shared.random_scenes import log_uniform
 
 import autdtorch as at
 from autdtorch.scene.geometry import rotation_matrix
@@ -46,11 +47,6 @@ class Drawn(NamedTuple):
 Family = Callable[[np.random.Generator], Drawn]
 
 
-def _between(rng: np.random.Generator, low: float, high: float) -> float:
-    """Draw a number evenly by its logarithm."""
-    return float(np.exp(rng.uniform(math.log(low), math.log(high))))
-
-
 def _angles(rng: np.random.Generator) -> Vector:
     """Draw angles, in every third scene none."""
     x, y, z = rng.uniform(-math.pi, math.pi, 3) * (rng.uniform() < 0.67)
@@ -61,8 +57,8 @@ def _material(rng: np.random.Generator) -> dict[str, Any]:
     """Draw a rigid body or a fluid that is denser than air."""
     if rng.uniform() < 0.5:
         return {"rigid": True}
-    speed = AIR.sound_speed * _between(rng, 0.9, 5.0)
-    return {"density": AIR.density * _between(rng, 2.0, 5e3), "sound_speed": speed}
+    speed = AIR.sound_speed * log_uniform(rng, 0.9, 5.0)
+    return {"density": AIR.density * log_uniform(rng, 2.0, 5e3), "sound_speed": speed}
 
 
 def _middle(rng: np.random.Generator) -> Array:
@@ -81,36 +77,51 @@ def _placed(rotation: Vector, parts: list[tuple[Array, Array]], material: dict[s
 
 def plate(rng: np.random.Generator) -> Drawn:
     """A plate of 0.02 to 1 mm."""
-    size = np.array([_between(rng, 0.02e-3, 1e-3), *rng.uniform(6e-3, 14e-3, 2)])
+    size = np.array([log_uniform(rng, 0.02e-3, 1e-3), *rng.uniform(6e-3, 14e-3, 2)])
     return _placed(_angles(rng), [(_middle(rng), rng.permutation(size))], _material(rng))
 
 
 def slit(rng: np.random.Generator) -> Drawn:
     """Two blocks with a slit of 0.3 to 2 mm."""
-    gap, size = _between(rng, 0.3e-3, 2e-3), rng.uniform(4e-3, 9e-3, 3)
+    gap, size = log_uniform(rng, 0.3e-3, 2e-3), rng.uniform(4e-3, 9e-3, 3)
     apart, middle = np.array([(gap + size[0]) / 2, 0, 0]), _middle(rng)
     return _placed(_angles(rng), [(middle - apart, size), (middle + apart, size)], _material(rng))
 
 
 def corner(rng: np.random.Generator) -> Drawn:
     """An L of two plates of 0.3 to 1.5 mm."""
-    thick, (long, wide), middle = _between(rng, 0.3e-3, 1.5e-3), rng.uniform(7e-3, 12e-3, 2), _middle(rng)
+    thick, (long, wide), middle = log_uniform(rng, 0.3e-3, 1.5e-3), rng.uniform(7e-3, 12e-3, 2), _middle(rng)
     floor = middle, np.array([long, wide, thick])
     wall = middle + np.array([thick - long, 0, long - thick]) / 2, np.array([thick, wide, long])
     return _placed(_angles(rng), [floor, wall], _material(rng))
 
 
+def block(rng: np.random.Generator) -> Drawn:
+    """A cuboid of 5 to 16 mm."""
+    return _placed(_angles(rng), [(_middle(rng), rng.uniform(5e-3, 16e-3, 3))], _material(rng))
+
+
+def apart(rng: np.random.Generator) -> Drawn:
+    """A cuboid and a ball that do not touch."""
+    left, right = (np.array([side, 0.0, 0.0]) + _middle(rng) for side in (-8e-3, 8e-3))
+    box = at.Box(
+        tuple(left.tolist()), tuple(rng.uniform(4e-3, 8e-3, 3).tolist()), _angles(rng), **_material(rng)
+    )
+    ball = at.Sphere(tuple(right.tolist()), rng.uniform(3e-3, 6e-3), **_material(rng))
+    return Drawn([box, ball])
+
+
 def needle(rng: np.random.Generator) -> Drawn:
     """A wire of 0.2 to 1 mm, 15 to 25 mm long."""
     axis = rng.normal(size=3) if rng.uniform() < 0.67 else np.eye(3)[rng.integers(3)]
-    height, radius = rng.uniform(15e-3, 25e-3), _between(rng, 0.1e-3, 0.5e-3)
+    height, radius = rng.uniform(15e-3, 25e-3), log_uniform(rng, 0.1e-3, 0.5e-3)
     body = at.Cylinder(tuple(_middle(rng).tolist()), radius, height, tuple(axis.tolist()), **_material(rng))
     return Drawn([body])
 
 
 def cylinder(rng: np.random.Generator) -> Drawn:
     """A cylinder from a coin to a rod."""
-    radius, height = rng.uniform(2e-3, 7e-3), _between(rng, 1e-3, 12e-3)
+    radius, height = rng.uniform(2e-3, 7e-3), log_uniform(rng, 1e-3, 12e-3)
     axis, center = rng.normal(size=3).tolist(), _middle(rng).tolist()
     return Drawn([at.Cylinder(tuple(center), radius, height, tuple(axis), **_material(rng))])
 
@@ -122,21 +133,20 @@ def _ball(rng: np.random.Generator, radius: float, ratios: tuple[float, float]) 
 
 def sphere(rng: np.random.Generator) -> Drawn:
     """A fluid ball, light or dense."""
-    return _ball(rng, rng.uniform(2e-3, 9e-3), (_between(rng, 0.05, 1e4), _between(rng, 0.6, 10)))
+    return _ball(rng, rng.uniform(2e-3, 9e-3), (log_uniform(rng, 0.05, 1e4), log_uniform(rng, 0.6, 10)))
 
 
 def slow(rng: np.random.Generator) -> Drawn:
     """A ball of a fluid in which sound is slow."""
-    return _ball(rng, rng.uniform(1e-3, 3e-3), (_between(rng, 0.1, 100), _between(rng, 0.3, 0.6)))
+    return _ball(rng, rng.uniform(1e-3, 3e-3), (log_uniform(rng, 0.1, 100), log_uniform(rng, 0.3, 0.6)))
 
 
 def touching(rng: np.random.Generator) -> Drawn:
     """Two cubes that touch at faces, edges or corners."""
     edges, middle = rng.uniform(4e-3, 8e-3, 2), _middle(rng)
     apart = edges.sum() / 2 * np.array([1, *(rng.uniform(size=2) < 0.5)])
-    return _placed(
-        _angles(rng), [(middle, np.full(3, edges[0])), (middle + apart, np.full(3, edges[1]))], _material(rng)
-    )
+    cubes = [(middle, np.full(3, edges[0])), (middle + apart, np.full(3, edges[1]))]
+    return _placed(_angles(rng), cubes, _material(rng))
 
 
 def torus(rng: np.random.Generator) -> Drawn:
@@ -150,9 +160,8 @@ def torus(rng: np.random.Generator) -> Drawn:
 def shell(rng: np.random.Generator) -> Drawn:
     """A hollow rigid ball with a wall of 0.3 to 3 mm; no sound enters."""
     radius, center = rng.uniform(6e-3, 11e-3), _middle(rng)
-    balls = [
-        pyvista.Icosphere(radius=each, nsub=5) for each in (radius, radius - _between(rng, 0.3e-3, 3e-3))
-    ]
+    within = radius - log_uniform(rng, 0.3e-3, 3e-3)
+    balls = [pyvista.Icosphere(radius=each, nsub=5) for each in (radius, within)]
     outer, inner = (ball.faces.reshape(-1, 4)[:, 1:] for ball in balls)
     vertices = np.concatenate([ball.points for ball in balls]).astype(np.float64) + center
     surface = vertices, np.concatenate([outer, inner[:, ::-1] + len(balls[0].points)])
@@ -163,7 +172,7 @@ def shell(rng: np.random.Generator) -> Drawn:
 
 def voxels(rng: np.random.Generator) -> Drawn:
     """A rigid ball as a mask of voxels of 0.4 to 1.2 mm."""
-    radius, edge, center = rng.uniform(6e-3, 11e-3), _between(rng, 0.4e-3, 1.2e-3), _middle(rng)
+    radius, edge, center = rng.uniform(6e-3, 11e-3), log_uniform(rng, 0.4e-3, 1.2e-3), _middle(rng)
     count = math.ceil(2 * radius / edge) + 3
     lower = center - edge * (count / 2 + rng.uniform(-0.5, 0.5, 3))
     places = np.stack(np.meshgrid(*[np.arange(count) + 0.5] * 3, indexing="ij"), axis=-1) * edge + lower
@@ -180,7 +189,10 @@ def shadow(rng: np.random.Generator) -> Drawn:
 
 FAMILIES: Mapping[str, Family] = {
     each.__name__: each
-    for each in (plate, slit, corner, needle, cylinder, sphere, slow, touching, torus, shell, voxels, shadow)
+    for each in (
+        *(plate, slit, corner, block, apart, needle, cylinder),
+        *(sphere, slow, touching, torus, shell, voxels, shadow),
+    )
 }
 
 
@@ -191,9 +203,7 @@ def scene_of(family: str, seed: int) -> tuple[at.Scene, torch.Tensor | None]:
     places: list[Array] = []
     if behind is not None:
         across = rng.uniform(-behind / 3, behind / 3, (6, 2))
-        places = [
-            np.array([x, y, side * behind]) for (x, y), side in zip(across, (-1,) * 3 + (1,) * 3, strict=True)
-        ]
+        places = [np.array([*xy, -behind if number < 3 else behind]) for number, xy in enumerate(across)]
     while len(places) < 6:
         direction = rng.normal(size=3)
         place = direction / np.linalg.norm(direction) * rng.uniform(18e-3, 34e-3)

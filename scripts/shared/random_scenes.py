@@ -29,16 +29,8 @@ LONG_SHARE = 0.01
 INSIDE_SHARE = 0.75
 """Share of the scenes without obstacles in the boundary layer."""
 KINDS = {
-    "box": 0.15,
-    "rotated box": 0.1,
-    "sphere": 0.1,
-    "cylinder": 0.1,
-    "plate": 0.15,
-    "needle": 0.1,
-    "shell": 0.05,
-    "voxels": 0.05,
-    "mesh": 0.05,
-    "wall": 0.15,
+    **{"box": 0.15, "rotated box": 0.1, "sphere": 0.1, "cylinder": 0.1, "plate": 0.15, "needle": 0.1},
+    **{"shell": 0.05, "voxels": 0.05, "mesh": 0.05, "wall": 0.15},
 }
 """Kinds of obstacles and their shares; walls are unbounded, in the scenes that allow it."""
 
@@ -51,45 +43,22 @@ TETRAHEDRON = np.eye(4)[:, 1:], np.array([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2
 
 @dataclass(frozen=True)
 class Trial:
-    """A random scene and its run.
+    """A random scene and its run."""
 
-    Attributes:
-        number: draws the scene again.
-        scene: the scene.
-        spacing: edge of a cell [m].
-        dtype: precision of the fields.
-        steps: of each run, at least; the driven run takes `FEWEST_PERIODS` if these are more.
-        labels: special features.
-        inside: whether all obstacles are inside the domain; else some may reach into the boundary layer.
-        refused: number of scenes drawn before it with obstacles too slow for the spacing.
-    """
-
-    number: int
+    number: int  # draws the scene again
     scene: Scene
-    spacing: float
+    spacing: float  # edge of a cell [m]
     dtype: torch.dtype
-    steps: int
+    steps: int  # of each run, at least; the driven run takes `FEWEST_PERIODS` if these are more
     labels: tuple[str, ...]
-    inside: bool
-    refused: int
+    inside: bool  # whether all obstacles are inside the domain; else some may reach into the boundary layer
+    refused: int  # scenes drawn before it with obstacles too slow for the spacing
 
     def __str__(self) -> str:
-        """Describe the scene, lengths in cells from the lower corner of the domain."""
-
-        def cells(*points: Any) -> str:
-            scaled = (np.asarray(point) / self.spacing for point in points)
-            return " to ".join(np.array2string(point, precision=3, separator=", ") for point in scaled)
-
-        lines = [
-            f"scene {self.number}: {WAVELENGTH / self.spacing:.2f} cells per wavelength, domain "
-            f"{cells(self.scene.domain[1])}, {self.dtype}, {', '.join(self.labels)}"
-        ]
-        for one in self.scene.obstacles:
-            material = f"density {one.density}, sound speed {one.sound_speed}"
-            lines.append(f"    {type(one).__name__} {cells(one.lower, one.upper)}, {material}")
-        lines += [f"    source {cells(point)}" for point in self.scene.array.positions]
-        lines += [f"    control point {cells(point)}" for point in self.scene.control_points]
-        return "\n".join(lines)
+        """Describe the scene."""
+        cells = f"{WAVELENGTH / self.spacing:.2f} cells per wavelength"
+        obstacles = "\n    ".join(map(repr, self.scene.obstacles))
+        return f"scene {self.number}: {cells}, {self.dtype}, {', '.join(self.labels)}\n    {obstacles}"
 
 
 def draw_trial(seed: int, number: int, long_share: float = LONG_SHARE) -> Trial:
@@ -97,7 +66,7 @@ def draw_trial(seed: int, number: int, long_share: float = LONG_SHARE) -> Trial:
     rng = np.random.default_rng((seed, number))
     long, inside, refused = bool(rng.uniform() < long_share), bool(rng.uniform() < INSIDE_SHARE), 0
     while True:
-        spacing = WAVELENGTH / _log_uniform(rng, MIN_CELLS_PER_WAVELENGTH, 20.0)
+        spacing = WAVELENGTH / log_uniform(rng, MIN_CELLS_PER_WAVELENGTH, 20.0)
         domain = np.full(3, 6.0) if long else rng.integers(6, 13, 3).astype(float)
         draft = _Draft(rng, spacing, domain, [], {"long"} if long else set())
         for _ in range(rng.integers(1, 5)):
@@ -127,19 +96,11 @@ def _refused(scene: Scene, spacing: float) -> bool:
 
 @dataclass
 class _Draft:
-    """A scene while it is drawn, lengths in cells.
-
-    Attributes:
-        rng: random numbers.
-        spacing: edge of a cell [m].
-        domain: its extent (3,).
-        obstacles: drawn so far.
-        labels: drawn so far.
-    """
+    """A scene while it is drawn, lengths in cells."""
 
     rng: np.random.Generator
-    spacing: float
-    domain: Array
+    spacing: float  # edge of a cell [m]
+    domain: Array  # its extent (3,)
     obstacles: list[Obstacle]
     labels: set[str]
 
@@ -153,10 +114,10 @@ class _Draft:
         if len(free) < 4:
             return None
         for _ in range(4):
-            near = self.rng.uniform() < 0.5
-            order = (
-                np.abs(gap[free] - self.rng.uniform(0.2, 1.5)) if near else self.rng.uniform(size=len(free))
-            )
+            if self.rng.uniform() < 0.5:
+                order = np.abs(gap[free] - self.rng.uniform(0.2, 1.5))
+            else:
+                order = self.rng.uniform(size=len(free))
             chosen.append(free[order.argmin()])
             free = np.setdiff1d(free, chosen)
         if gap[chosen].min() < 1.5:
@@ -193,13 +154,13 @@ class _Draft:
         if aligned:
             size, axis, turn = np.rint(size), np.eye(3)[rng.integers(3)], np.zeros(3)
         if kind == "plate":
-            size[rng.integers(3)] = _log_uniform(rng, 0.01, 1.0)
+            size[rng.integers(3)] = log_uniform(rng, 0.01, 1.0)
         elif kind == "needle":
-            size[0] = _log_uniform(rng, 0.1, 1.5)
+            size[0] = log_uniform(rng, 0.1, 1.5)
         elif kind == "shell":
             size[:] = size.max()
         elif thin:
-            size[rng.integers(3)] = _log_uniform(rng, 0.1, 1.0)
+            size[rng.integers(3)] = log_uniform(rng, 0.1, 1.0)
         center, place = self._center(size)
         if aligned and place == "apart":
             center = np.rint(2 * center) / 2
@@ -227,12 +188,13 @@ def _material(rng: np.random.Generator) -> tuple[dict[str, Any], set[str]]:
     """Return the material arguments of an obstacle, and labels."""
     if rng.uniform() < 0.2:
         return {"rigid": True}, {"rigid"}
-    density, speed = _log_uniform(rng, 1e-3, 1e4), _log_uniform(rng, 0.2, 17.0)
+    density, speed = log_uniform(rng, 1e-3, 1e4), log_uniform(rng, 0.2, 17.0)
     labels = {"light" if density < 1 else "heavy", "slow" if speed < 1 else "fast"}
     return {"density": AIR.density * density, "sound_speed": AIR.sound_speed * speed}, labels
 
 
-def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """Draw a number evenly by its logarithm."""
     return float(math.exp(rng.uniform(math.log(low), math.log(high))))
 
 

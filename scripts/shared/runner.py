@@ -51,6 +51,7 @@ def run(folder: str, description: str | None) -> int:
             for flag, settings in getattr(module, "OPTIONS", {}).items():
                 command.add_argument(flag, **settings)
             if hasattr(module, "DOCUMENT"):
+                command.description += f"\nWrites a block of docs/{module.DOCUMENT}."
                 command.add_argument("--output", type=Path, default=DOCS, help="folder of the written files")
     options = vars(parser.parse_args())
     name = options.pop("name")

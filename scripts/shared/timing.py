@@ -1,10 +1,13 @@
-"""Run times, memory and processes of measurements."""
+"""Run times, memory, processes and warnings of measurements."""
 
+import contextlib
+import logging
 import resource
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from logging.handlers import BufferingHandler
 from multiprocessing import get_context
 from typing import TypeVar
 
@@ -33,3 +36,14 @@ def in_new_process(work: Callable[[Argument], Result], argument: Argument) -> Re
 def peak_memory() -> int:
     """Return the largest resident set of this process so far [byte]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+@contextlib.contextmanager
+def logged_warnings() -> Iterator[list[logging.LogRecord]]:
+    """Collect the warnings that the package logs within the context."""
+    handler = BufferingHandler(1000)
+    handler.setLevel(logging.WARNING)
+    logger = logging.getLogger("autdtorch")
+    logger.addHandler(handler)
+    yield handler.buffer
+    logger.removeHandler(handler)

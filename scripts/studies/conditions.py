@@ -3,9 +3,6 @@
 Writes conditions.png and a block of the documentation. Each trial has its noise and drift, seeded by the
 number of the trial. The true score is the weakest focus that the resulting drive makes without noise on the
 device in its final state.
-
-    python scripts/study.py conditions                              all methods of the package
-    python scripts/study.py conditions --methods gabs identify      two of them
 """
 
 import inspect
@@ -14,6 +11,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -33,13 +31,9 @@ Wrap = Callable[[at.Objective, int], at.Objective]
 
 @dataclass(frozen=True)
 class Method:
-    """A method with its settings.
+    """A function of the package with its settings.
 
-    Attributes:
-        function: name in the package.
-        settings: keyword arguments.
-        together: whether all trials go in one call, which batches their work; only for methods whose trials
-            take equally many evaluations in every step.
+    `together` runs all trials in one call, for methods whose trials take equally many evaluations a step.
     """
 
     function: str
@@ -49,9 +43,7 @@ class Method:
     @property
     def label(self) -> str:
         """Return the name in the report."""
-        settings = (
-            value if isinstance(value, str) else f"{value} {key}" for key, value in self.settings.items()
-        )
+        settings = (each if isinstance(each, str) else f"{each} {key}" for key, each in self.settings.items())
         return ", ".join([label_of(self.function), *settings])
 
 
@@ -119,11 +111,9 @@ CONDITIONS: dict[str, Wrap] = {
     "all at once": bench,
 }
 
+NOISE = {str(snr): f"SNR {snr} dB" for snr in (10, 20, 30, 40)}
 AXES = {
-    "signal-to-noise ratio [dB]": {
-        **{str(snr): f"SNR {snr} dB" for snr in (10, 20, 30, 40)},
-        r"$\infty$": "undisturbed",
-    },
+    "signal-to-noise ratio [dB]": {**NOISE, r"$\infty$": "undisturbed"},
     "phase levels": {**{str(n): f"{n} levels" for n in (2, 4, 8, 16, 32, 256)}, "any": "undisturbed"},
 }
 """Rows of panels: label of the axis, then ticks and their conditions."""
@@ -131,12 +121,7 @@ AXES = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """The trials of a method in a scene under a condition.
-
-    Attributes:
-        true: weakest focus that each resulting drive makes (T,) [Pa].
-        observed: weakest focus observed for it (T,) [Pa].
-    """
+    """The weakest foci (T,) [Pa] of a method's trials under a condition."""
 
     true: torch.Tensor
     observed: torch.Tensor
@@ -196,10 +181,10 @@ def keys(outcomes: Outcomes, place: int) -> list[str]:
 def true_scores(outcomes: Outcomes, scene: str) -> str:
     """Return a table of mean true scores in a scene, rows of conditions and columns of methods."""
     methods = keys(outcomes, 2)
-    rows = [
-        [condition, *(f"{outcomes[scene, condition, method].true.mean():.2f}" for method in methods)]
-        for condition in keys(outcomes, 1)
-    ]
+    rows = []
+    for condition in keys(outcomes, 1):
+        means = [outcomes[scene, condition, method].true.mean() for method in methods]
+        rows.append([condition, *(f"{mean:.2f}" for mean in means)])
     return table(["perturbation", *methods], rows)
 
 
@@ -212,8 +197,7 @@ def plot_conditions(outcomes: Outcomes) -> Figure:
     for row, (label, ticks) in zip(panels, AXES.items(), strict=True):
         for ax, scene in zip(row, scenes, strict=True):
             for method, look in looks_of(methods).items():
-                line = [outcomes[scene, condition, method] for condition in ticks.values()]
-                _draw(ax, line, look, method)
+                _draw(ax, [outcomes[scene, condition, method] for condition in ticks.values()], look, method)
             ax.set_xticks(range(len(ticks)), list(ticks))
             ax.set_xlabel(label)
             ax.tick_params(labelsize=TICK_SIZE)
@@ -229,9 +213,7 @@ def plot_conditions(outcomes: Outcomes) -> Figure:
 
 
 def _draw(ax: Axes, outcomes: list[Outcome], look: Look, label: str) -> None:
-    colour, marker, dashes = look
-    means = torch.stack([outcome.true.mean() for outcome in outcomes]).numpy()
-    errors = torch.tensor([outcome.error for outcome in outcomes]).numpy()
-    places = range(len(outcomes))
-    ax.fill_between(places, means - errors, means + errors, color=colour, alpha=0.2, lw=0)
-    ax.plot(places, means, color=colour, marker=marker, linestyle=dashes, ms=4, lw=1.2, label=label)
+    means, errors = np.array([(float(outcome.true.mean()), outcome.error) for outcome in outcomes]).T
+    style = {"color": look.colour, "marker": look.marker, "linestyle": look.dashes, "ms": 4, "lw": 1.2}
+    ax.fill_between(range(len(means)), means - errors, means + errors, color=look.colour, alpha=0.2, lw=0)
+    ax.plot(means, label=label, **style)

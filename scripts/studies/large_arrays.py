@@ -1,15 +1,13 @@
 """Methods on arrays of 249 and 256 transducers, at equal numbers of evaluations.
 
-Fills in a block of the documentation.
-
-    python scripts/study.py large_arrays            a quarter of an hour
+Takes a quarter of an hour.
 """
 
 from collections.abc import Callable, Iterator
 from functools import partial
 
 import torch
-from shared.document import Page, printed, table
+from shared.document import Page, printed, spread, table
 from shared.scenes import MIDDLE, autd3_array, objective_of, paper_scene, with_array
 from shared.timing import timed
 
@@ -54,16 +52,8 @@ def rows(trials: int) -> Iterator[list[str]]:
     bounds = [at.focus_bound(objective.transfer_matrix) for objective in objectives]
     for name, method in METHODS.items():
         runs = [timed(lambda o=objective, m=method: m(o, trials=trials)) for objective in objectives]
-        shares = [
-            spread(100 * solution.score / bound) for (solution, _), bound in zip(runs, bounds, strict=True)
-        ]
+        pairs = zip((solution for solution, _ in runs), bounds, strict=True)
+        shares = [spread(100 * solution.score / bound, 1, torch.median) for solution, bound in pairs]
         evaluations = torch.stack([solution.evaluations.double().mean() for solution, _ in runs]).mean()
         seconds = [spent / len(solution.score) for solution, spent in runs]
         yield [name, f"{evaluations:.0f}", *shares, in_digits(sum(seconds) / len(seconds), 2)]
-
-
-def spread(shares: torch.Tensor) -> str:
-    """Format the median and the range of the trials."""
-    if len(shares) == 1:
-        return f"{shares.item():.1f}"
-    return f"{shares.median():.1f} ({shares.min():.1f} to {shares.max():.1f})"

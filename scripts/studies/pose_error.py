@@ -2,9 +2,7 @@
 
 Writes pose_errors.png and a block of the documentation. Drives are the best for the paper's cubes at their
 place. Then all cubes of a scene are shifted in random directions, or turned about random axes, as one body.
-T-matrices give the transfer matrix of each pose.
-
-    python scripts/study.py pose_error          about two minutes on 2 idle cores
+T-matrices give the transfer matrix of each pose. Takes about two minutes on 2 idle cores.
 """
 
 import math
@@ -58,21 +56,13 @@ def main(page: Page, poses: int, spacing: float) -> None:
 
 
 class Losses(NamedTuple):
-    """Shares of the weakest focus under a pose error.
-
-    Attributes:
-        scene: name.
-        unit: of the error, "mm" or "degrees".
-        error: the pose error.
-        same: share with the drive of the assumed pose, for each direction (N,).
-        new: share with a drive that was computed for the pose (N,).
-    """
+    """Shares of the weakest focus under a pose error [`unit`], for each direction (N,)."""
 
     scene: str
     unit: str
     error: float
-    same: torch.Tensor
-    new: torch.Tensor
+    same: torch.Tensor  # with the drive of the assumed pose
+    new: torch.Tensor  # with a drive that was computed for the pose
 
 
 def scene_of(name: str) -> at.Scene:
@@ -115,14 +105,13 @@ def plot_losses(losses: Sequence[Losses]) -> Figure:
         for name in SCENES:
             rows = [loss for loss in losses if (loss.scene, loss.unit) == (name, unit)]
             errors = [0.0, *(loss.error for loss in rows)]
-            low, middle, high = (
-                [1.0, *(float(loss.same.quantile(share)) for loss in rows)] for share in (0.05, 0.5, 0.95)
-            )
+            shares = torch.tensor([0.05, 0.5, 0.95], dtype=torch.float64)
+            low, middle, high = torch.stack([torch.ones(3), *(loss.same.quantile(shares) for loss in rows)]).T
             new = [1.0, *(float(loss.new.median()) for loss in rows)]
-            look = looks[name]
-            ax.plot(errors, middle, color=look.colour, label=readable(name))
-            ax.fill_between(errors, low, high, color=look.colour, alpha=0.2, linewidth=0)
-            ax.plot(errors, new, color=look.colour, linestyle=":", label=f"{readable(name)}, new drive")
+            colour = looks[name].colour
+            ax.plot(errors, middle, color=colour, label=readable(name))
+            ax.fill_between(errors, low, high, color=colour, alpha=0.2, linewidth=0)
+            ax.plot(errors, new, color=colour, linestyle=":", label=f"{readable(name)}, new drive")
         ax.set_xlabel(label)
         ax.set_xlim(left=0)
         ax.set_ylim(0.4, 1.1)

@@ -1,14 +1,12 @@
 """Place and turn of the paper's two cubes, recovered from pressure magnitudes.
 
 The measurement is a simulation of the turned cubes by `box`, in cells of 0.5 mm, with 1 % of noise. The model
-is a T-matrix of the cubes in cells of 1 mm, moved to a trial pose. Its derivatives by place and
-turn drive a least-squares fit from several starts. The first guess is the pose at rest.
-
-    python scripts/study.py recover_obstacle            20 seconds on 2 idle cores
+is a T-matrix of the cubes in cells of 1 mm, moved to a trial pose. Its derivatives by place and turn drive a
+least-squares fit from several starts. The first guess is the pose at rest. Takes 20 seconds on 2 idle cores.
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -55,21 +53,13 @@ def main(spacing: float, seed: int) -> None:
 
 @dataclass(frozen=True)
 class Fit:
-    """A pose that fits the measurement.
-
-    Attributes:
-        pose: offset [m] and rotation [rad] (6,).
-        misfit: rms of model minus measurement, relative to the rms of the measurement.
-        first: misfit of the start.
-        steps: evaluations of the model.
-        error: standard errors of the pose (6,) [m], [rad], from the misfit and the derivatives.
-    """
+    """A pose (6,) that fits the measurement; offsets [m] and rotations [rad]."""
 
     pose: torch.Tensor
-    misfit: float
-    first: float
-    steps: int
-    error: torch.Tensor
+    misfit: float  # rms of model minus measurement, relative to the rms of the measurement
+    first: float  # misfit of the start
+    steps: int  # evaluations of the model
+    error: torch.Tensor  # standard errors of the pose (6,), from the misfit and the derivatives
 
 
 def pose_of(offset: float | tuple[float, ...], degrees: float | tuple[float, ...]) -> torch.Tensor:
@@ -113,12 +103,10 @@ def fits(
         field = body.moved(pose[:3], pose[3:]).transfer_matrix(scene.array, scene.control_points)
         return ((field.abs() - observed) / rms).flatten()
 
-    def values(pose: Array) -> Array:
-        return residual(torch.from_numpy(pose)).numpy()
+    def of_array(function: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[Array], Array]:
+        return lambda pose: function(torch.from_numpy(pose)).numpy()
 
-    def derivatives(pose: Array) -> Array:
-        return torch.func.jacfwd(residual)(torch.from_numpy(pose)).numpy()
-
+    values, derivatives = of_array(residual), of_array(torch.func.jacfwd(residual))
     limit = pose_of(*LIMIT).numpy()
     for start in starts:
         best = least_squares(values, start.numpy(), derivatives, (-limit, limit), ftol=1e-6, x_scale="jac")

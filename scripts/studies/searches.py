@@ -1,8 +1,6 @@
 """Effect of order, levels and passes on LSSG and GABS.
 
-Fills in a block of the documentation.
-
-    python scripts/study.py searches            half a minute
+Takes half a minute.
 """
 
 import math
@@ -52,9 +50,7 @@ def measure(objective: at.Objective, trials: int) -> dict[str, Figures]:
         "LSSG": at.lssg,
         "LSSG, 2 passes": partial(at.lssg, passes=2),
         "GABS": gabs,
-        "GABS, 2 passes": partial(gabs, passes=2),
-        "GABS, 3 passes": partial(gabs, passes=3),
-        "GABS, 20 passes": partial(gabs, passes=20),
+        **{f"GABS, {passes} passes": partial(gabs, passes=passes) for passes in (2, 3, 20)},
         "GABS, order given": partial(at.gabs, order="given"),
         "GABS, by strength": partial(at.gabs, order="strength"),
         "GABS, 4 levels": partial(gabs, levels=4),

@@ -16,13 +16,12 @@ from benchmarks.accuracy import Row, compare, observed_order, store_reference, w
 from benchmarks.peer_programs.task import Answer, Task
 from benchmarks.peer_scene import next_smooth, scene_grid, spread
 from benchmarks.peers import OURS, Point, requirements, settled
-from benchmarks.scaling import foci
 from checks.damage import check
 from shared import cases, document
 from shared.cases import cube_case, free_space_case, piston_case, simulate, slab_case, sphere_case, wall_case
 from shared.document import DOCS, with_block
 from shared.runner import SCRIPTS, commands, run
-from shared.scenes import autd3_array, with_array
+from shared.scenes import autd3_array, paper_scene, with_array
 from small_scenes import small_scene
 from studies.conditions import CONDITIONS, Method, outcome
 
@@ -179,7 +178,7 @@ def test_exponent_of_a_power_law_is_its_power(
 
 
 def test_domain_holds_paper_and_large_array() -> None:
-    scene = foci(4)
+    scene = paper_scene("two_cubes")
     lower, upper = torch.tensor(with_array(scene, autd3_array((2, 1))).domain)
     assert (lower < torch.tensor(scene.domain[0])).all()
     assert (upper > torch.tensor(scene.domain[1])).all()
@@ -210,11 +209,11 @@ def task() -> Task:
 
 
 def point(program: str, error: float, seconds: float, remaining: float = 0.0, case: str = "cubes"):
-    return Point(case, program, "1 mm", 20, remaining, error, seconds, None)
+    return Point(case, program, "1 mm", 20, remaining, error, seconds)
 
 
 def test_tasks_and_answers_survive_their_files(tmp_path: Path) -> None:
-    for one in (task(), Answer(np.array([[1 + 2j]]), 0.5, 2.0, 0.0, 60)):
+    for one in (task(), Answer(np.array([[1 + 2j]]), 0.5, 2.0)):
         one.save(tmp_path / "one.npz")
         loaded = vars(type(one).load(tmp_path / "one.npz"))
         assert all(np.array_equal(loaded[name], value) for name, value in vars(one).items())

@@ -64,13 +64,7 @@ def simulate(task: Task) -> Answer:
     compiled = time.perf_counter()
     operator.apply(time_m=0, time_M=task.steps - 1, dt=np.float32(task.time_step))
     done = time.perf_counter()
-    return Answer(
-        task.phasors(np.asarray(receiver.data[: task.steps])),
-        setup_seconds=prepared - begin,
-        stepping_seconds=done - compiled,
-        compile_seconds=compiled - prepared,
-        updated_cells=density.size,
-    )
+    return Answer(task.phasors(np.asarray(receiver.data[: task.steps])), prepared - begin, done - compiled)
 
 
 def sparse(name: str, grid: Grid, task: Task, cells: np.ndarray) -> SparseTimeFunction:

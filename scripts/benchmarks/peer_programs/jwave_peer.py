@@ -39,13 +39,7 @@ def simulate(task: Task) -> Answer:
     ready = time.perf_counter()
     recorded = np.asarray(compiled(medium, sources))
     done = time.perf_counter()
-    return Answer(
-        task.phasors(recorded.reshape(task.steps, -1)),
-        setup_seconds=prepared - begin,
-        stepping_seconds=done - ready,
-        compile_seconds=ready - prepared,
-        updated_cells=int(np.prod(shape)),
-    )
+    return Answer(task.phasors(recorded.reshape(task.steps, -1)), prepared - begin, done - ready)
 
 
 def places(cells: np.ndarray, width: int) -> tuple[np.ndarray, ...]:

@@ -51,8 +51,7 @@ def simulate(task: Task) -> Answer:
     )
     recorded = np.empty((task.steps, len(order)), np.float32)
     recorded[:, order] = outputs["p"].T
-    seconds = time.perf_counter() - begin
-    return Answer(task.phasors(recorded), 0.0, seconds, 0.0, density.size)
+    return Answer(task.phasors(recorded), 0.0, time.perf_counter() - begin)
 
 
 def mask(shape: tuple[int, ...], cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

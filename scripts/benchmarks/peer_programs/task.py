@@ -41,35 +41,20 @@ class Stored:
 
 @dataclass(frozen=True)
 class Task(Stored):
-    """A simulation.
+    """A simulation."""
 
-    Attributes:
-        density: of the cells (X, Y, Z) [kg/m^3].
-        sound_speed: of all cells [m/s].
-        spacing: edge of a cell [m].
-        frequency: of the drive [Hz].
-        time_step: [s].
-        steps_per_period: of the drive.
-        source_cells: driven cells (S, 3).
-        source_weights: share of the source in each cell (S,).
-        receiver_cells: recorded cells (R, 3).
-        ends: periods (E,), ascending, at which phasors are returned; the last ends the run.
-        layer_cells: thickness of the boundary layer.
-        order: of the differences in space; 0 for spectral.
-    """
-
-    density: Array
-    sound_speed: float
-    spacing: float
-    frequency: float
-    time_step: float
-    steps_per_period: int
-    source_cells: Cells
-    source_weights: Array
-    receiver_cells: Cells
-    ends: Cells
-    layer_cells: int
-    order: int
+    density: Array  # of the cells (X, Y, Z) [kg/m^3]
+    sound_speed: float  # of all cells [m/s]
+    spacing: float  # edge of a cell [m]
+    frequency: float  # of the drive [Hz]
+    time_step: float  # [s]
+    steps_per_period: int  # of the drive
+    source_cells: Cells  # driven cells (S, 3)
+    source_weights: Array  # share of the source in each cell (S,)
+    receiver_cells: Cells  # recorded cells (R, 3)
+    ends: Cells  # periods (E,), ascending, at which phasors are returned; the last ends the run
+    layer_cells: int  # thickness of the boundary layer
+    order: int  # of the differences in space; 0 for spectral
 
     @property
     def steps(self) -> int:
@@ -92,21 +77,11 @@ class Task(Stored):
 
 @dataclass(frozen=True)
 class Answer(Stored):
-    """The result of a peer.
+    """The result of a peer."""
 
-    Attributes:
-        phasors: pressure (E, R) at the ends of the task, in any unit.
-        setup_seconds: time before stepping, without imports and compilation.
-        stepping_seconds: time of all steps.
-        compile_seconds: time of the compilation, not counted.
-        updated_cells: cells updated per step, boundary layers included.
-    """
-
-    phasors: NDArray[np.complex128]
-    setup_seconds: float
-    stepping_seconds: float
-    compile_seconds: float
-    updated_cells: int
+    phasors: NDArray[np.complex128]  # pressure (E, R) at the ends of the task, in any unit
+    setup_seconds: float  # before stepping, without imports and compilation
+    stepping_seconds: float  # of all steps
 
 
 def serve(simulate: Callable[[Task], Answer]) -> None:
