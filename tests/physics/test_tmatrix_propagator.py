@@ -197,7 +197,7 @@ def test_a_scene_without_obstacles_has_no_t_matrix_and_one_of_air_scatters_nothi
 
 
 def test_points_just_outside_a_turned_body_are_served():
-    """The sphere around obstacles turns with them, and is that of their operator."""
+    """The sphere around obstacles turns with them, and their T-matrix has the same one."""
     pair = (SMALL, replace(SMALL, center=(14.5e-3, 14e-3, 12e-3), size=(3e-3, 2e-3, 2e-3)))
     for angle in (0.3, 0.8, 1.4):
         scene = scene_of(*pair).moved(rotation=(0, 0.2, angle))

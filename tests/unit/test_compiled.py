@@ -1,12 +1,20 @@
-"""Compiled kernels: of the present source; damaged files are compiled again. Cold and warm: test_forks.py."""
+"""Compiled kernels, cold or warm, and PyTorch's global settings change no result."""
 
+import ast
+import contextlib
 import importlib.util
 import os
+from collections.abc import Iterator
+from pathlib import Path
+from unittest import mock
 
 import numba
 import numpy as np
 import pytest
+import torch
+from small_scenes import CUBE, small_scene
 
+import autdtorch as at
 from autdtorch.fdtd.kernels import compiled
 
 
@@ -83,3 +91,124 @@ def test_without_a_folder_to_write_to_kernels_run_and_say_so_once(kernel, monkey
     assert made()(3) == made()(3) == 6
     assert caplog.text.count("compiled in every process") == 1
     assert not os.path.exists(folder)
+
+
+PACKAGE = Path(at.__file__).parent
+
+
+@contextlib.contextmanager
+def setting(name: str, value: object) -> Iterator[None]:
+    """One of PyTorch's settings that has a function to get it and one to set it."""
+    before = getattr(torch, f"get_{name}")()
+    getattr(torch, f"set_{name}")(value)
+    try:
+        yield
+    finally:
+        getattr(torch, f"set_{name}")(before)
+
+
+@contextlib.contextmanager
+def threads(count: int) -> Iterator[None]:
+    processors = mock.patch("autdtorch.utils.process._processors", return_value=count)
+    with setting("num_threads", count), processors:
+        yield
+
+
+#: Pairs of settings, as each run takes seconds.
+STATES = {
+    "float16, three threads": lambda: (setting("default_dtype", torch.float16), threads(3)),
+    "float64, one thread": lambda: (setting("default_dtype", torch.float64), threads(1)),
+    "meta device, no gradients": lambda: (torch.device("meta"), torch.no_grad()),
+    "inference mode, coarse products": lambda: (
+        torch.inference_mode(),
+        setting("float32_matmul_precision", "medium"),
+    ),
+}
+
+
+def numbers(folder: Path) -> dict[str, torch.Tensor]:
+    """Return the numbers of a study, from the scene to files and metrics."""
+    values: dict[str, torch.Tensor] = {}
+    ball = at.Sphere((12e-3, 20e-3, 5e-3), 3e-3, density=0.2, sound_speed=900.0)
+    scene = small_scene((CUBE, ball), radius=1e-3, absorption=2.0)
+    propagators = {}
+    for method in ("box", "full", "free_space"):
+        propagators[method] = propagator = at.make_propagator(scene, method, 2e-3, 0.1, cache=False)
+        values[method] = propagator.transfer_matrix()
+        drive = at.drive_from_phases(torch.arange(4, dtype=torch.float64, device="cpu"))
+        values[f"{method} field"] = propagator.field(drive, scene.control_points + 1e-4)
+    _, error = propagators["box"].transfer_matrix(return_error=True)
+    values["error"] = torch.tensor(error, dtype=torch.float64, device="cpu")
+    objective = at.SimulatedObjective(scene, propagators["box"])
+    noisy = at.Noise(at.Quantised(at.Drift(at.FailedTransducers(objective, [1]), 0.1, 5), 16), 30.0)
+    for name, solution in {
+        "lss": at.lss(objective),
+        "lssg": at.lssg(objective, passes=2),
+        "gabs": at.gabs(objective, order="strength", trials=3),
+        "random": at.random_search(objective, levels=7, trials=2),
+        "bo": at.bayes_opt(objective, 18, trials=2, fixed_transducer=0),
+        "identify": at.identify(objective, 20, trials=2),
+        "gradient": at.gradient_ascent(objective, starts=3, steps=20),
+        "noisy": at.gabs(noisy, trials=2),
+    }.items():
+        values |= {f"{name} {key}": getattr(solution, key) for key in ("drive", "pressure", "history")}
+    metrics = at.focus_metrics(
+        values["gabs pressure"][0], values["gabs pressure"][:1].repeat(7, 1), cell_area=1e-6 / 3
+    )
+    assert metrics.area is not None
+    values |= {"mean": metrics.mean, "uniformity": metrics.uniformity, "area": metrics.area}
+    values["bound"] = torch.tensor(at.focus_bound(values["box"]), dtype=torch.float64, device="cpu")
+    at.save_drive(folder / "drive.csv", values["gabs drive"][0], scene.array)
+    values["saved"] = at.load_drive(folder / "drive.csv")
+    values["gradient of the drive"] = at.differentiable_field(scene, drive, spacing=2e-3)
+    values["volume"] = at.volume_field(propagators["free_space"], drive).nan_to_num()
+    return values
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, torch.Tensor]:
+    return numbers(tmp_path_factory.mktemp("expected"))
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_no_bit_changes(state: str, expected: dict[str, torch.Tensor], tmp_path: Path) -> None:
+    with contextlib.ExitStack() as settings:
+        for one in STATES[state]():
+            settings.enter_context(one)
+        computed = numbers(tmp_path)
+    for name, value in expected.items():
+        assert computed[name].device.type == "cpu", name
+        assert computed[name].dtype == value.dtype, name
+        assert torch.equal(computed[name].detach(), value.detach()), name
+
+
+def test_what_inference_mode_has_made_serves_gradients_later() -> None:
+    with torch.inference_mode():
+        scene = small_scene((CUBE,))
+        propagator = at.make_propagator(scene, "box", 2e-3, cache=False)
+        propagator.transfer_matrix()
+    drive = torch.ones(4, dtype=torch.complex128, requires_grad=True)
+    propagator.field(drive, scene.control_points).abs().sum().backward()
+    assert drive.grad is not None
+    assert drive.grad.abs().sum() > 0
+
+
+BOTH = {"REAL", "COMPLEX"}
+MAKERS = {"arange", "as_tensor", "empty", "eye", "full", "linspace"}
+MAKERS |= {"ones", "rand", "randn", "tensor", "zeros"}
+
+
+def test_every_tensor_is_made_with_its_dtype_and_device() -> None:
+    count = 0
+    for path in PACKAGE.rglob("*.py"):
+        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            match call:
+                case ast.Call(func=ast.Attribute(value=ast.Name("torch"), attr=name)) if name in MAKERS:
+                    keywords = {keyword.arg for keyword in call.keywords}
+                    if {ast.unparse(each.value) for each in call.keywords if each.arg is None} & BOTH:
+                        keywords |= {"device", "dtype"}
+                    # integers have one dtype, and what is there keeps its own
+                    required = {"device"} if name in ("arange", "as_tensor") else {"device", "dtype"}
+                    assert required <= keywords, f"{path}:{call.lineno}: {ast.unparse(call)}"
+                    count += 1
+    assert count > 100

@@ -102,7 +102,7 @@ def test_levels_come_back_as_the_device_plays_them(tmp_path, device, suffix):
     played = at.load_drive(path)
     at.save_drive(path, played, array, device)
     assert torch.equal(at.load_drive(path), played)
-    # Half a step of phase and of amplitude; a step of a pulse's amplitude is that of its phase at most.
+    # Half a step of phase and of amplitude; a step of a pulse's amplitude is at most a step of its phase.
     phase_error = math.pi / DEVICES[device].phase_levels.phases
     amplitude_error = {"autd3": 1 / 510, "sonicsurface": 0.5}.get(device, phase_error / 2)
     on = played.abs() > 0

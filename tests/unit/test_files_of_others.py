@@ -222,7 +222,7 @@ def test_any_comment_is_read_or_refused(tmp_path_factory, comment):
 
 
 def test_two_boards_of_openmpd_have_the_order_of_its_rows():
-    """As AcousTools writes them: x falls from column to column above, and rises below; y falls in each."""
+    """The order of AcousTools: x falls from column to column above, and rises below; y falls in each."""
     above = TransducerArray.openmpd((0, 0, 0.12), (0, 0, -1), angle=math.pi)
     both = above + TransducerArray.openmpd((0, 0, -0.12), (0, 0, 1))
     side = torch.linspace(-78.75e-3, 78.75e-3, 16, dtype=torch.float64)

@@ -67,7 +67,7 @@ def test_a_single_simulation_has_a_forecast(monkeypatch, caplog):
 
 
 class Writer:
-    """What stands for a stream in a window: all that `print` needs."""
+    """A stream of a program with windows: it has all that `print` needs."""
 
     def write(self, text: str) -> int:
         return len(text)

@@ -206,7 +206,7 @@ def test_an_obstacle_of_ones_own_is_refused(tmp_path):
 
 
 def test_the_frequency_of_air_is_no_part_of_a_saved_or_replaced_medium(tmp_path):
-    """It only brings a warning: media that differ in it are equal, and files have the numbers alone."""
+    """Media that differ in this frequency alone are equal, and files have no frequency."""
     air = at.Medium.air()
     scene = dataclasses.replace(
         scene_with(at.Sphere((0.04, 0.04, 0.04), 3e-3, rigid=True), plane=False), medium=air

@@ -1,4 +1,4 @@
-"""Calls that newcomers get wrong: each is told in one line with the field and the fix, or is right."""
+"""Calls that newcomers get wrong: a line names the field and the fix, or the call is right."""
 
 import inspect
 import math
