@@ -1,4 +1,4 @@
-"""This process: its threads, and its memory, which control groups limit."""
+"""Threads and memory of this process, which control groups limit."""
 
 import functools
 import os

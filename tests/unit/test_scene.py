@@ -180,7 +180,7 @@ def test_absorption_in_octaves(temperature: float, humidity: float, tabulated: t
 
 
 def test_far_above_the_relaxations_absorption_is_classical() -> None:
-    """The classical absorption rises as f^2/p: viscosity, heat and rotation, 1.84e-11 Np/m per Hz^2 at one atmosphere.
+    """Viscosity, heat and rotation absorb in proportion to f^2/p: 1.84e-11 Np/m per Hz^2 at one atmosphere.
 
     In dry air the relaxations are over at some 10 Hz: beyond, they add a constant, 1 mdB/m to 40 dB/m here.
     """
