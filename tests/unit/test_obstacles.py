@@ -311,7 +311,7 @@ def test_cavities_of_masks_and_meshes_are_filled():
     st.integers(0, 2**31),
 )
 def test_a_surface_has_the_voxels_on_their_sides_or_says_so(kind, size, more, seed):
-    """Centres lie at most 0.25 voxels beyond the surface, except for lost ones; no more are lost than were changed."""
+    """Centres lie at most 0.25 voxels beyond it, except for lost ones: at most as many as were changed."""
     random, count = np.random.default_rng(seed), 20
     places = np.moveaxis(np.indices((count,) * 3), 0, -1) - (count - 1) / 2 + random.uniform(-0.5, 0.5, 3)
     turned = np.abs(places @ rotation_matrix(random.uniform(-3, 3, 3).tolist()).numpy())
