@@ -289,12 +289,11 @@ def test_a_list_of_any_class_is_a_list(kind: Callable[[list[float]], Any]) -> No
     assert at.circle_points(kind([80e-3, 50e-3, 50e-3]), 30e-3, 4, (1, 0, 0)).equal(FOCI)
 
 
+@pytest.mark.filterwarnings("ignore::autdtorch.ScaleWarning")
 @pytest.mark.parametrize("method", ["box", "full"])
 def test_the_largest_scene_is_refused_for_its_memory(method: Any) -> None:
     far = 1e6
     wall = box(center=(0, 0, far / 2), size=(far, far, far - 2))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", at.ScaleWarning)
-        wide = scene(domain=((-far,) * 3, (far,) * 3), obstacles=[wall])
+    wide = scene(domain=((-far,) * 3, (far,) * 3), obstacles=[wall])
     with pytest.raises(ValueError, match=r"^spacing: 0\.001 m; (needs about|gives) "):
         at.make_propagator(wide, method)

