@@ -1,15 +1,26 @@
-"""Studies of a sweep, merged: which become one, and the names of the others."""
+"""Studies of a sweep, merged; results from others, whose names and texts are safe in files and reports."""
 
+import functools
+import re
+import tempfile
+from dataclasses import replace
 from functools import partial
+from html.parser import HTMLParser
+from pathlib import Path
 
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from markdown_it import MarkdownIt
 from small_scenes import SECTION as SCENE
 
 from autdtorch.io.scene_file import load_scene
 from autdtorch.methods.functions import gabs, lssg
-from autdtorch.study.report.tables import save_summary
-from autdtorch.study.results_file import RESULTS_FILE
+from autdtorch.study.report.document import as_page, code, fenced, table
+from autdtorch.study.report.study_report import write_report
+from autdtorch.study.report.tables import SUMMARY_FILE, save_summary
+from autdtorch.study.results_file import RESULTS_FILE, load_results, save_results
 from autdtorch.study.run_study import run_study
 from autdtorch.study.sweeps import collect_results
 
@@ -122,3 +133,160 @@ def test_a_copy_of_a_study_is_counted_once_with_a_warning(study, tmp_path, caplo
     assert only_method(tmp_path).trials == 1
     (line,) = caplog.messages
     assert all(str(tmp_path / name) in line for name in "01")
+
+
+HTML = "<img src=x onerror=alert(1)>\n\n<script>alert(1)</script>\n\na ` <b onclick=alert(1)>b</b>"
+MARKDOWN = "![a](https://evil.example/a.png) [b](https://evil.example) <https://evil.example> `` ``` ~~~"
+HOSTILE = f"{HTML}\n{MARKDOWN}\n\n</details>\n```\n{HTML}\n[x]: https://evil.example\n[x]"
+
+
+@pytest.fixture(autouse=True)
+def without_renderer(monkeypatch):
+    monkeypatch.setattr("autdtorch.study.report.study_report.rendering_problem", lambda: "not tried")
+
+
+def results_of(solver=None, seed=0):
+    settings = {"scene": SCENE, "method": {"_target_": "autdtorch.gabs"}, "solver": solver or {}}
+    methods = {"gabs": functools.partial(gabs, levels=2)}
+    with tempfile.TemporaryDirectory() as folder:
+        scenes, text = {"air": load_scene(SCENE)}, yaml.safe_dump(settings)
+        return run_study(scenes, methods, Path(folder), seed=seed, config=text)
+
+
+#: HDF5 itself has no groups of the first four names.
+NAMES = ["", ".", "a/b", "a\0b", "..", "...", "..\\a", "a\nb", "a b", "x" * 101, "é" * 51, "<b>", "![a](b)"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_study_refuses_a_name_that_is_no_part_of_a_file_name(tmp_path, name):
+    scene, method = load_scene(SCENE), functools.partial(gabs, levels=2)
+    with pytest.raises(ValueError, match=r"^scenes: "):
+        run_study({name: scene}, {"gabs": method}, tmp_path)
+    with pytest.raises(ValueError, match=r"^methods: "):
+        run_study({"air": scene}, {name: method}, tmp_path)
+
+
+@pytest.mark.parametrize("name", NAMES[4:])
+@pytest.mark.parametrize("field", ["scenes", "methods"])
+def test_results_with_such_a_name_are_refused(tmp_path, name, field):
+    results = results_of()
+    (scene,) = results.scenes.values()
+    other = {"air": replace(scene, methods={name: scene.methods["gabs"]})}
+    save_results(replace(results, scenes={name: scene} if field == "scenes" else other), tmp_path)
+    with pytest.raises(ValueError, match=rf"results\.h5: {field}: "):
+        load_results(tmp_path)
+
+
+def with_origin(results, **changes):
+    return replace(results, provenance=replace(results.provenance, **changes))
+
+
+def left(folder, *studies):
+    sweep = folder / "sweep"
+    for number, results in enumerate(studies):
+        save_results(results, sweep / str(number))
+    return sweep
+
+
+def collect(sweep):
+    found = collect_results(sweep)
+    save_summary(found, sweep / SUMMARY_FILE)
+    page = write_report(found.results, found.scenes, sweep, "autdtorch collect", found.seeds)
+    return page.read_text(encoding="utf-8")
+
+
+def test_the_names_of_what_was_swept_stay_in_the_folder(tmp_path):
+    solvers = ({"../../elsewhere": 1, "<b>": 1}, {"../../elsewhere": "../<b>", "語" * 300: "a\0b"})
+    page = collect(left(tmp_path, *map(results_of, solvers)))
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep"]
+    assert len(list((tmp_path / "sweep").glob("fig1_*.png"))) == len(solvers)
+    assert "<b>" not in page
+
+
+def test_settings_that_expand_or_read_a_variable_are_refused(tmp_path, monkeypatch):
+    tens = (f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 11))
+    config = "scene: &a0 [lol, lol]\n" + "".join(tens)
+    with pytest.raises(ValueError, match=r"results\.h5.*line"):
+        collect_results(left(tmp_path, with_origin(results_of(), config=config)))
+    monkeypatch.setenv("SECRET", "hunter2")
+    config = yaml.safe_dump({"scene": {**SCENE, "name": "${oc.env:SECRET}"}, "method": {}})
+    with pytest.raises(ValueError, match=r"name: '\$\{oc\.env:SECRET\}'"):
+        collect_results(left(tmp_path, with_origin(results_of(), config=config)))
+
+
+@pytest.mark.parametrize("end", ["", ".partial"])
+def test_a_report_is_not_written_through_a_link(tmp_path, end):
+    sweep = left(tmp_path, results_of())
+    mine = tmp_path / "mine"
+    mine.write_text("mine", encoding="utf-8")
+    for name in (SUMMARY_FILE, "report.md", "report.html", "fig1_air.png", "fig3d.png"):
+        (sweep / f"{name}{end}").symlink_to(mine)
+    collect(sweep)
+    assert mine.read_text(encoding="utf-8") == "mine"
+    assert not any((sweep / name).is_symlink() for name in (SUMMARY_FILE, "report.md", "report.html"))
+
+
+class Tags(HTMLParser):
+    """Tags and attributes of a page."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.found: list[tuple[str, str, str]] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attributes):
+        self.found += [(tag, "", ""), *((tag, name, value or "") for name, value in attributes)]
+
+
+OURS = {
+    "html", "head", "meta", "title", "style", "body", "h1", "h2", "p", "br", "em", "strong", "code",
+    "main", "nav", "a", "figure", "figcaption", "pre", "img", "div", "table", "thead", "tbody", "tr",
+    "th", "td", "ul", "li", "details", "summary",
+}  # fmt: skip
+ATTRIBUTES = {"lang", "charset", "name", "content", "class", "src", "alt", "href", "id", "scope", "role"}
+ATTRIBUTES |= {"aria-label", "tabindex", "width"}
+
+
+def test_a_report_shows_hostile_texts_as_texts(tmp_path):
+    versions = {"autdtorch": HOSTILE, HOSTILE: "1"}
+    texts = dict.fromkeys(("config", "source_digest", "date"), HOSTILE)
+    hostile = with_origin(results_of(), versions=versions, **texts)
+    page = write_report(hostile, {"air": load_scene(SCENE)}, tmp_path, HOSTILE).read_text("utf-8")
+    found = Tags(page).found
+    assert {tag for tag, _, _ in found} <= OURS
+    assert {name for _, name, _ in found if name} <= ATTRIBUTES
+    assert all(value.startswith("data:image/png;base64,") for _, name, value in found if name == "src")
+    assert all(re.fullmatch(r"#section-\d+", value) for _, name, value in found if name == "href")
+    # Each of the texts is there, and the version of autdtorch twice.
+    assert page.count("alert(1)") == 7 * HOSTILE.count("alert(1)")
+    text = (tmp_path / "report.md").read_text(encoding="utf-8")
+    tokens = MarkdownIt("commonmark").enable("table").parse(text)  # as others show it: with links and HTML
+    parts = [part for token in tokens for part in (token, *(token.children or ()))]
+    assert not any(part.type == "link_open" for part in parts)
+    assert not any("alert" in part.content for part in parts if part.type.startswith("html"))
+    images = {str(part.attrGet("src")) for part in parts if part.type == "image"}
+    assert images == {path.name for path in tmp_path.glob("*.png")}
+
+
+@pytest.mark.parametrize("text", [HTML, MARKDOWN[1:], "&lt;b&gt; <!-- c --> <?d?> <![CDATA[e]]>"])
+def test_a_page_has_no_html_and_no_links_but_its_own(tmp_path, text):
+    assert {tag for tag, _, _ in Tags(as_page(f"# {text}\n\n{text}\n", tmp_path)).found} <= OURS
+
+
+@pytest.mark.parametrize("source", ["../secret.png", "/etc/passwd", "https://a.example", "%2e%2e/secret.png"])
+def test_a_page_takes_images_of_its_folder_alone(tmp_path, source):
+    (tmp_path / "page").mkdir()
+    (tmp_path / "secret.png").write_bytes(b"secret")
+    with pytest.raises(ValueError, match=r"^image: "):
+        as_page(f"# Title\n\n![a]({source})\n", tmp_path / "page")
+
+
+@given(st.text() | st.text("`|\\<b>![a](c)\n\r "))
+def test_code_is_code_whatever_the_text(text):
+    parse = MarkdownIt("commonmark").enable("table").parse
+    (block,) = parse(fenced(text))
+    assert block.type == "fence"
+    for shown, count in ((f"x {code(text)} y", 1), (table([["head", "value"], ["x", code(text)]]), 4)):
+        cells = [token for token in parse(shown) if token.type == "inline"]
+        assert len(cells) == count
+        assert {part.type for part in cells[-1].children or ()} <= {"text", "code_inline"}
