@@ -125,7 +125,7 @@ def test_piston_far_away_is_its_directivity(reach):
     assert (ratio - piston_directivity(angle, K, radius)).abs().max() < 1e-4
 
 
-def test_piston_near_is_the_sum_over_its_disc():
+def test_piston_near_is_the_sum_over_its_disc_and_on_its_rim_the_closed_form():
     """Gauss quadrature in radius and trapezoids in angle: exponential at points a radius off the disc."""
     nodes, weights = np.polynomial.legendre.leggauss(40)
     rho, rho_weights = PISTON * (nodes + 1) / 2, PISTON * weights / 2
@@ -143,10 +143,7 @@ def test_piston_near_is_the_sum_over_its_disc():
     expected = at.green(points, grid, K) @ area.to(torch.complex128) / (math.pi * PISTON**2)
     field = piston_field(points, [[0.0, 0.0, 0.0]], K, PISTON, (0.0, 0.0, 1.0))
     assert torch.allclose(field[:, 0], expected, rtol=1e-10, atol=0)
-
-
-def test_piston_on_its_rim_is_the_closed_form():
-    """The disc is seen over half a turn: chords 2 a cos phi give a Bessel and a Struve function."""
+    # The disc is seen over half a turn: chords 2 a cos phi give a Bessel and a Struve function.
     reach = 2 * K * PISTON
     chords = j0(reach) + 1j * struve(0, reach) - 1
     expected = chords / (4j * math.pi * K * PISTON**2)

@@ -263,7 +263,7 @@ def test_the_dft_of_a_block_is_exact():
         assert torch.allclose(drive_dft(recorded, steps.denominator), phasor, rtol=1e-12)
 
 
-def test_a_given_time_step():
+def test_a_given_time_step_is_kept_below_the_limit():
     scene = small_scene((CUBE,))
     finest = make_propagator(scene, "full", 2e-3, time_step=2e-6)
     chosen = make_propagator(scene, "full", 2e-3)
@@ -272,9 +272,6 @@ def test_a_given_time_step():
     point = scene.control_points[:1]
     difference = relative_error(finest.transfer_matrix(point), chosen.transfer_matrix(point))
     assert difference < finest.tolerance + chosen.tolerance
-
-
-def test_a_time_step_above_the_limit_is_refused():
     scene = small_scene((CUBE,))
     with pytest.raises(ValueError, match=r"time_step: 3e-06 s; must be at most 2\.3\d+e-06 s") as error:
         make_propagator(scene, "full", 1e-3, time_step=3e-6)

@@ -126,15 +126,8 @@ def padded(method):
     return replace(method, solution=replace(method.solution, history=history))
 
 
-def test_what_pads_a_history_is_no_convergence():
+def test_what_pads_a_history_is_no_convergence_and_claims_without_data_have_no_verdict():
     assert judge_claims(changed(padded))[8][1] == judge_claims(study())[8][1]
-
-
-def undecided(results):
-    return [number for number, (_, verdict) in enumerate(judge_claims(results), start=1) if verdict is None]
-
-
-def test_claims_without_data_have_no_verdict():
     results = study()
     del results.scenes["homogeneous"]
     assert undecided(results) == [2, 3, 4, 6]
@@ -147,6 +140,10 @@ def test_claims_without_data_have_no_verdict():
     assert undecided(results) == [2, 3, 4, 7]
     without_area = changed(lambda method: replace(method, metrics=replace(method.metrics, area=None)))
     assert undecided(without_area) == [6, 7]
+
+
+def undecided(results):
+    return [number for number, (_, verdict) in enumerate(judge_claims(results), start=1) if verdict is None]
 
 
 DRAWS = 200

@@ -251,7 +251,7 @@ def test_scenes_of_other_scales_have_their_own_axis(factor: float, shared: bool)
     assert first.get_ylim()[1] >= 2.0
 
 
-def test_poses_draw_the_median_and_the_bound_along_the_path() -> None:
+def test_poses_and_levels_are_drawn_along_the_path_and_across_their_scene() -> None:
     scores = {"gabs": 1 + RANDOM.random((7, 5)), "lssg": 1 + RANDOM.random((7, 1))}
     figure = plot_poses(scores, np.arange(7.0), "path [mm]", "weakest focus [Pa]", np.full(7, 2.0))
     (ax,) = figure.axes
@@ -263,9 +263,6 @@ def test_poses_draw_the_median_and_the_bound_along_the_path() -> None:
     assert len(without.axes[0].get_lines()) == 2
     with pytest.raises(ValueError, match=r"scores\['gabs'\]: 7 poses; must be 6"):
         plot_poses(scores, np.arange(6.0), "", "")
-
-
-def test_levels_are_drawn_across_their_scene() -> None:
     history = {"empty": {"gabs": [[1.0, 2.0]]}, "two_cubes": {"gabs": [[1.0, 2.0]]}}
     figure = plot_convergence(history, {"empty": {"bound": 4.0, "90 %": 3.6}, "two_cubes": {"bound": 5.0}})
     for ax, expected in zip(figure.axes, ([4.0, 3.6], [5.0]), strict=True):

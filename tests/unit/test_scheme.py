@@ -268,16 +268,13 @@ def test_points_next_to_excluded_cells_use_the_others(cells):
     assert np.array_equal(same.weight, whole.weight)
 
 
-def test_a_point_on_a_cell_centre_is_that_cell():
+def test_a_point_on_a_cell_centre_is_that_cell_and_groups_of_nodes_read_their_mean():
     weights = interpolate_points(np.array([[9.0, 8.0, 7.0]]), SHAPE, FIRST, LAST, 2 * math.pi / 8.5)
     largest = weights.weight[0].argmax()
     assert weights.index[0, largest] == np.ravel_multi_index((9, 8, 7), SHAPE)
     # not to the last digit: the fit is regularised, which costs up to WIDTH_ERROR an axis
     assert weights.weight[0, largest] == pytest.approx(1, abs=3 * WIDTH_ERROR)
     assert np.sort(np.abs(weights.weight[0]))[-2] < WIDTH_ERROR
-
-
-def test_groups_of_nodes_read_their_mean():
     positions = np.random.default_rng(0).uniform(7, 13, (6, 3))
     positions[4:] = positions[3]  # of the second group one point alone: fewer cells than the first
     share = np.array([0.2, 0.3, 0.5])
