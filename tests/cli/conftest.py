@@ -1,11 +1,31 @@
 """Fixtures that run the command line in this process: a subprocess would have to import PyTorch each time."""
 
+import copy
+import functools
 import logging
 import sys
+from pathlib import Path
 
 import pytest
 
+from autdtorch.cli import config_files
+from autdtorch.cli.config_files import CONFIGS
 from autdtorch.cli.main import main
+from autdtorch.io.yaml_file import load_yaml
+
+
+@pytest.fixture(autouse=True, scope="session")
+def configs_parsed_once():
+    """Keep our parsed configs, which Hydra composes twice in each run."""
+    parsed = functools.cache(load_yaml)
+
+    def load(path):
+        absolute = Path(path).resolve()
+        return copy.deepcopy(parsed(absolute)) if absolute.is_relative_to(CONFIGS) else load_yaml(path)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(config_files, "load_yaml", load)
+        yield
 
 
 @pytest.fixture

@@ -96,7 +96,10 @@ GOAL_WORDS = {
 }
 
 
-def test_a_run_maximises_the_goal_of_its_settings_and_uses_no_results_of_another(run, tmp_path, capsys):
+def test_a_run_maximises_the_goal_of_its_settings_and_uses_no_results_of_another(
+    run, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr("autdtorch.cli.study_command._draw_plane", lambda *_: None)
     command = ("scene=homogeneous", "method=gabs", "method.levels=4", "plane_spacing=20e-3", "output=out")
     for words, goal in GOAL_WORDS.items():
         for reused in (False, True):

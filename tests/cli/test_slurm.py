@@ -166,7 +166,7 @@ def run_out_of_time(job, cluster):
 
 def test_disturbed_jobs_end_with_the_numbers_of_undisturbed_ones(cluster, tmp_path, run, write):
     write("halting/sitecustomize.py", HALTING)
-    paths = [str(tmp_path / "halting"), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
+    paths = filter(None, (str(tmp_path / "halting"), os.environ.get("PYTHONPATH")))
     environment = cluster | {"PYTHONPATH": os.pathsep.join(paths)}
     assert run("-m", *SWEEP) == 0
     undisturbed, disturbed = tmp_path / "multirun", tmp_path / "auf Slurm, gestört"

@@ -385,7 +385,7 @@ for name in ("left", "right"):
 
 
 def program(page, folder):
-    """Run the Python of a page, in this process unless it has loops and threads that end with the process."""
+    """Run the Python of a page, in this process if it can; a live view that it leaves is closed."""
     code = PYTHON[page]
     if "view3d" in code or "explore" in code:
         from autdtorch.plot.view3d import rendering_problem
@@ -394,7 +394,7 @@ def program(page, folder):
             pytest.skip(problem)
     if "playwright" in code and shutil.which("chromium") is None:
         pytest.skip("no Chromium")
-    if "explore" in code:
+    if "playwright" in code:  # whose loop another of Playwright in this process would refuse
         (folder / "page.py").write_text(code, "utf-8")
         done = run([sys.executable, "page.py"], folder)
         assert done.returncode == 0, done.stderr
@@ -404,7 +404,10 @@ def program(page, folder):
     with here(folder) as patch, matplotlib.rc_context({"backend": "Agg"}):
         for name in ("open_link", "open_scope", "FileSensor"):  # to be undone
             patch.setattr(hardware, name, getattr(hardware, name))
-        exec(compile(code, f"{page} as Python", "exec"), {"__name__": "__main__"})
+        names = {"__name__": "__main__"}
+        exec(compile(code, f"{page} as Python", "exec"), names)
+        if "live" in names:
+            names["live"].close()
 
 
 # --- tests
