@@ -18,6 +18,7 @@ from one_node_slurm import missing_programs, one_node_slurm
 from autdtorch.cli import slurm
 from autdtorch.cli.main import CONFIGS
 from autdtorch.cli.slurm import QueueWatcher
+from autdtorch.study.folder import TrialFile
 from autdtorch.study.results_file import load_results
 
 pytest.importorskip("submitit")
@@ -107,7 +108,7 @@ SWEEP += ("method=gabs", f"trials={TRIALS}")
 LAUNCHER = ("hydra/launcher=slurm", "hydra.launcher.timeout_min=5", "hydra.launcher.mem_gb=1")
 
 # A sitecustomize.py: a job that runs for the first time waits after a block of trials for what disturbs it.
-HALTING = """
+HALTING = f"""
 import os, time
 
 def append_and_wait(*block):
@@ -115,7 +116,7 @@ def append_and_wait(*block):
     time.sleep(300)
 
 if "SLURM_JOB_ID" in os.environ and os.environ.get("SLURM_RESTART_COUNT", "0") == "0":
-    from autdtorch.study.trial_file import TrialFile
+    from {TrialFile.__module__} import TrialFile
     append, TrialFile.append = TrialFile.append, append_and_wait
 """
 
