@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from autdtorch.fdtd.assembly.elements import elements_of
-from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells, sees
+from autdtorch.fdtd.assembly.heterogeneous import (
+    HeterogeneousCells,
+    corners_around,
+    flat_index,
+    heterogeneous_cells,
+    sees,
+)
 from autdtorch.fdtd.boundary import layer_columns, tuned_profile
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.interpolation import Interpolation, average_nodes, exclude_cells, interpolate_points
@@ -82,10 +88,10 @@ class Assembly:
         """
         if not len(self.heterogeneous.enclosed):
             return np.zeros(len(points), bool)
-        cells, shape = self.grid.to_cells(points), np.array(self.grid.shape)
-        corners = np.floor(cells).astype(np.int64)[:, None] + np.indices((2, 2, 2)).reshape(3, 8).T
+        cells = self.grid.to_cells(points)
+        corners = corners_around(cells)
         far = ((corners - cells[:, None]) ** 2).sum(axis=2)
-        index = np.ravel_multi_index(tuple(np.moveaxis(corners.clip(0, shape - 1), -1, 0)), self.grid.shape)
+        index = flat_index(corners, self.grid.shape)
         enclosed = np.isin(index, self.heterogeneous.enclosed)
         open_air = ~np.isin(index, self.heterogeneous.rigid)
         if len(both := np.flatnonzero(enclosed.any(axis=1) & open_air.any(axis=1))):
@@ -125,7 +131,8 @@ def assemble(
 def assemble_on(grid: Grid, region: Region, dtype: torch.dtype, time_step: float | None) -> Assembly:
     """Assemble a region on a grid, with at most a time step of `time_step` [s], by default the largest."""
     stencil = air_stencil(grid, region)
-    cells = heterogeneous_cells(elements_of(region, grid, stencil), stencil)
+    sources = grid.to_cells(torch.from_numpy(region.sources))
+    cells = heterogeneous_cells(elements_of(region, grid, stencil), stencil, sources)
     return assembly_of(grid, region, cells, dtype, time_step)
 
 

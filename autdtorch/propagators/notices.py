@@ -46,14 +46,15 @@ class Notices:
             self._logged |= {"surface"} if near else set()
 
     def of_cavities(self, points: torch.Tensor, pressure: torch.Tensor) -> None:
-        """Log that points (P, 3), with the pressure (P, K) of drives, are in a cavity of rigid obstacles."""
+        """Log that points (P, 3), with the pressure (P, K) of drives, are closed off by rigid obstacles."""
         silent = points[(pressure == 0).all(dim=1)]
         if len(silent) and "cavity" not in self._logged:
             enclosed = silent[self._simulation.enclosed(silent)]
             if len(enclosed):
-                more = f", and of {len(enclosed) - 1} more," if len(enclosed) > 1 else ""
-                text = "rigid obstacles enclose the point at %s mm: its pressure%s is 0"
-                self._once("cavity", text, _in_mm(enclosed[0]), more)
+                more = f" and {len(enclosed) - 1} more" if len(enclosed) > 1 else ""
+                text = "rigid obstacles close off the point at %s mm%s: pressure 0 (gaps narrower than a cell,"
+                text += " %.2g mm, may count as closed)"
+                self._once("cavity", text, _in_mm(enclosed[0]), more, 1e3 * self._plan.spacing)
 
     def of_sources(self, result: PressureMap) -> None:
         """Log that a source is next to an obstacle, where runs began at the transducers."""

@@ -262,7 +262,8 @@ class SimulatedPropagator:
         # only boxes know the incident field
         of_grids = errors_by_grids if self.method == "full" else grid_errors
         errors = of_grids(matrix, free, self.spacing, grids, self.plan.law)
-        errors = torch.where(matrix.any(dim=1), errors, 0.0)  # silence is exact
+        heard = torch.stack([each.matrix.any(dim=1) for each in results]).any(dim=0)
+        errors = torch.where(heard, errors, 0.0)  # silence on all grids is exact
         region = self.plan.region
         return errors + shape_errors(matrix, free, region) + rigid_errors(matrix, free, region)
 

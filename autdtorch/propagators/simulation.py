@@ -141,7 +141,7 @@ class Simulation(ABC):
     def fields(self, drive: torch.Tensor, points: torch.Tensor) -> PressureMap:
         """Return the pressure (P, R) of drives (R, M), none of them silent, at points (P, 3)."""
         key = digest_of(self.plan.key, points, drive)
-        return self._store.get(key, lambda: self._fields(drive, points))
+        return self._store.get(key, lambda: self._audible_fields(drive, points))
 
     def matrix_runs(self, points: torch.Tensor) -> int:
         """Return the number of runs that the transfer matrix of points (P, 3) takes."""
@@ -214,6 +214,12 @@ class Simulation(ABC):
         matrix[audible] = result.matrix
         return replace(result, matrix=matrix)
 
+    def _audible_fields(self, drive: torch.Tensor, points: torch.Tensor) -> PressureMap:
+        """Simulate the pressure of drives at points, by no run if no sound reaches any."""
+        if self.silent(points[:, None]).all():
+            return PressureMap(torch.zeros((len(points), len(drive)), **COMPLEX))
+        return self._fields(drive, points)
+
     def _matrix(self, points: torch.Tensor) -> PressureMap:
         """Simulate the transfer matrix of points (P, 3), none of them silent."""
         return self._matrix_of_orbits(points, self.orbits(points))
@@ -270,12 +276,14 @@ class Simulation(ABC):
         return orbits_of_transducers(points, self.symmetries)
 
     def _silence(self, points: torch.Tensor, sources: Apertures, strength: torch.Tensor) -> float:
-        """Return the norm of the pressure [Pa] at points (P, n, 3) below which a run may end: -80 dB.
+        """Return the norm of the pressure [Pa] at points (P, n, 3) below which a run may end.
 
-        It is relative to free space, as if the sources of strength (N,) [Pa m] did not cancel each other.
+        It is -80 dB, or the least whose tolerance is above rounding, relative to free space, as if the
+        sources of strength (N,) [Pa m] did not cancel each other.
         """
         distance = torch.cdist(points.mean(dim=1), sources.positions.mean(dim=1))
-        return SILENCE * float((strength.abs() / distance.clamp(min=self.plan.spacing / 2)).norm())
+        faintest = max(SILENCE, torch.finfo(self.plan.dtype).eps / self.plan.tolerance)
+        return faintest * float((strength.abs() / distance.clamp(min=self.plan.spacing / 2)).norm())
 
     def _refuse_enclosed_transducers(self) -> None:
         if len(self._enclosed_transducers):

@@ -70,15 +70,20 @@ class HeterogeneousCells:
         return mass
 
 
-def heterogeneous_cells(elements: Elements, stencil: Stencil) -> HeterogeneousCells:
-    """Assemble the stencil rows of all cells that are not of uniform air."""
+def heterogeneous_cells(
+    elements: Elements, stencil: Stencil, sources: Array | None = None
+) -> HeterogeneousCells:
+    """Assemble the stencil rows of all cells that are not of uniform air.
+
+    Air that rigid bodies part from all `sources`, positions (M, 3) [cells], is enclosed.
+    """
     x, y, z = elements.material.shape
     shape = (x + 1, y + 1, z + 1)
     touched = np.unique(_vertices(elements, shape))
     touched = touched[_inner(touched, shape)]
     coupling, mass, hard = _without_rigid(elements, touched, shape, stencil)
     walls = elements.materials.rigid.any()
-    enclosed = enclosed_cells(coupling, touched, hard, shape) if walls else np.zeros(0, np.int64)
+    enclosed = enclosed_cells(coupling, touched, hard, shape, sources) if walls else np.zeros(0, np.int64)
     hard[enclosed] = True
     if len(enclosed):
         coupling *= _both_open(hard, touched, shape)
@@ -267,10 +272,11 @@ _STEPS, _TOUCHING = 60, 1e-3
 
 
 def enclosed_cells(
-    coupling: Array, touched: Index, hard: NDArray[np.bool_], shape: tuple[int, int, int]
+    coupling: Array, touched: Index, hard: NDArray[np.bool_], shape: GridShape, sources: Array | None = None
 ) -> Index:
     """Return the flat indices of cells that are not connected with the outermost ones.
 
+    Outermost cells in several parts count where they are connected with `sources`, positions (M, 3) [cells].
     The `touched` cells (n,) have `coupling` (n, 27). All others are connected with the six beside them,
     unless they are rigid.
     """
@@ -290,7 +296,24 @@ def enclosed_cells(
     rim = inner & ~np.pad(inner[2:-2, 2:-2, 2:-2], 2)
     outside = np.zeros(size, bool)
     outside[connected[number[rim.ravel() & free]]] = True
+    if sources is not None and len(sources) and outside.sum() > 1:  # a wall parts the grid
+        beside = flat_index(corners_around(sources), shape)
+        reached = np.zeros(size, bool)
+        reached[connected[number[beside[free[beside]]]]] = True
+        outside &= reached
     return np.flatnonzero(free & inner.ravel() & ~outside[connected][number])
+
+
+def corners_around(points: Array) -> Index:
+    """Return the eight cells (N, 8, 3) around positions (N, 3) [cells]."""
+    corners = np.indices((2, 2, 2)).reshape(3, 8).T
+    return np.asarray(np.floor(points).astype(np.int64)[:, None] + corners, np.int64)
+
+
+def flat_index(cells: Index, shape: GridShape) -> Index:
+    """Return flat indices (...) of cells (..., 3); of those outside the grid, of the nearest cells."""
+    inside = cells.clip(0, np.array(shape) - 1)
+    return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(inside, -1, 0)), shape), np.int64)
 
 
 def sees(begin: Array, end: Array, walls: Sequence[Shape], spacing: float) -> NDArray[np.bool_]:

@@ -179,7 +179,8 @@ def plane_fields(section: Section, mobility: Array, count: int) -> PlaneFields:
     field = np.zeros((used.size, len(order)))
     field[:, 0] = used.ravel()
     field[fixed, 1:] = outside.reshape(used.size, -1)[fixed]
-    field[free, 1:] = _solved(matrix[free][:, free], matrix[free][:, fixed] @ -field[fixed, 1:])
+    if len(order) > 1:
+        field[free, 1:] = _solved(matrix[free][:, free], matrix[free][:, fixed] @ -field[fixed, 1:])
     share = width[:, :, None] * height[:, :, None] * np.outer(_INTEGRAL, _INTEGRAL).ravel()
     at = np.ix_(*map(_places_of_vertices, nodes, section.size))
     return PlaneFields(
@@ -261,7 +262,9 @@ def _rim_fields(section: Section, mobility: Array, nodes: list[Array], count: in
     at[0], at[:, -1] = 2 * wide + tall + high_y - nodes[1], wide + tall + high_x - nodes[0]
     at[-1], at[:, 0] = wide + nodes[1] - low_y, nodes[0] - low_x
     ends, closed = np.append(place, whole), np.vstack((value, value[:1]))
-    outside = np.stack([np.interp(at, ends, each) for each in closed.T], axis=-1)
+    outside = np.empty((*at.shape, len(order)))
+    for number, each in enumerate(closed.T):
+        outside[..., number] = np.interp(at, ends, each)
     return outside, np.concatenate(([0.0], order * whole / (2 * np.pi)))
 
 
@@ -281,8 +284,10 @@ def _smoothest(step: Array, mobility: Array, count: int) -> tuple[Array, Array]:
     np.add.at(stiffness, (ahead, here), -slope)
     some = np.flatnonzero(mass)
     scale = 1 / np.sqrt(mass[some])
-    last = min(count, len(some) - 1)
-    square, vectors = eigh(stiffness[np.ix_(some, some)] * scale[:, None] * scale, subset_by_index=(1, last))
+    last = max(0, min(count, len(some) - 1))
     value = np.zeros((size, last))
+    if not last:  # all of the line is in rigid material: around a duct
+        return value, np.zeros(0)
+    square, vectors = eigh(stiffness[np.ix_(some, some)] * scale[:, None] * scale, subset_by_index=(1, last))
     value[some] = vectors * scale[:, None] * np.sqrt(mass.sum())
     return value, np.sqrt(np.maximum(square, 0))

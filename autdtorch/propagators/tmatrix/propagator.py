@@ -155,6 +155,8 @@ class TMatrixPropagator:
 
     def _wave_errors(self, points: torch.Tensor, matrix: torch.Tensor) -> torch.Tensor:
         """Return the estimated errors (P,) of rows of G (P, M) that the waves serve."""
+        if not len(points):
+            return torch.zeros(0, **REAL)
         free = free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
         region = self.plan.region
         if not self.plan.runs:  # exact but for the waves left out

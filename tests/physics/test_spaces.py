@@ -1,0 +1,285 @@
+"""Open and closed spaces: what no sound reaches is 0 without a run, and changes nothing outside."""
+
+import itertools
+
+import numpy as np
+import pytest
+import pyvista
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_scenes import AIR, relative_error, small_scene
+
+from autdtorch.propagators import make_propagator
+from autdtorch.propagators.simulation import PressureMap
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.obstacles import Box, Mesh, Sphere, VoxelMask
+from autdtorch.scene.scene import Scene
+
+CENTER = (12.2e-3, 11.9e-3, 12.1e-3)
+OUTER, SPACING, STEADY = 4.2e-3, 1e-3, 1e-4
+
+
+def hollow_ball(wall: float) -> Mesh:
+    outer, inner = (pyvista.Icosphere(radius=radius, nsub=4) for radius in (OUTER, OUTER - wall))
+    triangles = [ball.faces.reshape(-1, 4)[:, 1:] for ball in (outer, inner)]
+    vertices = np.concatenate([outer.points, inner.points]).astype(np.float64) + CENTER
+    return Mesh.from_surface(
+        (vertices, np.concatenate([triangles[0], triangles[1][:, ::-1] + len(outer.points)])), rigid=True
+    )
+
+
+def room(wall: float, half: float = 4e-3) -> list[Box]:
+    walls = []
+    for axis, sign in itertools.product(range(3), (-1, 1)):
+        size, place = [2 * (half + wall)] * 3, list(CENTER)
+        size[axis], place[axis] = wall, place[axis] + sign * (half + wall / 2)
+        walls.append(Box(tuple(place), tuple(size), rigid=True))
+    return walls
+
+
+def with_points(scene: Scene, *points: tuple[float, float, float]) -> torch.Tensor:
+    return torch.cat((scene.control_points, torch.tensor(points, dtype=torch.float64)))
+
+
+def solid_ball():
+    ball = pyvista.Icosphere(radius=OUTER, nsub=4)
+    return Mesh.from_surface(
+        (ball.points.astype(np.float64) + CENTER, ball.faces.reshape(-1, 4)[:, 1:]), rigid=True
+    )
+
+
+def mask(hollow):
+    inside = np.ones((8, 8, 8), bool)
+    inside[3:5, 3:5, 3:5] = not hollow
+    return VoxelMask(inside, 1e-3, (8e-3,) * 3, rigid=True)
+
+
+# the same geometry, up to the order of triangles
+@pytest.mark.parametrize(
+    ("hollow", "solid", "difference"),
+    [
+        (hollow_ball(0.3e-3), solid_ball(), 10 * STEADY),
+        (hollow_ball(1e-3), solid_ball(), 10 * STEADY),
+        (mask(True), mask(False), 1e-12),
+    ],
+    ids=["thin ball", "ball", "mask"],
+)
+def test_a_hollow_rigid_body_is_a_solid_one(hollow, solid, difference):
+    matrices = [
+        make_propagator(small_scene((body,)), "box", SPACING, STEADY).transfer_matrix()
+        for body in (hollow, solid)
+    ]
+    assert relative_error(*matrices) < difference
+
+
+@pytest.mark.parametrize("method", ["box", "full"])
+@pytest.mark.parametrize("wall", [0.2e-3, 1.5e-3])
+def test_a_closed_room_is_silent_and_told(method, wall, caplog):
+    scene = small_scene(room(wall))
+    propagator = make_propagator(scene, method, SPACING, 1e-3)
+    points = with_points(scene, CENTER)
+    matrix = propagator.transfer_matrix(points)
+    assert not matrix[-1].any()
+    assert (matrix[:-1].norm(dim=1) > 0).all()
+    assert "close off the point at (12.2, 11.9, 12.1) mm" in caplog.text
+    assert max(run.periods for run in propagator.runs) < 100  # the empty room does not ring
+    block = make_propagator(
+        small_scene((Box(CENTER, (2 * (4e-3 + wall),) * 3, rigid=True),)), method, SPACING, 1e-3
+    )
+    # the same outer faces; next to transducers and points each is within 2.5 % of the truth at 1 mm
+    assert relative_error(matrix[:-1], block.transfer_matrix(points)[:-1]) < 0.05
+
+
+def test_no_run_begins_at_a_point_in_a_closed_room(caplog):
+    """Points fewer than transducers, far from the walls: runs would begin at them."""
+    around = small_scene(room(0.5e-3, 9e-3), extent=0.05)
+    center = torch.tensor([CENTER], dtype=torch.float64)
+    outside = TransducerArray([(40e-3, 40e-3, 30e-3 + 2e-3 * step) for step in range(3)], (0, 0, 1))
+    scene = Scene(outside, around.medium, 40e3, around.control_points, around.obstacles, domain=around.domain)
+    propagator = make_propagator(scene, "box", SPACING, 1e-3)
+    assert not propagator.transfer_matrix(center).any()
+    assert not propagator.runs
+    assert "close off the point" in caplog.text
+
+
+def test_an_open_room_is_not_silent(caplog):
+    scene = small_scene(room(0.5e-3)[1:])
+    points = with_points(scene, CENTER)
+    matrix = make_propagator(scene, "box", SPACING, 1e-3).transfer_matrix(points)
+    assert matrix[-1].norm() > 0
+    assert "close off" not in caplog.text
+
+
+def test_the_side_of_a_thin_wall_decides_not_the_nearest_cell():
+    wall, half = 0.05e-3, 4e-3
+    scene = small_scene(room(wall, half))
+    propagator = make_propagator(scene, "box", SPACING, 1e-3)
+    x, y, z = CENTER
+    above = [(x, y + 0.3e-3, z + half + wall + up) for up in (0.05e-3, 0.2e-3, 0.5e-3, 0.9e-3)]
+    below = [(x, y + 0.3e-3, z + half - down) for down in (0.05e-3, 0.2e-3, 0.5e-3, 0.9e-3)]
+    matrix = propagator.transfer_matrix(torch.tensor([*above, *below], dtype=torch.float64))
+    assert (matrix[:4].norm(dim=1) > 0).all()
+    assert not matrix[4:].any()
+    assert not propagator.point_errors(torch.tensor(below, dtype=torch.float64)).any()
+
+
+@pytest.mark.parametrize("method", ["box", "full"])
+def test_a_ball_beside_a_closed_room_opens_no_wall(method):
+    """Elements beside a curved body see walls at points of a lattice, between which 0.05 mm would be lost."""
+    ball = Sphere((CENTER[0] + 6.3e-3, *CENTER[1:]), 2.2e-3, rigid=True)
+    scene = small_scene([*room(0.05e-3), ball])
+    points = with_points(scene, CENTER)
+    assert not make_propagator(scene, method, SPACING, 1e-3).transfer_matrix(points)[-1].any()
+
+
+@pytest.mark.parametrize("half", [4e-3, 20e-3])
+def test_a_transducer_in_a_closed_room_is_refused(half):
+    """Also where its distance from the walls allows its field to be stored."""
+    empty, domain = small_scene(), ((-0.02,) * 3, (0.05,) * 3)
+    inside = TransducerArray([CENTER], (0, 0, 1))
+    scene = Scene(inside, empty.medium, 40e3, [(0.0, 0.0, 0.045)], room(1e-3, half), domain=domain)
+    with pytest.raises(ValueError, match=r"array\.positions\[0\]: .* is enclosed by rigid obstacles"):
+        make_propagator(scene, "box", SPACING).transfer_matrix()
+
+
+@pytest.mark.parametrize("method", ["box", "full"])
+@pytest.mark.parametrize(("balls", "tolerance"), [(1, 1e-3), (2, 1e-3), (1, 1e-5)])
+def test_a_run_ends_where_a_drive_cancels(method, balls, tolerance):
+    """In a plane of symmetry two opposite drives leave rounding alone, which never becomes steady."""
+    array = TransducerArray([(-10e-3, 0.0, -20e-3), (10e-3, 0.0, -20e-3)], (0, 0, 1))
+    obstacles = [Sphere((0.0, y, 0.0), 3e-3, rigid=True) for y in (0.0, 18e-3)[:balls]]
+    domain = ((-15e-3, -10e-3, -25e-3), (15e-3, 25e-3, 15e-3))
+    scene = Scene(array, small_scene().medium, 40e3, [(0.0, 0.0, 10e-3)], obstacles, domain=domain)
+    propagator = make_propagator(scene, method, 1.5e-3, tolerance)
+    drive = torch.tensor([1.0, -1.0], dtype=torch.complex128)
+    cancelled, whole = (
+        propagator.field(each, scene.control_points).abs() for each in (drive, drive.abs() + 0j)
+    )
+    assert (cancelled < 1e-3 * whole).all()
+    assert max(run.periods for run in propagator.runs) < 100
+
+
+@pytest.mark.filterwarnings("ignore::autdtorch.OverlapWarning")
+def test_air_cut_from_a_rigid_cube_is_a_notch_between_plates():
+    """The pressure at a point in the notch is equal to the one between plates that leave the notch free."""
+    x, y, z = CENTER
+    cube = Box(CENTER, (10e-3,) * 3, rigid=True)
+    air = Box((x + 2e-3, y, z), (10e-3, 4e-3, 4e-3), density=1.293, sound_speed=340.0)
+    plates = [Box((x - 4e-3, y, z), (2e-3, 10e-3, 10e-3), rigid=True)]
+    for side in (-3.5e-3, 3.5e-3):
+        plates.append(Box((x + 1e-3, y + side, z), (8e-3, 3e-3, 10e-3), rigid=True))
+        plates.append(Box((x + 1e-3, y, z + side), (8e-3, 4e-3, 3e-3), rigid=True))
+    scene, matrices = small_scene(), []
+    points = [(x + 3.1e-3, y + 0.4e-3, z), (x + 8.3e-3, y, z)]
+    for obstacles in ([cube, air], plates):
+        built = Scene(scene.array, scene.medium, 40e3, points, obstacles, domain=scene.domain)
+        matrices.append(make_propagator(built, "full", SPACING, STEADY).transfer_matrix())
+    assert relative_error(*matrices) < 1e-3  # one body in two descriptions; measured 0
+
+
+@settings(max_examples=6)
+@given(
+    half=st.tuples(*[st.floats(2e-3, 5e-3)] * 3),
+    wall=st.floats(0.02e-3, 2e-3),
+    shift=st.tuples(*[st.floats(-0.5e-3, 0.5e-3)] * 3),
+    missing=st.none() | st.integers(0, 5),
+    method=st.sampled_from(["box", "full"]),
+    others=st.lists(st.sampled_from(["ball", "ledge", "tilted"]), max_size=2),
+)
+def test_rooms_are_closed_until_a_wall_is_taken_out(half, wall, shift, missing, method, others):
+    """Walls of any thickness at any place between the cells, with bodies that stand in them or outside."""
+    center = np.array(CENTER) + shift
+    walls = []
+    for axis, sign in itertools.product(range(3), (-1, 1)):
+        size, place = 2 * (np.array(half) + wall), center.copy()
+        size[axis], place[axis] = wall, place[axis] + sign * (half[axis] + wall / 2)
+        walls.append(Box(tuple(place), tuple(size), rigid=True))
+    if missing is not None:
+        del walls[missing]
+    x, y, z = center.tolist()
+    bodies = {
+        "ball": Sphere((x, y + half[1] + wall + 1e-3, z), 1.2e-3, rigid=True),
+        "ledge": Box((x, y, z + half[2]), (1.5e-3,) * 3, rigid=True),
+        "tilted": Box((x, y - half[1] - wall, z), (2e-3,) * 3, (0.3, 0.2, 0.5), rigid=True),
+    }
+    scene = small_scene([*walls, *(bodies[name] for name in others)])
+    within = torch.from_numpy(center + np.array([(0, 0, 0), (1e-3, -0.7e-3, 0.4e-3)]))
+    simulation = make_propagator(scene, method, SPACING).simulation
+    silent = simulation.silent(torch.cat((scene.control_points, within))[:, None])
+    assert silent.tolist() == [False] * 3 + [missing is None] * 2
+
+
+def narrow_hole(edge: float, wall: float = 1.5e-3, half: float = 4e-3) -> list[Box]:
+    """A room with a square hole in the middle of a wall."""
+    x, y, z = CENTER
+    z, whole, beside = z + half + wall / 2, 2 * (half + wall), half + wall - edge / 2
+    offset = (edge + beside) / 2
+    frame = [Box((x + sign * offset, y, z), (beside, whole, wall), rigid=True) for sign in (-1, 1)]
+    frame += [Box((x, y + sign * offset, z), (edge, beside, wall), rigid=True) for sign in (-1, 1)]
+    return [*room(wall)[:-1], *frame]
+
+
+def test_less_enters_a_room_by_a_narrower_hole():
+    """Also by one narrower than a cell, around which the section of a window is all rigid."""
+    entered = []
+    for edge in (1.5e-3, 1e-3, 0.7e-3):
+        matrix = make_propagator(small_scene(narrow_hole(edge)), "box", SPACING, 1e-2).transfer_matrix(
+            torch.tensor([CENTER], dtype=torch.float64)
+        )
+        entered.append(float(matrix.norm()))
+    # the flow through a hole grows with its area (thick wall) or its edge (thin wall): 1.43 ** (1 to 2)
+    ratios = [one / other for one, other in itertools.pairwise(entered)]
+    assert all(1.3 < ratio < 3 for ratio in ratios)
+
+
+ACROSS = Box((15e-3, 12e-3, 12e-3), (2e-3, 1.0, 1.0), rigid=True)
+
+
+def test_behind_a_wall_across_the_domain_is_silence(caplog):
+    scene = small_scene((ACROSS,))
+    propagator = make_propagator(scene, "full", SPACING, 1e-3)
+    assert not propagator.transfer_matrix().any()
+    drive = torch.ones(4, dtype=torch.complex128)
+    assert not propagator.field(drive, scene.control_points).any()
+    assert not propagator.point_errors().any()
+    assert not propagator.runs
+    assert "close off the point at (22.3, 7.44, 14.4) mm and 2 more" in caplog.text
+    in_front = torch.tensor([(10e-3, 12e-3, 13e-3)], dtype=torch.float64)
+    both = propagator.transfer_matrix(torch.cat((in_front, scene.control_points)))
+    assert both[0].all()
+    assert not both[1:].any()
+
+
+def test_a_wall_between_transducers_leaves_no_side_silent():
+    """Each side has sound, of its transducer alone: nothing passes."""
+    array = TransducerArray([(3e-3, 12e-3, 11e-3), (21e-3, 12e-3, 13e-3)], (1, 0, 0))
+    points = [(8e-3, 12e-3, 12e-3), (22e-3, 10e-3, 9e-3)]
+    scene = Scene(array, AIR, 40e3, points, (ACROSS,), domain=((0, 0, 0), (24e-3,) * 3))
+    size = make_propagator(scene, "full", SPACING, 1e-3).transfer_matrix().abs()
+    assert (size.diag() > 1).all()
+    assert (size - torch.diag(size.diag())).max() < 1e-12 * size.max()
+
+
+@pytest.mark.parametrize("method", ["box", "full", "tmatrix"])
+def test_a_scene_whose_points_are_all_enclosed_ends_without_a_run(method):
+    empty = small_scene()
+    scene = Scene(empty.array, AIR, 40e3, [CENTER], room(1.5e-3), domain=empty.domain)
+    propagator = make_propagator(scene, method, SPACING)
+    matrix, error = propagator.transfer_matrix(return_error=True)
+    assert not matrix.any()
+    assert error == 0
+    assert not propagator.point_errors().any()
+    assert not propagator.field(torch.ones(4, dtype=torch.complex128), scene.control_points).any()
+    assert not propagator.runs
+
+
+def test_silence_on_one_grid_alone_is_not_exact():
+    """A gap that another grid resolves: the error is the pressure there, relative to -80 dB at least."""
+    scene = small_scene(room(1.5e-3))
+    propagator = make_propagator(scene, "box", SPACING)
+    free = propagator._free(scene.control_points)
+    faint, nothing = (PressureMap(share * free) for share in (1e-3, 0.0))
+    assert not propagator._errors([nothing, nothing], free).any()
+    # the pressure is 10 times -80 dB; the error of the coarser grid is 2.3 to 5 times that of the finer one
+    assert (propagator._errors([nothing, faint], free) > 1).all()
