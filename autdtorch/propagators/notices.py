@@ -52,7 +52,9 @@ class Notices:
             enclosed = silent[self._simulation.enclosed(silent)]
             if len(enclosed):
                 more = f" and {len(enclosed) - 1} more" if len(enclosed) > 1 else ""
-                text = "rigid obstacles close off the point at %s mm%s: pressure 0 (gaps narrower than a cell,"
+                text = (
+                    "rigid obstacles close off the point at %s mm%s: pressure 0 (gaps narrower than a cell,"
+                )
                 text += " %.2g mm, may count as closed)"
                 self._once("cavity", text, _in_mm(enclosed[0]), more, 1e3 * self._plan.spacing)
 
