@@ -70,7 +70,7 @@ class Judged:
     near: bool  # whether the claim is within a factor of three
     true: float  # relative error
     seconds: float
-    ratio: float  # of the run time to that of the coarsest sufficient grid; NaN if no grid is sufficient
+    ratio: float  # run time over the time on the coarsest sufficient grid; NaN if no grid is sufficient
 
 
 def judged(family: str, seed: int, tolerance: float) -> Judged | None:

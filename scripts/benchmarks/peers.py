@@ -99,8 +99,8 @@ def main(page: Page, coarse: bool, venvs: Path) -> None:
 class Setting:
     """The settings of a peer's run.
 
-    `offset` is that of cell centres from the focus [cells]. At 1 mm and less, 0 puts focus and transducers on
-    cell centres, 1/2 the faces of the cubes between them.
+    `offset` moves the cell centres away from the focus [cells]. At 1 mm and less, 0 puts focus and
+    transducers on cell centres, 1/2 the faces of the cubes between them.
     """
 
     peer: str

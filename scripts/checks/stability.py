@@ -75,7 +75,7 @@ def main(scenes: int, seed: int, only: int | None, long_share: float, processes:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of a trial; growth is that of the logarithm of the pressure's norm over the last half."""
+    """The result of a trial. The logarithm of the pressure's norm grows over the last half of a run."""
 
     trial: Trial
     rate: dict[str, float]  # growth per period, by run
