@@ -41,6 +41,7 @@ from .scene.drive import amplitudes_of, drive_from_phases, focus_phases, phases_
 from .scene.geometry import Plane, circle_points, sphere_points
 from .scene.medium import Medium
 from .scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
+from .scene.porous import porous
 from .scene.scene import OverlapWarning, ScaleWarning, Scene
 from .study.results_file import load_results
 from .study.sweeps import Sweep, collect_results
@@ -131,6 +132,7 @@ __all__ = [
     "plot_scaling",
     "plot_scene",
     "plot_trials",
+    "porous",
     "random_search",
     "run",
     "save_drive",

@@ -9,6 +9,7 @@ The N = (L + 1)^2 waves up to the degree L are in the order (l, m), m from -l to
 
 from __future__ import annotations
 
+import cmath
 import functools
 import math
 from typing import NamedTuple
@@ -17,7 +18,7 @@ import numpy as np
 import torch
 from scipy.special import spherical_jn, spherical_yn
 
-from autdtorch.utils.array_types import COMPLEX, REAL, ComplexArray
+from autdtorch.utils.array_types import COMPLEX, REAL, AnyArray, ComplexArray
 
 _LOST = 1e-280  # Magnitude below which j_l loses digits to underflow
 _TINY = 1e-12  # distance from the centre [m] below which a point has the direction z
@@ -146,7 +147,11 @@ def regular_radial(degree: int, x: torch.Tensor) -> torch.Tensor:
 
 
 def sphere_coefficients(
-    degree: int, size: float, density_ratio: float = math.inf, speed_ratio: float = 1.0
+    degree: int,
+    size: float,
+    density_ratio: complex = math.inf,
+    speed_ratio: complex = 1.0,
+    impedance: complex | None = None,
 ) -> ComplexArray:
     """Return b_l / d_l (L + 1,) of a sphere of size ka, for incoming d_l j_l Y_lm and outgoing b_l h_l Y_lm.
 
@@ -155,13 +160,17 @@ def sphere_coefficients(
         size: k a, real.
         density_ratio: density ratio, sphere over medium; infinite if rigid.
         speed_ratio: ratio of sound speeds, sphere over medium.
+        impedance: of the surface, over that of the medium, in place of both ratios.
     """
     order = np.arange(degree + 1)
     regular, slope = spherical_jn(order, size), spherical_jn(order, size, derivative=True)
     out = regular + 1j * spherical_yn(order, size)
     out_slope = slope + 1j * spherical_yn(order, size, derivative=True)
-    inner, inner_slope = np.ones(degree + 1), np.zeros(degree + 1)
-    if not math.isinf(density_ratio):
+    inner: AnyArray = np.ones(degree + 1)
+    inner_slope: AnyArray = np.zeros(degree + 1)
+    if impedance is not None:  # the velocity into the surface is p / impedance
+        inner_slope = np.full(degree + 1, -1j / impedance)
+    elif not cmath.isinf(density_ratio):
         inside = size / speed_ratio
         inner, slope_inside = spherical_jn(order, inside), spherical_jn(order, inside, derivative=True)
         lost = np.abs(inner) < _LOST  # j_l is proportional to x^l there

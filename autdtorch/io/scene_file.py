@@ -25,6 +25,7 @@ from autdtorch.scene.arrays import FORMS, recipes_of
 from autdtorch.scene.drive import amplitudes_of, drive_from_phases, phases_of
 from autdtorch.scene.geometry import Plane, circle_points, sphere_points
 from autdtorch.scene.obstacles import KINDS, Obstacle
+from autdtorch.scene.porous import porous
 from autdtorch.scene.scene import Medium, Scene
 from autdtorch.utils.files import replace_file
 from autdtorch.utils.units import warned_within
@@ -58,6 +59,7 @@ _JOINED: dict[str, tuple[str, Builder]] = {  # an example of an entry, and how a
     "array": ("{type: autd3, center: [0, 0, 0]}", partial(reduce, operator.add)),
     "control_points": ("{type: points, positions: [...]}", torch.cat),
 }
+_COMPLEX = ("density", "sound_speed", "impedance")  # keys of obstacles with numbers such as 1.5+0.2j, a text
 _BUILDERS: dict[str, Builder] = {  # of sections without `type`
     "observation_plane": Plane,
     "domain": lambda lower, upper: (finite_vector("lower", lower), finite_vector("upper", upper)),
@@ -69,8 +71,10 @@ def load_scene(source: str | os.PathLike[str] | Mapping[str, Any], modules: Coll
 
     Control points and array are a section each, or a list of sections, whose points or transducers follow one
     another. An obstacle has a `type`, or the `_target_` of a user's class, such as
-    `mymodule.MyObstacle`. The section `pose`, with the keys `offset` and `rotation`, or `rotation_degrees`,
-    moves all obstacles as one body; see `Scene.moved`.
+    `mymodule.MyObstacle`. Its complex numbers are written as in `impedance: 1.5+0.2j`. Its section `porous`,
+    `{flow_resistivity: 200e3}`, is the material that `porous` returns for the scene's frequency and medium.
+    The section `pose`, with the keys `offset` and `rotation`, or `rotation_degrees`, moves all obstacles as
+    one body; see `Scene.moved`.
 
     Args:
         source: path of the file, or the mapping. A value may be an interpolation of another key, `${key}`;
@@ -93,8 +97,14 @@ def load_scene(source: str | os.PathLike[str] | Mapping[str, Any], modules: Coll
     _check_keys(where, section, Scene)
     air = partial(Medium.air, frequency=section["frequency"])
     folder = Path() if isinstance(source, Mapping) else Path(source).parent
+    medium: Any = _part(f"{where}: medium", "medium", section["medium"], air, folder, trusted)
+    foam = partial(porous, frequency=section["frequency"], medium=medium)
+    if isinstance(obstacles := section.get("obstacles"), list):
+        places = [(f"{where}: obstacles[{index}]", entry) for index, entry in enumerate(obstacles)]
+        section["obstacles"] = [_with_material(place, entry, foam) for place, entry in places]
     parts = {
-        key: _part(f"{where}: {key}", key, value, air, folder, trusted) for key, value in section.items()
+        key: medium if key == "medium" else _part(f"{where}: {key}", key, value, air, folder, trusted)
+        for key, value in section.items()
     }
     scene: Scene = _build(where, parts, Scene)
     return _build(f"{where}: pose", _mapping(f"{where}: pose", pose), scene.moved) if pose else scene
@@ -156,6 +166,27 @@ def _part(
     return _build(where, section, builder)
 
 
+def _with_material(where: str, section: object, foam: Builder) -> object:
+    """Return the section of an obstacle with numbers in place of the section `porous` and of text."""
+    if not isinstance(section, dict):
+        return section
+    section = dict(section)
+    for key in _COMPLEX:
+        if isinstance(text := section.get(key), str):
+            try:
+                section[key] = complex("".join(text.split()))
+            except ValueError as error:
+                raise invalid(f"{where}.{key}", text, "must be a number such as 1.5 or 1.5+0.2j") from error
+    material = section.pop("porous", None)
+    if material is None:
+        return section
+    place = f"{where}.porous"
+    computed = _build(place, _mapping(place, material), foam)
+    if both := [key for key in computed if section.get(key) is not None]:
+        raise invalid(f"{where}.{both[0]}", section[both[0]], "must be absent beside porous, which sets it")
+    return section | computed
+
+
 def _build(where: str, section: dict[str, Any], builder: Builder) -> Any:
     _check_keys(where, section, builder)
     with within(where), warned_within(where):
@@ -182,6 +213,13 @@ def _parameters(builder: Builder) -> dict[str, inspect.Parameter]:
     return {key: entry for key, entry in inspect.signature(builder).parameters.items() if key not in bound}
 
 
+class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
+    """The writer of YAML, to which complex numbers are texts such as 1.5+0.2j."""
+
+
+_Dumper.add_representer(complex, lambda dumper, value: dumper.represent_str(str(value).strip("()")))
+
+
 class _Code(str):
     """An expression in Python."""
 
@@ -206,7 +244,8 @@ def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
     require_kind("scene", scene, Scene)
     sections = scene_sections(scene, path.stem)
     write_files(scene, path.with_suffix(""))
-    text = yaml.safe_dump(sections, sort_keys=False, default_flow_style=None, width=110, allow_unicode=True)
+    layout = {"sort_keys": False, "default_flow_style": None, "width": 110, "allow_unicode": True}
+    text = yaml.dump(sections, Dumper=_Dumper, **layout)
     replace_file(path, text.encode())
 
 

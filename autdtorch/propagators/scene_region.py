@@ -28,9 +28,9 @@ def region_of(scene: Scene) -> Region:
     """Return the region of a scene; parallel walls across it continue through the boundary layers."""
     bodies = []
     for one, (_, continued) in zip(scene.obstacles, _walls(scene), strict=True):
-        density, speed = one.density, one.sound_speed
-        fluid = None if density is None or speed is None else Fluid(density, speed)
-        bodies.append(Body(one, fluid, continued, one.uncertainty))
+        material = one.fluid_at(scene.frequency)
+        fluid = None if material is None else Fluid(*material)
+        bodies.append(Body(one, fluid, continued, one.uncertainty, impedance=one.impedance))
     medium, positions = scene.medium, np.asarray(scene.array.positions.numpy())
     air = Fluid(medium.density, medium.sound_speed)
     return Region(air, scene.attenuation, scene.frequency, tuple(bodies), scene.domain, positions)
@@ -68,13 +68,13 @@ def _overlap(one: Shape, other: Shape) -> bool:
 def difference_from_rigid(body: Body, region: Region) -> float:
     """Return the approximate relative difference between the fields of a fluid body and of a rigid one.
 
-    For a density ratio m and an impedance ratio z, a body moves in proportion to 1 / m and yields in
-    proportion to 1 / z. Through a wall of thickness d, 1 / (m k d) passes (mass law); here d is the mean
-    thickness.
+    For a density ratio m and an impedance ratio z, complex where the body absorbs, it moves in proportion to
+    1 / |m| and yields in proportion to 1 / |z|. Through a wall of thickness d, 1 / (|m| k d) passes (mass
+    law); here d is the mean thickness.
     """
     assert body.fluid is not None
-    heavier = body.fluid.inertia / region.fluid.inertia
-    stiffer = body.fluid.phase_speed / region.fluid.phase_speed
+    heavier = abs(body.fluid.density) / abs(region.fluid.density)
+    stiffer = abs(body.fluid.sound_speed) / abs(region.fluid.sound_speed)
     if heavier <= 1 or stiffer < _STIFF:
         return math.inf
     thickness = mean_thickness(*(part.numpy() for part in body.shape.surface()))

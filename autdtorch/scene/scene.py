@@ -21,8 +21,8 @@ from autdtorch.utils.array_types import REAL
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.spatial import nearest, require_distinct
 from autdtorch.utils.text import counted, html_facts
+from autdtorch.utils.units import DECIBELS, angles, warn_user
 from autdtorch.utils.units import ScaleWarning as ScaleWarning
-from autdtorch.utils.units import angles, warn_user
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
@@ -40,9 +40,9 @@ from autdtorch.utils.validation import (
 _DEFAULT_MARGIN = 2.0  # [wavelengths] of air on each side, by default
 _FARTHEST = 1e6  # [m] along an axis; far beyond any simulation, and volumes do not overflow
 _FREQUENCIES = 1e-3, 1e12  # [Hz]
-_DECIBELS = 20 / math.log(10)  # in a neper
 _LOWEST = 1000.0  # [Hz], below which a frequency may be in kHz
 _MOST_ABSORPTION = 3.0  # [dB per wavelength]: the model assumes a small imaginary part of the wavenumber
+_MOST_OF_OBSTACLE = 27.0  # [dB per wavelength], an imaginary part of half the wavenumber
 
 
 class OverlapWarning(UserWarning):
@@ -96,7 +96,7 @@ class Scene:
         Raises:
             ValueError: a field of the wrong type or out of range, or a coordinate beyond 1e6 m. Also a point
                 in or on an obstacle, coincident with another or outside the domain, or a medium that absorbs
-                more than 3 dB per wavelength.
+                more than 3 dB per wavelength, or an obstacle more than 27.
 
         Warns:
             OverlapWarning: two obstacles of different materials overlap.
@@ -129,6 +129,7 @@ class Scene:
             if self.frequency < _LOWEST:
                 accepted += f"; is the frequency, {self.frequency:g}, in Hz, 40 kHz as 40e3?"
             raise invalid("Scene.medium.absorption", medium.absorption, accepted, "dB/m")
+        _require_waves_inside(self)
         _require_separate_points(self)
         _require_in_domain(self)
         _warn_of_overlaps(self.obstacles)
@@ -188,7 +189,7 @@ class Scene:
     @property
     def attenuation(self) -> float:
         """Attenuation in the medium, alpha [Np/m]: a plane wave decays as e^{-alpha x}."""
-        return self.medium.absorption / _DECIBELS
+        return self.medium.absorption / DECIBELS
 
     @property
     def complex_wavenumber(self) -> complex:
@@ -238,12 +239,17 @@ class Scene:
 
 def _kinds(obstacles: tuple[Obstacle, ...]) -> list[str]:
     """Return the number of obstacles of each kind and material as texts."""
-    counts = Counter(
-        f"{type(obstacle).__name__} "
-        + ("(rigid)" if obstacle.rigid else f"({obstacle.density:.4g} kg/m³, {obstacle.sound_speed:.4g} m/s)")
-        for obstacle in obstacles
-    )
+    counts = Counter(f"{type(obstacle).__name__} ({_material(obstacle)})" for obstacle in obstacles)
     return [f"{count} x {kind}" for kind, count in counts.items()]
+
+
+def _material(obstacle: Obstacle) -> str:
+    if obstacle.impedance is not None:
+        return f"impedance {obstacle.impedance:.4g}"
+    if obstacle.rigid:
+        return "rigid"
+    absorption = f", {obstacle.absorption:.3g} dB/m" if obstacle.absorption else ""
+    return f"{obstacle.density:.4g} kg/m³, {obstacle.sound_speed:.4g} m/s{absorption}"
 
 
 def _corners(domain: ArrayLike) -> tuple[Vector, Vector]:
@@ -287,6 +293,17 @@ def _require_within(name: str, points: torch.Tensor) -> None:
         raise invalid(name, first, f"every coordinate must be in {-_FARTHEST:g} to {_FARTHEST:g}", "m")
 
 
+def _require_waves_inside(scene: Scene) -> None:
+    """Refuse absorptions that leave no wave in an obstacle, which an impedance describes better."""
+    for index, obstacle in enumerate(scene.obstacles):
+        if obstacle.absorption and obstacle.sound_speed is not None:
+            most = _MOST_OF_OBSTACLE * scene.frequency / obstacle.sound_speed.real
+            if obstacle.absorption > most:
+                accepted = f"must be at most {most:.4g} dB/m, {_MOST_OF_OBSTACLE:g} dB per wavelength inside"
+                accepted += "; porous() and impedance= describe what absorbs more"
+                raise invalid(f"Scene.obstacles[{index}].absorption", obstacle.absorption, accepted, "dB/m")
+
+
 def _require_separate_points(scene: Scene) -> None:
     """Refuse coincident points and points in or on an obstacle; on it, rounding would choose the side."""
     require_distinct("Scene.control_points", scene.control_points)
@@ -309,7 +326,8 @@ def _require_separate_points(scene: Scene) -> None:
 
 def _is_of_medium(scene: Scene, obstacle: Obstacle) -> bool:
     """Return whether an obstacle is of the medium's material: it cuts earlier ones, and hides no point."""
-    return (obstacle.density, obstacle.sound_speed) == (scene.medium.density, scene.medium.sound_speed)
+    material = obstacle.density, obstacle.sound_speed, obstacle.absorption
+    return material == (scene.medium.density, scene.medium.sound_speed, 0.0)
 
 
 def _in_later_medium(scene: Scene, index: int, points: torch.Tensor) -> torch.Tensor:
@@ -323,7 +341,7 @@ def _in_later_medium(scene: Scene, index: int, points: torch.Tensor) -> torch.Te
 
 def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
     """Warn of overlapping pairs of different material, where the order of the list matters."""
-    material = attrgetter("density", "sound_speed", "rigid")
+    material = attrgetter("density", "sound_speed", "rigid", "absorption", "impedance")
     pairs = [
         f"{index} overlaps {earlier}"
         for index, obstacle in enumerate(obstacles)

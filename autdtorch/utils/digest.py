@@ -54,8 +54,8 @@ def package_versions(*more: str) -> dict[str, str]:
 
 def _add(digest: Any, part: Any) -> None:
     """Add a value with its kind and length, so that different values give different input."""
-    if part is None or isinstance(part, str | bool | int | float):
-        text = part.hex() if isinstance(part, float) else repr(part)
+    if part is None or isinstance(part, str | bool | int | float | complex):
+        text = part.hex() if isinstance(part, float) else repr(part)  # of complex numbers exact too
         digest.update(f"{type(part).__name__} {len(text)} {text}\n".encode())
     elif hasattr(part, "__array__"):
         array = np.ascontiguousarray(part)

@@ -21,6 +21,9 @@ from autdtorch.utils.validation import (
     real_tensor,
 )
 
+DECIBELS = 20 / math.log(10)
+"""Decibels in a neper."""
+
 _place: ContextVar[str] = ContextVar("place of what is warned of", default="")
 _LEAST_DEGREES = 10.0  # beyond a turn in rad, so that whole numbers of rad, as a loop over turns has, are few
 _BETWEEN = {"autdtorch", "contextlib", "dataclasses", "functools"}  # call for the user, as `replace` does

@@ -149,12 +149,11 @@ def placed(obstacles: Sequence[Obstacle], medium: Medium, frequency: float, solv
 
 def _of_sphere(sphere: Obstacle, scene: Scene, degree: int) -> torch.Tensor:
     assert isinstance(sphere, Sphere)
-    ratios = math.inf, 1.0
-    if not sphere.rigid:
-        assert sphere.density is not None
-        assert sphere.sound_speed is not None
-        ratios = sphere.density / scene.medium.density, sphere.sound_speed / scene.medium.sound_speed
-    each = torch.from_numpy(sphere_coefficients(degree, scene.wavenumber * sphere.radius, *ratios))
+    ratios: tuple[complex, complex] = math.inf, 1.0
+    if (material := sphere.fluid_at(scene.frequency)) is not None:
+        ratios = material[0] / scene.medium.density, material[1] / scene.medium.sound_speed
+    size = scene.wavenumber * sphere.radius
+    each = torch.from_numpy(sphere_coefficients(degree, size, *ratios, sphere.impedance))
     return torch.diag(each[degrees(degree)])
 
 

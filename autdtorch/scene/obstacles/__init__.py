@@ -1,4 +1,4 @@
-"""Obstacles: boxes, spheres, cylinders, meshes and voxel masks, of a fluid material or rigid."""
+"""Obstacles: boxes, spheres, cylinders, meshes and voxel masks, of a fluid, rigid or with an impedance."""
 
 from autdtorch.scene.obstacles.base import Obstacle as Obstacle
 from autdtorch.scene.obstacles.mesh import Mesh as Mesh

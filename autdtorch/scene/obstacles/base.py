@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -12,33 +13,46 @@ from typing import Any, ClassVar, Self
 import torch
 
 from autdtorch.utils.array_types import REAL
+from autdtorch.utils.units import DECIBELS
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
     Vector,
     boolean,
-    fluid,
+    complex_number,
+    equivalent_fluid,
     invalid,
     not_negative,
+    positive,
     real_tensor,
 )
 
+_IMPEDANCES = 1e-2, 1e6  # ratios to the medium; beyond are pressure-release and rigid surfaces
 _SAMPLES = 16  # along each axis of the intersection of two bounding boxes
 
 
 @dataclass(frozen=True, kw_only=True)
 class Obstacle(ABC):
-    """A body of a fluid material, or a rigid body. Several obstacles in a list make a union.
+    """A body of a fluid material, a rigid body, or one whose surface has an impedance.
 
-    Obstacles are constant. `dataclasses.replace` returns one that is moved, rescaled or of another material.
+    Several obstacles in a list make a union. Obstacles are constant. `dataclasses.replace` returns one that
+    is moved, rescaled or of another material.
 
     Attributes:
-        density: of the material [kg/m^3], 1e-9 to 1e9; None if rigid.
-        sound_speed: of the material [m/s], 1e-3 to 1e6; None if rigid.
+        density: of the material [kg/m^3], 1e-9 to 1e9; None if rigid or with an impedance. Complex, with an
+            imaginary part >= 0, in a porous material: `porous` computes it, and the sound speed.
+        sound_speed: of the material [m/s], 1e-3 to 1e6; None if rigid or with an impedance. Complex, with an
+            imaginary part <= 0, in a material that absorbs.
         rigid: True for walls that do not move.
+        absorption: of a plane wave in the material at the drive frequency [dB/m], >= 0, instead of complex
+            numbers.
+        impedance: of the surface, pressure over the velocity into it, as a ratio to density times sound
+            speed of the medium, with a real part >= 0; complex where it stores energy too. It is locally
+            reacting: no sound travels inside. Its size is 0.01 to 1e6; about 3700 is skin in air.
 
     Raises:
-        ValueError: a density or sound speed out of range; both a material and rigid, or neither.
+        ValueError: a value out of range, or one that adds energy; more than one of a material, rigid and an
+            impedance, or none of them; an absorption of what is rigid or complex.
     """
 
     position_field: ClassVar[str] = ""
@@ -51,25 +65,60 @@ class Obstacle(ABC):
     unit_question: ClassVar[str] = "are its lengths in m, 16 mm as 16e-3?"
     """Question to the user about an obstacle that is far too large."""
 
-    density: float | None = None
-    sound_speed: float | None = None
+    density: complex | None = None
+    sound_speed: complex | None = None
     rigid: bool = False
+    absorption: float = 0.0
+    impedance: complex | None = None
 
     def __post_init__(self) -> None:
         """Check the material."""
         kind = type(self).__name__
         object.__setattr__(self, "rigid", boolean(f"{kind}.rigid", self.rigid))
-        if self.rigid:
-            if (material := (self.density, self.sound_speed)) != (None, None):
+        object.__setattr__(self, "absorption", not_negative(f"{kind}.absorption", self.absorption, "dB/m"))
+        material = self.density, self.sound_speed
+        absent = [entry is None for entry in material]
+        if self.impedance is not None:
+            if self.rigid or not all(absent):
+                accepted = "must have either an impedance, a material or rigid=True, no two of them"
+                raise invalid(f"{kind}.impedance", self.impedance, accepted)
+            object.__setattr__(self, "impedance", _impedance(f"{kind}.impedance", self.impedance))
+        elif self.rigid:
+            if not all(absent):
                 accepted = "must have either a material or rigid=True, not both"
                 raise invalid(f"{kind}.rigid", material, accepted)
-            return
+        else:
+            if any(absent):
+                missing = "density" if absent[0] else "sound_speed"
+                accepted = "must have both density and sound_speed, or else rigid=True or an impedance"
+                raise invalid(f"{kind}.{missing}", None, accepted)
+            material = equivalent_fluid(kind, *material)
+            object.__setattr__(self, "density", material[0])
+            object.__setattr__(self, "sound_speed", material[1])
+        if self.absorption and not all(isinstance(entry, float) for entry in material):
+            accepted = "must be 0 beside an impedance or complex numbers, which describe all losses"
+            if self.rigid:
+                accepted = "must be 0: a rigid body absorbs nothing; impedance= describes a surface that does"
+            raise invalid(f"{kind}.absorption", self.absorption, accepted, "dB/m")
+
+    @property
+    def is_lossy(self) -> bool:
+        """Whether the obstacle absorbs sound."""
+        numbers = (self.density or 0.0, self.sound_speed or 0.0)
+        soft = self.impedance is not None and self.impedance.real > 0
+        return soft or self.absorption > 0 or any(isinstance(number, complex) for number in numbers)
+
+    def fluid_at(self, frequency: float) -> tuple[complex, complex] | None:
+        """Return density [kg/m^3] and sound speed [m/s] at a frequency [Hz], complex where it absorbs.
+
+        None for a rigid body and one with an impedance.
+        """
+        angular = 2 * math.pi * positive("frequency", frequency, "Hz")
         if self.density is None or self.sound_speed is None:
-            missing = "density" if self.density is None else "sound_speed"
-            raise invalid(f"{kind}.{missing}", None, "must have both density and sound_speed, or rigid=True")
-        density, sound_speed = fluid(kind, self.density, self.sound_speed)
-        object.__setattr__(self, "density", density)
-        object.__setattr__(self, "sound_speed", sound_speed)
+            return None
+        if self.absorption == 0:
+            return self.density, self.sound_speed
+        return self.density, angular / complex(angular / self.sound_speed.real, self.absorption / DECIBELS)
 
     @property
     @abstractmethod
@@ -199,6 +248,18 @@ def shared_box(
     corners = torch.tensor([box, other], **REAL)
     lower, upper = corners[:, 0].amax(dim=0), corners[:, 1].amin(dim=0)
     return (lower, upper) if (upper - lower).min() > LENGTH_TOLERANCE else None
+
+
+def _impedance(name: str, value: object) -> complex:
+    """Return the impedance of a passive surface, a ratio to that of the medium."""
+    impedance = complex_number(name, value)
+    if impedance.real < 0:
+        raise invalid(name, value, "must have a real part >= 0: a negative one adds energy")
+    least, most = _IMPEDANCES
+    if not least <= abs(impedance) <= most:
+        ratio = "density times sound speed of the medium, some 413 Pa s/m in air"
+        raise invalid(name, value, f"must have a size of {least:g} to {most:g}, as a ratio to {ratio}")
+    return impedance
 
 
 def _points(values: ArrayLike) -> torch.Tensor:

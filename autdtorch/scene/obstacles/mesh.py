@@ -116,9 +116,11 @@ class Mesh(Obstacle):
         repair: bool = False,
         *,
         rotation_degrees: Vector | None = None,
-        density: float | None = None,
-        sound_speed: float | None = None,
+        density: complex | None = None,
+        sound_speed: complex | None = None,
         rigid: bool = False,
+        absorption: float = 0.0,
+        impedance: complex | None = None,
     ) -> Mesh:
         """Make a mesh of vertices (V, 3) and triangles of their indices (F, 3), or of a PyVista `PolyData`.
 
@@ -132,6 +134,7 @@ class Mesh(Obstacle):
         with within("Mesh.surface"):
             source.vertices, source.faces = _solid(_triangles(surface), boolean("repair", repair))
         material: dict[str, Any] = {"density": density, "sound_speed": sound_speed, "rigid": rigid}
+        material |= {"absorption": absorption, "impedance": impedance}
         return cls(source, scale, offset, rotation, repair, rotation_degrees=rotation_degrees, **material)
 
     def filled(self) -> Self:

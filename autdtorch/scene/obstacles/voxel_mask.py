@@ -99,9 +99,11 @@ class VoxelMask(Obstacle):
         level: float | None = None,
         smooth: bool = True,
         *,
-        density: float | None = None,
-        sound_speed: float | None = None,
+        density: complex | None = None,
+        sound_speed: complex | None = None,
         rigid: bool = False,
+        absorption: float = 0.0,
+        impedance: complex | None = None,
     ) -> VoxelMask:
         """Read the voxels from `path`, a .npy file or an .npz file with a single array.
 
@@ -112,6 +114,7 @@ class VoxelMask(Obstacle):
         """
         values = _read(path_of("VoxelMask.path", path))
         material: dict[str, Any] = {"density": density, "sound_speed": sound_speed, "rigid": rigid}
+        material |= {"absorption": absorption, "impedance": impedance}
         return cls(values, spacing, origin, level, smooth, **material)
 
     @classmethod
@@ -124,9 +127,11 @@ class VoxelMask(Obstacle):
         smooth: bool = True,
         *,
         scale: float = 1.0,
-        density: float | None = None,
-        sound_speed: float | None = None,
+        density: complex | None = None,
+        sound_speed: complex | None = None,
         rigid: bool = False,
+        absorption: float = 0.0,
+        impedance: complex | None = None,
     ) -> VoxelMask:
         """Make a body of a PyVista `ImageData`, from the values of its cells or, without any, of its points.
 
@@ -142,6 +147,7 @@ class VoxelMask(Obstacle):
         scale = positive("VoxelMask.scale", scale)
         edges, lower = (tuple(scale * one for one in each) for each in (spacing, origin))
         material: dict[str, Any] = {"density": density, "sound_speed": sound_speed, "rigid": rigid}
+        material |= {"absorption": absorption, "impedance": impedance}
         return cls(values, edges, lower, level, smooth, **material)
 
     @property
