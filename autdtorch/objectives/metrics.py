@@ -82,7 +82,8 @@ def _area_per_focus(
         expected = ", ".join([*map(str, pressure.shape[:-1]), "Nu", "Nv"])
         raise ValueError(f"plane_pressure: shape {tuple(plane.shape)}; must be ({expected}), like pressure")
     threshold = pressure.mean(dim=-1)[..., None, None] / math.sqrt(2)
-    return (plane >= threshold).sum(dim=(-2, -1), dtype=torch.float64) * (cell_area / pressure.shape[-1])
+    loud = (plane >= threshold) & (threshold > 0)  # silent foci have no area
+    return loud.sum(dim=(-2, -1), dtype=torch.float64) * (cell_area / pressure.shape[-1])
 
 
 def _median(values: torch.Tensor) -> float:
