@@ -83,7 +83,10 @@ def heterogeneous_cells(
     touched = touched[_inner(touched, shape)]
     coupling, mass, hard = _without_rigid(elements, touched, shape, stencil)
     walls = elements.materials.rigid.any()
-    enclosed = enclosed_cells(coupling, touched, hard, shape, sources) if walls else np.zeros(0, np.int64)
+    usual = stencil.total / _densest(elements)
+    enclosed = np.zeros(0, np.int64)
+    if walls:
+        enclosed = enclosed_cells(coupling, touched, hard, shape, usual, sources)
     hard[enclosed] = True
     if len(enclosed):
         coupling *= _both_open(hard, touched, shape)
@@ -133,7 +136,7 @@ def _without_rigid(
     hard = elements.materials.rigid[_cell_material(elements)]
     hard[vertices] = elements.materials.rigid[interface.material]
     inside, count = hard[touched], -1
-    densest = elements.materials.density[~elements.materials.rigid].max()
+    densest = _densest(elements)
     least = np.full(len(hard), _RIGID_COUPLING * stencil.total)
     least[vertices[interface.finite]] = max(_SLIVER_COUPLING / densest, _LEAST_COUPLING) * stencil.total
     hard[touched] = False
@@ -147,6 +150,11 @@ def _without_rigid(
         interface = condensed(elements.interface, out)
         changed = np.isin(touched, vertices[out.any(axis=1)])
         coupling[changed], mass[changed] = _assembled(elements, interface, touched[changed], shape, stencil)
+
+
+def _densest(elements: Elements) -> float:
+    """Return the largest density, relative to air."""
+    return float(elements.materials.density[~elements.materials.rigid].max())
 
 
 def _both_open(hard: NDArray[np.bool_], touched: Index, shape: GridShape) -> NDArray[np.bool_]:
@@ -265,20 +273,25 @@ def _uniform_cells(
 
 
 # Coupling of two cells, relative to the sum of either, up to which nothing passes: 1e-5 or less through a
-# thin rigid body, and more through a heavy fluid
+# thin rigid body, and more through a heavy fluid. Slivers have the sum of a cell of the densest fluid.
 _BLOCKED = 1e-4
 # Steps from a place to a cell beside it, and the distance [cells] at which a wall is reached
 _STEPS, _TOUCHING = 60, 1e-3
 
 
 def enclosed_cells(
-    coupling: Array, touched: Index, hard: NDArray[np.bool_], shape: GridShape, sources: Array | None = None
+    coupling: Array,
+    touched: Index,
+    hard: NDArray[np.bool_],
+    shape: GridShape,
+    usual: float,
+    sources: Array | None = None,
 ) -> Index:
     """Return the flat indices of cells that are not connected with the outermost ones.
 
     Outermost cells in several parts count where they are connected with `sources`, positions (M, 3) [cells].
-    The `touched` cells (n,) have `coupling` (n, 27). All others are connected with the six beside them,
-    unless they are rigid.
+    The `touched` cells (n,) have `coupling` (n, 27), whose sum is at least `usual` but in slivers. All others
+    are connected with the six beside them, unless they are rigid.
     """
     free = ~hard
     uniform = free.copy()
@@ -287,7 +300,7 @@ def enclosed_cells(
     number = regions.ravel()  # of each connected region of uniform cells, from 1 on; 32 bits
     places = np.flatnonzero(free[touched])
     number[touched[places]] = count + 1 + np.arange(len(places))
-    one, other = _connections(coupling, touched, places, free, shape)
+    one, other = _connections(coupling, touched, places, free, shape, usual)
     size = count + 1 + len(places)
     ends = number[one], number[other]
     _, connected = connected_components(coo_array((np.ones(len(one)), ends), (size, size)), directed=False)
@@ -334,11 +347,11 @@ def sees(begin: Array, end: Array, walls: Sequence[Shape], spacing: float) -> ND
 
 
 def _connections(
-    coupling: Array, touched: Index, places: Index, free: NDArray[np.bool_], shape: tuple[int, int, int]
+    coupling: Array, touched: Index, places: Index, free: NDArray[np.bool_], shape: GridShape, usual: float
 ) -> tuple[Index, Index]:
     """Return the pairs of cells (k,) and (k,) between which sound passes, of the touched ones at `places`."""
     size = np.abs(coupling)
-    row, neighbour = size.sum(axis=1), touched[places, None] + flat_offsets(shape)
+    row, neighbour = size.sum(axis=1).clip(min=usual), touched[places, None] + flat_offsets(shape)
     place = np.searchsorted(touched, neighbour).clip(max=len(touched) - 1)
     theirs = np.where(touched[place] == neighbour, row[place], np.inf)
     passes = (size[places] > _BLOCKED * np.minimum(row[places, None], theirs)) & free[neighbour]
