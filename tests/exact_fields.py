@@ -15,6 +15,7 @@ STEP = 1e-3 / K
 SLOPE_TOLERANCE = 1e-5
 
 FLUIDS = [(77.0, 1.0), (2.5, 0.6), (0.1, 3.0)]  # density ratio, speed ratio
+ABSORBING = [(1.4 + 0.9j, 0.7 - 0.23j), (2.5, 0.6 - 0.02j), (9 + 4j, 1.5 - 0.6j)]  # the first is foam
 
 
 def sampled(field, points):

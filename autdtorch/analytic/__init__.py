@@ -2,6 +2,7 @@
 
 The time factor is e^{-i w t}. A point source has the field e^{ikr} / (4 pi r) of `green`; times 4 pi S it has
 the source strength S. Ratios are obstacle over medium: density_ratio = rho_1 / rho, speed_ratio = c_1 / c.
+They are complex where the obstacle absorbs.
 """
 
 from autdtorch.analytic.green import green, piston_directivity, piston_field, piston_on_axis
@@ -13,13 +14,14 @@ from autdtorch.analytic.planes import (
     soft_plane,
     step_coefficients,
 )
-from autdtorch.analytic.sphere import fluid_sphere, rigid_sphere, soft_sphere
+from autdtorch.analytic.sphere import fluid_sphere, impedance_sphere, rigid_sphere, soft_sphere
 
 __all__ = [
     "fluid_half_space",
     "fluid_slab",
     "fluid_sphere",
     "green",
+    "impedance_sphere",
     "piston_directivity",
     "piston_field",
     "piston_on_axis",

@@ -13,10 +13,11 @@ from itertools import pairwise
 import numpy as np
 import torch
 from scipy.integrate import cumulative_trapezoid
-from scipy.special import hankel1, jv
+from scipy.special import hankel1, hankel2, jv
 
 from autdtorch.analytic.green import green
 from autdtorch.utils.array_types import Array, ComplexArray
+from autdtorch.utils.fluids import fluid_ratios
 from autdtorch.utils.units import real_wavenumber
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
@@ -91,16 +92,16 @@ def fluid_half_space(
     wavenumber: float,
     origin: Vector,
     normal: Vector,
-    density_ratio: float,
-    speed_ratio: float,
+    density_ratio: complex,
+    speed_ratio: complex,
     *,
     scattered: bool = False,
 ) -> torch.Tensor:
     """Return the field of point sources in front of a fluid half-space, on both sides of its face.
 
-    Arguments, returns and errors as for `rigid_plane`, with the ratios rho_1 / rho > 0 and c_1 / c > 0; the
-    points may be anywhere. With `scattered`, the field of the sources in the infinite medium is subtracted.
-    The error is about 1e-10 of the direct wave.
+    Arguments, returns and errors as for `rigid_plane`, with the ratios rho_1 / rho > 0 and c_1 / c > 0, both
+    complex in a fluid that absorbs, as of an `Obstacle`; the points may be anywhere. With `scattered`, the
+    field of the sources in the infinite medium is subtracted. The error is about 1e-10 of the direct wave.
 
     Source: Brekhovskikh & Godin, Acoustics of Layered Media II (1992), chapter 1.
     """
@@ -115,8 +116,8 @@ def fluid_slab(
     origin: Vector,
     normal: Vector,
     thickness: float,
-    density_ratio: float,
-    speed_ratio: float,
+    density_ratio: complex,
+    speed_ratio: complex,
     *,
     scattered: bool = False,
 ) -> torch.Tensor:
@@ -191,18 +192,19 @@ class Layering:
     """
 
     wavenumber: float  # k of the medium in front [rad/m]
-    density_ratio: float  # rho_1 / rho of the fluid and the medium
-    speed_ratio: float  # c_1 / c of the fluid and the medium
+    density_ratio: complex  # rho_1 / rho of the fluid and the medium
+    speed_ratio: complex  # c_1 / c of the fluid and the medium
     thickness: float | None = None  # d of a slab [m], None for a half-space
 
     def __post_init__(self) -> None:
         """Check the attributes and make them floats."""
         object.__setattr__(self, "wavenumber", real_wavenumber(self.wavenumber))
-        object.__setattr__(self, "density_ratio", positive("density_ratio", self.density_ratio))
-        object.__setattr__(self, "speed_ratio", positive("speed_ratio", self.speed_ratio))
+        density, speed = fluid_ratios(self.density_ratio, self.speed_ratio)
+        object.__setattr__(self, "density_ratio", density)
+        object.__setattr__(self, "speed_ratio", speed)
 
     @property
-    def inner_wavenumber(self) -> float:
+    def inner_wavenumber(self) -> complex:
         """Wavenumber in the fluid [rad/m]."""
         return self.wavenumber / self.speed_ratio
 
@@ -240,7 +242,7 @@ class Layering:
         return outer, inner, 2 * outer * cosine - 1j * (outer**2 + inner**2) * sine
 
 
-def vertical_wavenumber(wavenumber: float, kappa: ComplexArray) -> ComplexArray:
+def vertical_wavenumber(wavenumber: complex, kappa: ComplexArray) -> ComplexArray:
     """Return the root gamma of k^2 - kappa^2 with the branch cut from kappa = k upwards.
 
     For real kappa >= 0 the wave travels or decays away from its source. The root is analytic in the fourth
@@ -251,7 +253,7 @@ def vertical_wavenumber(wavenumber: float, kappa: ComplexArray) -> ComplexArray:
 
 
 def step_coefficients(
-    angle: ArrayLike, density_ratio: float, speed_ratio: float
+    angle: ArrayLike, density_ratio: complex, speed_ratio: complex
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the reflection and transmission coefficients of a plane wave at a fluid half-space.
 
@@ -259,8 +261,8 @@ def step_coefficients(
 
     Args:
         angle: of incidence, any shape [rad], in [0, pi/2).
-        density_ratio: rho_1 / rho > 0.
-        speed_ratio: c_1 / c > 0.
+        density_ratio: rho_1 / rho > 0, complex in a fluid that absorbs.
+        speed_ratio: c_1 / c > 0, complex in a fluid that absorbs.
 
     Returns:
         R and T, complex128 in the shape of `angle`: reflected and transmitted pressure at the faces over the
@@ -276,7 +278,7 @@ def step_coefficients(
 
 
 def slab_coefficients(
-    angle: ArrayLike, wavenumber: float, thickness: float, density_ratio: float, speed_ratio: float
+    angle: ArrayLike, wavenumber: float, thickness: float, density_ratio: complex, speed_ratio: complex
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the reflection and transmission coefficients of a plane wave at a fluid slab in a medium.
 
@@ -316,11 +318,15 @@ def source_response(layering: Layering, offset: float, height: float, source_hei
     F(kappa) J_0(kappa offset) kappa / gamma from kappa = 0 to infinity (Brekhovskikh & Godin, Acoustics of
     Layered Media II, 1992, chapter 1). F = e^{i gamma height} gives `green`. Singularities of F lie between
     0 and the larger wavenumber: branch points and poles of guided waves on the real axis, poles of leaky
-    waves above it. The contour passes below all of them. Beyond, where F is real for real kappa and decays
-    like e^{-kappa height}, both halves of J_0 follow their paths of steepest descent.
+    waves above it, and all above it in a fluid that absorbs. The contour passes below all of them. Beyond,
+    where F decays like e^{-kappa height}, both halves of J_0 follow their paths of steepest descent. Without
+    absorption F is real there for real kappa.
     """
-    wavenumbers = (layering.wavenumber, layering.inner_wavenumber)
-    vertical, end = source_height + abs(height), 1.5 * max(wavenumbers)
+    wavenumbers = layering.wavenumber, layering.inner_wavenumber
+    vertical, end = (
+        source_height + abs(height),
+        1.5 * max(layering.wavenumber, abs(layering.inner_wavenumber)),
+    )
 
     def integrand(kappa: ComplexArray) -> ComplexArray:
         gamma = vertical_wavenumber(layering.wavenumber, kappa)
@@ -332,11 +338,12 @@ def source_response(layering: Layering, offset: float, height: float, source_hei
 
     kappa, weights = _contour(wavenumbers, end, offset, vertical + 2 * layering.depth)
     total = np.sum(weights * integrand(kappa) * jv(0, kappa * offset))
-    return complex(0.25j / np.pi * (total + _tail(integrand, end, offset, vertical)))
+    is_real = not isinstance(layering.density_ratio * layering.speed_ratio, complex)
+    return complex(0.25j / np.pi * (total + _tail(integrand, end, offset, vertical, is_real)))
 
 
 def _contour(
-    wavenumbers: tuple[float, float], end: float, offset: float, vertical: float
+    wavenumbers: tuple[float, complex], end: float, offset: float, vertical: float
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return nodes and weights along 0, dip - i dip, end - i dip, end.
 
@@ -357,10 +364,10 @@ def _contour(
 
 
 def _panel_edges(
-    start: complex, stop: complex, wavenumbers: tuple[float, float], offset: float, vertical: float
+    start: complex, stop: complex, wavenumbers: tuple[float, complex], offset: float, vertical: float
 ) -> Array:
     """Return the edges of panels, as fractions of a leg, for the limits of phase and length."""
-    length, singular = abs(stop - start), max(wavenumbers)
+    length, singular = abs(stop - start), max(abs(wavenumber) for wavenumber in wavenumbers)
     nearest = max(min(-start.imag, -stop.imag), min(start.real, stop.real) - singular)
     along = np.linspace(0, 1, 2 + int(8 * length / nearest))
     kappa = (start + (stop - start) * along).astype(np.complex128)
@@ -372,7 +379,11 @@ def _panel_edges(
 
 
 def _tail(
-    integrand: Callable[[ComplexArray], ComplexArray], start: float, offset: float, height: float
+    integrand: Callable[[ComplexArray], ComplexArray],
+    start: float,
+    offset: float,
+    height: float,
+    is_real: bool,
 ) -> complex:
     distance = float(np.hypot(offset, height))
     length = _TAIL / distance
@@ -386,9 +397,13 @@ def _tail(
     direction = (height + 1j * offset) / distance
     kappa = (start + direction * along).astype(np.complex128)
     upper = np.sum(weights * direction * integrand(kappa) * hankel1(0, kappa * offset))
-    # 2 J_0 = H^(1) + H^(2), and here integrand(conj kappa) = -conj integrand(kappa): the integral of H^(2) on
-    # the mirrored path is minus the conjugate of the integral of H^(1).
-    return complex(1j * upper.imag)
+    # 2 J_0 = H^(1) + H^(2). Without absorption, integrand(conj kappa) = -conj integrand(kappa): the integral
+    # of H^(2) on the mirrored path is minus the conjugate of the integral of H^(1).
+    if is_real:
+        return complex(1j * upper.imag)
+    below = kappa.conj()
+    lower = np.sum(weights * direction.conjugate() * integrand(below) * hankel2(0, below * offset))
+    return complex((upper + lower) / 2)
 
 
 def _gauss(edges: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""Point sources outside a rigid or fluid sphere.
+"""Point sources outside a sphere: rigid, soft, of a fluid, or with an impedance.
 
 The partial-wave series of Anderson (1950, JASA 22, 426; also Morse & Ingard, Theoretical Acoustics (1968),
 chapter 8) is written with ratios of Hankel functions and logarithmic derivatives, which overflow at no order.
@@ -19,13 +19,17 @@ from typing import TypeAlias
 import torch
 
 from autdtorch.analytic.green import green
+from autdtorch.utils.array_types import COMPLEX
+from autdtorch.utils.fluids import fluid_ratios
 from autdtorch.utils.units import real_wavenumber
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
     Vector,
     boolean,
+    complex_number,
     finite_vector,
+    invalid,
     points_tensor,
     positive,
 )
@@ -39,6 +43,7 @@ _BLOCK = 256  # points summed at a time, to limit memory
 _NEGLIGIBLE = 1e-17  # fraction of the largest term at which a series ends
 _MOST_ORDERS = 2**16  # enough for a point on the surface and a source 6e-4 radii off it
 _SOFT = 1e20  # admittance of a surface without pressure
+_LEAST_IMPEDANCE = 1 / _SOFT
 _CENTER = 1e-100  # replacement for k r = 0, where the field has a limit but its factors do not
 
 
@@ -94,26 +99,52 @@ def soft_sphere(
     return _field_outside(setup, lambda _: _SOFT, boolean("scattered", scattered))
 
 
+def impedance_sphere(
+    points: ArrayLike,
+    sources: ArrayLike,
+    wavenumber: float,
+    center: Vector,
+    radius: float,
+    impedance: complex,
+    *,
+    scattered: bool = False,
+) -> torch.Tensor:
+    """Return the field of point sources outside a sphere whose surface has an impedance.
+
+    Arguments, returns and errors as for `rigid_sphere`, with the `impedance` of the surface as a ratio to
+    rho c of the medium: pressure over the velocity into it, with a real part >= 0, and not 0. The surface is
+    locally reacting, dp/dr = -i k p / impedance.
+
+    Source: Morse & Ingard, Theoretical Acoustics (1968), section 8.2.
+    """
+    ratio = complex_number("impedance", impedance)
+    if ratio.real < 0 or abs(ratio) < _LEAST_IMPEDANCE:
+        raise invalid("impedance", impedance, "must have a real part >= 0, and not be 0")
+    setup = _setup(points, sources, wavenumber, center, radius)
+    admittance = torch.tensor(1j / ratio, **COMPLEX).to(setup.points.device)
+    return _field_outside(setup, lambda _: admittance, boolean("scattered", scattered))
+
+
 def fluid_sphere(
     points: ArrayLike,
     sources: ArrayLike,
     wavenumber: float,
     center: Vector,
     radius: float,
-    density_ratio: float,
-    speed_ratio: float,
+    density_ratio: complex,
+    speed_ratio: complex,
     *,
     scattered: bool = False,
 ) -> torch.Tensor:
     """Return the field of point sources outside a fluid sphere, outside and inside it.
 
-    Arguments, returns and errors as for `rigid_sphere`, with the ratios rho_1 / rho > 0 and c_1 / c > 0;
-    points may be anywhere. With `scattered`, the field of the sources in the infinite medium is subtracted.
+    Arguments, returns and errors as for `rigid_sphere`, with the ratios rho_1 / rho > 0 and c_1 / c > 0, both
+    complex in a sphere that absorbs, as of an `Obstacle`; points may be anywhere. With `scattered`, the field
+    of the sources in the infinite medium is subtracted.
 
     Source: Anderson (1950), JASA 22, 426, with the partial waves of a point source for those of a plane wave.
     """
-    density_ratio = positive("density_ratio", density_ratio)
-    speed_ratio = positive("speed_ratio", speed_ratio)
+    density_ratio, speed_ratio = fluid_ratios(density_ratio, speed_ratio)
     scattered = boolean("scattered", scattered)
     setup = _setup(points, sources, wavenumber, center, radius)
     inside = setup.point_distances < setup.radius
@@ -122,7 +153,7 @@ def fluid_sphere(
         field[inside] = _field_inside(setup.at(inside), density_ratio, speed_ratio, scattered)
     if not inside.all():
         boundary = _fluid_boundary(setup.size, density_ratio, speed_ratio)
-        inner_size = float(setup.size) / speed_ratio
+        inner_size = float(setup.size) / abs(speed_ratio)
         field[~inside] = _field_outside(setup.at(~inside), boundary, scattered, inner_size)
     return field
 
@@ -183,7 +214,9 @@ def _field_outside(
     return field if scattered else field + green(setup.points, setup.sources, setup.wavenumber)
 
 
-def _field_inside(setup: _Setup, density_ratio: float, speed_ratio: float, scattered: bool) -> torch.Tensor:
+def _field_inside(
+    setup: _Setup, density_ratio: complex, speed_ratio: complex, scattered: bool
+) -> torch.Tensor:
     x, inner_size = setup.size, setup.size / speed_ratio
     boundary = _fluid_boundary(x, density_ratio, speed_ratio)
 
@@ -193,12 +226,12 @@ def _field_inside(setup: _Setup, density_ratio: float, speed_ratio: float, scatt
         return modes[:, None] * _product(kr, orders) * _hankel_fall(kr, inner_size, orders)
 
     inner_wavenumber = setup.wavenumber / speed_ratio
-    kr = (inner_wavenumber * setup.point_distances).clamp(min=_CENTER)
-    field = _series(setup, kr, radial, float(inner_size))
+    kr = inner_wavenumber * setup.point_distances.clamp(min=_CENTER)
+    field = _series(setup, kr, radial, float(inner_size.abs()))
     return field - green(setup.points, setup.sources, setup.wavenumber) if scattered else field
 
 
-def _fluid_boundary(x: torch.Tensor, density_ratio: float, speed_ratio: float) -> Boundary:
+def _fluid_boundary(x: torch.Tensor, density_ratio: complex, speed_ratio: complex) -> Boundary:
     """Return the condition that p and (1/rho) dp/dr are continuous."""
     return lambda orders: -_bessel_slopes(x / speed_ratio, orders) / (density_ratio * speed_ratio)
 
@@ -249,7 +282,7 @@ def _enough_orders(setup: _Setup, inner_size: float) -> int:
 
 def _bessel_slopes(x: torch.Tensor, orders: int) -> torch.Tensor:
     """Return j_n'(x) / j_n(x), (orders + 1, *x.shape), by downward recurrence of j_{n-1} / j_n."""
-    largest = float(x.max())
+    largest = float(x.abs().max())
     start = math.ceil(max(orders, largest) + 8 * math.cbrt(largest)) + 32
     ratio = (2 * start + 1) / x
     ratios = []
@@ -280,7 +313,8 @@ def _hankel_fall(near: torch.Tensor, far: torch.Tensor, orders: int) -> torch.Te
     steps_near, steps_far = _hankel_ratios(near, orders), _hankel_ratios(far, orders)
     size = max(near.numel(), far.numel())
     steps = (steps_near.reshape(orders + 1, -1) / steps_far.reshape(orders + 1, -1)).expand(-1, size).clone()
-    steps[0] = torch.polar(near / far, far - near)
+    turn = far - near
+    steps[0] = near / far * torch.exp(1j * turn) if turn.is_complex() else torch.polar(near / far, turn)
     return steps.cumprod(dim=0)
 
 

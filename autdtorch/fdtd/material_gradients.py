@@ -25,7 +25,7 @@ from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stencil import OFFSETS, Stencil
 from autdtorch.fdtd.stepping import Assembly, air_stencil, assembly_of
 from autdtorch.utils.array_types import REAL, Array, Index
-from autdtorch.utils.validation import fluid
+from autdtorch.utils.fluids import fluid
 
 _STEP = 1e-4  # Relative step of the central differences: truncation and rounding are about 1e-8
 _RIM = 2  # Cells of air around the maps: the first depends on them, the second is its neighbour

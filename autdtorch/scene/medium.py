@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from autdtorch.utils.fluids import fluid
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.units import warn_user
-from autdtorch.utils.validation import fluid, not_negative, number_between
+from autdtorch.utils.validation import not_negative, number_between
 
 _TEMPERATURES = -20.0, 50.0  # deg C; range of ISO 9613-1
 _PRESSURES = 50e3, 200e3  # Pa; from half an atmosphere to the limit of ISO 9613-1

@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 import torch
-from exact_fields import FLUIDS, SLOPE_TOLERANCE, STEP, WAVELENGTH, K, relative, sampled, slope
+from exact_fields import ABSORBING, FLUIDS, SLOPE_TOLERANCE, STEP, WAVELENGTH, K, relative, sampled, slope
 
 from autdtorch import analytic
 from autdtorch.analytic.green import green
@@ -74,6 +74,45 @@ def test_slab_conserves_energy_and_sums_its_echoes(density_ratio, speed_ratio):
     assert torch.allclose(reflected, step * (1 - pass_once**2) / echoes, rtol=0, atol=1e-10)
 
 
+@pytest.mark.parametrize(("density_ratio", "speed_ratio"), ABSORBING)
+def test_absorbing_slabs_absorb_and_sum_their_echoes(density_ratio, speed_ratio):
+    reflected, transmitted = coefficients(ANGLES, density_ratio, speed_ratio, THICKNESS)
+    assert (reflected.abs() ** 2 + transmitted.abs() ** 2 < 1).all()
+    outer = torch.cos(ANGLES)
+    inner = torch.sqrt(1 / speed_ratio**2 - torch.sin(ANGLES).to(torch.complex128) ** 2)
+    step = (density_ratio * outer - inner) / (density_ratio * outer + inner)
+    # Rounding, magnified where cos is small.
+    assert torch.allclose(coefficients(ANGLES, density_ratio, speed_ratio)[0], step, rtol=0, atol=1e-12)
+    pass_once = torch.exp(1j * K * inner * THICKNESS)
+    echoes = 1 - step**2 * pass_once**2
+    assert torch.allclose(transmitted, (1 - step**2) * pass_once / echoes, rtol=0, atol=1e-10)
+    assert torch.allclose(reflected, step * (1 - pass_once**2) / echoes, rtol=0, atol=1e-10)
+
+
+def test_thin_resistive_slab_is_the_impedance_of_its_backing():
+    """A slab of a very slow absorbing fluid reflects as Z: (Z cos - 1) / (Z cos + 1), at all angles."""
+    slow = 1e-4 - 0.5e-4j
+    reflected, _ = coefficients(ANGLES, 2e4, slow, THICKNESS)
+    impedance = 2e4 * slow * torch.cos(ANGLES)
+    assert torch.allclose(reflected, (impedance - 1) / (impedance + 1), rtol=0, atol=1e-7)  # (c_1 / c)^2
+
+
+@pytest.mark.parametrize(
+    ("ratios", "message"),
+    [
+        ((1.0 - 0.1j, 1.0), "density_ratio: .* imaginary part >= 0"),
+        ((1.0, 1.0 + 0.1j), "speed_ratio: .* imaginary part <= 0"),
+        ((1.0 + 0.5j, 1.0), "speed_ratio: 1.0; .* imaginary part <= 0; it is"),
+        ((-1.0, 1.0), "density_ratio: -1.0; must be finite and > 0"),
+    ],
+)
+def test_fluids_that_add_energy_are_refused(ratios, message):
+    with pytest.raises(ValueError, match=message):
+        analytic.step_coefficients(0.0, *ratios)
+    with pytest.raises(ValueError, match=message):
+        fluid_sphere(*ratios)(OUTSIDE, SOURCES)
+
+
 def test_slabs_that_let_all_pass():
     reflected, transmitted = coefficients(ANGLES, 3.0, 2.0, 1e-12)
     # First order in k d = 7e-10, over cos of the last angle, 0.02.
@@ -104,7 +143,7 @@ def faces(layer):
     return [0.0, -THICKNESS] if layer is fluid_slab else [0.0]
 
 
-@pytest.mark.parametrize("fluid", FLUIDS)
+@pytest.mark.parametrize("fluid", [*FLUIDS, *ABSORBING])
 @pytest.mark.parametrize("layer", [fluid_half_space, fluid_slab])
 def test_pressure_and_normal_velocity_are_continuous_on_plane_faces(layer, fluid):
     density_ratio, speed_ratio = fluid
@@ -122,7 +161,7 @@ def test_pressure_and_normal_velocity_are_continuous_on_plane_faces(layer, fluid
         # Slopes on either side of a gap of 2e-9 m are k |p| times the ratios at most: 1e-5 or so.
         assert ((upper[:, 0] - lower[:, 0]).abs() < 1e-4 * scale).all()
         jump = slope(upper) / above + slope(lower) / below
-        steepest = max(1 / speed_ratio, 1) ** 3 * max(1 / density_ratio, 1)
+        steepest = max(1 / abs(speed_ratio), 1) ** 3 * max(1 / abs(density_ratio), 1)
         assert (jump.abs() < 10 * SLOPE_TOLERANCE * steepest * K * scale).all()
 
 
@@ -164,7 +203,7 @@ def test_slab_of_the_mediums_sound_speed_is_a_row_of_images(density_ratio, thick
 
 
 @pytest.mark.parametrize("layer", [fluid_half_space, fluid_slab])
-@pytest.mark.parametrize("fluid", [*FLUIDS, (3.0, 0.5)])
+@pytest.mark.parametrize("fluid", [*FLUIDS, (3.0, 0.5), *ABSORBING])
 def test_layers_are_reciprocal(layer, fluid):
     first = above_plane([1e-3, 0.02])[0]
     second = above_plane([5e-4, 0.03])[1:].reshape(-1, 3)
@@ -230,6 +269,10 @@ def fluid_sphere(density_ratio, speed_ratio):
     return partial(analytic.fluid_sphere, **BALL, density_ratio=density_ratio, speed_ratio=speed_ratio)
 
 
+def impedance_sphere(impedance):
+    return partial(analytic.impedance_sphere, **BALL, impedance=impedance)
+
+
 def test_pressure_on_a_soft_sphere_and_normal_velocity_on_a_rigid_one_are_zero():
     points = on_sphere([RADIUS]).reshape(-1, 3)
     # Rounding of some 40 terms.
@@ -259,7 +302,7 @@ def test_rigid_sphere_of_ka_60_holds_a_hundredth_of_its_radius_off():
     assert abs(field[0] / green(points[:1], source, K) - 2) < 0.02
 
 
-@pytest.mark.parametrize("fluid", FLUIDS)
+@pytest.mark.parametrize("fluid", [*FLUIDS, *ABSORBING])
 def test_pressure_and_normal_velocity_are_continuous_on_a_fluid_sphere(fluid):
     def field(points):
         return fluid_sphere(*fluid)(points, SOURCES)
@@ -271,8 +314,28 @@ def test_pressure_and_normal_velocity_are_continuous_on_a_fluid_sphere(fluid):
     # Points 1e-8 m apart: k 1e-8 = 7e-6 at most, over the ratio of speeds or of densities.
     assert (outside[:, 0] - inside[:, 0]).abs().max() < 1e-4 * scale
     jump = slope(outside) + slope(inside) / density_ratio
-    steepest = max(1 / speed_ratio, 1) ** 3 * max(1 / density_ratio, 1)
+    steepest = max(1 / abs(speed_ratio), 1) ** 3 * max(1 / abs(density_ratio), 1)
     assert jump.abs().max() < 10 * SLOPE_TOLERANCE * steepest * K * scale
+
+
+@pytest.mark.parametrize("impedance", [1.5 + 1j, 0.3 - 2j])
+def test_velocity_into_a_sphere_is_pressure_over_impedance(impedance):
+    points = on_sphere([RADIUS, RADIUS + STEP, RADIUS + 2 * STEP])
+    field = sampled(lambda points: impedance_sphere(impedance)(points, SOURCES), points)
+    scale = field[:, 0].abs().max()
+    steepest = max(1, 1 / abs(impedance)) ** 2
+    assert (slope(field) / K + 1j * field[:, 0] / impedance).abs().max() < SLOPE_TOLERANCE * steepest * scale
+
+
+def test_impedance_sphere_is_rigid_soft_or_a_fluid_without_waves_along_it():
+    rigid = impedance_sphere(1e12)(OUTSIDE, SOURCES) - rigid_sphere(OUTSIDE, SOURCES)
+    assert relative(rigid, OUTSIDE, SOURCES) < 1e-10  # first order in 1 / impedance
+    soft = impedance_sphere(1e-9)(OUTSIDE, SOURCES) - soft_sphere(OUTSIDE, SOURCES)
+    assert relative(soft, OUTSIDE, SOURCES) < 1e-7
+    # In a slow fluid all waves go straight inwards, and none comes back that absorbs: 1 / (k_1 a)^2 = 1e-6.
+    slow = 0.01 - 0.004j
+    locally = impedance_sphere(200 * slow)(OUTSIDE, SOURCES) - fluid_sphere(200, slow)(OUTSIDE, SOURCES)
+    assert relative(locally, OUTSIDE, SOURCES) < 1e-3  # 1 / (k_1 a), curvature
 
 
 @pytest.mark.parametrize("scattered", [False, True])
@@ -292,7 +355,15 @@ def test_sphere_of_the_medium_is_not_there():
         assert relative(fluid_sphere(1, 1)(points, SOURCES, scattered=True), points, SOURCES) < 1e-12
 
 
-@pytest.mark.parametrize("sphere", [rigid_sphere, soft_sphere, *(fluid_sphere(*fluid) for fluid in FLUIDS)])
+@pytest.mark.parametrize(
+    "sphere",
+    [
+        rigid_sphere,
+        soft_sphere,
+        impedance_sphere(1.5 + 1j),
+        *(fluid_sphere(*fluid) for fluid in [*FLUIDS, *ABSORBING]),
+    ],
+)
 def test_spheres_are_reciprocal_and_split_into_incident_and_scattered(sphere):
     field = sphere(OUTSIDE, SOURCES)
     # Rounding.

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Self
 import torch
 
 from autdtorch.utils.array_types import REAL
+from autdtorch.utils.fluids import equivalent_fluid
 from autdtorch.utils.units import DECIBELS
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
@@ -20,7 +21,6 @@ from autdtorch.utils.validation import (
     Vector,
     boolean,
     complex_number,
-    equivalent_fluid,
     invalid,
     not_negative,
     positive,
