@@ -42,6 +42,7 @@ from .scene.geometry import Plane, circle_points, sphere_points
 from .scene.medium import Medium
 from .scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
 from .scene.porous import porous
+from .scene.reflectors import Reflector
 from .scene.scene import OverlapWarning, ScaleWarning, Scene
 from .study.results_file import load_results
 from .study.sweeps import Sweep, collect_results
@@ -80,6 +81,7 @@ __all__ = [
     "Quantised",
     "QuietPoints",
     "RandomSearch",
+    "Reflector",
     "ScaleWarning",
     "Scene",
     "SimulatedObjective",

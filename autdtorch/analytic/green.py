@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from scipy.special import j1
 
 from autdtorch.scene.arrays import TransducerArray, strengths_of
 from autdtorch.utils.array_types import COMPLEX
+from autdtorch.utils.images import NO_MIRRORS, Image, distinct
 from autdtorch.utils.process import require_memory
 from autdtorch.utils.spatial import distances
 from autdtorch.utils.units import real_wavenumber
@@ -57,13 +59,32 @@ def green(points: ArrayLike, sources: ArrayLike, wavenumber: complex) -> torch.T
     return torch.polar(torch.exp(-alpha * r) / (4 * math.pi * r), k * r)
 
 
-def free_space_matrix(points: ArrayLike, array: TransducerArray, wavenumber: complex) -> torch.Tensor:
-    """Return the transfer matrix (P, M), complex128, of an array in free space: S e^{i k r} / r (Eq. 2).
+def free_space_matrix(
+    points: ArrayLike, array: TransducerArray, wavenumber: complex, images: Sequence[Image] = NO_MIRRORS
+) -> torch.Tensor:
+    """Return the transfer matrix (P, M), complex128, of an array without obstacles: S e^{i k r} / r (Eq. 2).
 
     The mean over discs is that over `array.nodes`. Arguments and errors as for `green`; pressure [Pa] per
-    unit drive.
+    unit drive. `images` are those of the space in reflectors, `Scene.images`.
     """
     positions, weights = array.nodes
+    if len(images) > 1:
+        parts = [
+            image.weight * _matrix_of_nodes(points, array, image.of(positions), weights, wavenumber)
+            for image in distinct(images, positions)
+        ]
+        return torch.stack(parts).sum(dim=0)
+    return _matrix_of_nodes(points, array, positions, weights, wavenumber)
+
+
+def _matrix_of_nodes(
+    points: ArrayLike,
+    array: TransducerArray,
+    positions: torch.Tensor,
+    weights: torch.Tensor,
+    wavenumber: complex,
+) -> torch.Tensor:
+    """Return the transfer matrix (P, M) of transducers with nodes (M, n, 3) [m]; see `free_space_matrix`."""
     points = differentiable_points("points", points)
     require_memory("points", tuple(points.shape), PAIR_BYTES * len(points) * len(array))
     # node by node, with memory for one matrix only

@@ -21,7 +21,8 @@ from autdtorch.fdtd.grid import (
     crossing_time,
     domain_extent,
 )
-from autdtorch.fdtd.region import Region
+from autdtorch.fdtd.reflection import near_mirrors, whole_region, with_images
+from autdtorch.fdtd.region import Region, bounds
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil
@@ -32,6 +33,7 @@ logger = logging.getLogger(__name__)
 
 MOST_PASSES = 12  # Most passes of the iteration between boxes; beyond, one box is cheaper
 _MOST_OBSTACLES = 64  # Most obstacles that are grouped; more share one box
+_ECHOES = 3  # Passes of a usual iteration between obstacles and mirrors
 # Periods of a usual run among obstacles, relative to the fewest; 1.0 to 3.5 depending on the resonances
 USUAL_PERIODS = 1.7
 # Time of a step of a cell in a boundary layer, of a run in a box beside its steps, and of a term of a sum
@@ -94,7 +96,8 @@ class Grouping:
     """Grids with the ascending indices of the obstacles on each, their axes, and the expected passes.
 
     Axes are rows of matrices (3, 3). Passes are those of the iteration between boxes. Grids are aligned if
-    every face is parallel to the axes of its grid.
+    every face is parallel to the axes of its grid. A grid holds the images of its obstacles in its `mirrors`,
+    ascending indices of those next to them.
     """
 
     groups: tuple[tuple[int, ...], ...]
@@ -102,6 +105,7 @@ class Grouping:
     grids: tuple[GridCost, ...]
     passes: int
     aligned: bool
+    mirrors: tuple[tuple[int, ...], ...] = ()
 
     @property
     def cells(self) -> int:
@@ -125,12 +129,14 @@ def choose_grids(
     """Return the method and its grids; for "auto" the cheapest of "box" and "full" that is accurate."""
     if method in ("box", "tmatrix"):
         return method, cheapest_boxes(region, spacing, tolerance, runs)
+    walls = any(body.continued for body in region.bodies)
+    if method == "auto" and region.mirrors and not walls:
+        return "box", cheapest_boxes(region, spacing, tolerance, runs)
     domain = _grids(region, spacing, [_Outline.of_domain(region, spacing)])
     if method == "full":
         return method, domain
     boxes = cheapest_boxes(region, spacing, tolerance, runs)
     gain = runs * domain.grids[0].work / boxes.box_cost(runs)
-    walls = any(body.continued for body in region.bodies)
     first, last = region.domain
     outside = any((np.less(one.lower, first) | np.greater(one.upper, last)).any() for one in region.shapes)
     tilted = any(map(is_turned, boxes.axes))
@@ -145,7 +151,7 @@ def choose_grids(
 def one_box(region: Region, spacing: float) -> Grouping:
     """Return one box of `spacing` [m] for all obstacles."""
     surfaces = list(map(flat_faces, region.shapes))
-    return _grids(region, spacing, [_Outline.around(region, range(len(surfaces)), surfaces)])
+    return _grids(region, spacing, [_Outline.around(region, range(len(surfaces)), surfaces, spacing)])
 
 
 def cheapest_boxes(region: Region, spacing: float, tolerance: float, runs: int) -> Grouping:
@@ -163,46 +169,57 @@ def _partitions(region: Region, spacing: float, tolerance: float) -> Iterator[tu
     """Yield one box and those apart, with the passes of the iteration between them."""
     surfaces = list(map(flat_faces, region.shapes))
     numbers = range(len(surfaces))
-    yield [_Outline.around(region, numbers, surfaces)], 1
+    yield [_Outline.around(region, numbers, surfaces, spacing)], 1
     if len(surfaces) > _MOST_OBSTACLES:
         return
-    boxes = [_Outline.around(region, [index], surfaces) for index in numbers]
+    boxes = [_Outline.around(region, [index], surfaces, spacing) for index in numbers]
     while len(boxes) > 1:
         gaps = _gaps(boxes, spacing)
         if gaps.min() > 0 and (passes := _expected_passes(boxes, tolerance)) <= MOST_PASSES:
             yield list(boxes), passes
         first, second = sorted(map(int, np.unravel_index(gaps.argmin(), gaps.shape)))
         both = sorted((*boxes[first].group, *boxes.pop(second).group))
-        boxes[first] = _Outline.around(region, both, surfaces)
+        boxes[first] = _Outline.around(region, both, surfaces, spacing)
 
 
 @dataclass(frozen=True)
 class _Outline:
     """The obstacles of a box, its axes, one a row (3, 3), and its extent along them.
 
-    It is aligned if every face of its obstacles is parallel to them.
+    It is aligned if every face of its obstacles is parallel to them. It holds their images in its `mirrors`.
     """
 
     group: tuple[int, ...]
     axes: Array
     extent: Extent
     aligned: bool
+    mirrors: tuple[int, ...] = ()
 
     @classmethod
-    def around(cls, region: Region, group: Sequence[int], surfaces: Sequence[FlatFaces]) -> _Outline:
+    def around(
+        cls, region: Region, group: Sequence[int], surfaces: Sequence[FlatFaces], spacing: float
+    ) -> _Outline:
         """Return the outline of the box of a group, turned along its faces."""
         faces = [surfaces[index] for index in group]
         axes = axes_along(faces)
         shapes = [turned_shape(region.bodies[index].shape, axes) for index in group]
+        near = near_mirrors(region, *bounds(shapes), axes, spacing)
+        if near:
+            bodies = with_images(
+                [region.bodies[index] for index in group], [region.mirrors[number] for number in near]
+            )
+            faces = [flat_faces(body.shape) for body in bodies]
+            axes = axes_along(faces)
+            shapes = [turned_shape(body.shape, axes) for body in bodies]
         aligned = all(each.all_aligned(axes) for each in faces)
-        return cls(tuple(group), axes, bodies_extent(shapes, region.wavelength), aligned)
+        return cls(tuple(group), axes, bodies_extent(shapes, region.wavelength), aligned, near)
 
     @classmethod
     def of_domain(cls, region: Region, spacing: float) -> _Outline:
         """Return the outline of the whole domain, which follows the axes of the scene."""
         axes, shapes = np.eye(3), region.shapes
         aligned = bool(shapes) and all(flat_faces(shape).all_aligned(axes) for shape in shapes)
-        return cls(tuple(range(len(shapes))), axes, domain_extent(region, spacing), aligned)
+        return cls(tuple(range(len(shapes))), axes, domain_extent(whole_region(region), spacing), aligned)
 
     @property
     def middle(self) -> Array:
@@ -218,7 +235,10 @@ class _Outline:
 def _grids(region: Region, spacing: float, boxes: Sequence[_Outline], passes: int = 1) -> Grouping:
     grids = tuple(grid_cost(region, box.extent, spacing) for box in boxes)
     groups, axes = tuple(box.group for box in boxes), tuple(box.axes for box in boxes)
-    return Grouping(groups, axes, grids, passes, all(box.aligned for box in boxes))
+    mirrors = tuple(box.mirrors for box in boxes)
+    if any(len(near) < len(region.mirrors) for near in mirrors):
+        passes = max(passes, _ECHOES)
+    return Grouping(groups, axes, grids, passes, all(box.aligned for box in boxes), mirrors)
 
 
 def _gaps(boxes: Sequence[_Outline], spacing: float) -> Array:

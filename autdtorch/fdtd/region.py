@@ -11,6 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from autdtorch.utils.array_types import Array
+from autdtorch.utils.images import Mirror
 from autdtorch.utils.validation import Vector
 
 
@@ -88,6 +89,7 @@ class Region:
     domain: tuple[Vector, Vector]
     # positions of the transducers (M, 3) [m]; a grid stays symmetric where they are
     sources: Array
+    mirrors: tuple[Mirror, ...] = ()  # planes that reflect
 
     @property
     def wavenumber(self) -> float:

@@ -24,6 +24,7 @@ from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.turning import turned_shape
 from autdtorch.utils.apertures import Apertures, Discs
 from autdtorch.utils.array_types import COMPLEX, Array, Index
+from autdtorch.utils.images import NO_MIRRORS, SPACE_ITSELF, Image
 from autdtorch.utils.process import cached_property
 
 # Distance [cells] from the rim of the interior within which points are not read from the grid. Interpolation
@@ -41,6 +42,12 @@ class ScatteredField:
     assembly: Assembly
     wavenumber: complex  # complex wavenumber in air [rad/m]
     axes: Array  # axes of the grid, one a row (3, 3)
+    images: tuple[Image, ...] = NO_MIRRORS  # of what it radiates; the first is the space itself
+
+    @property
+    def echoes(self) -> tuple[Image, ...]:
+        """The images that send back what the box radiates."""
+        return self.images[1:]
 
     @property
     def driven(self) -> Tensor:
@@ -58,12 +65,25 @@ class ScatteredField:
         return Sources(torch.from_numpy(assembly.heterogeneous.index), both)
 
     def waves(
-        self, points: Tensor | Discs, sources: Tensor | Discs, amplitude: Tensor, nearest: float = 0.0
+        self,
+        points: Tensor | Discs,
+        sources: Tensor | Discs,
+        amplitude: Tensor,
+        nearest: float = 0.0,
+        images: Sequence[Image] = NO_MIRRORS,
     ) -> Tensor:
-        """Return fields (P, R) at points (P, 3) [m] of sources (N, 3) [m], amplitudes (N, R) [Pa m]."""
+        """Return fields (P, R) at points (P, 3) [m] of images of sources (N, 3), amplitudes (N, R) [Pa m]."""
         from autdtorch.fdtd.kernels.cpu_waves import superposition  # loads numba
 
-        return superposition(points, sources, amplitude, self.wavenumber, nearest, self.assembly.dtype)
+        def of(image: Image) -> Tensor:
+            seen = sources if image is SPACE_ITSELF else _seen(sources, image)
+            field = superposition(points, seen, amplitude, self.wavenumber, nearest, self.assembly.dtype)
+            return field if image is SPACE_ITSELF else image.weight * field
+
+        total = of(images[0])
+        for image in images[1:]:
+            total = total + of(image)
+        return total
 
     def incident(self, points: Tensor, sources: Apertures, strength: Tensor, nearest: float = 0.0) -> Tensor:
         """Return the incident field (P,) at points (P, 3) [m] of sources with strengths (N,) [Pa m]."""
@@ -90,9 +110,16 @@ class ScatteredField:
         picked = Interpolation(surface[:, None], np.ones((len(surface), 1))).matrix(cells)
         return NearToFar(self, targets, far, within, cells, outward @ picked, inner.matrix(cells))
 
-    def radiated(self, amplitude: Tensor, points: Tensor | Discs) -> Tensor:
-        """Return fields (P, R) at points (P, 3) [m] of the Huygens surface with amplitudes (n, R) [Pa m]."""
-        return self.waves(points, self.surface[0], amplitude)
+    def radiated(
+        self, amplitude: Tensor, points: Tensor | Discs, images: Sequence[Image] | None = None
+    ) -> Tensor:
+        """Return fields (P, R) at points (P, 3) [m] of the Huygens surface with amplitudes (n, R) [Pa m].
+
+        By default with all images of it.
+        """
+        return self.waves(
+            points, self.surface[0], amplitude, images=self.images if images is None else images
+        )
 
     def inside(self, points: Tensor) -> Tensor:
         """Return the mask of points (..., 3) read from the grid; others are clear of the Huygens surface."""
@@ -154,6 +181,13 @@ class ScatteredField:
         return self.positions(index), cells, csr_array((value, (row, place)), (len(index), len(cells)))
 
 
+def _seen(sources: Tensor | Discs, image: Image) -> Tensor | Discs:
+    """Return the image of sources."""
+    if isinstance(sources, Discs):
+        return sources._replace(centers=image.of(sources.centers), normals=sources.normals @ image.matrix.mT)
+    return image.of(sources)
+
+
 @dataclass(frozen=True)
 class NearToFar:
     """The near-to-far-field transform from phasors of a box's cells to the scattered field at P targets."""
@@ -180,6 +214,8 @@ class NearToFar:
         near, runs = self.targets.chosen(~self.far), amplitude.shape[1]
         field = torch.zeros((*self.within.shape, runs), **COMPLEX)
         field[self.within] = inner
+        if self.box.echoes and self.within.any():
+            field[self.within] += self.box.radiated(amplitude, near.positions[self.within], self.box.echoes)
         field[~self.within] = self.box.radiated(amplitude, near.positions[~self.within])
         mean = torch.zeros((len(self.far), runs), **COMPLEX)
         mean[~self.far] = torch.einsum("pnr,n->pr", field, near.weights.to(field.dtype))
@@ -199,10 +235,11 @@ class NearToFar:
         within, some = self.within[near], self.targets.chosen(chosen[~far])
         received = torch.zeros((len(self.box.surface[0]), len(far)), **COMPLEX)
         # reciprocity of Green's function
-        received[:, ~far] = self._received(some, weights * ~within, far=False)
-        received[:, far] = self._received(
-            self.targets.chosen(chosen[far]), weights.sum().expand(int(far.sum()), 1), far=True
-        )
+        received[:, ~far] = self._received(some, weights * ~within, False, self.box.images)
+        if self.box.echoes and within.any():
+            received[:, ~far] += self._received(some, weights * within, False, self.box.echoes)
+        discs, ones = self.targets.chosen(chosen[far]), weights.sum().expand(int(far.sum()), 1)
+        received[:, far] = self._received(discs, ones, True, self.box.images)
         read = torch.zeros_like(self.within)
         read[near] = within
         row, node = torch.nonzero(within, as_tuple=True)
@@ -210,7 +247,7 @@ class NearToFar:
         mean = csr_array((weights[node].numpy(), place), (len(far), len(row)))
         return FieldMatrices(self.outward, received, csr_array(mean @ self.inward[read[self.within].numpy()]))
 
-    def _received(self, targets: Apertures, weights: Tensor, far: bool) -> Tensor:
+    def _received(self, targets: Apertures, weights: Tensor, far: bool, images: Sequence[Image]) -> Tensor:
         """Return waves (m, P) from the Huygens surface to P targets, with weights (P, n) of their nodes.
 
         Targets that are `far` discs have one weight each.
@@ -223,7 +260,7 @@ class NearToFar:
             amplitude = torch.zeros((of_nodes.numel(), len(of_nodes)), **COMPLEX)
             amplitude[torch.arange(len(columns), device="cpu"), columns] = of_nodes.flatten().to(amplitude)
             sources = some.discs if far else some.positions.flatten(0, 1)
-            waves.append(self.box.waves(self.box.surface[0], sources, amplitude))
+            waves.append(self.box.waves(self.box.surface[0], sources, amplitude, images=images))
         return torch.cat(waves, dim=1)
 
 

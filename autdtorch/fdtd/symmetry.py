@@ -22,11 +22,13 @@ from autdtorch.fdtd.stencil import OFFSETS, places_of
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.images import Mirror
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 # Largest difference of equal stencil rows, relative to the weight of a face: on a grid of 1 mm, shifts by
 # `LENGTH_TOLERANCE` cause it
 _ROUNDING = 1e-6
+_TURNED = 1e-9  # Difference of equal unit normals
 _NONE = -1  # Index of an image that is none of the points
 
 
@@ -43,6 +45,20 @@ class Symmetry:
         if (self.matrix == np.eye(3)).all():
             return np.arange(len(points))
         return _matched(points[:, None].numpy(), np.ones(1), self.matrix, self.center)
+
+    def keeps(self, mirrors: Sequence[Mirror]) -> bool:
+        """Return whether it maps each mirror to one of the same reflection."""
+        others = [(np.array(mirror.point), np.array(mirror.normal), mirror.reflection) for mirror in mirrors]
+        for point, normal, reflection in others:
+            moved, turned = self.matrix @ (point - self.center) + self.center, self.matrix @ normal
+            if not any(
+                reflection == factor
+                and np.abs(turned - other).max() < _TURNED
+                and abs((moved - place) @ other) < LENGTH_TOLERANCE
+                for place, other, factor in others
+            ):
+                return False
+        return True
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,10 +33,11 @@ _SAGITTA = 1.5  # Growth of a bounding box, relative to the distance of triangle
 
 @dataclass(frozen=True, eq=False)
 class Turned:
-    """A shape in the coordinates of other axes."""
+    """A shape in the coordinates of other axes, or its image in a mirror."""
 
     shape: Shape
     axes: Array  # the axes, one a row, in the coordinates of the shape (3, 3)
+    offset: Array = field(default_factory=lambda: np.zeros(3))  # place of the origin (3,) [m]
 
     @property
     def lower(self) -> Vector:
@@ -50,15 +51,23 @@ class Turned:
 
     def signed_distance(self, points: Tensor, /) -> Tensor:
         """Return the distance (...) [m] of points (..., 3) to the surface, negative inside."""
-        return self.shape.signed_distance(points @ torch.from_numpy(self.axes))
+        return self.shape.signed_distance(
+            (points - torch.from_numpy(self.offset)) @ torch.from_numpy(self.axes)
+        )
 
     def surface(self) -> tuple[Tensor, Tensor]:
         """Return vertices (V, 3) [m] and triangles (F, 3), counter-clockwise as seen from outside."""
         vertices, triangles = self.shape.surface()
-        return vertices @ torch.from_numpy(self.axes.T), triangles
+        if np.linalg.det(self.axes) < 0:  # an image turns the other way
+            triangles = triangles.flip(1)
+        return vertices @ torch.from_numpy(self.axes.T) + torch.from_numpy(self.offset), triangles
 
     @cached_property
     def _bounds(self) -> tuple[Vector, Vector]:
+        if (np.abs(self.axes).max(axis=1) == 1).all():
+            corners = np.array([self.shape.lower, self.shape.upper]) @ self.axes.T + self.offset
+            (x, y, z), (u, v, w) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
+            return (x, y, z), (u, v, w)
         vertices, triangles = self.surface()
         middle = self.signed_distance(vertices[triangles].mean(dim=1))
         beyond = _SAGITTA * float(middle.abs().max())

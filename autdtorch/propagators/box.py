@@ -22,6 +22,7 @@ from scipy.spatial import KDTree
 
 from autdtorch.fdtd.grid import Grid, make_box
 from autdtorch.fdtd.grouping import one_box
+from autdtorch.fdtd.reflection import other_images, with_images
 from autdtorch.fdtd.region import Body, Region
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
 from autdtorch.fdtd.steady_state import MOST_JUDGED, SteadyState, run_to_steady_state
@@ -35,7 +36,7 @@ from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.moving import circumscribed, is_movable, shifted
-from autdtorch.scene.scene import require_clear
+from autdtorch.scene.scene import require_clear, require_in_front
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL, Array, Index
 from autdtorch.utils.digest import digest_of
@@ -47,6 +48,8 @@ _CELL_BYTES = 20
 """Memory of an assembled cell [bytes]."""
 
 _ENTRY_BYTES = torch.complex128.itemsize
+
+_RESONANCE = "the echo between obstacles and reflectors does not decay: the scene resonates"
 
 
 class Judged(NamedTuple):
@@ -124,13 +127,15 @@ class BoxSimulation(Simulation):
         """The assembled boxes."""
         plan = self.plan
         plan.require_feasible()
-        boxes = []
-        for group, axes in zip(plan.grouping.groups, plan.grouping.axes, strict=True):
-            part = replace(plan.region, bodies=tuple(plan.region.bodies[index] for index in group))
+        boxes, grouping, region = [], plan.grouping, plan.region
+        for group, axes, near in zip(grouping.groups, grouping.axes, grouping.mirrors, strict=True):
+            bodies = [region.bodies[index] for index in group]
+            part = replace(region, bodies=with_images(bodies, [region.mirrors[number] for number in near]))
             if is_turned(axes):
                 logger.debug("the grid around obstacles %s is turned along their faces", list(group))
             assembly = assembled_box(part, axes, plan.spacing, plan.dtype, plan.time_step)
-            boxes.append(ScatteredField(assembly, plan.scene.complex_wavenumber, axes))
+            images = other_images(region, near, plan.scene.images)
+            boxes.append(ScatteredField(assembly, plan.scene.complex_wavenumber, axes, images))
         return boxes
 
     @property
@@ -144,6 +149,7 @@ class BoxSimulation(Simulation):
 
     def _check(self, points: torch.Tensor) -> None:
         require_clear(self.plan.scene.array, "points", points)
+        require_in_front(self.plan.scene.reflectors, "points", points)
 
     def _in_enclosed_cells(self, points: torch.Tensor) -> torch.Tensor:
         enclosed = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu")
@@ -229,6 +235,8 @@ class BoxSimulation(Simulation):
         around = sphere_points(center, radius + scene.wavelength, MOST_JUDGED)
         apart = torch.cdist(around, scene.array.nodes.positions.reshape(-1, 3)).amin(dim=1)
         around = around[apart > self.plan.spacing]  # their own 1/r would hide the rest
+        for mirror in self.plan.region.mirrors:
+            around = around[mirror.height(around) >= 0]
         groups = [part[~self.silent(part[:, None])] for part in (places, around)]
         ends = np.cumsum([0, *map(len, groups)])
         slices = tuple(slice(*pair) for pair in itertools.pairwise(ends) if pair[0] < pair[1])
@@ -247,7 +255,7 @@ class BoxSimulation(Simulation):
     ) -> torch.Tensor:
         """Return the incident field (P, R) [Pa] at P receivers in R runs; see `_run`."""
         points, weights = receivers.positions, receivers.weights.to(torch.complex128)
-        drives = zip(sources, strength, strict=True)
+        drives = [self.imaged(*drive) for drive in zip(sources, strength, strict=True)]
         fields = [self.boxes[0].incident(points.reshape(-1, 3), *drive) for drive in drives]
         return torch.stack([field.reshape(points.shape[:-1]) @ weights for field in fields], dim=1)
 
@@ -263,7 +271,8 @@ class BoxSimulation(Simulation):
     ) -> tuple[Solved, list[Run]]:
         """Simulate R runs until the pressure at the judged receivers has converged; see `_run`."""
         receivers, every, groups = judged
-        drives, some = list(zip(sources, strength, strict=True)), receivers.chosen(slice(None, None, every))
+        drives = [self.imaged(*drive) for drive in zip(sources, strength, strict=True)]
+        some = receivers.chosen(slice(None, None, every))
         transforms = [box.near_to_far(receivers) for box in self.boxes]
         readings = [transform.matrices(every) for transform in transforms]
         sizes = [len(transform.cells) for transform in transforms]
@@ -277,7 +286,7 @@ class BoxSimulation(Simulation):
             return [pressure[group] for group in groups]
 
         bodies = [_Scatterer(self, transform, stepped) for transform in transforms]
-        if len(bodies) == 1:
+        if len(bodies) == 1 and not self.boxes[0].echoes:
 
             @torch.no_grad()  # holds in one thread only
             def alone(run: int) -> tuple[SteadyState, float]:
@@ -295,6 +304,8 @@ class BoxSimulation(Simulation):
             least = torch.tensor(floors, **REAL).mT.clamp(min=torch.finfo(torch.float64).tiny)
             observe_all = functools.partial(observed, runs=slice(None))
             states = iterated(bodies, driving, observe_all, least, self.plan.tolerance)
+            if not states and len(bodies) == 1:
+                raise ValueError(_RESONANCE)
             if not states:
                 logger.debug("the iteration between %d boxes does not converge: one box instead", len(bodies))
                 return self._in_one_box._solved(sources, strength, judged, stepped)
@@ -340,9 +351,11 @@ class _Scatterer:
         """Return the amplitudes of the Huygens surface."""
         return self.transform.amplitudes(phasors)
 
-    def incoming(self, other: _Scatterer, outgoing: torch.Tensor) -> torch.Tensor:
-        """Return the field (n, R) that the Huygens surface of another box radiates to this one."""
-        return other.transform.box.radiated(outgoing, self.transform.box.driven)
+    def incoming(self, other: _Scatterer, outgoing: torch.Tensor) -> torch.Tensor | None:
+        """Return the field (n, R) that a Huygens surface radiates to this box, its own by mirrors only."""
+        box = other.transform.box
+        images = box.echoes if other is self else box.images
+        return box.radiated(outgoing, self.transform.box.driven, images) if images else None
 
 
 @dataclass(frozen=True)
@@ -366,7 +379,7 @@ def assembled_box(
     """
     part = turned(region, axes)
     grid = make_box(part, spacing)
-    if not all(map(is_movable, region.shapes)):
+    if not all(isinstance(shape, Obstacle) and is_movable(shape) for shape in region.shapes):
         return assemble_on(grid, part, dtype, time_step)
     bodies = tuple(_shifted(body, grid, axes) for body in region.bodies)
     here = replace(grid, origin=(0.0, 0.0, 0.0))

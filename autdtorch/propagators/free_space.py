@@ -10,15 +10,15 @@ import torch
 
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.scene.drive import validate_drive
-from autdtorch.scene.scene import Scene
+from autdtorch.scene.scene import Scene, require_in_front
 from autdtorch.utils.text import counted
-from autdtorch.utils.validation import ArrayLike, boolean, points_grid, require_kind
+from autdtorch.utils.validation import ArrayLike, boolean, differentiable_points, points_grid, require_kind
 
 logger = logging.getLogger(__name__)
 
 
 class FreeSpacePropagator:
-    """The exact field of the array in free space; obstacles are ignored.
+    """The exact field of the array without obstacles, which are ignored; reflectors are not.
 
     Attributes:
         scene: the scene it was made for.
@@ -52,7 +52,10 @@ class FreeSpacePropagator:
         The error is 0, or infinite if obstacles are ignored. Points on a transducer raise `ValueError`.
         """
         points = self.scene.control_points if points is None else points
-        matrix = free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
+        scene = self.scene
+        points = differentiable_points("points", points)
+        require_in_front(scene.reflectors, "points", points)
+        matrix = free_space_matrix(points, scene.array, scene.complex_wavenumber, scene.images)
         error = math.inf if self.scene.obstacles else 0.0
         return (matrix, error) if boolean("return_error", return_error) else matrix
 

@@ -9,10 +9,11 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from autdtorch.fdtd.reflection import whole_region
 from autdtorch.fdtd.steady_state import MOST_JUDGED, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
-from autdtorch.scene.scene import require_inside
+from autdtorch.scene.scene import require_in_front, require_inside
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.process import cached_property, one_library_thread
 
@@ -26,7 +27,7 @@ class DomainSimulation(Simulation):
         """The assembled grid of the domain."""
         plan = self.plan
         plan.require_feasible()
-        return (assemble(plan.region, plan.spacing, plan.dtype, plan.time_step),)
+        return (assemble(whole_region(plan.region), plan.spacing, plan.dtype, plan.time_step),)
 
     def near_obstacle(self, points: torch.Tensor) -> bool:
         """Return whether the interpolation kernel of any point (N, 3) has heterogeneous cells."""
@@ -38,6 +39,7 @@ class DomainSimulation(Simulation):
 
     def _check(self, points: torch.Tensor) -> None:
         require_inside(self.plan.scene.domain, "points", points)
+        require_in_front(self.plan.scene.reflectors, "points", points)
 
     def _simulate(
         self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures, stepped: Stepped
@@ -51,7 +53,8 @@ class DomainSimulation(Simulation):
         rows, runs = [], []
         for source, amplitude in zip(sources, strength, strict=True):
             begin = time.perf_counter()
-            forces = assembly.sources(source.positions, amplitude, source.weights)
+            everything, strengths = self.imaged(source, amplitude)
+            forces = assembly.sources(everything.positions, strengths, everything.weights)
             steady = run_to_steady_state(
                 assembly, self._kernel, forces, cells, plan.tolerance, plan.max_periods,
                 lambda phasor: [torch.from_numpy(judged @ phasor.numpy())], stepped,

@@ -44,8 +44,11 @@ class Scatterer(Protocol):
         """Return outgoing waves (m, R) of phasors (k, R)."""
         ...
 
-    def incoming(self, other: Self, outgoing: torch.Tensor) -> torch.Tensor:
-        """Return the waves (n, R) that come in from another body's outgoing ones (m, R)."""
+    def incoming(self, other: Self, outgoing: torch.Tensor) -> torch.Tensor | None:
+        """Return the waves (n, R) that come in from outgoing ones (m, R); None from a body to itself.
+
+        With reflectors, waves of a body come back to it.
+        """
         ...
 
 
@@ -54,10 +57,11 @@ def solved(
 ) -> torch.Tensor:
     """Return the outgoing waves (N, M) of all bodies, given their maps T_i (n, n) and S_ij as matrices.
 
-    `incident` are the waves (n, M) on each body; `between` has 0 matrices on its diagonal.
+    `incident` are the waves (n, M) on each body. The diagonal of `between`, the waves that come back from a
+    body, is 0 without reflectors.
     """
     alone = torch.cat([matrix @ waves for matrix, waves in zip(maps, incident, strict=True)])
-    if len(maps) == 1:
+    if len(maps) == 1 and not between[0][0].any():
         return alone
     rows = [torch.cat(list(row), dim=1) for row in between]
     coupled = torch.cat([matrix @ row for matrix, row in zip(maps, rows, strict=True)])
@@ -120,10 +124,6 @@ def iterated(
                 return [(state, seconds) for state in states]
         before, smaller = list(values), size
         sent = list(zip(bodies, outgoing, strict=True))
-        incoming = [
-            torch.stack([body.incoming(other, waves) for other, waves in sent if other is not body]).sum(
-                dim=0
-            )
-            for body in bodies
-        ]
+        parts_of = ([body.incoming(other, waves) for other, waves in sent] for body in bodies)
+        incoming = [torch.stack([part for part in each if part is not None]).sum(dim=0) for each in parts_of]
     return []

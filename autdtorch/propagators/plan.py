@@ -16,6 +16,7 @@ from autdtorch.fdtd.grid_errors import Law
 from autdtorch.fdtd.grouping import Grouping, choose_grids
 from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels.choice import available_kernel, precision_of
+from autdtorch.fdtd.reflection import require_domain, require_sharp, whole_region
 from autdtorch.fdtd.region import Region
 from autdtorch.propagators.scene_region import region_of, with_rigid
 from autdtorch.propagators.store import key_of
@@ -124,6 +125,8 @@ class Plan:
     @cached_property
     def _costs(self) -> Costs:
         array, points, region = self.scene.array, len(self.scene.control_points), self.region
+        if self.method == "full":
+            region = whole_region(region)
         transducers = apertures_of(array)
         around = np.array([corner for shape in region.shapes for corner in (shape.lower, shape.upper)])
         far = transducers.far_from(torch.from_numpy(around.reshape(-1, 3)), region.wavenumber)
@@ -159,6 +162,10 @@ class Plan:
                     field, value, f"gives {shape} cells, must be at most {MAX_CELLS:.0e} in all", unit
                 )
         require_spacing(self.region, self.spacing)
+        if self.method == "full":
+            require_domain(self.region)
+        for near in self.grouping.mirrors:
+            require_sharp(self.region, near, self.spacing)
 
 
 def plan(

@@ -33,7 +33,10 @@ def region_of(scene: Scene) -> Region:
         bodies.append(Body(one, fluid, continued, one.uncertainty, impedance=one.impedance))
     medium, positions = scene.medium, np.asarray(scene.array.positions.numpy())
     air = Fluid(medium.density, medium.sound_speed)
-    return Region(air, scene.attenuation, scene.frequency, tuple(bodies), scene.domain, positions)
+    return Region(
+        air, scene.attenuation, scene.frequency, tuple(bodies), scene.domain, positions,
+        tuple(one.mirror for one in scene.reflectors),
+    )  # fmt: skip
 
 
 def with_rigid(region: Region, tolerance: float) -> Region:

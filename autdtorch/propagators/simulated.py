@@ -269,7 +269,7 @@ class SimulatedPropagator:
 
     def _free(self, points: torch.Tensor) -> torch.Tensor:
         """Return the matrix of points in free space."""
-        return free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
+        return free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber, self.scene.images)
 
 
 def simulation_of(plan: Plan, store: Store) -> Simulation:

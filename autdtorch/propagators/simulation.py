@@ -159,7 +159,17 @@ class Simulation(ABC):
     @cached_property
     def symmetries(self) -> list[Symmetry]:
         """Symmetries of the scene on its grid."""
-        return symmetries(self.assemblies, self.plan.grouping.axes[0], apertures_of(self.plan.scene.array))
+        scene, axes = self.plan.scene, self.plan.grouping.axes[0]
+        every = symmetries(self.assemblies, axes, apertures_of(scene.array))
+        return [each for each in every if each.keeps(self.plan.region.mirrors)]
+
+    def imaged(self, sources: Apertures, strength: torch.Tensor) -> tuple[Apertures, torch.Tensor]:
+        """Return sources of strength (N,) [Pa m] with all their images in the scene's reflectors."""
+        images = self.plan.scene.images
+        if len(images) == 1:
+            return sources, strength
+        everything, weights = sources.with_images(images)
+        return everything, weights * strength.repeat(len(weights) // len(strength))
 
     @property
     def time_step(self) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 
@@ -17,8 +17,11 @@ from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.base import overlap, shared_box
 from autdtorch.scene.obstacles.moving import moved
 from autdtorch.scene.plausibility import extent_of, unit_hint, warn_of_implausible
+from autdtorch.scene.reflectors import Reflector, require_arrangement
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.hints import suggesting
+from autdtorch.utils.images import Image, images_of
+from autdtorch.utils.process import cached_property
 from autdtorch.utils.spatial import nearest, require_distinct
 from autdtorch.utils.text import counted, html_facts
 from autdtorch.utils.units import DECIBELS, angles, warn_user
@@ -64,6 +67,7 @@ class Scene:
         observation_plane: plane of pictures and focal areas, or None.
         domain: corners (lower, upper) [m] of the simulated space; obstacles may extend beyond it.
         name: for titles and file names.
+        reflectors: planes that reflect everything in front of them.
     """
 
     array: TransducerArray
@@ -74,6 +78,7 @@ class Scene:
     observation_plane: Plane | None
     domain: tuple[Vector, Vector]
     name: str
+    reflectors: tuple[Reflector, ...]
 
     def __init__(
         self,
@@ -85,6 +90,7 @@ class Scene:
         observation_plane: Plane | None = None,
         domain: ArrayLike | None = None,
         name: str = "scene",
+        reflectors: Iterable[Reflector] = (),
     ) -> None:
         """Check and copy the input; the arguments are the attributes, see `Scene`.
 
@@ -93,10 +99,15 @@ class Scene:
         obstacles that leave it, see the methods of `make_propagator`. By default it is the bounding box of
         everything, with a margin of two wavelengths on each side.
 
+        Array, control points and observation plane lie in front of all reflectors, or in them; obstacles are
+        cut at them.
+
         Raises:
             ValueError: a field of the wrong type or out of range, or a coordinate beyond 1e6 m. Also a point
                 in or on an obstacle, coincident with another or outside the domain, or a medium that absorbs
-                more than 3 dB per wavelength, or an obstacle more than 27.
+                more than 3 dB per wavelength, or an obstacle more than 27; or
+                something behind a reflector, or reflectors that are neither at right angles nor facing each
+                other, a wavelength apart.
 
         Warns:
             OverlapWarning: two obstacles of different materials overlap.
@@ -130,6 +141,9 @@ class Scene:
                 accepted += f"; is the frequency, {self.frequency:g}, in Hz, 40 kHz as 40e3?"
             raise invalid("Scene.medium.absorption", medium.absorption, accepted, "dB/m")
         _require_waves_inside(self)
+        object.__setattr__(self, "reflectors", members("Scene.reflectors", reflectors, Reflector))
+        require_arrangement(self.reflectors, self.wavelength)
+        _require_in_front(self)
         _require_separate_points(self)
         _require_in_domain(self)
         _warn_of_overlaps(self.obstacles)
@@ -165,7 +179,7 @@ class Scene:
         require_kind("other", other, Scene)
         if self is other:
             return True
-        alike = ("medium", "frequency", "obstacles", "observation_plane", "domain")
+        alike = ("medium", "frequency", "obstacles", "observation_plane", "domain", "reflectors")
         array, theirs = self.array, other.array
         return (
             all(getattr(self, name) == getattr(other, name) for name in alike)
@@ -201,12 +215,20 @@ class Scene:
         """Wavelength in the medium, c / f [m]."""
         return self.medium.sound_speed / self.frequency
 
+    @cached_property
+    def images(self) -> tuple[Image, ...]:
+        """The images of the space in the reflectors, the space itself first."""
+        size = float((torch.tensor(self.domain[1], **REAL) - torch.tensor(self.domain[0], **REAL)).norm())
+        return images_of([one.mirror for one in self.reflectors], self.complex_wavenumber, size)
+
     def __repr__(self) -> str:
         """Return name, frequency, counts and extent, with units."""
         wave = f"{self.frequency / 1e3:.4g} kHz, wavelength {1e3 * self.wavelength:.4g} mm"
         points = counted(len(self.control_points), "control point")
         counts = f"{counted(len(self.array), 'transducer')}, {points}"
         space = f"{counted(len(self.obstacles), 'obstacle')}, domain {self._size()} mm"
+        if self.reflectors:
+            space = f"{counted(len(self.reflectors), 'reflector')}, {space}"
         return f"Scene({self.name!r}, {wave}, {counts}, {space})"
 
     def _repr_html_(self) -> str:
@@ -222,6 +244,7 @@ class Scene:
             ),
             ("control points", str(len(self.control_points))),
             ("obstacles", ", ".join(_kinds(self.obstacles)) or "none"),
+            ("reflectors", str(len(self.reflectors))),
             ("domain", f"{self._size()} mm, {self._size(self.wavelength, 3)} wavelengths"),
         ]
         return html_facts(f"Scene {self.name!r}", facts)
@@ -302,6 +325,35 @@ def _require_waves_inside(scene: Scene) -> None:
                 accepted = f"must be at most {most:.4g} dB/m, {_MOST_OF_OBSTACLE:g} dB per wavelength inside"
                 accepted += "; porous() and impedance= describe what absorbs more"
                 raise invalid(f"Scene.obstacles[{index}].absorption", obstacle.absorption, accepted, "dB/m")
+
+
+def _require_in_front(scene: Scene) -> None:
+    """Refuse what lies behind a reflector; obstacles that cross one are cut."""
+    contents = [*_contents(scene)[:2], ("Scene.array.nodes", scene.array.nodes.positions.reshape(-1, 3))]
+    if scene.observation_plane is not None:
+        contents.append(("Scene.observation_plane corner", scene.observation_plane.corners))
+    for number, reflector in enumerate(scene.reflectors):
+        for name, places in contents:
+            require_in_front([reflector], name, places, number)
+        for index, obstacle in enumerate(scene.obstacles):
+            highest = float(reflector.height(obstacle.surface()[0]).max())
+            if highest <= LENGTH_TOLERANCE:
+                accepted = f"is wholly behind reflector {number}, must be in front of it"
+                raise invalid(f"Scene.obstacles[{index}]", extent_of(obstacle), accepted)
+
+
+def require_in_front(
+    reflectors: Sequence[Reflector], name: str, points: torch.Tensor, first_number: int = 0
+) -> None:
+    """Refuse points (N, 3) [m] behind a reflector."""
+    for number, reflector in enumerate(reflectors, first_number):
+        height = reflector.height(points)
+        if (height < -LENGTH_TOLERANCE).any():
+            lowest = int(height.argmin())
+            accepted = (
+                f"is {-1e3 * float(height[lowest]):.4g} mm behind reflector {number}, must be in front of it"
+            )
+            raise invalid(f"{name}[{lowest}]", points[lowest], accepted, "m")
 
 
 def _require_separate_points(scene: Scene) -> None:

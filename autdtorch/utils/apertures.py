@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
 import torch
 
-from autdtorch.utils.array_types import REAL, AnyArray, Array
+from autdtorch.utils.array_types import COMPLEX, REAL, AnyArray, Array
+from autdtorch.utils.images import Image, distinct
 
 PATTERN_TERMS = 13
 """Powers of the square of the sine of an angle in a far-field pattern."""
@@ -37,6 +38,19 @@ class Apertures(NamedTuple):
         """Return some of the sources or receivers."""
         normals, radii = (None if part is None else part[index] for part in (self.normals, self.radii))
         return self._replace(positions=self.positions[index], normals=normals, radii=radii)
+
+    def with_images(self, images: Sequence[Image]) -> tuple[Self, torch.Tensor]:
+        """Return all images of the apertures, one image after the other, and their weights (G N,)."""
+        parts = distinct(images, self.positions)
+        turned = (
+            None if self.normals is None else torch.cat([self.normals @ each.matrix.mT for each in parts])
+        )
+        positions = torch.cat([image.of(self.positions) for image in parts])
+        radii = None if self.radii is None else self.radii.repeat(len(parts))
+        weights = torch.tensor([complex(image.weight) for image in parts], **COMPLEX)
+        return self._replace(positions=positions, normals=turned, radii=radii), weights.repeat_interleave(
+            len(self.positions)
+        )
 
     @property
     def discs(self) -> Discs:

@@ -13,8 +13,9 @@ from autdtorch.analytic.spherical_waves import enough_degrees
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle, Sphere
 from autdtorch.scene.obstacles.moving import circumscribed
+from autdtorch.scene.reflectors import Reflector
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.validation import LENGTH_TOLERANCE
+from autdtorch.utils.validation import LENGTH_TOLERANCE, invalid
 
 _MOST_BODIES, _MOST_WAVES = 3, 2000
 """Bodies, and waves around all, up to which "auto" takes T-matrices."""
@@ -65,6 +66,11 @@ def waves_to_simulate(scene: Scene, error: float, most: int | None = None) -> in
         if any(waves(max(np.subtract(one.upper, one.lower)) / 2) > most for one in unknown):
             return None
     bodies = bodies_of(obstacles)
+    if crossed := [number for number, one in enumerate(scene.reflectors) if not _in_front(one, bodies)]:
+        if most is not None:
+            return None
+        accepted = f"needs the spheres around obstacles to be in front of reflector {crossed[0]}; take box"
+        raise invalid("method", "tmatrix", accepted)
     counts = [waves(body.radius) for body in bodies]
     closed = [
         has_closed_form([obstacles[index] for index in body.obstacles], scene.medium) for body in bodies
@@ -81,6 +87,11 @@ def are_outside(points: torch.Tensor, bodies: Sequence[ObstacleGroup]) -> torch.
     """Return which points (P, 3) [m] are outside the spheres of all bodies."""
     apart = torch.stack([(points - body.center).norm(dim=1) - body.radius for body in bodies])
     return (apart > LENGTH_TOLERANCE).all(dim=0)
+
+
+def _in_front(reflector: Reflector, bodies: Sequence[ObstacleGroup]) -> bool:
+    """Return whether the spheres of bodies are in front of a reflector."""
+    return all(float(reflector.height(body.center)) >= body.radius for body in bodies)
 
 
 def _body(obstacles: Sequence[Obstacle], chosen: tuple[int, ...]) -> ObstacleGroup:

@@ -74,6 +74,7 @@ class StillBody:
     medium: Medium
     frequency: float
     solver: Solver
+    fewest_degrees: int = 0
 
     @cached_property
     def sphere(self) -> tuple[torch.Tensor, float]:
@@ -94,7 +95,9 @@ class StillBody:
     @property
     def degree(self) -> int:
         """The largest degree of the waves."""
-        return enough_degrees(self.scene.wavenumber * self.sphere[1], self.solver.error)
+        return max(
+            enough_degrees(self.scene.wavenumber * self.sphere[1], self.solver.error), self.fewest_degrees
+        )
 
     @property
     def waves(self) -> BodyWaves:
@@ -137,14 +140,16 @@ class Placed(NamedTuple):
         return BodyMatrix(matrix, scene.complex_wavenumber, radius, place, self.turn @ axes)
 
 
-def placed(obstacles: Sequence[Obstacle], medium: Medium, frequency: float, solver: Solver) -> Placed:
+def placed(
+    obstacles: Sequence[Obstacle], medium: Medium, frequency: float, solver: Solver, fewest_degrees: int = 0
+) -> Placed:
     """Return the body that obstacles make, around the origin where they can be moved."""
     still, turn = at_rest(obstacles)
     shift = torch.zeros(3, **REAL)
     if all(map(is_movable, still)):
         shift, _ = circumscribed(still)
         still = tuple(shifted(one, -shift, _DIGITS) for one in still)
-    return Placed(StillBody(still, medium, frequency, solver), turn, turn @ shift)
+    return Placed(StillBody(still, medium, frequency, solver, fewest_degrees), turn, turn @ shift)
 
 
 def _of_sphere(sphere: Obstacle, scene: Scene, degree: int) -> torch.Tensor:

@@ -17,12 +17,13 @@ from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.propagators.simulation import Run
 from autdtorch.propagators.store import Store
-from autdtorch.propagators.tmatrix.bodies import ObstacleGroup, are_outside, bodies_of
+from autdtorch.propagators.tmatrix.bodies import ObstacleGroup, are_outside, bodies_of, has_closed_form
 from autdtorch.propagators.tmatrix.body import Placed, Solver, placed
 from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster, scattered_waves, waves_at
 from autdtorch.scene.drive import validate_drive
-from autdtorch.scene.scene import require_clear
+from autdtorch.scene.scene import require_clear, require_in_front
 from autdtorch.utils.array_types import COMPLEX, REAL
+from autdtorch.utils.images import Image
 from autdtorch.utils.process import cached_property, one_library_thread
 from autdtorch.utils.validation import ArrayLike, boolean, differentiable_points, points_grid, points_tensor
 
@@ -34,6 +35,7 @@ _SLOWEST = 0.9  # Ratio of successive pairs of degrees up to which a sum is extr
 _ERRORS = 1e-8, 0.1  # Range of the error at which degrees are left out
 _MORE_WAVES = 1e-3  # Tolerance for which the waves left out are computed, relative to the one asked for
 _ROUNDING = 1e-12  # Error of sums of all waves
+_NEAREST = 0.68  # Largest relative place of a limit point that is resolved: 48 degrees for 1e-8
 _TINY = torch.finfo(torch.float64).tiny
 
 
@@ -91,7 +93,10 @@ class TMatrixPropagator:
     def bodies(self) -> TMatrixCluster:
         """The bodies of the scene."""
         with torch.inference_mode(False):  # later calls may need gradients
-            return TMatrixCluster(TMatrix(*body.matrix(self._store)) for body in placed_bodies(self.plan))
+            return TMatrixCluster(
+                (TMatrix(*body.matrix(self._store)) for body in placed_bodies(self.plan)),
+                self.scene.reflectors,
+            )
 
     @property
     def planned_runs(self) -> int:
@@ -157,7 +162,7 @@ class TMatrixPropagator:
         """Return the estimated errors (P,) of rows of G (P, M) that the waves serve."""
         if not len(points):
             return torch.zeros(0, **REAL)
-        free = free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
+        free = free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber, self.scene.images)
         region = self.plan.region
         if not self.plan.runs:  # exact but for the waves left out
             more = self.plan.at(self.spacing, _MORE_WAVES * self.tolerance)
@@ -199,6 +204,7 @@ class TMatrixPropagator:
     def _checked(self, points: ArrayLike | None) -> torch.Tensor:
         places = differentiable_points("points", self.scene.control_points if points is None else points)
         require_clear(self.scene.array, "points", places.detach())
+        require_in_front(self.scene.reflectors, "points", places.detach())
         return places.cpu()
 
     def _by_waves(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -217,8 +223,8 @@ class TMatrixPropagator:
 
     def _converged(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return G (P, M) at points (P, 3), and where (P,) the waves have converged to the tolerance."""
-        waves, scattered = waves_at(self.bodies, points), self._scattered
-        direct = free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
+        waves, scattered = waves_at(self.bodies, points, self.scene.images), self._scattered
+        direct = free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber, self.scene.images)
         matrix = waves @ scattered[0] + direct
         left_out = self._left_out(waves.detach(), scattered)
         return matrix, left_out <= self.tolerance * matrix.detach().norm(dim=1)
@@ -227,7 +233,7 @@ class TMatrixPropagator:
     def _scattered(self) -> list[torch.Tensor]:
         """Outgoing waves (N, M) of all bodies, by all degrees and with the highest ones left out."""
         with torch.inference_mode(False):
-            return scattered_waves(self.bodies, self.scene.array, (0, _FEWER, 2 * _FEWER))
+            return scattered_waves(self.bodies, self.scene.array, self.scene.images, (0, _FEWER, 2 * _FEWER))
 
     @staticmethod
     def _left_out(waves: torch.Tensor, scattered: Sequence[torch.Tensor]) -> torch.Tensor:
@@ -242,5 +248,28 @@ def placed_bodies(plan: Plan) -> list[Placed]:
     """Return the bodies of a plan's scene, before they are simulated."""
     scene, error = plan.scene, min(max(plan.tolerance, _ERRORS[0]), _ERRORS[1])
     solver = Solver(plan.spacing, error, plan.kernel, plan.dtype, plan.max_periods, plan.time_step)
-    groups = [[scene.obstacles[index] for index in body.obstacles] for body in bodies_of(scene.obstacles)]
-    return [placed(group, scene.medium, scene.frequency, solver) for group in groups]
+    bodies, settings = bodies_of(scene.obstacles), (scene.medium, scene.frequency, solver)
+    groups = [[scene.obstacles[index] for index in body.obstacles] for body in bodies]
+    near = [_degrees_between(body, bodies, scene.images, error) for body in bodies]
+    known = [has_closed_form(group, scene.medium) for group in groups]  # others would take more runs
+    return [
+        placed(group, *settings, fewest_degrees=fewest if closed else 0)
+        for group, fewest, closed in zip(groups, near, known, strict=True)
+    ]
+
+
+def _degrees_between(
+    body: ObstacleGroup, bodies: Sequence[ObstacleGroup], images: Sequence[Image], error: float
+) -> int:
+    """Return the degrees of the waves between a body and its nearest neighbour or image.
+
+    Waves that go back and forth between two spheres come from a limit point in each, as images of images do.
+    """
+    fewest = 0
+    for other in bodies:
+        for image in images[1:] if other is body else images:
+            apart = float((body.center - image.of(other.center)).norm())
+            middle = (apart**2 + body.radius**2 - other.radius**2) / (2 * apart) / body.radius
+            place = middle - math.sqrt(max(middle**2 - 1, 0.0))  # of the limit point, relative to the radius
+            fewest = max(fewest, math.ceil(math.log(error) / math.log(min(place, _NEAREST))))
+    return fewest

@@ -27,9 +27,12 @@ from autdtorch.scene.arrays import TransducerArray, strengths_of
 from autdtorch.scene.geometry import composed_rotation
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.reflectors import Reflector, require_arrangement
+from autdtorch.scene.scene import require_in_front
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.files import read_arrays, write_arrays
 from autdtorch.utils.hints import renamed_keywords
+from autdtorch.utils.images import Image, distinct, images_of
 from autdtorch.utils.process import one_library_thread, require_memory
 from autdtorch.utils.units import turn_tensor, warn_user
 from autdtorch.utils.validation import (
@@ -205,15 +208,17 @@ class TMatrixCluster:
     Attributes:
         bodies: their T-matrices, all with one wavenumber. Their circumscribed spheres must not overlap;
             obstacles that are nearer make one body.
+        reflectors: planes that reflect, in front of all spheres, as in a `Scene`.
 
     Raises:
-        ValueError: no body, other wavenumbers, or spheres that overlap.
+        ValueError: no body, other wavenumbers, or spheres that overlap or cross a reflector.
     """
 
     bodies: tuple[TMatrix, ...]
+    reflectors: tuple[Reflector, ...]
 
     @renamed_keywords(operators="bodies")
-    def __init__(self, bodies: Iterable[TMatrix]) -> None:
+    def __init__(self, bodies: Iterable[TMatrix], reflectors: Iterable[Reflector] = ()) -> None:
         """Check the bodies; see the class."""
         bodies = members("bodies", bodies, TMatrix)
         if not bodies:
@@ -227,6 +232,15 @@ class TMatrixCluster:
                     accepted = f"must be at least {least:.4g} m from that of another body"
                     raise invalid(f"bodies[{number}].center", f"{apart:.4g} m apart", accepted)
         object.__setattr__(self, "bodies", bodies)
+        reflectors = members("reflectors", reflectors, Reflector)
+        require_arrangement(reflectors, 2 * math.pi / bodies[0].wavenumber.real)
+        for number, body in enumerate(bodies):
+            for index, reflector in enumerate(reflectors):
+                height = float(reflector.height(body.center.detach()))
+                if height < body.radius - LENGTH_TOLERANCE:
+                    accepted = f"must be at least {body.radius:.4g} m in front of reflector {index}"
+                    raise invalid(f"bodies[{number}].center", f"{height:.4g} m", accepted)
+        object.__setattr__(self, "reflectors", reflectors)
 
     @property
     def operators(self) -> tuple[TMatrix, ...]:
@@ -246,9 +260,17 @@ class TMatrixCluster:
         require_kind("array", array, TransducerArray)
         places, grid = points_grid("points", points)
         targets = places.cpu()
-        direct = free_space_matrix(targets, array, self.bodies[0].wavenumber)
-        (scattered,) = scattered_waves(self, array)
-        parts = [waves_at(self, part) @ scattered for part in parts_of(targets, len(scattered))]
+        for name, places in (("points", targets.detach()), ("array.positions", array.positions)):
+            require_in_front(self.reflectors, name, places.reshape(-1, 3))
+        everything = torch.cat(
+            [targets.detach(), array.positions, *(body.center[None] for body in self.bodies)]
+        )
+        size = float((everything.amax(dim=0) - everything.amin(dim=0)).norm().detach())
+        mirrors = [reflector.mirror for reflector in self.reflectors]
+        images = images_of(mirrors, self.bodies[0].wavenumber, size)
+        direct = free_space_matrix(targets, array, self.bodies[0].wavenumber, images)
+        (scattered,) = scattered_waves(self, array, images)
+        parts = [waves_at(self, part, images) @ scattered for part in parts_of(targets, len(scattered))]
         return (direct + torch.cat(parts)).reshape(*grid, -1)
 
 
@@ -258,26 +280,24 @@ def parts_of(points: torch.Tensor, waves: int) -> tuple[torch.Tensor, ...]:
     return torch.split(points, max(1, _AT_ONCE // (each * waves)))
 
 
-def waves_at(cluster: TMatrixCluster, points: torch.Tensor) -> torch.Tensor:
-    """Return the outgoing waves (P, N) of all bodies at points (P, 3) [m]."""
-    return torch.cat([_outgoing_waves(body, points) for body in cluster.bodies], dim=1)
+def waves_at(cluster: TMatrixCluster, points: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:
+    """Return the outgoing waves (P, N) of all bodies and their images at points (P, 3) [m]."""
+    return torch.cat([_outgoing_waves(body, points, images) for body in cluster.bodies], dim=1)
 
 
 def scattered_waves(
-    cluster: TMatrixCluster, array: TransducerArray, left_out: Sequence[int] = (0,)
+    cluster: TMatrixCluster, array: TransducerArray, images: Sequence[Image], left_out: Sequence[int] = (0,)
 ) -> list[torch.Tensor]:
     """Return the coefficients (N, M) [Pa] of all bodies' outgoing waves under unit drives of an array.
 
-    Once for each number of highest degrees that are left out, whose coefficients are 0.
+    Once for each number of highest degrees that are left out, whose coefficients are 0. Images of a body add
+    no unknowns: their waves are its own, mirrored.
     """
-    incident = [_incoming_waves(body, array) for body in cluster.bodies]
+    incident = [_incoming_waves(body, array, images) for body in cluster.bodies]
     count = sum(map(len, incident))
     require_memory("bodies", f"{count} waves", _ENTRY_BYTES * count**2)
     between = [
-        [
-            torch.zeros_like(body.matrix) if other is body else _regular_waves(body, other)
-            for other in cluster.bodies
-        ]
+        [_regular_waves(body, other, images[1:] if other is body else images) for other in cluster.bodies]
         for body in cluster.bodies
     ]
     return [
@@ -286,9 +306,19 @@ def scattered_waves(
     ]
 
 
-def _incoming_waves(body: TMatrix, array: TransducerArray) -> torch.Tensor:
+def _incoming_waves(body: TMatrix, array: TransducerArray, images: Sequence[Image]) -> torch.Tensor:
     """Return the coefficients (N, M) [Pa] of the regular waves of unit drives around a body."""
     positions, weights = array.nodes
+    _offsets(body, "array.positions", positions)
+    waves = [
+        image.weight * _incoming_from(body, image.of(positions), weights)
+        for image in distinct(images, positions)
+    ]
+    return 4j * math.pi * body.wavenumber * strengths_of(array) * torch.stack(waves).sum(dim=0)
+
+
+def _incoming_from(body: TMatrix, positions: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    """Return the regular waves (N, M) around a body, of transducers with nodes (M, n, 3) [m]."""
     offsets = _offsets(body, "array.positions", positions)
     means = [
         torch.einsum(
@@ -298,16 +328,24 @@ def _incoming_waves(body: TMatrix, array: TransducerArray) -> torch.Tensor:
         )
         for some in parts_of(offsets, len(body.matrix))
     ]
-    return 4j * math.pi * body.wavenumber * strengths_of(array) * torch.cat(means, dim=1)
+    return torch.cat(means, dim=1)
 
 
-def _outgoing_waves(body: TMatrix, points: torch.Tensor) -> torch.Tensor:
-    """Return the outgoing waves (P, N) of a body at points (P, 3) [m]."""
-    return outgoing_waves(body.degree, body.wavenumber, _offsets(body, "points", points))
+def _outgoing_waves(body: TMatrix, points: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:
+    """Return the outgoing waves (P, N) of a body and its images at points (P, 3) [m].
+
+    A mirrored wave at a point is the wave at the mirrored point.
+    """
+    total: torch.Tensor | float = 0.0
+    for image in images:
+        offsets = _offsets(body, "points", image.of(points))
+        total = total + image.weight * outgoing_waves(body.degree, body.wavenumber, offsets)
+    assert isinstance(total, torch.Tensor)
+    return total
 
 
-def _regular_waves(body: TMatrix, other: TMatrix) -> torch.Tensor:
-    """Return S (N, K): outgoing waves of another body as regular waves around this one.
+def _regular_waves(body: TMatrix, other: TMatrix, images: Sequence[Image]) -> torch.Tensor:
+    """Return S (N, K): outgoing waves of another body's images as regular waves around this one.
 
     The waves of the other are sampled on shells inside this body's sphere, where they are regular, and
     their harmonics are divided by j_l in the least-squares sense over shells.
@@ -323,10 +361,12 @@ def _regular_waves(body: TMatrix, other: TMatrix) -> torch.Tensor:
     back = (harmonics(body.degree, directions).conj() * area[:, None]).mT
     radii = torch.tensor(_SHELLS, **REAL) * body.radius
     sizes = regular_radial(body.degree, body.wavenumber * radii[:, None])
-    waves: torch.Tensor = torch.zeros((), **COMPLEX)
+    waves: torch.Tensor = torch.zeros((len(body.matrix), len(other.matrix)), **COMPLEX)
+    if not images:
+        return waves
     for radius, size in zip(radii, sizes, strict=True):
         shell = body.center + radius * directions @ body.axes.mT
-        waves = waves + size.conj()[:, None] * (back @ _outgoing_waves(other, shell))
+        waves = waves + size.conj()[:, None] * (back @ _outgoing_waves(other, shell, images))
     return waves / sizes.abs().square().sum(dim=0)[:, None]
 
 

@@ -1,0 +1,116 @@
+"""Planes that reflect: the panel of an array, tables and walls, by images."""
+
+from __future__ import annotations
+
+import cmath
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Self
+
+import numpy as np
+import torch
+
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.utils.images import Mirror
+from autdtorch.utils.validation import (
+    LENGTH_TOLERANCE,
+    ArrayLike,
+    Vector,
+    finite_number,
+    finite_vector,
+    invalid,
+    require_kind,
+    unit_vector,
+)
+
+_FLAT = 1e-6
+"""Distance [m] by which transducers may be off the plane of their panel."""
+
+
+@dataclass(frozen=True, init=False)
+class Reflector:
+    """An infinite plane that reflects all sound in front of it, exactly, by images.
+
+    A transducer in the plane is its own image: with a reflection of 1, the pressure of a monopole doubles,
+    and a disc is a piston in an infinite baffle. Two or three planes may be at right angles, and two may face
+    each other. Obstacles that cross a plane end there. A magnitude below 1 is an approximation, as the factor
+    of a real surface depends on the angle (docs/room.md has the error).
+
+    Attributes:
+        point: a point of the plane (3,) [m].
+        normal: unit normal (3,), into the space that is simulated.
+        reflection: pressure that returns, relative to the incident one: 1 for a rigid plane, -1 for one that
+            gives way; also complex, with a magnitude up to 1.
+
+    Raises:
+        ValueError: a coordinate that is not finite, a normal of length 0, or a reflection above 1.
+    """
+
+    point: Vector
+    normal: Vector
+    reflection: float | complex
+
+    def __init__(self, point: ArrayLike, normal: ArrayLike, reflection: complex = 1.0) -> None:
+        """Check the plane; any length of the normal will do."""
+        object.__setattr__(self, "point", finite_vector("Reflector.point", point))
+        object.__setattr__(self, "normal", unit_vector("Reflector.normal", normal))
+        object.__setattr__(self, "reflection", _factor(reflection))
+
+    @classmethod
+    def behind(cls, array: TransducerArray, reflection: complex = 1.0) -> Self:
+        """Return the panel that an array stands in, flush with its transducers.
+
+        Raises:
+            ValueError: the transducers are not in one plane, or do not face along its normal.
+        """
+        require_kind("array", array, TransducerArray)
+        normal, point = array.normals[0], array.positions.mean(dim=0)
+        turned = (array.normals - normal).norm(dim=1).max()
+        beside = ((array.positions - point) @ normal).abs().max()
+        if turned > LENGTH_TOLERANCE or beside > _FLAT:
+            reason = "face in several directions" if turned > LENGTH_TOLERANCE else "are not in one plane"
+            raise invalid("array", array, f"its transducers {reason}; a panel needs a flat array")
+        return cls(point, normal, reflection)
+
+    @property
+    def mirror(self) -> Mirror:
+        """The plane as solvers take it."""
+        return Mirror(self.point, self.normal, self.reflection)
+
+    def height(self, places: torch.Tensor) -> torch.Tensor:
+        """Return the distance (...) [m] of places (..., 3) in front of the plane, negative behind."""
+        return self.mirror.height(places)
+
+
+def require_arrangement(reflectors: Sequence[Reflector], wavelength: float) -> None:
+    """Refuse planes that are neither at right angles nor facing each other, at least a wavelength apart."""
+    for (first, one), (second, other) in combinations(enumerate(reflectors), 2):
+        name, plane = f"Scene.reflectors[{second}].normal", f"reflector {first}"
+        if one.mirror.is_perpendicular(other.mirror):
+            continue
+        if not one.mirror.is_parallel(other.mirror):
+            accepted = f"must be at a right angle to that of {plane}, or against it"
+            raise invalid(name, other.normal, accepted)
+        gap = float(one.height(torch.tensor(other.point, dtype=torch.float64)))
+        if np.dot(one.normal, other.normal) > 0:
+            raise invalid(name, other.normal, f"must be against that of {plane}, which is parallel")
+        if gap < wavelength:
+            accepted = (
+                f"is {gap:.4g} m in front of {plane}, must be at least a wavelength, {wavelength:.4g} m"
+            )
+            raise invalid(f"Scene.reflectors[{second}].point", other.point, accepted, "m")
+
+
+def _factor(value: object) -> float | complex:
+    """Return a reflection factor after checking it; a real number where it is one."""
+    name = "Reflector.reflection"
+    if isinstance(value, complex | np.complexfloating) and value.imag != 0:
+        factor: float | complex = complex(value)
+        if not cmath.isfinite(factor):
+            raise invalid(name, value, "must be finite")
+    else:
+        factor = finite_number(name, value.real if isinstance(value, complex) else value)
+    if abs(factor) > 1 + LENGTH_TOLERANCE:
+        raise invalid(name, value, "its magnitude must be at most 1")
+    return factor
