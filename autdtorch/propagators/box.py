@@ -345,7 +345,13 @@ class _Scatterer:
         def observe(phasors: torch.Tensor) -> list[torch.Tensor]:
             return [self.outgoing(phasors)]
 
-        return [self.answer(*run, observe) for run in zip(incoming.mT, tolerances, strict=True)]
+        at_once = self.simulation._kernel.at_once(self.transform.box.assembly.grid.shape)
+
+        @torch.no_grad()  # holds in one thread only
+        def run(pair: tuple[torch.Tensor, float]) -> SteadyState:
+            return self.answer(*pair, observe)
+
+        return spread(run, list(zip(incoming.mT, tolerances, strict=True)), at_once)
 
     def outgoing(self, phasors: torch.Tensor) -> torch.Tensor:
         """Return the amplitudes of the Huygens surface."""

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from autdtorch.fdtd.grouping import MOST_PASSES
-from autdtorch.fdtd.steady_state import Extrapolation, SteadyState
+from autdtorch.fdtd.steady_state import SteadyState
 from autdtorch.utils.array_types import COMPLEX, REAL
 
 logger = logging.getLogger(__name__)
@@ -27,7 +27,19 @@ _LOOSEST = 0.1
 """Largest tolerance of a run, relative to its pass."""
 
 _CAUTION = 2.0
-"""Safety factor: neglected scattering orders are estimated as this many times the next one."""
+"""Safety factor: what the orders so far leave is estimated as this many times their residual."""
+
+_SLOWEST = 0.9
+"""Largest ratio of successive orders at which their sum is extrapolated."""
+
+_TOGETHER = 16
+"""Most runs whose orders are combined."""
+
+_MOST_FITTED = 4096
+"""Most cells whose phasors decide the weights of orders."""
+
+_NOISE = 1e-4
+"""Singular values, relative to the largest, that are noise of runs: those of orders without news."""
 
 Observe = Callable[[torch.Tensor], Sequence[torch.Tensor]]
 """Observe: maps phasors (k,) or (k, R) to the quantities that must all converge."""
@@ -85,10 +97,8 @@ def iterated(
     """
     begin, runs, incoming = time.perf_counter(), incident[0].shape[1], list(incident)
     largest = torch.stack([waves.norm(dim=0) for waves in incident]).amax(dim=0)
-    sequences = [Extrapolation(MOST_PASSES) for _ in range(runs)]
     periods, reached, unsettled = np.zeros(runs, np.int64), np.ones(runs, bool), torch.zeros(runs, **REAL)
-    sums: torch.Tensor | None = None
-    before: list[torch.Tensor] = []
+    orders: list[torch.Tensor] = []
     smaller: torch.Tensor | None = None
     for number in range(1, MOST_PASSES + 1):
         parts, residuals = [], torch.zeros((len(bodies), runs), **REAL)
@@ -101,29 +111,47 @@ def iterated(
             reached &= [each.converged for each in steady]
             residuals[index] = share * torch.tensor([each.residual for each in steady], **REAL)
         unsettled += residuals.amax(dim=0)
-        order = torch.cat(parts)
-        sums = order if sums is None else sums + order
-        for sequence, column in zip(sequences, sums.mT.numpy(), strict=True):
-            sequence.append(column)
-        phasors = torch.from_numpy(np.stack([sequence.limit() for sequence in sequences], axis=1))
+        orders.append(torch.cat(parts))
         outgoing = [body.outgoing(part) for body, part in zip(bodies, parts, strict=True)]
-        size, values = torch.cat(outgoing).norm(dim=0), observe(phasors)
-        before = before or list(observe(torch.zeros_like(phasors)))
-        changes = [
-            (value - last).norm(dim=0) / torch.maximum(value.norm(dim=0), floor)
-            for value, last, floor in zip(values, before, floors, strict=True)
-        ]
-        change = torch.stack(changes).amax(dim=0)
+        size = torch.cat(outgoing).norm(dim=0)
         if smaller is not None:
-            remaining = _CAUTION * change * (size / smaller).clamp(max=1)
+            phasors, left = extrapolated(orders)
+            values, silent = observe(phasors), observe(torch.zeros_like(phasors))
+            missing = [
+                (part - nothing).norm(dim=0) / torch.maximum(value.norm(dim=0), floor)
+                for part, nothing, value, floor in zip(observe(left), silent, values, floors, strict=True)
+            ]
+            echo = (size / smaller).clamp(max=_SLOWEST)
+            remaining = _CAUTION * torch.stack(missing).amax(dim=0) * echo / (1 - echo)
             if (remaining <= tolerance / 2).all():
                 seconds = (time.perf_counter() - begin) / runs
                 logger.debug("%d boxes, %d passes of multiple scattering", len(bodies), number)
                 residual = (unsettled + remaining).tolist()
                 states = map(SteadyState, phasors.mT, periods.tolist(), residual, reached.tolist())
                 return [(state, seconds) for state in states]
-        before, smaller = list(values), size
+        smaller = size
         sent = list(zip(bodies, outgoing, strict=True))
         parts_of = ([body.incoming(other, waves) for other, waves in sent] for body in bodies)
         incoming = [torch.stack([part for part in each if part is not None]).sum(dim=0) for each in parts_of]
     return []
+
+
+def extrapolated(orders: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the sum of all scattering orders (k, R) of R runs from two or more, and what it leaves (k, R).
+
+    With x_(n+1) = K x_n, the sum is b = x_0 + K b. It is sought among the orders of all runs, as the one of
+    least residual x_0 + K v - v (the generalised minimal residual of Saad and Schultz 1986, with several
+    right-hand sides), and passed through K once more. Of many runs, each has its own orders alone.
+    """
+    count, runs = orders[0].shape
+    if runs > _TOGETHER:
+        each = [extrapolated([order[:, [run]] for order in orders]) for run in range(runs)]
+        sums, left = zip(*each, strict=True)
+        return torch.cat(sums, dim=1), torch.cat(left, dim=1)
+    some = slice(None, None, -(-count // _MOST_FITTED))
+    sources, answers = torch.cat(list(orders[:-1]), dim=1), torch.cat(list(orders[1:]), dim=1)
+    size = sources[some].norm(dim=0).clamp_min(torch.finfo(torch.float64).tiny)
+    change = (sources - answers) / size
+    fitted = np.linalg.lstsq(change[some].numpy(), orders[0][some].numpy(), rcond=_NOISE)[0]
+    weights = torch.from_numpy(fitted)
+    return orders[0] + answers / size @ weights, orders[0] - change @ weights
