@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
+from autdtorch.fdtd.coupling import Coupling, coupling_of
 from autdtorch.fdtd.grid import Grid, make_box
 from autdtorch.fdtd.grouping import one_box
 from autdtorch.fdtd.reflection import other_images, with_images
@@ -40,6 +41,7 @@ from autdtorch.scene.scene import require_clear, require_in_front
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL, Array, Index
 from autdtorch.utils.digest import digest_of
+from autdtorch.utils.images import Image
 from autdtorch.utils.process import cached_property, one_library_thread, spread
 
 logger = logging.getLogger(__name__)
@@ -137,6 +139,19 @@ class BoxSimulation(Simulation):
             images = other_images(region, near, plan.scene.images)
             boxes.append(ScatteredField(assembly, plan.scene.complex_wavenumber, axes, images))
         return boxes
+
+    def coupling(
+        self, target: ScatteredField, source: ScatteredField, images: Sequence[Image]
+    ) -> Coupling | None:
+        """Return the coupling from a box to another or to itself; see `coupling_of`."""
+        key = self.boxes.index(target), self.boxes.index(source)
+        if key not in self._couplings:
+            self._couplings[key] = coupling_of(target, source, images)
+        return self._couplings[key]
+
+    @cached_property
+    def _couplings(self) -> dict[tuple[int, int], Coupling | None]:
+        return {}
 
     @property
     def assemblies(self) -> Sequence[Assembly]:
@@ -359,9 +374,12 @@ class _Scatterer:
 
     def incoming(self, other: _Scatterer, outgoing: torch.Tensor) -> torch.Tensor | None:
         """Return the field (n, R) that a Huygens surface radiates to this box, its own by mirrors only."""
-        box = other.transform.box
+        box, here = other.transform.box, self.transform.box
         images = box.echoes if other is self else box.images
-        return box.radiated(outgoing, self.transform.box.driven, images) if images else None
+        if not images:
+            return None
+        coupling = self.simulation.coupling(here, box, images)
+        return coupling.field(outgoing) if coupling else box.radiated(outgoing, here.driven, images)
 
 
 @dataclass(frozen=True)
