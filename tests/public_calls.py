@@ -278,6 +278,8 @@ OTHERS: dict[str, Any] = {
     "Oscilloscope.port": Made(lambda _: scope()._port),
     "Plane.size": (0.1, 0.1),
     "Scene.equals.other": AIR_ALONE,
+    "porous.flow_resistivity": 1e5,
+    "Reflector.point": (0.0, 0.0, 0.0),
     "SimulatedObjective.scene": AIR_ALONE,
     "VoxelMask.from_image.image": Made(lambda _: image()),
     "VoxelMask.from_image.name": None,

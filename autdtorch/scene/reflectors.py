@@ -52,7 +52,13 @@ class Reflector:
     reflection: float | complex
 
     def __init__(self, point: ArrayLike, normal: ArrayLike, reflection: complex = 1.0) -> None:
-        """Check the plane; any length of the normal will do."""
+        """Check the plane.
+
+        Args:
+            point: (3,) [m].
+            normal: (3,) of any length.
+            reflection: see the class.
+        """
         object.__setattr__(self, "point", finite_vector("Reflector.point", point))
         object.__setattr__(self, "normal", unit_vector("Reflector.normal", normal))
         object.__setattr__(self, "reflection", _factor(reflection))
@@ -78,10 +84,6 @@ class Reflector:
         """The plane as solvers take it."""
         return Mirror(self.point, self.normal, self.reflection)
 
-    def height(self, places: torch.Tensor) -> torch.Tensor:
-        """Return the distance (...) [m] of places (..., 3) in front of the plane, negative behind."""
-        return self.mirror.height(places)
-
 
 def require_arrangement(reflectors: Sequence[Reflector], wavelength: float) -> None:
     """Refuse planes that are neither at right angles nor facing each other, at least a wavelength apart."""
@@ -92,7 +94,7 @@ def require_arrangement(reflectors: Sequence[Reflector], wavelength: float) -> N
         if not one.mirror.is_parallel(other.mirror):
             accepted = f"must be at a right angle to that of {plane}, or against it"
             raise invalid(name, other.normal, accepted)
-        gap = float(one.height(torch.tensor(other.point, dtype=torch.float64)))
+        gap = float(one.mirror.height(torch.tensor(other.point, dtype=torch.float64)))
         if np.dot(one.normal, other.normal) > 0:
             raise invalid(name, other.normal, f"must be against that of {plane}, which is parallel")
         if gap < wavelength:

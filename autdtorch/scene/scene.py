@@ -336,7 +336,7 @@ def _require_in_front(scene: Scene) -> None:
         for name, places in contents:
             require_in_front([reflector], name, places, number)
         for index, obstacle in enumerate(scene.obstacles):
-            highest = float(reflector.height(obstacle.surface()[0]).max())
+            highest = float(reflector.mirror.height(obstacle.surface()[0]).max())
             if highest <= LENGTH_TOLERANCE:
                 accepted = f"is wholly behind reflector {number}, must be in front of it"
                 raise invalid(f"Scene.obstacles[{index}]", extent_of(obstacle), accepted)
@@ -347,7 +347,7 @@ def require_in_front(
 ) -> None:
     """Refuse points (N, 3) [m] behind a reflector."""
     for number, reflector in enumerate(reflectors, first_number):
-        height = reflector.height(points)
+        height = reflector.mirror.height(points)
         if (height < -LENGTH_TOLERANCE).any():
             lowest = int(height.argmin())
             accepted = (

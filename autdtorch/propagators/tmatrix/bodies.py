@@ -91,7 +91,7 @@ def are_outside(points: torch.Tensor, bodies: Sequence[ObstacleGroup]) -> torch.
 
 def _in_front(reflector: Reflector, bodies: Sequence[ObstacleGroup]) -> bool:
     """Return whether the spheres of bodies are in front of a reflector."""
-    return all(float(reflector.height(body.center)) >= body.radius for body in bodies)
+    return all(float(reflector.mirror.height(body.center)) >= body.radius for body in bodies)
 
 
 def _body(obstacles: Sequence[Obstacle], chosen: tuple[int, ...]) -> ObstacleGroup:

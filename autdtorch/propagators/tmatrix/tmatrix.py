@@ -236,7 +236,7 @@ class TMatrixCluster:
         require_arrangement(reflectors, 2 * math.pi / bodies[0].wavenumber.real)
         for number, body in enumerate(bodies):
             for index, reflector in enumerate(reflectors):
-                height = float(reflector.height(body.center.detach()))
+                height = float(reflector.mirror.height(body.center.detach()))
                 if height < body.radius - LENGTH_TOLERANCE:
                     accepted = f"must be at least {body.radius:.4g} m in front of reflector {index}"
                     raise invalid(f"bodies[{number}].center", f"{height:.4g} m", accepted)
