@@ -5,10 +5,12 @@ It is driven in the receivers' cells by the derivatives of the loss by their rec
 and its pressures are multiplied by the masses:
 
     dL / d force_is  = sum_t lambda_i(t) signal_s(t)
-    dL / d weight_ij = sum_t lambda_i(t) (p_j(t) - p_i(t)).
+    dL / d weight_ij = sum_t lambda_i(t) (p_j(t) - p_i(t))
+    dL / d loss_ij   = sum_t lambda_i(t) (p_j(t) - p_j(t - 1))
+    dL / d ground_i  = -sum_t lambda_i(t) p_i(t).
 
-The second sum needs the run itself in reverse. Its state is stored at the beginning of segments, which are
-stepped again with the heterogeneous cells and their neighbours as receivers.
+All but the first sum need the run itself in reverse. Its state is stored at the beginning of segments, which
+are stepped again with the heterogeneous cells and their neighbours as receivers.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import math
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -40,14 +42,16 @@ def recorded(
 ) -> Tensor:
     """Step from silence, once per row of `signal` (steps, S), and return the record (steps, R).
 
-    Differentiable, once, by `sources.force` and by `heterogeneous_weight`; derivatives by rows in the
-    boundary layers are zero. Sources and receivers, as those of `assembly`, must be outside of the layers,
-    where reciprocity does not hold.
+    Differentiable, once, by `sources.force`, `heterogeneous_weight`, `loss_weight` and `loss_ground`;
+    derivatives by rows in the boundary layers are zero. Sources and receivers, as those of `assembly`, must
+    be outside of the layers, where reciprocity does not hold.
     """
-    weight = assembly.coefficients.heterogeneous_weight
-    coefficients = replace(assembly.coefficients, heterogeneous_weight=weight.detach())
+    names = "heterogeneous_weight", "loss_weight", "loss_ground"
+    rows = {name: getattr(assembly.coefficients, name) for name in names}
+    constant = {name: row.detach() for name, row in rows.items()}
+    coefficients = replace(assembly.coefficients, **constant)
     run = _Run(kernel, replace(assembly, coefficients=coefficients), sources.index, receivers, signal)
-    result: Tensor = _Recorded.apply(sources.force, weight, run)  # type: ignore[no-untyped-call]
+    result: Tensor = _Recorded.apply(sources.force, *rows.values(), run)  # type: ignore[no-untyped-call]
     return result
 
 
@@ -76,8 +80,9 @@ class _Run:
     def fields(
         self, state: WaveState, sources: Sources, cells: Tensor, signal: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the pressure in cells (k,) before the first step (1, k), and after each (steps, k)."""
-        first = state.now.reshape(1, -1)[:, cells.to(state.now.device)].cpu()
+        """Return the two pressures in cells (k,) before the first step (2, k), and after each (steps, k)."""
+        both = torch.stack((state.before.reshape(-1), state.now.reshape(-1)))
+        first = both[:, cells.to(state.now.device)].cpu()
         return first, self.advance(state, sources, self.single(cells), signal)[1]
 
     def mass(self, cells: Tensor) -> Tensor:
@@ -104,6 +109,8 @@ class _Neighbourhood:
     """The heterogeneous cells outside the layers, and the cells whose field their derivatives need."""
 
     mask: Tensor  # of these among the heterogeneous cells
+    lossy_mask: Tensor  # of these among the lossy cells
+    lossy: Tensor  # places of the lossy ones among these (l,)
     index: Tensor  # their flat indices (n,)
     cells: Tensor  # flat indices of these, of their neighbours and of the receivers (k,), ascending
     offsets: Tensor  # flat offsets to the neighbours (27,)
@@ -114,41 +121,63 @@ class _Neighbourhood:
         grid, heterogeneous = run.assembly.grid, run.assembly.coefficients.heterogeneous_index
         mask = torch.from_numpy(grid.inside(heterogeneous.numpy()))
         index, offsets = heterogeneous[mask], torch.from_numpy(flat_offsets(grid.shape))
+        losses = run.assembly.coefficients.loss_index
+        lossy_mask = torch.from_numpy(grid.inside(losses.numpy()))
+        lossy = torch.searchsorted(index, losses[lossy_mask])
         used = torch.zeros(math.prod(grid.shape), dtype=torch.bool, device="cpu")
         used[run.receivers.index] = True
         for offset in offsets:
             used[index + offset] = True
         points = Interpolation(run.receivers.index.numpy(), run.receivers.weight.numpy())
-        return cls(mask, index, used.nonzero().reshape(-1), offsets, points)
+        return cls(mask, lossy_mask, lossy, index, used.nonzero().reshape(-1), offsets, points)
 
     def received(self, field: Tensor) -> Tensor:
         """Return the record of the receivers (steps, R) from the field in the cells (steps, k)."""
         return torch.from_numpy((self.points.matrix(self.cells.numpy()) @ field.numpy().T).T)
 
-    def correlate(self, adjoint: Tensor, first: Tensor, after: Tensor, total: Tensor) -> None:
-        """Add sums of lambda_i (p_j - p_i) to `total` (n, 27), of lambda (steps, n) and `_Run.fields`."""
+    def correlate(self, adjoint: Tensor, first: Tensor, after: Tensor, totals: _Totals) -> None:
+        """Add the sums over steps to `totals`, of lambda (steps, n) and `_Run.fields`."""
+        field = torch.cat((first, after)).T  # before, at and after each step
+        now = field[:, 1:-1].contiguous()
+        self._correlate(adjoint, now, self.index, totals.weight)
+        if len(self.lossy):
+            lossy, change = self.index[self.lossy], now - field[:, :-2]
+            here = torch.searchsorted(self.cells, lossy)
+            adjoint = adjoint[:, self.lossy]
+            self._correlate(adjoint, change, lossy, totals.loss)
+            totals.loss.add_((adjoint.T * change[here]).sum(dim=1, keepdim=True))
+            totals.ground.sub_((adjoint.T * now[here]).sum(dim=1))
+
+    def _correlate(self, adjoint: Tensor, field: Tensor, index: Tensor, total: Tensor) -> None:
+        """Add sums of lambda_i (f_j - f_i) to `total` (n, 27), of lambda (steps, n) in cells `index` (n,)."""
         from autdtorch.fdtd.kernels.cpu import correlate  # loads numba
 
-        field = after.new_empty(after.shape[::-1])
-        field[:, 0], field[:, 1:] = first[0], after[:-1].T
         place = torch.zeros(int(self.cells[-1]) + 1, dtype=torch.int32, device="cpu")
         place[self.cells] = torch.arange(len(self.cells), dtype=torch.int32, device="cpu")
-        tensors = adjoint.T.contiguous(), field, self.index, self.offsets, place, total
+        tensors = adjoint.T.contiguous(), field, index, self.offsets, place, total
         arrays = [tensor.numpy() for tensor in tensors]
-        ends = pairwise([*range(0, len(self.index), _CHUNK), len(self.index)])
+        ends = pairwise([*range(0, len(index), _CHUNK), len(index)])
         spread(lambda rows: correlate(*rows, *arrays), ends)
+
+
+class _Totals(NamedTuple):
+    """Derivatives by the rows of cells outside the layers."""
+
+    weight: Tensor  # (n, 27)
+    loss: Tensor  # (l, 27)
+    ground: Tensor  # (l,)
 
 
 class _Recorded(torch.autograd.Function):
     """The run forwards; the adjoint run and the segments it needs backwards."""
 
     @staticmethod
-    def forward(ctx: Any, force: Tensor, weight: Tensor, run: _Run) -> Tensor:
-        """Record, and store the states at the cuts where derivatives by the weights are needed."""
+    def forward(ctx: Any, force: Tensor, weight: Tensor, loss: Tensor, ground: Tensor, run: _Run) -> Tensor:
+        """Record, and store the states at the cuts where derivatives by the rows are needed."""
         sources, steps = Sources(run.driven, force.detach()), len(run.signal)
         state = run.assembly.silence(sources)
         ctx.run, ctx.sources, ctx.around, ctx.cuts = run, sources, None, [0, steps]
-        if not ctx.needs_input_grad[1]:
+        if not any(ctx.needs_input_grad[1:4]):
             return run.advance(state, sources, run.receivers, run.signal)[1]
         ctx.around = around = _Neighbourhood.of(run)
         ctx.cuts, ctx.states = _cuts(steps, state, len(around.cells)), []
@@ -166,12 +195,12 @@ class _Recorded(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor, Tensor | None, None]:
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
         """Step the adjoint run, and again the segments."""
         run, around, steps, driven = ctx.run, ctx.around, len(slope), len(ctx.run.driven)
         by_force = torch.zeros_like(ctx.sources.force)
-        rows = 0 if around is None else len(around.index)
-        by_row = torch.zeros((rows, 27), dtype=by_force.dtype, device="cpu")
+        rows, lossy = (0, 0) if around is None else (len(around.index), len(around.lossy))
+        totals = _Totals(*(by_force.new_zeros(size) for size in ((rows, 27), (lossy, 27), (lossy,))))
         if slope.any():
             cells = [run.driven] if around is None else [run.driven, around.index]
             mass, read = torch.cat([run.mass(group) for group in cells]), run.single(torch.cat(cells))
@@ -187,12 +216,14 @@ class _Recorded(torch.autograd.Function):
                     fields = ctx.last
                     if end < steps:
                         fields = run.fields(ctx.states[number], ctx.sources, around.cells, part)
-                    around.correlate(adjoint[:, driven:], *fields, by_row)
+                    around.correlate(adjoint[:, driven:], *fields, totals)
         if around is None:
-            return by_force, None, None
-        by_weight = torch.zeros_like(run.assembly.coefficients.heterogeneous_weight)
-        by_weight[around.mask] = by_row
-        return by_force, by_weight, None
+            return by_force, None, None, None, None
+        c, masks = run.assembly.coefficients, (around.mask, around.lossy_mask, around.lossy_mask)
+        by_rows = [torch.zeros_like(each) for each in (c.heterogeneous_weight, c.loss_weight, c.loss_ground)]
+        for each, mask, total in zip(by_rows, masks, totals, strict=True):
+            each[mask] = total
+        return by_force, *by_rows, None
 
 
 def _cuts(steps: int, state: WaveState, cells: int) -> list[int]:

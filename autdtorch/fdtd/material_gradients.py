@@ -2,7 +2,7 @@
 
 For obstacles the derivatives are central differences of the whole assembly. Maps are differentiated by
 autograd. On a map two cells are coupled by both densities in series, 2 / (rho_i + rho_j). The
-mass of a cell is 1 / (rho_i f_i), with density and speed factor f as in `assembly/unions.py`. Uniform maps
+mass of a cell is 1 / (rho_i f_i), with density and speed factor f as in `assembly/materials.py`. Uniform maps
 give the stencil rows of an obstacle of that material. Surfaces are staircases half-way between two cells, for
 which densities are scaled.
 """
@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from autdtorch.fdtd.assembly.elements import elements_of
-from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
+from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells, lossy_cells
+from autdtorch.fdtd.damping import Damping, SteppedCells, stepped_cells
 from autdtorch.fdtd.grid import Grid, domain_extent
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.region import Fluid, Region
@@ -28,6 +29,7 @@ from autdtorch.utils.array_types import REAL, Array, Index
 from autdtorch.utils.fluids import fluid
 
 _STEP = 1e-4  # Relative step of the central differences: truncation and rounding are about 1e-8
+_LEAST_ABSORPTION = 1.0  # Absorption [Np/m] from which its step is relative
 _RIM = 2  # Cells of air around the maps: the first depends on them, the second is its neighbour
 
 
@@ -38,46 +40,75 @@ class DifferentiableCells:
     heterogeneous: HeterogeneousCells
     weight: Tensor  # their stencil rows (n, 27), differentiable
     mass: Tensor  # their mass (n,), differentiable
+    damping: Damping | None = None  # of the lossy ones, differentiable
 
     def assembly(self, grid: Grid, region: Region, dtype: torch.dtype, time_step: float | None) -> Assembly:
         """Return an assembly that is differentiable by its stencil rows; see `assembly_of`."""
         assembly = assembly_of(grid, region, self.heterogeneous, dtype, time_step)
         coefficients = assembly.coefficients
-        weight = (coefficients.face / assembly.stencil.face * self.weight).to(dtype)
-        return replace(assembly, coefficients=replace(coefficients, heterogeneous_weight=weight))
+        cells = self._at_time_step(assembly)
+        weight = (coefficients.face / assembly.stencil.face * cells.weight).to(dtype)
+        rows = replace(
+            coefficients,
+            heterogeneous_weight=weight,
+            loss_weight=cells.loss.to(dtype),
+            loss_ground=cells.ground.to(dtype),
+        )
+        return replace(assembly, coefficients=rows)
 
-    def driven(self, sources: Sources) -> Sources:
+    def _at_time_step(self, assembly: Assembly) -> SteppedCells:
+        """Return the cells at the time step of an assembly."""
+        if self.damping is None:
+            return SteppedCells(self.weight, self.mass, torch.zeros((0, 27), **REAL), torch.zeros(0, **REAL))
+        steps = float(assembly.steps_per_period)
+        return stepped_cells(self.weight, self.mass, self.damping, assembly.stencil, steps)
+
+    def driven(self, sources: Sources, assembly: Assembly) -> Sources:
         """Return the assembly's sources, differentiable also by the mass of the cells they are in."""
         index = self.heterogeneous.index
         _, place, driven = np.intersect1d(index, sources.index.numpy(), return_indices=True)
         share = torch.ones(len(sources.index), dtype=self.mass.dtype, device="cpu")
-        share[driven] = torch.from_numpy(self.heterogeneous.mass[place]) / self.mass[place]
+        mass = self._at_time_step(assembly).mass
+        share[driven] = torch.from_numpy(assembly.heterogeneous.mass[place]) / mass[place]
         return Sources(sources.index, share.to(sources.force)[:, None] * sources.force)
 
 
 def cells_of_obstacles(
-    region: Region, grid: Grid, density: Tensor | None = None, sound_speed: Tensor | None = None
+    region: Region,
+    grid: Grid,
+    density: Tensor | None = None,
+    sound_speed: Tensor | None = None,
+    absorption: Tensor | None = None,
 ) -> DifferentiableCells:
-    """Return the cells of K bodies, differentiable by density and sound speed (K,); rigid ones are not."""
+    """Return the cells of K bodies, differentiable by density, sound speed and absorption [Np/m] (K,).
+
+    Rigid bodies are not. Of a lossy fluid these are the real part of the density, the phase speed, and the
+    attenuation of its waves; the imaginary part of the density stays.
+    """
     stencil = air_stencil(grid, region)
-    materials = {"density": density, "sound_speed": sound_speed}
+    materials = {"density": density, "sound_speed": sound_speed, "absorption": absorption}
     base = _assembled(region, grid, stencil, materials)
     differences = list(_differences(region, grid, stencil, materials))
     every = [base.index, *(cells.index for _, _, sides in differences for cells in sides)]
     index = np.unique(np.concatenate(every))
-    weight, mass = (torch.from_numpy(part) for part in _on(index, base, stencil))
-    cells = replace(base, index=index, weight=weight.numpy(), mass=mass.numpy())
+    weight, mass, loss = (torch.from_numpy(part) for part in _on(index, base, stencil))
+    lossy = loss.any(dim=1).numpy()
     for value, step, sides in differences:
         ahead, behind = (_on(index, side, stencil) for side in sides)
-        rows, masses = ((more - less) / (2 * step) for more, less in zip(ahead, behind, strict=True))
-        changed = np.flatnonzero(rows.any(axis=1) | (masses != 0))
+        rows, masses, losses = ((more - less) / (2 * step) for more, less in zip(ahead, behind, strict=True))
+        lossy |= losses.any(axis=1)
+        changed = np.flatnonzero(rows.any(axis=1) | (masses != 0) | losses.any(axis=1))
         if not grid.inside(index[changed]).all():
             reason = "an obstacle that is differentiated reaches into the boundary layers"
             raise ValueError(f"density, sound_speed: {reason}; must end inside the domain")
         places, shift = torch.from_numpy(changed), value - value.detach()
         weight = weight.index_add(0, places, shift * torch.from_numpy(rows[changed]))
         mass = mass.index_add(0, places, shift * torch.from_numpy(masses[changed]))
-    return DifferentiableCells(cells, weight, mass)
+        loss = loss.index_add(0, places, shift * torch.from_numpy(losses[changed]))
+    damping = Damping.of(np.flatnonzero(lossy), loss[torch.from_numpy(lossy)]) if lossy.any() else None
+    numbers = replace(base, index=index, weight=weight.detach().numpy(), mass=mass.detach().numpy())
+    cells = replace(numbers, losses=lossy_cells(loss.detach().numpy()))
+    return DifferentiableCells(cells, weight, mass, damping)
 
 
 def _differences(
@@ -88,36 +119,46 @@ def _differences(
         if values is None or not values.requires_grad:
             continue
         for number in (number for number, body in enumerate(region.bodies) if body.fluid is not None):
-            step, sides = _STEP * float(values.detach()[number]), []
-            for way in (1, -1):
+            here, sides = float(values.detach()[number]), []
+            step = _STEP * max(here, _LEAST_ABSORPTION if name == "absorption" else 0.0)
+            ends = here + step, max(here - step, 0.0)
+            for end in ends:
                 moved = values.detach().clone()
-                moved[number] += way * step
+                moved[number] = end
                 sides.append(_assembled(region, grid, stencil, materials | {name: moved}))
-            yield values[number], step, sides
+            yield values[number], (ends[0] - ends[1]) / 2, sides
 
 
 def _assembled(
     region: Region, grid: Grid, stencil: Stencil, materials: dict[str, Tensor | None]
 ) -> HeterogeneousCells:
-    """Assemble a region whose K bodies have other densities (K,) and sound speeds (K,)."""
-    bodies = list(region.bodies)
+    """Assemble a region whose K bodies have other densities, sound speeds and absorptions (K,)."""
+    bodies, angular = list(region.bodies), 2 * math.pi * region.frequency
     for number, body in enumerate(bodies):
-        if body.fluid is not None:
-            density, sound_speed = (
-                usual if values is None else values[number].item()
-                for usual, values in zip(body.fluid, materials.values(), strict=True)
+        if body.fluid is not None and any(values is not None for values in materials.values()):
+            usual = body.fluid
+            parts = usual.density.real, usual.phase_speed, angular * (1 / usual.sound_speed).imag
+            density, sound_speed, absorption = (
+                part if values is None else values[number].item()
+                for part, values in zip(parts, materials.values(), strict=True)
             )
-            bodies[number] = replace(body, fluid=Fluid(*fluid(f"obstacles[{number}]", density, sound_speed)))
+            density, sound_speed = fluid(f"obstacles[{number}]", density, sound_speed)
+            changed_fluid = Fluid(density, sound_speed)
+            if absorption or usual.density.imag:
+                slowness = complex(1 / sound_speed, absorption / angular)
+                changed_fluid = Fluid(complex(density, usual.density.imag), 1 / slowness)
+            bodies[number] = replace(body, fluid=changed_fluid)
     changed = replace(region, bodies=tuple(bodies))
     return heterogeneous_cells(elements_of(changed, grid, stencil), stencil)
 
 
-def _on(index: Index, cells: HeterogeneousCells, stencil: Stencil) -> tuple[Array, Array]:
-    """Return stencil rows (n, 27) and mass (n,) at `index` (n,), which has `cells` and cells of air."""
+def _on(index: Index, cells: HeterogeneousCells, stencil: Stencil) -> tuple[Array, Array, Array]:
+    """Return rows (n, 27), mass (n,) and losses (n, 29) at `index` (n,), of `cells` and of cells of air."""
     weight, mass = np.tile(stencil.weights, (len(index), 1)), np.ones(len(index))
+    loss = np.zeros((len(index), 29))
     place = np.searchsorted(index, cells.index)
-    weight[place], mass[place] = cells.weight, cells.mass
-    return weight, mass
+    weight[place], mass[place], loss[place] = cells.weight, cells.mass, cells.loss_rows
+    return weight, mass, loss
 
 
 def domain_cells(region: Region, grid: Grid) -> tuple[slice, ...]:
@@ -152,7 +193,7 @@ def cells_of_maps(
 
 
 def _speed_factor(stencil: Stencil, speed_ratio: Tensor) -> Tensor:
-    """Return `unions.speed_factor` for each cell: cos(k . n) averages to sin(|k n|) / |k n|."""
+    """Return `materials.speed_factor` for each cell: cos(k . n) averages to sin(|k n|) / |k n|."""
     wave = complex(stencil.kappa, stencil.eta) / speed_ratio
     symbol = torch.zeros_like(speed_ratio)
     for count, weight, length in (

@@ -1,9 +1,10 @@
 """The scattered field in a box: driven in heterogeneous cells, radiated from a Huygens surface.
 
 The pressure is p_inc + p_scat, with the exact field p_inc in free space. In heterogeneous cells the scheme
-then drives p_scat by the force sum_j (w_ij - w_air) (p_inc,j - p_inc,i). Around them chi steps from 1 to 0
-between two cells of air. The cells there radiate sum_j w_ij (chi_j - chi_i) p_scat,j by the exact Green's
-function: the sources of a field that is p_scat outside and zero inside (a discrete Huygens surface).
+then drives p_scat by the force sum_j (w_ij - w_air) (p_inc,j - p_inc,i), and by the losses of p_inc. Around
+them chi steps from 1 to 0 between two cells of air. The cells there radiate sum_j w_ij (chi_j - chi_i)
+p_scat,j by the exact Green's function: the sources of a field that is p_scat outside and zero inside (a
+discrete Huygens surface).
 """
 
 from __future__ import annotations
@@ -61,6 +62,12 @@ class ScatteredField:
         step = incident - incident[:, 13, None]
         factor = assembly.coefficients.face / assembly.stencil.face
         force = factor * ((assembly.heterogeneous.weight - assembly.stencil.weights) * step).sum(axis=1)
+        if len(lossy := assembly.coefficients.loss_index):
+            place = np.searchsorted(assembly.heterogeneous.index, lossy.numpy())
+            change = 1 - np.exp(2j * np.pi / float(assembly.steps_per_period))  # over a step, of a phasor
+            rows, ground = assembly.coefficients.loss_weight, assembly.coefficients.loss_ground
+            force[place] += change * (rows.double().numpy() * incident[place]).sum(axis=1)
+            force[place] -= ground.double().numpy() * incident[place, 13]
         both = torch.view_as_real(torch.from_numpy(force)).to(assembly.dtype)
         return Sources(torch.from_numpy(assembly.heterogeneous.index), both)
 

@@ -41,7 +41,8 @@ def largest_eigenvalue(index: Index, weight: Array, stencil: Stencil, shape: tup
     """Return an upper bound of the largest eigenvalue of the operator.
 
     It is the larger one of uniform air, and of the heterogeneous cells `index` (n,), ascending, with a rim of
-    one cell. A mode above those of air is bound to these cells and fades within a cell.
+    one cell. A mode above those of air is bound to these cells and fades within a cell. The weight of a cell
+    itself, zero in air, counts as stiffness against silence.
     """
     air = stencil.largest_symbol
     unlike = (np.abs(weight - stencil.weights) > _ROUNDING).any(axis=1)

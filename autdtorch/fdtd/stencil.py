@@ -79,8 +79,11 @@ class Stencil:
 
     def isotropic_symbol(self, kappa: float) -> float:
         """Return the mean real part of the symbol of another sound speed, at equal loss per wavelength."""
-        loss = self.eta / self.kappa
-        return _mean_symbol(kappa * complex(1, loss), (self.face, self.edge, self.corner)).real
+        return self.mean_symbol(kappa * complex(1, self.eta / self.kappa)).real
+
+    def mean_symbol(self, kappa: complex) -> complex:
+        """Return the symbol at a complex wavenumber times spacing, averaged over directions."""
+        return _mean_symbol(kappa, (self.face, self.edge, self.corner))
 
     def time_factor(self, steps_per_period: float) -> float:
         """Return C, the factor on the weights for `steps_per_period` steps per period."""

@@ -22,11 +22,12 @@ from autdtorch.fdtd.assembly.heterogeneous import (
     sees,
 )
 from autdtorch.fdtd.boundary import layer_columns, tuned_profile
+from autdtorch.fdtd.damping import at_time_step, fewest_stable_steps
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.interpolation import Interpolation, average_nodes, exclude_cells, interpolate_points
 from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, WaveState, uniform_state
 from autdtorch.fdtd.region import Region, Shape
-from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
+from autdtorch.fdtd.stability import whole_steps
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import invalid
@@ -52,7 +53,7 @@ class Assembly:
     # time steps per period of the drive: steps (numerator) and periods (denominator) of a block
     steps_per_period: Fraction
     coefficients: Coefficients  # the input of the kernel
-    heterogeneous: HeterogeneousCells  # the cells that are not of uniform air
+    heterogeneous: HeterogeneousCells  # the cells that are not of uniform air, at this time step
 
     @property
     def dtype(self) -> torch.dtype:
@@ -146,10 +147,11 @@ def assembly_of(
 ) -> Assembly:
     """Return the assembly of a grid with known heterogeneous cells; see `assemble_on`."""
     stencil, frequency = air_stencil(grid, region), region.frequency
-    largest = largest_eigenvalue(cells.index, cells.weight, stencil, grid.shape)
-    fewest = fewest_steps(stencil, largest)
+    fewest = fewest_stable_steps(cells, stencil, grid.shape)
     steps_per_period = whole_steps(_wanted_steps(fewest, time_step, frequency))
     steps = float(steps_per_period)
+    losses = cells.losses
+    cells, loss, ground = at_time_step(cells, stencil, steps)
     damping = stencil.damping(steps)
     factor = stencil.time_factor(steps) / (1 + damping)
     keep = (1 - damping) / (1 + damping)
@@ -175,6 +177,9 @@ def assembly_of(
         columns=columns,
         crossed=crossed,
         crossing=crossing,
+        loss_index=torch.from_numpy(cells.index[:0] if losses is None else cells.index[losses.place]),
+        loss_weight=loss.to(dtype),
+        loss_ground=ground.to(dtype),
     )
     logger.debug(
         "grid %s at %.3g mm, %d heterogeneous cells; %d steps in %d periods: %.4g us, %.1f %% of the limit",

@@ -150,7 +150,7 @@ def _matched(groups: Array, weights: Array, matrix: Array, center: Array) -> Ind
 
 
 def _maps_cells(cells: HeterogeneousCells, grid: Grid, matrix: Index, rounding: float) -> bool:
-    """Return whether a turn of the grid maps heterogeneous cells onto cells with equal rows and mass."""
+    """Return whether a turn maps heterogeneous cells onto cells with equal rows, mass and losses."""
     shape = np.array(grid.shape)
 
     def image(index: Index) -> Index:
@@ -167,4 +167,10 @@ def _maps_cells(cells: HeterogeneousCells, grid: Grid, matrix: Index, rounding: 
         return False
     # a neighbour of an image is the image of the neighbour at the offset mapped back
     turned = (np.array(OFFSETS) @ matrix + 1) @ (9, 3, 1)
-    return bool((np.abs(cells.weight - cells.weight[order][:, turned]) <= rounding).all())
+    if not (np.abs(cells.weight - cells.weight[order][:, turned]) <= rounding).all():
+        return False
+    if cells.losses is None:
+        return True
+    losses = cells.loss_rows
+    images_of_losses = losses[order][:, [*turned, 27, 28]]
+    return bool((np.abs(losses - images_of_losses) <= rounding).all())

@@ -103,7 +103,7 @@ def differentiable_field(
     fields = [torch.zeros((0, len(targets)), **COMPLEX)]
     for row in drive.reshape(-1, drive.shape[-1]):
         strength = strengths_of(scene.array) * row.cpu()
-        sources = cells.driven(assembly.sources(nodes.positions, strength, nodes.weights))
+        sources = cells.driven(assembly.sources(nodes.positions, strength, nodes.weights), assembly)
         record = recorded(stepper, assembly, sources, receivers, signal)
         fields.append(drive_dft(record[-steps:], block)[None])  # the last block
     return torch.cat(fields).reshape(*drive.shape[:-1], len(targets))

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -42,11 +43,15 @@ WHOLE = BlockSizes(x=32, y=32, z=32, lanes=1024)
 BLOCKS = None if torch.cuda.is_available() else WHOLE
 
 
-def parts(obstacles, dtype, absorption=0.0):
+def parts(obstacles, dtype, absorption=0.0, lossy=False):
     """Coefficients of a scene; sources and receivers all over the grid, in special cells too."""
     assembly = assemble(region_of(small_scene(obstacles, SIZE, absorption)), 1e-3, dtype)
     c, shape = assembly.coefficients, assembly.grid.shape
     generator = torch.Generator().manual_seed(1)
+    if lossy:
+        index = c.heterogeneous_index[::3]
+        weight = torch.rand((len(index), 27), generator=generator).to(dtype)
+        c = replace(c, loss_index=index, loss_weight=weight, loss_ground=weight[:, 0])
     inner = torch.zeros(shape, dtype=torch.bool)
     inner[1:-1, 1:-1, 1:-1] = True
     somewhere = torch.nonzero(inner.reshape(-1)).reshape(-1)[::97]
@@ -91,17 +96,18 @@ def assert_same(one, other, tolerance):
 # float64: rounding of sums of 27 terms, over two steps; float32: the design's parity figure, 1e-4 of the
 # peak, of which rounding takes a hundredth
 @pytest.mark.parametrize(
-    ("obstacles", "absorption", "dtype", "tolerance"),
+    ("obstacles", "absorption", "dtype", "tolerance", "lossy"),
     [
-        pytest.param((), 0.0, torch.float64, 1e-12, id="air"),
-        pytest.param((HEAVY,), 40.0, torch.float64, 1e-12, id="heavy obstacle in absorbing air"),
-        pytest.param((RIGID,), 0.0, torch.float64, 1e-12, id="rigid obstacle"),
-        pytest.param((WALL,), 0.0, torch.float64, 1e-12, id="wall through the layers"),
-        pytest.param((RIGID, WALL), 40.0, torch.float32, 1e-6, id="float32"),
+        pytest.param((), 0.0, torch.float64, 1e-12, False, id="air"),
+        pytest.param((HEAVY,), 40.0, torch.float64, 1e-12, False, id="heavy obstacle in absorbing air"),
+        pytest.param((RIGID,), 0.0, torch.float64, 1e-12, False, id="rigid obstacle"),
+        pytest.param((WALL,), 0.0, torch.float64, 1e-12, False, id="wall through the layers"),
+        pytest.param((HEAVY, WALL), 40.0, torch.float64, 1e-12, True, id="losses"),
+        pytest.param((RIGID, WALL), 40.0, torch.float32, 1e-6, False, id="float32"),
     ],
 )
-def test_cuda_kernel_is_the_reference_kernel(obstacles, absorption, dtype, tolerance):
-    case = parts(obstacles, dtype, absorption)
+def test_cuda_kernel_is_the_reference_kernel(obstacles, absorption, dtype, tolerance, lossy):
+    case = parts(obstacles, dtype, absorption, lossy)
     c = case[1]
     assert (len(c.heterogeneous_index) > 0) == bool(obstacles)
     assert (len(c.sound_hard_index) > 0) == (RIGID in obstacles)

@@ -29,12 +29,21 @@ PLATE = Box((12e-3, 12e-3, 21.7e-3), (30e-3, 40e-3, 1.7e-3), density=5.0, sound_
 
 
 @functools.cache  # no kernel changes them
-def scene_parts(dtype, absorption=0.0):
-    return assembled_parts(small_scene((CUBE, RIGID, FAST, PLATE), absorption=absorption), 1e-3, dtype)
+def scene_parts(dtype, absorption=0.0, lossy=False):
+    parts = assembled_parts(small_scene((CUBE, RIGID, FAST, PLATE), absorption=absorption), 1e-3, dtype)
+    if not lossy:
+        return parts
+    assembly, *others = parts
+    c = assembly.coefficients
+    index = c.heterogeneous_index[::3]  # in the layers too
+    weight = torch.rand((len(index), 27), generator=torch.Generator().manual_seed(0)).to(dtype) / 100
+    return replace(
+        assembly, coefficients=replace(c, loss_index=index, loss_weight=weight, loss_ground=weight[:, 0])
+    ), *others
 
 
-def advance(kernel, dtype, steps):
-    assembly, sources, receivers = scene_parts(dtype, absorption=40.0)
+def advance(kernel, dtype, steps, lossy=False):
+    assembly, sources, receivers = scene_parts(dtype, 40.0, lossy)
     signal = drive_signal(assembly.steps_per_period, 0, steps).to(dtype)
     return kernel.advance(assembly.silence(sources), assembly.coefficients, sources, receivers, signal)
 
@@ -42,30 +51,30 @@ def advance(kernel, dtype, steps):
 # float64: rounding grows with the steps and the sums of 27 terms; float32: the design's parity figure, 1e-4
 # of the peak
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
-@pytest.mark.parametrize("steps", [40, 41])  # waves reach all layers in 30
-def test_cpu_kernel_is_the_reference_kernel(dtype, tolerance, steps):
-    state, recorded = advance(CpuKernel(), dtype, steps)
-    expected, expected_recorded = advance(ReferenceKernel(), dtype, steps)
+@pytest.mark.parametrize(("steps", "lossy"), [(40, False), (41, False), (41, True)])  # all layers in 30
+def test_cpu_kernel_is_the_reference_kernel(dtype, tolerance, steps, lossy):
+    state, recorded = advance(CpuKernel(), dtype, steps, lossy)
+    expected, expected_recorded = advance(ReferenceKernel(), dtype, steps, lossy)
     for value, reference in zip(
         all_tensors(state, recorded), all_tensors(expected, expected_recorded), strict=True
     ):
         assert (value - reference).abs().max() <= tolerance * max(float(reference.abs().max()), 1e-30)
 
 
-@pytest.mark.parametrize("chunks", [2, 4])
-def test_chunks_of_planes_are_the_whole(chunks, monkeypatch):
+@pytest.mark.parametrize(("chunks", "lossy"), [(2, False), (4, False), (4, True)])
+def test_chunks_of_planes_are_the_whole(chunks, lossy, monkeypatch):
     """Chunks change the order of sums; the number of threads changes nothing."""
-    whole = advance(CpuKernel(), torch.float64, 41)
+    whole = advance(CpuKernel(), torch.float64, 41, lossy)
     planes = whole[0].now.shape[0] - 2
     monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._CHUNK_CELLS", 1)
     monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._CHUNK_PLANES", planes // chunks)
     assert len(_cuts(whole[0].now.shape)) == chunks + 1
-    parts = advance(CpuKernel(), torch.float64, 41)
+    parts = advance(CpuKernel(), torch.float64, 41, lossy)
     for value, reference in zip(all_tensors(*parts), all_tensors(*whole), strict=True):
         assert (value - reference).abs().max() <= 1e-12 * reference.abs().max()
     for threads in (1, 3):
         monkeypatch.setattr("autdtorch.fdtd.kernels.cpu.thread_count", lambda count=threads: count)
-        again = advance(CpuKernel(), torch.float64, 41)
+        again = advance(CpuKernel(), torch.float64, 41, lossy)
         assert all(map(torch.equal, all_tensors(*again), all_tensors(*parts)))
 
 

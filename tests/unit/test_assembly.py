@@ -12,9 +12,9 @@ from autdtorch.fdtd.assembly.element import VERTICES, InterfaceElements, stiffne
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import condensed, heterogeneous_cells
 from autdtorch.fdtd.assembly.layers import mean_thickness, two_port
+from autdtorch.fdtd.assembly.materials import speed_factor
 from autdtorch.fdtd.assembly.prisms import Prisms, prisms, stacked
 from autdtorch.fdtd.assembly.sections import MaterialKey, Section, plane_fields
-from autdtorch.fdtd.assembly.unions import speed_factor
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
 from autdtorch.propagators.scene_region import region_of
@@ -176,7 +176,7 @@ def test_condensation_keeps_the_energy_positive(exponents, gone):
     """Coupling of all sizes, as where three materials meet."""
     coupling = 10.0 ** np.array(exponents)[None]
     interface = InterfaceElements(
-        coupling, np.full((1, 8), 0.1), np.zeros((1, 8), np.int64), np.zeros(1, bool)
+        coupling, np.full((1, 8), 0.1), np.zeros((1, 8), np.int64), np.zeros(1, bool), np.zeros((1, 0))
     )
     out = np.array([gone >> vertex & 1 for vertex in range(8)], bool)
     matrix = stiffness_matrix(condensed(interface, out[None]).coupling)[0]

@@ -160,7 +160,8 @@ def aligned_elements(
     coupling[corners], mass[corners] = _cornered(kinds[corners], blocks, materials, stencil)
     vertex = blocks.at_vertices(first[:, None] + VERTICES)
     place = place.ravel()
-    return InterfaceElements(coupling[place], mass[place], vertex, np.zeros(len(first), bool))
+    nothing = np.zeros(len(first), bool), np.zeros((len(first), 0))
+    return InterfaceElements(coupling[place], mass[place], vertex, *nothing)
 
 
 def _layered(

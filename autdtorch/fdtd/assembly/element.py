@@ -30,6 +30,16 @@ LATTICE = np.array(list(itertools.product(range(SUBCELLS + 1), repeat=3))) / SUB
 CORNERS = np.ravel_multi_index((VERTICES * SUBCELLS).T, (SUBCELLS + 1,) * 3)
 
 
+class MaterialLosses(NamedTuple):
+    """Losses of materials relative to air, which is number 0; see `losses.py`."""
+
+    coupling: Array  # damping coefficients over the coupling of air (m,)
+    mass: Array  # damping coefficient of a cell beyond that of air (m,)
+    tangent: float  # largest ratio of `coupling` to the coupling itself
+    admittance: NDArray[np.complex128]  # of the surface (m,); zero where it is rigid or a fluid's
+    variants: tuple[Materials, ...]  # materials without loss, from which elements are continued
+
+
 @dataclass(frozen=True)
 class Materials:
     """Materials relative to air, which is number 0."""
@@ -38,6 +48,13 @@ class Materials:
     mass: Array  # mass of a cell (m,)
     slowness: Array  # wavenumber (m,), 1 for rigid materials
     rigid: NDArray[np.bool_]  # mask of the rigid materials (m,)
+    losses: MaterialLosses | None = None  # None if nothing absorbs
+
+    @property
+    def reacting(self) -> NDArray[np.bool_]:
+        """Mask of the materials whose surface has an impedance (m,)."""
+        nothing = np.zeros(len(self.rigid), bool)
+        return nothing if self.losses is None else np.asarray(self.losses.admittance != 0)
 
     @property
     def speed(self) -> Array:
@@ -52,6 +69,8 @@ class InterfaceElements(NamedTuple):
     mass: Array  # lumped mass at the vertices (n, 8)
     material: Index  # number of the material at each vertex (n, 8)
     finite: NDArray[np.bool_]  # mask of finite elements, whose rigid vertices remain cells (n,)
+    # damping of the pairs and vertices, and the vertices' stiffness (n, 44); none (n, 0) if nothing absorbs
+    loss: Array
 
     @classmethod
     def joined(cls, parts: Sequence[InterfaceElements]) -> InterfaceElements:
@@ -60,7 +79,13 @@ class InterfaceElements(NamedTuple):
 
     def chosen(self, some: Index) -> InterfaceElements:
         """Return some of the elements."""
-        return InterfaceElements(self.coupling[some], self.mass[some], self.material[some], self.finite[some])
+        return self._replace(
+            coupling=self.coupling[some],
+            mass=self.mass[some],
+            material=self.material[some],
+            finite=self.finite[some],
+            loss=self.loss[some],
+        )
 
 
 def coupling_by_edges(stencil: Stencil) -> Array:
@@ -101,6 +126,11 @@ def distance_to_material(distance: Array, material: Index, inner: Index) -> Arra
 def subcell_means(values: Array) -> Array:
     """Return the means (n, 64) of lattice values (n, 125) over the corners of each sub-cell."""
     return np.asarray(_over_subcells(values)[0])
+
+
+def subcell_gradients(values: Array) -> Array:
+    """Return the gradients (n, 64, 3) of lattice values (n, 125) in each sub-cell."""
+    return np.asarray(SUBCELLS * np.moveaxis(_over_subcells(values)[1:], 0, -1))
 
 
 def volume_coverage(distance: Array) -> Array:

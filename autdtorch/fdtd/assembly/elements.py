@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from autdtorch.fdtd.assembly.aligned import Blocks, aligned_elements
 from autdtorch.fdtd.assembly.edges import edges_of, reductions
 from autdtorch.fdtd.assembly.element import FAR, LATTICE, SUBCELLS, InterfaceElements, Materials
+from autdtorch.fdtd.assembly.impedance import with_impedance
 from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
+from autdtorch.fdtd.assembly.losses import GROUND, with_losses
 from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, quadratic, roughness
 from autdtorch.fdtd.assembly.unions import Union, unions_of
 from autdtorch.fdtd.grid import Grid
@@ -63,7 +65,11 @@ def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
     whole = np.where(cut, -1, material)
     index = np.flatnonzero(cut & ~beside), np.flatnonzero(cut & beside)
     parts = (
-        aligned_elements(places_of(index[0], cut.shape), blocks, materials, stencil),
+        with_losses(
+            lambda kinds: aligned_elements(places_of(index[0], cut.shape), blocks, kinds, stencil),
+            materials,
+            stencil,
+        ),
         _interface(bodies, index[1], whole, grid, materials, stencil),
     )
     order = np.argsort(np.concatenate(index))
@@ -192,6 +198,7 @@ def _interface(
 ) -> InterfaceElements:
     """Return the interface elements, at flat indices (n,); `whole` as in `_thick`."""
     none = np.zeros((0, 28)), np.zeros((0, 8)), np.zeros((0, 8), np.int64), np.zeros(0, bool)
+    no_loss = np.zeros((0, 0 if materials.losses is None else GROUND.stop))
     numbers = np.array([body.material for body in bodies], np.int64)
     shapes = [shape for body in bodies for shape in body.shapes]
     edges = [
@@ -211,14 +218,14 @@ def _interface(
         edged = np.asarray(less.any(axis=(1, 2)))
         finite = _finite(bodies, distance, first, edged, whole, grid)
         kinds, kind = _distinct(distance, finite, less)
-        elements = interface_elements(
-            Bodies(distance, numbers, finite, less).chosen(kinds), materials, stencil
-        )
+        near = Bodies(distance, numbers, finite, less).chosen(kinds)
+        elements = with_losses(lambda these: interface_elements(near, these, stencil), materials, stencil)
+        elements = with_impedance(elements, near.distance, numbers, materials, stencil)
         progress.advance(len(first))
         return elements.chosen(kind)
 
     with show_progress(len(index), "measuring surfaces") as progress:
-        parts = [InterfaceElements(*none), *spread(chunk, range(0, len(index), _CHUNK))]
+        parts = [InterfaceElements(*none, no_loss), *spread(chunk, range(0, len(index), _CHUNK))]
     return InterfaceElements.joined(parts)
 
 

@@ -26,6 +26,7 @@ from autdtorch.fdtd.assembly.element import (
     uniform_coupling,
 )
 from autdtorch.fdtd.assembly.elements import Elements
+from autdtorch.fdtd.assembly.losses import COUPLING, GROUND, MASS, condensed_loss
 from autdtorch.fdtd.region import Shape
 from autdtorch.fdtd.stencil import Stencil, flat_offsets, places_of
 from autdtorch.utils.array_types import Array, Index
@@ -51,6 +52,16 @@ _MASS_TRANSFERS = 6  # Largest number of mass transfers to light cells; one is n
 
 
 @dataclass(frozen=True)
+class LossyCells:
+    """Damping coefficients of l lossy cells, and their stiffness against silence; see `losses.py`."""
+
+    place: Index  # places of the cells among the heterogeneous ones (l,), ascending
+    coupling: Array  # c_ij with the 27 neighbours (l, 27)
+    mass: Array  # g_i beyond that of absorbing air (l,)
+    ground: Array  # stiffness against silence (l,)
+
+
+@dataclass(frozen=True)
 class HeterogeneousCells:
     """Cells whose stencil rows differ from those of uniform air."""
 
@@ -61,6 +72,17 @@ class HeterogeneousCells:
     rigid: Index  # flat indices of the rigid cells, ascending
     shell: Index  # rigid cells next to other cells; no cell reads those behind them
     enclosed: Index  # rigid cells of air, which no sound reaches, ascending
+    losses: LossyCells | None = None  # None if nothing absorbs
+    tangent: float = 0.0  # largest ratio of damping to stiffness in a material
+
+    @property
+    def loss_rows(self) -> Array:
+        """Losses of all cells (n, 29): coupling, mass and ground of `LossyCells`, zero elsewhere."""
+        rows = np.zeros((len(self.index), 29))
+        if self.losses is not None:
+            losses = self.losses
+            rows[losses.place] = np.column_stack((losses.coupling, losses.mass, losses.ground))
+        return rows
 
     def mass_of(self, cells: Index) -> Array:
         """Return the mass (k,) of cells (k,) that are heterogeneous or of air."""
@@ -81,7 +103,7 @@ def heterogeneous_cells(
     shape = (x + 1, y + 1, z + 1)
     touched = np.unique(_vertices(elements, shape))
     touched = touched[_inner(touched, shape)]
-    coupling, mass, hard = _without_rigid(elements, touched, shape, stencil)
+    coupling, mass, hard, interface = _without_rigid(elements, touched, shape, stencil)
     walls = elements.materials.rigid.any()
     usual = stencil.total / _densest(elements)
     enclosed = np.zeros(0, np.int64)
@@ -94,15 +116,25 @@ def heterogeneous_cells(
     mass = _transferred_mass(coupling, mass, elements, touched, shape, largest)
     weight = coupling / mass[:, None]
     changed = (np.abs(weight - stencil.weights) > _ROW_ROUNDING).any(axis=1) | (mass != 1)
+    loss = _touched_losses(elements, interface, touched, hard, shape, stencil)
+    changed |= loss.any(axis=1)
     changed &= ~hard[touched]
-    surface = touched[changed], weight[changed], mass[changed]
+    surface = touched[changed], weight[changed], mass[changed], loss[changed]
     uniform = _uniform_cells(elements, touched, hard, shape, stencil)
-    index, weight, mass = (np.concatenate(part) for part in zip(surface, uniform, strict=True))
+    index, weight, mass, loss = (np.concatenate(part) for part in zip(surface, uniform, strict=True))
     order = np.argsort(index)
     around = np.unique(_neighbours(touched, shape))
     shell = around[hard[around] & _inner(around, shape)]
     rows = index[order], weight[order], mass[order]
-    return HeterogeneousCells(*rows, np.flatnonzero(hard), shell, enclosed)
+    losses = elements.materials.losses
+    tangent = 0.0 if losses is None else losses.tangent
+    return HeterogeneousCells(*rows, np.flatnonzero(hard), shell, enclosed, lossy_cells(loss[order]), tangent)
+
+
+def lossy_cells(loss: Array) -> LossyCells | None:
+    """Return the lossy of n cells, from the losses of all (n, 29): coupling, mass and ground."""
+    place = np.flatnonzero(loss.any(axis=1))
+    return LossyCells(place, loss[place, :27], *loss[place, 27:].T) if len(place) else None
 
 
 def _neighbours(index: Index, shape: GridShape) -> Index:
@@ -130,8 +162,8 @@ def _cell_material(elements: Elements) -> NDArray[np.int16]:
 
 def _without_rigid(
     elements: Elements, touched: Index, shape: GridShape, stencil: Stencil
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return coupling and mass of the touched cells, and the mask (k,) of rigid cells."""
+) -> tuple[Array, Array, NDArray[np.bool_], InterfaceElements]:
+    """Return coupling and mass of the touched cells, the mask (k,) of rigid cells, and the elements left."""
     vertices, interface = _vertices(elements, shape), elements.interface
     hard = elements.materials.rigid[_cell_material(elements)]
     hard[vertices] = elements.materials.rigid[interface.material]
@@ -140,16 +172,46 @@ def _without_rigid(
     least = np.full(len(hard), _RIGID_COUPLING * stencil.total)
     least[vertices[interface.finite]] = max(_SLIVER_COUPLING / densest, _LEAST_COUPLING) * stencil.total
     hard[touched] = False
-    coupling, mass = _assembled(elements, interface, touched, shape, stencil)
+    coupling, mass = _assembled(elements, _stiffness(elements, interface, stencil), touched, shape)
     while True:
         coupling *= _both_open(hard, touched, shape)
         hard[touched] |= inside & (np.abs(coupling).sum(axis=1) <= least[touched])
         if hard.sum() == count or not inside.any():
-            return coupling, mass, hard
+            return coupling, mass, hard, interface
         count, out = hard.sum(), hard[vertices]
         interface = condensed(elements.interface, out)
         changed = np.isin(touched, vertices[out.any(axis=1)])
-        coupling[changed], mass[changed] = _assembled(elements, interface, touched[changed], shape, stencil)
+        parts = _stiffness(elements, interface, stencil)
+        coupling[changed], mass[changed] = _assembled(elements, parts, touched[changed], shape)
+
+
+def _touched_losses(
+    elements: Elements,
+    interface: InterfaceElements,
+    touched: Index,
+    hard: NDArray[np.bool_],
+    shape: GridShape,
+    stencil: Stencil,
+) -> Array:
+    """Return the losses of the touched cells (n, 29), as of `lossy_cells`; none (n, 0) if nothing absorbs."""
+    losses = elements.materials.losses
+    if losses is None:
+        return np.zeros((len(touched), 0))
+    uniform = losses.coupling[:, None] * uniform_coupling(stencil), np.repeat(losses.mass[:, None] / 8, 8, 1)
+    damping = uniform, (interface.loss[:, COUPLING], interface.loss[:, MASS])
+    stiffness = [np.zeros_like(part) for part in uniform], (0 * damping[1][0], interface.loss[:, GROUND])
+    (coupling, mass), (_, ground) = (
+        _assembled(elements, [np.concatenate(part) for part in zip(*parts, strict=True)], touched, shape)
+        for parts in (damping, stiffness)
+    )
+    return np.column_stack((coupling * _both_open(hard, touched, shape), mass, ground))
+
+
+def _stiffness(elements: Elements, interface: InterfaceElements, stencil: Stencil) -> list[Array]:
+    """Return coupling (k, 28) and mass (k, 8) of elements of one material, then of those at surfaces."""
+    kinds = elements.materials
+    uniform = uniform_coupling(stencil) / kinds.density[:, None], np.repeat(kinds.mass[:, None] / 8, 8, 1)
+    return [np.concatenate(part) for part in zip(uniform, interface[:2], strict=True)]
 
 
 def _densest(elements: Elements) -> float:
@@ -177,26 +239,27 @@ def condensed(interface: InterfaceElements, out: NDArray[np.bool_]) -> Interface
     matrix[gone[:, :, None] | gone[:, None, :]] = 0
     coupling = interface.coupling.copy()
     coupling[some] = -matrix[:, PAIRS[:, 0], PAIRS[:, 1]]
-    return interface._replace(coupling=coupling, mass=np.where(out, 0, interface.mass))
+    loss = interface.loss.copy()
+    if loss.shape[1]:
+        loss[some] = condensed_loss(loss[some], -inverse @ across.transpose(0, 2, 1), gone)
+    return interface._replace(coupling=coupling, mass=np.where(out, 0, interface.mass), loss=loss)
 
 
 def _assembled(
-    elements: Elements, interface: InterfaceElements, touched: Index, shape: GridShape, stencil: Stencil
+    elements: Elements, parts: Sequence[Array], touched: Index, shape: GridShape
 ) -> tuple[Array, Array]:
-    """Return coupling (n, 27) and mass (n,) of the touched cells, summed over their elements."""
+    """Return coupling (n, 27) and mass (n,) of the touched cells, summed over `parts` as of `_stiffness`."""
     coupling, mass = np.zeros((len(touched), 27)), np.zeros(len(touched))
     cube = coupling.reshape(-1, 3, 3, 3)
     places = places_of(touched, shape)
-    cells, kinds = tuple(cells - 1 for cells in shape), elements.materials
+    cells = tuple(cells - 1 for cells in shape)
     # elements by kind: of one material, then those that surfaces intersect
-    count = len(kinds.density)
+    count = len(elements.materials.density)
     kind = elements.material.astype(np.int64).ravel()
     kind[elements.index] = count + np.arange(len(elements.index))
-    pairs, masses = np.zeros((count + len(elements.index), 8, 8)), np.empty((count + len(elements.index), 8))
-    pairs[:, PAIRS[:, 0], PAIRS[:, 1]] = pairs[:, PAIRS[:, 1], PAIRS[:, 0]] = np.concatenate(
-        (uniform_coupling(stencil) / kinds.density[:, None], interface.coupling)
-    )
-    masses[:count], masses[count:] = kinds.mass[:, None] / 8, interface.mass
+    of_pairs, masses = parts
+    pairs = np.zeros((len(masses), 8, 8))
+    pairs[:, PAIRS[:, 0], PAIRS[:, 1]] = pairs[:, PAIRS[:, 1], PAIRS[:, 0]] = of_pairs
     for number, vertex in enumerate(VERTICES):
         element = kind[np.ravel_multi_index(tuple((places - vertex).T), cells)]
         x, y, z = (slice(1 - end, 3 - end) for end in vertex)
@@ -262,14 +325,19 @@ def _needed_mass(
 
 def _uniform_cells(
     elements: Elements, touched: Index, hard: NDArray[np.bool_], shape: GridShape, stencil: Stencil
-) -> tuple[Index, Array, Array]:
-    """Return index, weight and mass of cells inside obstacles with another sound speed than air."""
-    factor, material = elements.materials.speed, _cell_material(elements)
-    inside = (factor != 1)[material] & ~hard
+) -> tuple[Index, Array, Array, Array]:
+    """Return index, weight, mass and losses of cells inside obstacles that absorb or have another speed."""
+    materials, material = elements.materials, _cell_material(elements)
+    factor, losses = materials.speed, materials.losses
+    loss = np.zeros((len(factor), 0))
+    if losses is not None:
+        nothing = np.zeros_like(losses.mass)
+        loss = np.column_stack((losses.coupling[:, None] * stencil.weights, losses.mass, nothing))
+    inside = ((factor != 1) | loss.any(axis=1))[material] & ~hard
     inside[touched] = False
     index = np.flatnonzero(inside)
-    index = index[_inner(index, shape)]
-    return index, factor[material[index], None] * stencil.weights, elements.materials.mass[material[index]]
+    number = material[index := index[_inner(index, shape)]]
+    return index, factor[number, None] * stencil.weights, materials.mass[number], loss[number]
 
 
 # Coupling of two cells, relative to the sum of either, up to which nothing passes: 1e-5 or less through a

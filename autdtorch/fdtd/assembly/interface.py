@@ -79,7 +79,9 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
     vertex = _vertex_materials(distance, material)
     layered = layered_axis(distance)
     near = (np.abs(distance) < FAR).any(axis=2)
-    finite = (near & bodies.finite).any(axis=0) & (layered < 0)
+    # a surface with an impedance needs pressures on both sides
+    allowed = bodies.finite & ((layered < 0) | materials.reacting[material, None])
+    finite = np.asarray((near & allowed).any(axis=0))
     coupling, mass = np.zeros((len(vertex), 28)), np.zeros(vertex.shape)
     if finite.any():
         coupling[finite], mass[finite] = _finite_elements(bodies.chosen(finite), materials, stencil)
@@ -87,7 +89,7 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
         cut = _Cut(vertex[other], volumes[other], coupling[other], mass[other])
         _set_others(cut, bodies.chosen(other), layered[other], materials, stencil)
         coupling[other], mass[other] = cut.coupling, cut.mass
-    return InterfaceElements(coupling, mass, vertex, finite)
+    return InterfaceElements(coupling, mass, vertex, finite, np.zeros((len(vertex), 0)))
 
 
 class _Cut(NamedTuple):

@@ -94,7 +94,7 @@ def _flows(width: Array, density: Array, wavenumber: Array, across: float) -> tu
     """Return the resistance between the planes (n,), and the flow into each at equal unit pressures (n, 2).
 
     `across` is the square of the wavenumber along the planes [rad^2/cell^2]. Assembled densities give the
-    waves their exact flow on the grid (`unions.flow_factor`).
+    waves their exact flow on the grid (`materials.flow_factor`).
     """
     true = density * wavenumber / np.sin(wavenumber)
     square = wavenumber**2 - across

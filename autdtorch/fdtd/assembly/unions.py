@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -10,15 +9,14 @@ import numpy as np
 import torch
 
 from autdtorch.fdtd.assembly.element import Materials
+from autdtorch.fdtd.assembly.materials import Kind, materials_of
 from autdtorch.fdtd.grid import Grid
-from autdtorch.fdtd.region import Fluid, Region, Shape, bounds
+from autdtorch.fdtd.region import Body, Region, Shape, bounds
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.thin_walls import thickened
 from autdtorch.fdtd.turning import is_along, slender_faces
 from autdtorch.utils.array_types import Array, Index
 
-# Density with which rigid bodies are assembled; cells that remain almost uncoupled become rigid
-_RIGID_DENSITY = 1e5
 # Distance by which bodies are grown, so that touching bodies leave no film of air between them
 _CONTACT_GAP = 1e-9
 
@@ -89,33 +87,20 @@ class Union:
         return np.array(ranges, np.int64).T
 
 
-def speed_factor(stencil: Stencil, speed_ratio: float) -> float:
-    """Return the factor by which to divide masses, so that a wave in a material has the drive's frequency."""
-    return stencil.symbol / stencil.isotropic_symbol(stencil.kappa / speed_ratio)
-
-
-def flow_factor(kappa: float, speed_ratio: float) -> float:
-    """Return the factor on a material's coupling and mass with which the flow of waves is continuous.
-
-    On a grid the discrete flow of a wave of unit pressure and flow is sin(k) / k, with the wavenumber k of
-    the material. At oblique incidence the two normal k differ, but the ratio is unchanged to second order.
-    """
-    inner = kappa / speed_ratio
-    return math.sin(kappa) / kappa / (math.sin(inner) / inner)
-
-
 def unions_of(region: Region, grid: Grid, stencil: Stencil) -> tuple[list[Union], Materials]:
     """Return unions of consecutive bodies that share a material, and the materials."""
     air = region.fluid
-    fluids: list[Fluid | None] = [air]
+    kinds = [Kind(air, None)]
     unions: list[Union] = []
-    for body in region.bodies:
-        if body.fluid not in fluids:
-            fluids.append(body.fluid)
-        aligned = is_along(body.shape, np.eye(3), grid.spacing)
+    for number, body in enumerate(region.bodies):
+        _require_continuable(number, body)
+        kind = Kind(body.fluid, body.impedance)
+        if kind not in kinds:
+            kinds.append(kind)
+        aligned = body.impedance is None and is_along(body.shape, np.eye(3), grid.spacing)
         union = Union(
             (body.shape,),
-            fluids.index(body.fluid),
+            kinds.index(kind),
             body.continued,
             aligned,
             body.fluid is None,
@@ -125,12 +110,16 @@ def unions_of(region: Region, grid: Grid, stencil: Stencil) -> tuple[list[Union]
             unions[-1] = replace(union, shapes=(*unions[-1].shapes, *union.shapes))
         else:
             unions.append(union)
-    density = np.full(len(fluids), _RIGID_DENSITY)
-    factor, slowness = np.ones(len(fluids)), np.ones(len(fluids))
-    for number, fluid in enumerate(fluids):
-        if fluid is not None:
-            ratio = fluid.phase_speed / air.phase_speed
-            density[number] = fluid.inertia / air.inertia / flow_factor(stencil.kappa, ratio)
-            factor[number], slowness[number] = speed_factor(stencil, ratio), 1 / ratio
-    rigid = np.array([fluid is None for fluid in fluids])
-    return unions, Materials(density, 1 / (density * factor), slowness, rigid)
+    return unions, materials_of(kinds, air, stencil)
+
+
+def _require_continuable(number: int, body: Body) -> None:
+    """Refuse bodies through the boundary layers that these do not absorb waves in.
+
+    Layers stretch the coupling of cells, and not the damping of it by a complex density.
+    """
+    if body.continued and body.fluid is not None and body.fluid.density.imag:
+        raise ValueError(
+            f"obstacles[{number}]: a fluid of complex density ({body.fluid.density:.3g} kg/m^3) crosses the"
+            ' whole domain; must end inside it, or use method="box"'
+        )

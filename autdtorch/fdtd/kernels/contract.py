@@ -7,13 +7,14 @@ A step takes the pressures `now` and `before` at two successive times to the nex
 2. in heterogeneous cells instead new = (1 + keep) now - keep before + sum_j weight_j (now_j - now);
 3. the boundary layers add the stretching of the two neighbours' sum along each axis (`boundary.py`), as in
    air, times `layer_scale` in heterogeneous cells, and by column the difference at interfaces;
-4. the sources are added: new += sum_s signal_s force_s, of the S signals that they share;
-5. the outermost ring and the sound-hard cells stay zero.
+4. in lossy cells new += sum_j loss_j (now_j - before_j) - ground now, with the cell itself among the j;
+5. the sources are added: new += sum_s signal_s force_s, of the S signals that they share;
+6. the outermost ring and the sound-hard cells stay zero.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import torch
@@ -53,6 +54,18 @@ class Columns:
         return cls(index, index[:, :1].expand(0, width), torch.zeros((0, width), dtype=dtype, device="cpu"))
 
 
+def _no_cells() -> Tensor:
+    return torch.zeros(0, dtype=torch.int64, device="cpu")
+
+
+def _no_rows() -> Tensor:
+    return torch.zeros((0, 27), device="cpu")
+
+
+def _no_numbers() -> Tensor:
+    return torch.zeros(0, device="cpu")
+
+
 @dataclass(frozen=True)
 class Coefficients:
     """The medium as a kernel sees it."""
@@ -75,6 +88,10 @@ class Coefficients:
     # flat place, among the terms (L, n) of the `crossed`, of the term to add to the sums across each cell of
     # the columns (m, L + 2) int64; L n for none
     crossing: Tensor
+    # flat indices (l,) int64 of the lossy cells, ascending, each of them heterogeneous
+    loss_index: Tensor = field(default_factory=_no_cells)
+    loss_weight: Tensor = field(default_factory=_no_rows)  # their rows on the change of a step (l, 27)
+    loss_ground: Tensor = field(default_factory=_no_numbers)  # their stiffness against silence (l,)
 
     @property
     def layer_cells(self) -> int:

@@ -23,7 +23,13 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.kernels.compiled import INNER, entry
 from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, WaveState
-from autdtorch.fdtd.kernels.cpu_intrinsics import add_to_counter, give_way, read_counter, row_offsets
+from autdtorch.fdtd.kernels.cpu_intrinsics import (
+    add_to_counter,
+    give_way,
+    read_counter,
+    row_offsets,
+    sum_of_rows,
+)
 from autdtorch.fdtd.kernels.cpu_layers import FlatMemory, plane_profiles, rows_profile, stretch
 from autdtorch.fdtd.kernels.cpu_sweep import sweep_planes
 from autdtorch.fdtd.stencil import OFFSETS
@@ -80,7 +86,17 @@ def _sweep_chunk(c, p, q, medium, layers, cells, room):  # type: ignore[no-untyp
 
 
 @njit(**INNER)
-def _finish_chunk(c, q, medium, cells, outermost, sources, row, sound_hard):  # type: ignore[no-untyped-def]
+def _damp_chunk(c, p, q, losses, offset):  # type: ignore[no-untyped-def]
+    """Compute the losses in the cells of chunk c, before the sweep overwrites the pressures `q` before."""
+    index, weight, total, ground, starts, change = losses
+    for n in range(starts[c], starts[c + 1]):
+        cell = index[n]
+        rows = sum_of_rows(p, cell, offset, weight, n * 27) - sum_of_rows(q, cell, offset, weight, n * 27)
+        change[n] = rows + total[n] * (p[cell] - q[cell]) - ground[n] * p[cell]
+
+
+@njit(**INNER)
+def _finish_chunk(c, q, medium, cells, losses, outermost, sources, row, sound_hard):  # type: ignore[no-untyped-def]
     """Add the terms of the neighbours to the outermost planes of chunk c; then set its single cells."""
     cuts, starts, driven_starts, hard_starts = medium[:4]
     ny, nz = int(medium[5]), int(medium[6])
@@ -96,6 +112,9 @@ def _finish_chunk(c, q, medium, cells, outermost, sources, row, sound_hard):  # 
     for n in range(starts[cuts[c]], starts[cuts[c + 1]]):
         absorbed = scale[n] * (q[index[n]] - swept[n]) if scale[n] != 0 else scale[n]
         q[index[n]] = new[n] + absorbed
+    lossy, _, _, _, loss_starts, change = losses
+    for n in range(loss_starts[c], loss_starts[c + 1]):
+        q[lossy[n]] += change[n]
     driven, force = sources
     for s in range(len(row)):
         force_of_signal, signal = force[s], row[s]
@@ -143,16 +162,17 @@ def _finish_columns(p, q, columns, memory):  # type: ignore[no-untyped-def]
 
 @entry()
 def _advance(  # type: ignore[no-untyped-def]
-    p, q, medium, layers, cells, room, columns, memory, sound_hard, sources, receivers, signal, recorded,
-    counters,
+    p, q, medium, layers, cells, losses, room, columns, memory, sound_hard, sources, receivers, signal,
+    recorded, counters,
 ):  # fmt: skip
     """Do tasks until none is left; each worker calls this with the same arguments.
 
-    A step has two phases with a task for each chunk, sweep it and finish it, and a third if interfaces pass
-    through the boundary layers. The first phase records the step before.
+    A step has two phases with a task for each chunk, sweep it and finish it. One is before these if cells are
+    lossy, and one after if interfaces pass through the boundary layers. The first records the step before.
     """
     chunks, steps, read = len(medium[0]) - 1, len(signal), recorded.shape[1]
-    kinds = 3 if len(columns[0][0]) else 2
+    swept = 1 if len(losses[0]) else 0  # the phase of the sweep
+    kinds = swept + (3 if len(columns[0][0]) else 2)
     for _ in range((kinds * steps + 1) * chunks):
         task = add_to_counter(counters, _CLAIMED, 1)
         phase, c = task // chunks, task % chunks
@@ -165,11 +185,13 @@ def _advance(  # type: ignore[no-untyped-def]
             if step > 0:
                 first, last = np.uint64(c * read // chunks), np.uint64((c + 1) * read // chunks)
                 _record(now, receivers, first, last, recorded[step - 1])
-            if step < steps:
-                _sweep_chunk(c, now, new, medium, layers, cells, room)
-        elif kind == 1:
-            _finish_chunk(c, new, medium, cells, room[-1], sources, signal[step], sound_hard)
-        elif c == 0:
+            if swept and step < steps:
+                _damp_chunk(c, now, new, losses, cells[2])
+        if kind == swept and step < steps:
+            _sweep_chunk(c, now, new, medium, layers, cells, room)
+        elif kind == swept + 1:
+            _finish_chunk(c, new, medium, cells, losses, room[-1], sources, signal[step], sound_hard)
+        elif kind == swept + 2 and c == 0:
             _finish_columns(now, new, columns, memory)
             for n in range(len(sound_hard)):
                 new[sound_hard[n]] = 0
@@ -213,6 +235,16 @@ def _heterogeneous_cells(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, 
     scale[np.searchsorted(index, c.layer_index.numpy())] = c.layer_scale.numpy()
     new, swept = np.empty_like(scale), np.empty_like(scale)
     return index, weight.reshape(-1), row_offsets(shape), scale, air, new, swept
+
+
+def _losses(c: Coefficients, plane: int, cuts: NDArray[np.int64], dtype: type) -> tuple[AnyArray, ...]:
+    """Return the lossy cells: indices, rows, their sums, ground, the first in each chunk, workspace."""
+    index: AnyArray = c.loss_index.contiguous().numpy()
+    weight: AnyArray = c.loss_weight.contiguous().numpy().astype(dtype, copy=False)
+    ground: AnyArray = c.loss_ground.contiguous().numpy().astype(dtype, copy=False)
+    total = weight.sum(axis=1)
+    starts = np.searchsorted(index, plane * cuts)
+    return index, weight.reshape(-1), total, ground, starts, np.empty_like(total)
 
 
 def _share_of_processors(work: Callable[[], object], workers: int) -> float:
@@ -271,6 +303,7 @@ class CpuKernel:
             medium,
             tuple(part.reshape(-1) for part in memory.arrays),
             _heterogeneous_cells(c, shape),
+            _losses(c, plane, cuts, dtype),
             _room(len(cuts) - 1, shape, c.layer_cells, dtype),
             (_columns(c, c.columns), _columns(c, c.crossed), c.crossing.numpy()),
             tuple((psi.numpy(), zeta.numpy()) for psi, zeta in state.memory[4:]),

@@ -150,7 +150,8 @@ class DeviceRun:
         sizes = {"CELLS": m.cells, "DEPTHS": m.depths, "LANES": blocks.lanes}
         cuda_steps.prepare[(m.ends.crossed + triton.cdiv(received.size, lanes),)](
             now, other, m.shape, m.weights, m.profile, old, new, m.terms, m.heterogeneous, m.crossed,
-            received, m.ends, self._first, offset, CROSSED_WIDTH=len(m.crossed.weight), **sizes,
+            received, m.ends, self._first, offset, LOSSY=len(m.heterogeneous.loss) > 0,
+            CROSSED_WIDTH=len(m.crossed.weight), **sizes,
         )  # fmt: skip
         cuda_steps.sweep[(m.tiles + triton.cdiv(m.columns.size, blocks.lanes),)](
             now, other, m.shape, m.weights, m.profile, old, new, m.terms, m.columns, m.tiles,

@@ -150,7 +150,8 @@ def _stretch_columns(p, columns, old, new, profile, crossed, terms, program, WID
 
 
 @triton.jit
-def _gather_heterogeneous(p, before, shape, weights, heterogeneous, program, LANES: tl.constexpr):
+def _gather_heterogeneous(p, before, shape, weights, heterogeneous, program, LOSSY: tl.constexpr,
+                          LANES: tl.constexpr):  # fmt: skip
     n = program * LANES + tl.arange(0, LANES)
     mask = n < heterogeneous.size
     cell = tl.load(heterogeneous.cell + n, mask=mask, other=0)
@@ -165,8 +166,15 @@ def _gather_heterogeneous(p, before, shape, weights, heterogeneous, program, LAN
                 value = tl.load(beside, mask=mask, other=0)
                 place = n + (9 * x + 3 * y + z) * heterogeneous.size
                 change += tl.load(heterogeneous.weight + place, mask=mask, other=0) * (value - middle)
+                if LOSSY:
+                    past = before + cell + ((x - 1) * plane + (y - 1) * shape.nz + (z - 1))
+                    step = value - tl.load(past, mask=mask, other=0)
+                    change += tl.load(heterogeneous.loss + place, mask=mask, other=0) * step
                 kind = (x - 1) * (x - 1) + (y - 1) * (y - 1) + (z - 1) * (z - 1)
                 air += tl.load(weights + kind) * value
+    if LOSSY:
+        ground = tl.load(heterogeneous.loss + n + 27 * heterogeneous.size, mask=mask, other=0)
+        change -= ground * middle
     scale = tl.load(heterogeneous.scale + n, mask=mask, other=0)
     # The sweep gives `air` and the layers' term; `settle` adds `scale` times that.
     tl.store(heterogeneous.settled + n, middle + keep * (middle - old) + change - scale * air, mask=mask)
@@ -186,8 +194,8 @@ def _read(p, receivers, row, program, LANES: tl.constexpr):
 
 @triton.jit(do_not_specialize=["offset"])
 def prepare(p, before, shape, weights, profile, old, new, terms, heterogeneous, crossed, receivers, ends,
-            first, offset, CROSSED_WIDTH: tl.constexpr, CELLS: tl.constexpr, DEPTHS: tl.constexpr,
-            LANES: tl.constexpr):  # fmt: skip
+            first, offset, LOSSY: tl.constexpr, CROSSED_WIDTH: tl.constexpr, CELLS: tl.constexpr,
+            DEPTHS: tl.constexpr, LANES: tl.constexpr):  # fmt: skip
     """The part of a step that only reads pressures; receivers are read after the step before."""
     program = tl.program_id(0)
     if program < ends.z:
@@ -198,7 +206,8 @@ def prepare(p, before, shape, weights, profile, old, new, terms, heterogeneous, 
         _stretch_yz(p, shape, old.z, old.yz, new.yz, profile, terms.yz, program - ends.y, CELLS, DEPTHS,
                     LANES)  # fmt: skip
     elif program < ends.heterogeneous:
-        _gather_heterogeneous(p, before, shape, weights, heterogeneous, program - ends.yz, DEPTHS * LANES)
+        _gather_heterogeneous(p, before, shape, weights, heterogeneous, program - ends.yz, LOSSY,
+                              DEPTHS * LANES)  # fmt: skip
     elif program < ends.crossed:
         _stretch_columns(p, crossed, old.crossed, new.crossed, profile, terms.crossed, terms.crossed,
                          program - ends.heterogeneous, CROSSED_WIDTH, False, CELLS, DEPTHS,

@@ -43,6 +43,7 @@ class Heterogeneous(NamedTuple):
     weight: Tensor  # stencil rows (27, n)
     scale: Tensor  # of the layers' term, 0 outside of them (n,)
     settled: Tensor  # workspace: new pressure less `scale` times the result of the sweep (n,)
+    loss: Tensor  # rows on the change of a step, and ground (28, n); none (0, n) without losses
 
 
 class ColumnTable(NamedTuple):
@@ -89,7 +90,10 @@ def heterogeneous_table(c: Coefficients, device: torch.device) -> Heterogeneous:
     scale = torch.zeros(count, dtype=c.heterogeneous_weight.dtype, device=device)
     scale[torch.searchsorted(index, c.layer_index.to(device))] = c.layer_scale.to(device)
     weight = c.heterogeneous_weight.to(device).T.contiguous()
-    return Heterogeneous(count, index.contiguous(), weight, scale, torch.zeros_like(scale))
+    loss = weight.new_zeros((28 if len(c.loss_index) else 0, count))
+    place = torch.searchsorted(index, c.loss_index.to(device).contiguous())
+    loss[:, place] = torch.cat((c.loss_weight.T, c.loss_ground[None])).to(weight)[: len(loss)]
+    return Heterogeneous(count, index.contiguous(), weight, scale, torch.zeros_like(scale), loss)
 
 
 def column_table(columns: Columns, crossing: Tensor, device: torch.device) -> ColumnTable:

@@ -61,6 +61,10 @@ class ReferenceKernel:
         columns, shares = _absorb_columns(flat_now, c.columns, beside, state.memory.columns, c)
         inside = c.columns.index.T[1:-1].reshape(-1)
         new = (new + term).reshape(-1).index_add(0, inside, shares.reshape(-1))
+        if len(c.loss_index):
+            around = c.loss_index[:, None] + torch.from_numpy(flat_offsets(state.now.shape))
+            lost = (c.loss_weight * (flat_now - flat_before)[around]).sum(-1)
+            new = new.index_add(0, c.loss_index, lost - c.loss_ground * flat_now[c.loss_index])
         new = new.index_add(0, driven, force).index_fill(0, c.sound_hard_index, 0)
         memory = memory._replace(columns=columns, crossed=crossed)
         return WaveState(new.reshape(state.now.shape), state.now, memory)

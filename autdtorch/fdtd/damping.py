@@ -1,0 +1,113 @@
+"""Losses in the time step: damping that is exact at the drive's frequency and stable at all others.
+
+A cell of mass m with the damping coefficients g and c (`assembly/losses.py`), in air that absorbs by D a
+step, is stepped by
+
+    m (p+ - 2 p + p-) + (m D + d) (p+ - p-) = C sum_j [ k_ij (p_j - p_i) + e_ij (s_j - s_i) ],    s = p - p-.
+
+With the phase theta of a step at the drive's frequency, g is exact for d = g tan(theta / 2) / symbol, and c
+for e = c / sin(theta) with a stiffness k that is less by c tan(theta / 2). The damping e of the coupling is
+late by half a step. The scheme is stable for 0 <= k, 0 <= 2 d + e and C (k + 2 e) <= 4 m as forms: the
+second is what passive means, and the third limits the time step.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells
+from autdtorch.fdtd.assembly.losses import LARGEST_TANGENT
+from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue
+from autdtorch.fdtd.stencil import Stencil
+from autdtorch.utils.array_types import REAL, Index
+
+_TRIALS = 8  # Largest number of time steps that are tried
+
+
+class Damping(NamedTuple):
+    """Damping coefficients of l lossy cells, as tensors; see `heterogeneous.LossyCells`."""
+
+    place: Tensor
+    coupling: Tensor
+    mass: Tensor
+    ground: Tensor
+
+    @classmethod
+    def of(cls, place: Index, losses: Tensor) -> Damping:
+        """Return the damping of cells at `place` (l,), from coupling, mass and ground (l, 29)."""
+        return cls(torch.from_numpy(place), losses[:, :27], losses[:, 27], losses[:, 28])
+
+
+class SteppedCells(NamedTuple):
+    """Cells at a time step; `loss` and `ground` contain the time factor, the others do not."""
+
+    weight: Tensor  # stencil rows (n, 27)
+    mass: Tensor  # masses with which sources and adjoint runs count (n,)
+    loss: Tensor  # rows of the lossy cells on the change of a step (l, 27)
+    ground: Tensor  # their stiffness against silence (l,)
+
+
+def damping_of(cells: HeterogeneousCells) -> Damping | None:
+    """Return the damping of cells, None if nothing absorbs."""
+    if cells.losses is None:
+        return None
+    losses = cells.losses
+    return Damping(*map(torch.from_numpy, (losses.place, losses.coupling, losses.mass, losses.ground)))
+
+
+def at_time_step(
+    cells: HeterogeneousCells, stencil: Stencil, steps_per_period: float
+) -> tuple[HeterogeneousCells, Tensor, Tensor]:
+    """Return the cells with rows and masses at a time step, and `loss` and `ground` of `SteppedCells`."""
+    damping = damping_of(cells)
+    if damping is None:
+        return cells, torch.zeros((0, 27), **REAL), torch.zeros(0, **REAL)
+    rows = torch.from_numpy(cells.weight), torch.from_numpy(cells.mass)
+    weight, mass, loss, ground = stepped_cells(*rows, damping, stencil, steps_per_period)
+    return replace(cells, weight=weight.numpy(), mass=mass.numpy()), loss, ground
+
+
+def stepped_cells(
+    weight: Tensor, mass: Tensor, damping: Damping, stencil: Stencil, steps_per_period: float
+) -> SteppedCells:
+    """Return heterogeneous cells with rows (n, 27), mass (n,) and damping at a time step; differentiable."""
+    turn = 2 * math.pi / steps_per_period
+    tangent, of_air = math.tan(turn / 2), stencil.damping(steps_per_period)
+    factor = stencil.time_factor(steps_per_period) / (1 + of_air)
+    place, coupling, damped, ground = damping
+    lost = tangent / stencil.symbol * damped
+    before, here = mass[place], mass[place] + lost / (1 + of_air)
+    whole = mass.index_add(0, place, lost / (1 + of_air))
+    rows = (weight[place] * before[:, None] - tangent * coupling) / here[:, None]
+    late = factor / math.sin(turn) * coupling / here[:, None]
+    keep = (before * (1 - of_air) - lost) / (before * (1 + of_air) + lost)
+    own = keep - (1 - of_air) / (1 + of_air) - late.sum(dim=1)
+    loss = late.index_add(1, torch.tensor([13], device="cpu"), own[:, None])
+    return SteppedCells(weight.index_copy(0, place, rows), whole, loss, factor * ground / here)
+
+
+def fewest_stable_steps(cells: HeterogeneousCells, stencil: Stencil, shape: tuple[int, int, int]) -> float:
+    """Return steps per period at which cells are stable, close to the limit.
+
+    The limit depends on the steps per period N itself, as damping counts by cot(pi / N).
+    """
+    fewest = fewest_steps(stencil, largest_eigenvalue(cells.index, cells.weight, stencil, shape))
+    losses = cells.losses
+    if losses is None or not (losses.coupling.any() or losses.ground.any()):
+        return fewest
+    steps = max(fewest, math.pi / math.atan(LARGEST_TANGENT / max(cells.tangent, 1e-9)))
+    damped = losses.coupling / cells.mass[losses.place, None]
+    for _ in range(_TRIALS):
+        rows = cells.weight.copy()
+        rows[losses.place] += damped / math.tan(math.pi / steps)
+        rows[losses.place, 13] = losses.ground / cells.mass[losses.place]
+        needed = fewest_steps(stencil, largest_eigenvalue(cells.index, rows, stencil, shape))
+        if needed <= steps:
+            break
+        steps = needed**2 / steps
+    return steps
