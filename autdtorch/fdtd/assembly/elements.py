@@ -40,7 +40,7 @@ _ROUGH = 0.01
 # density ratio 77 have errors of up to 2.4 and 2.7 % (15 mm) and 2.8 and 2.1 % (8 mm) at 1 mm.
 _FLUID_REDUCTION = 0.3
 _SAME = 1e-9  # Difference of distances [cells] up to which elements are alike
-_LEAST_GRADIENT = 0.3  # Least mean gradient of a signed distance in an element with one surface
+_GROUND_GRADIENT = 0.3  # Least mean gradient of a signed distance in an element with one surface
 
 
 @dataclass(frozen=True)
@@ -166,13 +166,13 @@ def _thick(
     """
     gradient, middle = mean_gradient(distance), distance.mean(axis=1)
     steep = np.linalg.norm(gradient, axis=1)  # small where the two faces of a plate cancel
-    normal = gradient / np.maximum(steep, _LEAST_GRADIENT)[:, None]
+    normal = gradient / np.maximum(steep, _GROUND_GRADIENT)[:, None]
     below = (middle[:, None] + _DEPTHS)[:, :, None] * normal[:, None]
     places = first[:, None] + 0.5 - below
     element = np.clip(places.astype(np.int64), 0, np.array(whole.shape) - 1)
     inside = whole[tuple(np.moveaxis(element, -1, 0))] == body.material
     inside[~inside] = body.distance(places[~inside], grid) < 0
-    return np.asarray(inside.all(axis=1) & (steep > _LEAST_GRADIENT))
+    return np.asarray(inside.all(axis=1) & (steep > _GROUND_GRADIENT))
 
 
 def _distinct(distance: Array, finite: NDArray[np.bool_], less: Array) -> tuple[Index, Index]:

@@ -197,12 +197,11 @@ def _touched_losses(
     losses = elements.materials.losses
     if losses is None:
         return np.zeros((len(touched), 0))
-    uniform = losses.coupling[:, None] * uniform_coupling(stencil), np.repeat(losses.mass[:, None] / 8, 8, 1)
-    damping = uniform, (interface.loss[:, COUPLING], interface.loss[:, MASS])
-    stiffness = [np.zeros_like(part) for part in uniform], (0 * damping[1][0], interface.loss[:, GROUND])
+    pairs = losses.coupling[:, None] * uniform_coupling(stencil)
+    vertices = np.repeat(losses.mass[:, None] / 8, 8, axis=1)
+    loss = np.concatenate((np.column_stack((pairs, vertices, np.zeros_like(vertices))), interface.loss))
     (coupling, mass), (_, ground) = (
-        _assembled(elements, [np.concatenate(part) for part in zip(*parts, strict=True)], touched, shape)
-        for parts in (damping, stiffness)
+        _assembled(elements, (loss[:, COUPLING], loss[:, part]), touched, shape) for part in (MASS, GROUND)
     )
     return np.column_stack((coupling * _both_open(hard, touched, shape), mass, ground))
 

@@ -82,11 +82,11 @@ def with_impedance(
             total[some] += admittance[number] * part
     factor = 0.5j * stencil.slope.real
     coupling, mass = factor * coupling, factor * mass
-    loss = np.concatenate((-coupling.imag, mass.imag, np.maximum(-mass.real, 0)), axis=1)
+    loss = -coupling.imag, mass.imag, np.maximum(-mass.real, 0)
     return elements._replace(
         coupling=elements.coupling + coupling.real,
         mass=elements.mass + np.maximum(mass.real, 0) / stencil.symbol,
-        loss=elements.loss + loss,
+        loss=elements.loss + np.concatenate(loss, axis=1),
     )
 
 

@@ -16,6 +16,7 @@ parts times a step. From these the values at i times the imaginary parts follow 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.assembly.element import (
     PAIRS,
+    VERTICES,
     InterfaceElements,
     Materials,
     stiffness_matrix,
@@ -49,13 +51,13 @@ def with_losses(
         return still._replace(loss=np.zeros((len(still.mass), GROUND.stop)))
     values = ((one.coupling, one.mass) for one in (still, *sides))
     coupling, mass = (_continued(*each) for each in zip(*values, strict=True))
-    loss = np.concatenate((-coupling.imag, stencil.symbol * mass.imag, np.zeros_like(still.mass)), axis=1)
     # the stiffness of a step at the largest tangent of half its phase
     tangent = LARGEST_TANGENT / max(materials.losses.tangent, LARGEST_TANGENT)
-    unstable = _negative(stiffness_matrix(coupling.real - tangent * loss[:, COUPLING]))
-    loss[unstable, COUPLING] = 0
-    real = np.where(unstable[:, None], still.coupling, coupling.real)
-    return still._replace(coupling=real, mass=mass.real, loss=_passive(loss, stencil, still.mass))
+    stable = ~_negative(stiffness_matrix(coupling.real + tangent * coupling.imag))[:, None]
+    air = stencil.loss * still.mass  # all cells absorb as air does
+    loss = _passive(np.where(stable, -coupling.imag, 0), stencil.symbol * mass.imag, air)
+    real = np.where(stable, coupling.real, still.coupling)
+    return still._replace(coupling=real, mass=np.asarray(mass.real), loss=loss)
 
 
 STEP = 0.05
@@ -71,18 +73,35 @@ def _continued(still: Array, ahead: Array, behind: Array) -> NDArray[np.complex1
     return still + 1j * np.divide(slope**2, below, out=np.zeros_like(below), where=below != 0)
 
 
-def _passive(loss: Array, stencil: Stencil, mass: Array) -> Array:
-    """Return losses (n, 44) that absorb at any pressure, with `mass` (n, 8) as in air."""
-    air = stencil.loss * mass
-    form = stiffness_matrix(loss[:, COUPLING])
-    form[:, range(8), range(8)] += loss[:, MASS] + air
-    wrong = np.flatnonzero(_negative(form))
-    if len(wrong):
-        values, vectors = np.linalg.eigh(stiffness_matrix(loss[wrong, COUPLING]))
-        positive = (vectors * np.maximum(values, 0)[:, None]) @ vectors.transpose(0, 2, 1)
-        loss[wrong, COUPLING] = -positive[:, PAIRS[:, 0], PAIRS[:, 1]]
-        loss[wrong, MASS] = np.maximum(loss[wrong, MASS], -air[wrong])
-    return loss
+def _passive(coupling: Array, mass: Array, air: Array) -> Array:
+    """Return losses (n, 44) that absorb at any pressure.
+
+    They are close to damping of coupling (n, 28) and of mass (n, 8), beside that of air (n, 8).
+    """
+    form = stiffness_matrix(coupling)
+    form[:, range(8), range(8)] += mass + air
+    some = np.flatnonzero(_negative(form))
+    positive = _positive(form[some])
+    coupling[some] = -positive[:, PAIRS[:, 0], PAIRS[:, 1]]
+    mass[some] = positive.sum(axis=2) - air[some]
+    return np.concatenate((coupling, mass, np.zeros_like(mass)), axis=1)
+
+
+# Constant and linear fields at the vertices, of unit length (8, 4)
+_LINEAR = np.column_stack((np.full(8, 0.5), VERTICES - 0.5)) / math.sqrt(2)
+
+
+def _positive(form: Array) -> Array:
+    """Return forms (n, 8, 8) without their negative parts.
+
+    Constant and linear fields keep the power that they have, if it is positive: only the rest is cut.
+    """
+    power, directions = np.linalg.eigh(_LINEAR.T @ form @ _LINEAR)
+    share = np.divide(1, power, out=np.zeros_like(power), where=power > 0)
+    forces = form @ _LINEAR @ directions
+    flow = (forces * share[:, None]) @ forces.transpose(0, 2, 1)
+    values, vectors = np.linalg.eigh(form - flow)
+    return np.asarray(flow + (vectors * np.maximum(values, 0)[:, None]) @ vectors.transpose(0, 2, 1))
 
 
 def _negative(matrix: Array) -> NDArray[np.bool_]:

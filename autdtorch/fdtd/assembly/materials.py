@@ -102,12 +102,13 @@ def _passive(coupling: complex, mass: complex, stencil: Stencil) -> tuple[comple
     """Turn the phases of both, which leaves the wavenumber, until waves of every length are damped.
 
     Errors of the grid, of second order in the wavenumber, may give a fluid that absorbs by its density alone
-    a mass that amplifies, and conversely.
+    a mass that amplifies. A fluid that absorbs by its bulk modulus alone may amplify the shortest waves by
+    its coupling.
     """
-    if mass.imag < -stencil.loss / stencil.symbol * mass.real:
-        turn = cmath.exp(-1j * cmath.phase(mass))
-        coupling, mass = coupling * turn, mass * turn
-    if stencil.symbol * mass.imag + stencil.loss * mass.real < stencil.largest_symbol * coupling.imag:
-        turn = cmath.exp(-1j * cmath.phase(coupling))
-        coupling, mass = coupling * turn, mass * turn
+    for symbol in (0.0, stencil.largest_symbol):
+        power = stencil.symbol * mass.imag + stencil.loss * mass.real - symbol * coupling.imag
+        if power < 0:
+            # to first order; the rest is rounding
+            turn = cmath.exp(1j * power / (symbol * coupling.real - stencil.symbol * mass.real))
+            coupling, mass = coupling * turn, mass * turn
     return coupling, mass
