@@ -57,8 +57,6 @@ def _add(digest: Any, part: Any) -> None:
     if part is None or isinstance(part, str | bool | int | float | complex):
         text = part.hex() if isinstance(part, float) else repr(part)  # of complex numbers exact too
         digest.update(f"{type(part).__name__} {len(text)} {text}\n".encode())
-    elif isinstance(part, complex):
-        _add(digest, ("complex", part.real, part.imag))
     elif hasattr(part, "__array__"):
         array = np.ascontiguousarray(part)
         digest.update(f"array {array.dtype.str} {array.shape}\n".encode() + array.tobytes())
