@@ -26,6 +26,7 @@ from autdtorch.scene.drive import amplitudes_of, drive_from_phases, phases_of
 from autdtorch.scene.geometry import Plane, circle_points, sphere_points
 from autdtorch.scene.obstacles import KINDS, Obstacle
 from autdtorch.scene.porous import porous
+from autdtorch.scene.reflectors import Reflector
 from autdtorch.scene.scene import Medium, Scene
 from autdtorch.utils.files import replace_file
 from autdtorch.utils.units import warned_within
@@ -59,7 +60,7 @@ _JOINED: dict[str, tuple[str, Builder]] = {  # an example of an entry, and how a
     "array": ("{type: autd3, center: [0, 0, 0]}", partial(reduce, operator.add)),
     "control_points": ("{type: points, positions: [...]}", torch.cat),
 }
-_COMPLEX = ("density", "sound_speed", "impedance")  # keys of obstacles with numbers such as 1.5+0.2j, a text
+_COMPLEX = ("density", "sound_speed", "impedance", "reflection")  # keys of numbers such as 1.5+0.2j, a text
 _BUILDERS: dict[str, Builder] = {  # of sections without `type`
     "observation_plane": Plane,
     "domain": lambda lower, upper: (finite_vector("lower", lower), finite_vector("upper", upper)),
@@ -73,6 +74,8 @@ def load_scene(source: str | os.PathLike[str] | Mapping[str, Any], modules: Coll
     another. An obstacle has a `type`, or the `_target_` of a user's class, such as
     `mymodule.MyObstacle`. Its complex numbers are written as in `impedance: 1.5+0.2j`. Its section `porous`,
     `{flow_resistivity: 200e3}`, is the material that `porous` returns for the scene's frequency and medium.
+    A reflector has `point`, `normal` and `reflection`, the arguments of `Reflector`, or is `{type: panel}`,
+    the panel that the array stands in (`Reflector.behind`).
     The section `pose`, with the keys `offset` and `rotation`, or `rotation_degrees`, moves all obstacles as
     one body; see `Scene.moved`.
 
@@ -102,10 +105,12 @@ def load_scene(source: str | os.PathLike[str] | Mapping[str, Any], modules: Coll
     if isinstance(obstacles := section.get("obstacles"), list):
         places = [(f"{where}: obstacles[{index}]", entry) for index, entry in enumerate(obstacles)]
         section["obstacles"] = [_with_material(place, entry, foam) for place, entry in places]
+    reflectors = section.pop("reflectors", [])
     parts = {
         key: medium if key == "medium" else _part(f"{where}: {key}", key, value, air, folder, trusted)
         for key, value in section.items()
     }
+    parts["reflectors"] = _reflectors(f"{where}: reflectors", reflectors, parts["array"])
     scene: Scene = _build(where, parts, Scene)
     return _build(f"{where}: pose", _mapping(f"{where}: pose", pose), scene.moved) if pose else scene
 
@@ -166,17 +171,26 @@ def _part(
     return _build(where, section, builder)
 
 
+def _reflectors(where: str, value: object, array: object) -> list[Reflector]:
+    """Build the reflectors of a list of sections; a panel is that of the array."""
+    if not isinstance(value, list):
+        raise invalid(where, value, "must be a list of reflectors, such as [{type: panel}]")
+    builders = {"panel": partial(Reflector.behind, array=array), "plane": Reflector}
+    reflectors = []
+    for index, entry in enumerate(value):
+        place = f"{where}[{index}]"
+        section = _with_numbers(place, _mapping(place, entry))
+        kind = section.pop("type", "plane")
+        require_one_of(f"{place}: type", kind, builders)
+        reflectors.append(_build(place, section, builders[kind]))
+    return reflectors
+
+
 def _with_material(where: str, section: object, foam: Builder) -> object:
     """Return the section of an obstacle with numbers in place of the section `porous` and of text."""
     if not isinstance(section, dict):
         return section
-    section = dict(section)
-    for key in _COMPLEX:
-        if isinstance(text := section.get(key), str):
-            try:
-                section[key] = complex("".join(text.split()))
-            except ValueError as error:
-                raise invalid(f"{where}.{key}", text, "must be a number such as 1.5 or 1.5+0.2j") from error
+    section = _with_numbers(where, section)
     material = section.pop("porous", None)
     if material is None:
         return section
@@ -185,6 +199,18 @@ def _with_material(where: str, section: object, foam: Builder) -> object:
     if both := [key for key in computed if section.get(key) is not None]:
         raise invalid(f"{where}.{both[0]}", section[both[0]], "must be absent beside porous, which sets it")
     return section | computed
+
+
+def _with_numbers(where: str, section: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a section with complex numbers in place of their text."""
+    section = dict(section)
+    for key in _COMPLEX:
+        if isinstance(text := section.get(key), str):
+            try:
+                section[key] = complex("".join(text.split()))
+            except ValueError as error:
+                raise invalid(f"{where}.{key}", text, "must be a number such as 1.5 or 1.5+0.2j") from error
+    return section
 
 
 def _build(where: str, section: dict[str, Any], builder: Builder) -> Any:
@@ -274,6 +300,8 @@ def scene_sections(scene: Scene, name: str) -> dict[str, Any]:
         sections["observation_plane"] = {
             field.name: list(getattr(plane, field.name)) for field in fields(Plane)
         }
+    if scene.reflectors:
+        sections["reflectors"] = [_reflector(one) for one in scene.reflectors]
     return sections
 
 
@@ -290,6 +318,12 @@ def _obstacle(obstacle: Obstacle, name: str, where: str) -> dict[str, Any]:
         accepted = f"must be one of {', '.join(kind.__name__ for kind in types)} to be saved"
         raise invalid(where, type(obstacle).__name__, accepted)
     return {"type": types[type(obstacle)]} | obstacle.section(name)
+
+
+def _reflector(reflector: Reflector) -> dict[str, Any]:
+    """Return the section of a reflector, without the default."""
+    section: dict[str, Any] = {"point": list(reflector.point), "normal": list(reflector.normal)}
+    return section | ({} if reflector.reflection == 1 else {"reflection": reflector.reflection})
 
 
 def scene_lines(scene: Scene, drive: torch.Tensor, name: str, beside: bool = False) -> str:
@@ -324,12 +358,16 @@ def scene_lines(scene: Scene, drive: torch.Tensor, name: str, beside: bool = Fal
     if scene.observation_plane is not None:
         plane = "plane"
         lines.append(_call(plane, Plane, sections["observation_plane"]))
+    reflectors = [f"reflector_{number}" for number in range(len(scene.reflectors))]
+    for reflector, section in zip(reflectors, sections.get("reflectors", ()), strict=True):
+        lines.append(_call(reflector, Reflector, section))
+    planes = f", reflectors=[{', '.join(reflectors)}]" if reflectors else ""
     lines.append(_call("medium", Medium, sections["medium"]))
     lines.append(f"points = {_value(sections['control_points']['positions'], 9)}")
     domain = [sections["domain"]["lower"], sections["domain"]["upper"]]
     lines.append(
         f"scene = at.Scene(\n    array, medium, {scene.frequency!r}, points, [{', '.join(obstacles)}], "
-        f"{plane}, {domain!r}, name={scene.name!r}\n)"
+        f"{plane}, {domain!r}, name={scene.name!r}{planes}\n)"
     )
     values = {"phases": phases_of(drive).tolist()}
     amplitudes = amplitudes_of(drive).clamp(max=1.0)  # rounding may exceed 1

@@ -224,6 +224,29 @@ def test_the_frequency_of_air_is_no_part_of_a_saved_or_replaced_medium(tmp_path)
     assert dataclasses.replace(air, absorption=1.0).absorption_frequency is None
 
 
+FACTORS = st.sampled_from([1.0, -1.0, 0.3, -0.2 + 0.5j])
+
+
+@given(NORMAL, st.lists(FACTORS, min_size=1, max_size=3))
+@settings(max_examples=20, deadline=None)
+def test_reflectors_are_saved_and_written_as_python_to_the_bit(tmp_path_factory, normal, factors):
+    tilted = at.TransducerArray.grid((2, 2), 10e-3, (0.02, 0.01, -0.03), normal, radius=4e-3)
+    panel = at.Reflector.behind(tilted, factors[0])
+    middle, front = (torch.tensor(each, dtype=torch.float64) for each in (panel.point, panel.normal))
+    across = torch.linalg.svd(front[None]).Vh[1:]  # two directions at right angles in the panel
+    planes = [panel] + [
+        at.Reflector(middle - 0.05 * each, each, factor)
+        for each, factor in zip(across, factors[1:], strict=False)
+    ]
+    scene = at.Scene(tilted, at.Medium.air(20.0), 40e3, [middle + 0.06 * front], reflectors=planes)
+    path = tmp_path_factory.mktemp("reflectors") / "scene.yaml"
+    at.save_scene(path, scene)
+    require_equal(at.load_scene(path), scene)
+    made = {}
+    exec(scene_lines(scene, torch.ones(4, dtype=torch.complex128), "scene"), made)
+    require_equal(made["scene"], scene)
+
+
 SCENE = """
 frequency: 40e3
 medium: {density: 1.2, sound_speed: 343.0}

@@ -14,6 +14,7 @@ from small_scenes import CORNER
 from autdtorch.io.scene_file import load_scene
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
+from autdtorch.scene.reflectors import Reflector
 from autdtorch.scene.scene import Medium
 
 SCENES = Path(__file__).parents[2] / "configs" / "scene"
@@ -193,6 +194,21 @@ def test_control_points_of_several_groups_follow_one_another(tmp_path):
     assert points[6:, 0].tolist() == pytest.approx([90e-3] * 6)
 
 
+SIDE = {"point": [0, 0, 0], "normal": [0, 1, 0], "reflection": 0.9}
+
+
+def test_reflectors_are_planes_or_the_panel_of_the_array():
+    section = OmegaConf.to_container(OmegaConf.load(SCENES / "sphere.yaml"))
+    table = {"point": [0, 0, 0], "normal": [0, 0, 2], "reflection": " 0.5 + 0.25j"}
+    scene = load_scene(section | {"reflectors": [{"type": "panel"}, table, {"type": "plane", **SIDE}]})
+    panel, below, beside = scene.reflectors
+    assert panel == Reflector.behind(scene.array)
+    assert below == Reflector((0, 0, 0), (0, 0, 1), 0.5 + 0.25j)
+    assert beside == Reflector(**SIDE)
+    assert len(scene.images) == 8
+    assert load_scene(section | {"reflectors": None}).reflectors == ()
+
+
 def test_scenes_read_in_threads_leave_warnings_as_they_were():
     """Each section has its place in front of its warnings, which threads must not mix up."""
     box = {"type": "box", "center": [0.05, 0, 0], "size": [0.01] * 3, "rigid": True}
@@ -213,6 +229,7 @@ def test_scenes_read_in_threads_leave_warnings_as_they_were():
     assert all("obstacles[0]" in one for one in told)
 
 
+TABLE = {"point": [0, 0, 0], "normal": [1, 0, 0]}
 FLAT = {"type": "box", "center": [0, 0, 0], "size": [1, 1, 0], "rigid": True}
 
 
@@ -232,6 +249,23 @@ FLAT = {"type": "box", "center": [0, 0, 0], "size": [1, 1, 0], "rigid": True}
         ("obstacles", [FLAT], "obstacles[0]: Box.size: (1, 1, 0) m; every entry must be finite and > 0"),
         ("frequency", -1, "scene mapping: Scene.frequency: -1 Hz; must be"),
         ("domain.lower", [0, 0], "domain: lower: (0, 0); must be 3 real numbers"),
+        (
+            "reflectors",
+            {"type": "panel"},
+            "reflectors: {'type': 'panel'}; must be a list of reflectors, such as [",
+        ),
+        ("reflectors", ["panel"], "reflectors[0]: 'panel'; must be a mapping of keys to"),
+        ("reflectors", [{"type": "wall"}], "reflectors[0]: type: 'wall'; must be one of panel, plane"),
+        ("reflectors", [{"point": [0, 0, 0]}], "reflectors[0]: missing key 'normal'; allowed keys: point"),
+        ("reflectors", [TABLE | {"reflexion": 1}], "key 'reflexion' (did you mean 'reflection'?); allowed"),
+        ("reflectors", [TABLE | {"reflection": 1.5}], "reflectors[0]: Reflector.reflection: 1.5; its magn"),
+        ("reflectors", [TABLE | {"reflection": "half"}], "[0].reflection: 'half'; must be a number such as"),
+        (
+            "reflectors",
+            [{"type": "panel", "point": [0, 0, 0]}],
+            "unknown key 'point'; allowed keys: reflection",
+        ),
+        ("reflectors", [TABLE | {"point": [0.2, 0, 0]}], "behind reflector 0, must be in front of it"),
         ("frequency", "${tone}", "Interpolation key 'tone' not found"),
         ("frequency", "???", "Missing mandatory value: frequency"),
     ],

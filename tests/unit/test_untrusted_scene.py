@@ -121,6 +121,8 @@ def test_a_missing_value_is_reported_in_a_line_with_its_key(tmp_path, kind, valu
     [
         ({"array": np.zeros(3)}, "array: Value 'ndarray'"),
         ({"array": object()}, "array: Value 'object'"),
+        ({"reflectors": [np.zeros(3)]}, "reflectors[0]: Value 'ndarray'"),
+        ({"reflectors": [{"type": "panel", "point": object()}]}, "reflectors[0].point: Value 'object'"),
         ({"domain": [[0, 0, 0], np.ones(3)]}, r"domain[1]: Value 'ndarray'"),
         ({object(): 1}, "Incompatible key type 'object'"),
         ({("array",): 1}, "unhashable type"),
@@ -152,6 +154,19 @@ def test_an_interpolation_is_a_whole_key_without_resolver(tmp_path, monkeypatch,
     with pytest.raises(ValueError, match=": name: ") as caught:
         load_scene(source)
     assert "hunter2" not in one_line(caught.value)
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        "{_target_: os.system}", "{type: _target_}", "{type: panel, array: x}", "[[[]]]",
+        "{point: [.inf, 0, 0], normal: [1, 0, 0]}", "{point: 1, normal: [1, 0, 0]}",
+        "{point: [0, 0, 0], normal: [1, 0, 0], reflection: 1e999j}",
+        "{point: [0, 0, 0], normal: [1, 0, 0], reflection: __import__('os')}",
+    ],
+)  # fmt: skip
+def test_a_reflector_is_a_few_checked_numbers(tmp_path: Path, entry: str) -> None:
+    assert "reflectors" in refused(tmp_path, f"{SCENE}reflectors: [{entry}]\n")
 
 
 @pytest.mark.parametrize("tag", ["!!python/object/apply:pathlib.Path", "!!python/name:os.system", "!mine"])
