@@ -171,11 +171,11 @@ def _part(
     return _build(where, section, builder)
 
 
-def _reflectors(where: str, value: object, array: object) -> list[Reflector]:
+def _reflectors(where: str, value: object, array: Any) -> list[Reflector]:
     """Build the reflectors of a list of sections; a panel is that of the array."""
     if not isinstance(value, list):
         raise invalid(where, value, "must be a list of reflectors, such as [{type: panel}]")
-    builders = {"panel": partial(Reflector.behind, array=array), "plane": Reflector}
+    builders: dict[str, Builder] = {"panel": partial(Reflector.behind, array=array), "plane": Reflector}
     reflectors = []
     for index, entry in enumerate(value):
         place = f"{where}[{index}]"

@@ -9,6 +9,7 @@ from typing import Literal, overload
 import torch
 
 from autdtorch.analytic.green import free_space_matrix
+from autdtorch.propagators.behind import silent_behind
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene, require_in_front
 from autdtorch.utils.text import counted
@@ -59,6 +60,7 @@ class FreeSpacePropagator:
         error = math.inf if self.scene.obstacles else 0.0
         return (matrix, error) if boolean("return_error", return_error) else matrix
 
+    @silent_behind
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
         """Return the pressure of drives at points; see `SimulatedPropagator.field`."""
         drive = validate_drive(drive, len(self.scene.array)).cpu()

@@ -12,6 +12,7 @@ import torch
 
 from autdtorch.analytic.green import PAIR_BYTES, free_space_matrix
 from autdtorch.fdtd.grid_errors import errors_by_grids, grid_errors, rigid_errors, shape_errors, sizes
+from autdtorch.propagators.behind import silent_behind
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.propagators.notices import Notices, warn_of_unsettled
@@ -179,6 +180,7 @@ class SimulatedPropagator:
         shape, rigid = (float(of(matrix, free, self.plan.region)) for of in (shape_errors, rigid_errors))
         return self._error(results, points) if self._coarser else math.inf, shape, rigid
 
+    @silent_behind
     @one_library_thread()
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
         """Return the pressure of drives at points, from a simulation for each drive or the transfer matrix.
@@ -188,7 +190,8 @@ class SimulatedPropagator:
 
         Args:
             drive: (..., M) complex, |q| <= 1, on any device.
-            points: (P, 3) or a grid such as (Nu, Nv, 3) [m].
+            points: (P, 3) or a grid such as (Nu, Nv, 3) [m], which may cross obstacles and reflectors; behind
+                these it is 0.
 
         Returns:
             complex128 (..., P) or (..., Nu, Nv) [Pa], on the CPU; differentiable by the drive.

@@ -9,6 +9,7 @@ import torch
 from autdtorch.propagators.simulated import Propagator
 from autdtorch.scene.drive import validate_single_drive
 from autdtorch.scene.obstacles.base import inside_any
+from autdtorch.scene.reflectors import are_in_front
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.spatial import nearest
@@ -28,7 +29,7 @@ def volume_field(propagator: Propagator, drive: ArrayLike, spacing: float | None
 
     Returns:
         complex128 (Nx, Ny, Nz) [Pa], with Nx = Lx / spacing rounded and at least 2, likewise Ny and Nz. NaN
-        in obstacles and within half a wavelength of a transducer.
+        in obstacles, behind reflectors and within half a wavelength of a transducer.
 
     Raises:
         ValueError: `drive` or `spacing` is out of range, or there are more than 10 million cells.
@@ -51,6 +52,7 @@ def volume_field(propagator: Propagator, drive: ArrayLike, spacing: float | None
 
 
 def are_shown(scene: Scene, points: torch.Tensor) -> torch.Tensor:
-    """Return which points (N, 3) [m] are neither in obstacles nor next to transducers, bool (N,)."""
+    """Return which points (N, 3) [m] are not in obstacles, behind reflectors or next to transducers."""
     gap, _ = nearest(points, scene.array.nodes.positions.reshape(-1, 3))
-    return (gap > _CLEARANCE * scene.wavelength) & ~inside_any(points, scene.obstacles)
+    clear = (gap > _CLEARANCE * scene.wavelength) & ~inside_any(points, scene.obstacles)
+    return clear & are_in_front(scene.reflectors, points)

@@ -104,6 +104,14 @@ def require_arrangement(reflectors: Sequence[Reflector], wavelength: float) -> N
             raise invalid(f"Scene.reflectors[{second}].point", other.point, accepted, "m")
 
 
+def are_in_front(reflectors: Sequence[Reflector], points: torch.Tensor) -> torch.Tensor:
+    """Return which points (..., 3) [m] are in front of all reflectors or in them, bool (...)."""
+    front = torch.ones(points.shape[:-1], dtype=torch.bool, device=points.device)
+    for reflector in reflectors:
+        front &= reflector.mirror.height(points) >= -LENGTH_TOLERANCE
+    return front
+
+
 def _factor(value: object) -> float | complex:
     """Return a reflection factor after checking it; a real number where it is one."""
     name = "Reflector.reflection"

@@ -13,6 +13,7 @@ import torch
 
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.grid_errors import grid_errors, rigid_errors, shape_errors, sizes
+from autdtorch.propagators.behind import silent_behind
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.propagators.simulation import Run
@@ -177,6 +178,7 @@ class TMatrixPropagator:
         known = shape_errors(matrix, free, region) + rigid_errors(matrix, free, region)
         return self.tolerance + errors + known
 
+    @silent_behind
     @one_library_thread()
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
         """Return the pressure of drives at points; see `SimulatedPropagator.field`."""
