@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
+from autdtorch.fdtd.absorption import absorption
 from autdtorch.fdtd.coupling import Coupling, coupling_of
 from autdtorch.fdtd.grid import Grid, make_box
 from autdtorch.fdtd.grouping import one_box
@@ -30,8 +31,9 @@ from autdtorch.fdtd.steady_state import MOST_JUDGED, SteadyState, run_to_steady_
 from autdtorch.fdtd.stepping import Assembly, assemble_on
 from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_array, orbits_of_transducers
 from autdtorch.fdtd.turning import is_turned, turned
+from autdtorch.propagators.absorbed_power import Radiators
 from autdtorch.propagators.multiple_scattering import Observe, iterated
-from autdtorch.propagators.simulation import PressureMap, Run, Simulation, Stepped
+from autdtorch.propagators.simulation import AbsorbingCells, PressureMap, Run, Simulation, Stepped
 from autdtorch.propagators.store import BODIES, MOST_BYTES, key_of
 from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.scene.geometry import sphere_points
@@ -158,6 +160,27 @@ class BoxSimulation(Simulation):
         """The assembled grids of the boxes."""
         return [box.assembly for box in self.boxes]
 
+    @cached_property
+    def absorptions(self) -> Sequence[AbsorbingCells]:
+        """The cells of each box that absorb."""
+        region, result = self.plan.region, []
+        for box, group, near in zip(
+            self.boxes, self.plan.grouping.groups, self.plan.grouping.mirrors, strict=True
+        ):
+            bodies, mirrors = [region.bodies[index] for index in group], [region.mirrors[one] for one in near]
+            form = absorption(box.assembly, replace(region, bodies=with_images(bodies, mirrors)), box.axes)
+            result.append(AbsorbingCells.of(form, box.positions(form.cells), group, bodies, mirrors))
+        return result
+
+    def radiators(self, drive: torch.Tensor) -> list[Radiators]:
+        """Return the Huygens surfaces as monopoles, in runs of drives (R, M)."""
+        array, key = self.plan.scene.array, digest_of(self.plan.key, "drives", drive)
+        sources, strength = [apertures_of(array)] * len(drive), strengths_of(array) * drive
+        radiation = self._store.get(key, lambda: self._radiation(sources, strength))
+        simulation = self if list(radiation.boxes) == self.boxes else self._in_one_box
+        parts = zip(radiation.boxes, radiation.amplitudes, simulation.plan.grouping.mirrors, strict=True)
+        return [Radiators(box.surface[0], amplitude, near) for box, amplitude, near in parts]
+
     def near_obstacle(self, points: torch.Tensor) -> bool:
         """Return whether the interpolation kernel of any point (N, 3) has heterogeneous cells."""
         return any(box.near_obstacle(points) for box in self.boxes)
@@ -279,7 +302,7 @@ class BoxSimulation(Simulation):
     ) -> tuple[torch.Tensor, list[Run]]:
         solved, runs = self._solved(sources, strength, Judged.of(receivers), stepped)
         total = self._incident(sources, strength, receivers) + solved.pressure
-        return total.mT.masked_fill(self.silent(receivers.positions), 0), runs
+        return total.mT, runs
 
     def _solved(
         self, sources: Sequence[Apertures], strength: torch.Tensor, judged: Judged, stepped: Stepped

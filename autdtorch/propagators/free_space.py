@@ -9,9 +9,11 @@ from typing import Literal, overload
 import torch
 
 from autdtorch.analytic.green import free_space_matrix
+from autdtorch.propagators.absorbed_power import AbsorbedPower, power_into_reflectors, radiators_of_array
 from autdtorch.propagators.behind import silent_behind
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene, require_in_front
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import ArrayLike, boolean, differentiable_points, points_grid, require_kind
 
@@ -59,6 +61,14 @@ class FreeSpacePropagator:
         matrix = free_space_matrix(points, scene.array, scene.complex_wavenumber, scene.images)
         error = math.inf if self.scene.obstacles else 0.0
         return (matrix, error) if boolean("return_error", return_error) else matrix
+
+    def absorbed_power(self, drive: torch.Tensor) -> AbsorbedPower:
+        """Return the power [W] absorbed, by reflectors alone; see `SimulatedPropagator.absorbed_power`."""
+        drive = validate_drive(drive, len(self.scene.array)).cpu().detach()
+        flat = drive.reshape(-1, drive.shape[-1])
+        power = power_into_reflectors(self.scene, [radiators_of_array(self.scene, flat)], len(flat))
+        obstacles = torch.zeros((*drive.shape[:-1], len(self.scene.obstacles)), **REAL)
+        return AbsorbedPower(obstacles, power.reshape(*drive.shape[:-1], power.shape[1]))
 
     @silent_behind
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:

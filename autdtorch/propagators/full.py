@@ -9,10 +9,13 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from autdtorch.fdtd.absorption import absorption
 from autdtorch.fdtd.reflection import whole_region
 from autdtorch.fdtd.steady_state import MOST_JUDGED, run_to_steady_state
+from autdtorch.fdtd.stencil import places_of
 from autdtorch.fdtd.stepping import Assembly, assemble
-from autdtorch.propagators.simulation import Run, Simulation, Stepped
+from autdtorch.propagators.absorbed_power import Radiators
+from autdtorch.propagators.simulation import AbsorbingCells, Run, Simulation, Stepped
 from autdtorch.scene.scene import require_in_front, require_inside
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.process import cached_property, one_library_thread
@@ -28,6 +31,21 @@ class DomainSimulation(Simulation):
         plan = self.plan
         plan.require_feasible()
         return (assemble(whole_region(plan.region), plan.spacing, plan.dtype, plan.time_step),)
+
+    @cached_property
+    def absorptions(self) -> Sequence[AbsorbingCells]:
+        """The cells of the domain that absorb."""
+        (assembly,), region = self.assemblies, self.plan.region
+        form = absorption(assembly, whole_region(region))
+        places = torch.from_numpy(
+            np.array(assembly.grid.origin)
+            + assembly.grid.spacing * places_of(form.cells, assembly.grid.shape)
+        )
+        return [AbsorbingCells.of(form, places, range(len(region.bodies)), region.bodies, region.mirrors)]
+
+    def radiators(self, drive: torch.Tensor) -> list[Radiators]:
+        """Return nothing: reflectors of a domain absorb nothing."""
+        return []
 
     def near_obstacle(self, points: torch.Tensor) -> bool:
         """Return whether the interpolation kernel of any point (N, 3) has heterogeneous cells."""
@@ -62,4 +80,4 @@ class DomainSimulation(Simulation):
             )  # fmt: skip
             runs.append(Run.of(steady, time.perf_counter() - begin))
             rows.append(torch.from_numpy(reading @ steady.pressure.numpy()))
-        return torch.stack(rows).masked_fill(self.silent(receivers.positions), 0), runs
+        return torch.stack(rows), runs

@@ -12,6 +12,7 @@ import torch
 
 from autdtorch.analytic.green import PAIR_BYTES, free_space_matrix
 from autdtorch.fdtd.grid_errors import errors_by_grids, grid_errors, rigid_errors, shape_errors, sizes
+from autdtorch.propagators.absorbed_power import AbsorbedPower
 from autdtorch.propagators.behind import silent_behind
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.full import DomainSimulation
@@ -21,7 +22,7 @@ from autdtorch.propagators.simulation import PressureMap, Run, Simulation
 from autdtorch.propagators.store import Store
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.array_types import COMPLEX
+from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.process import cached_property, one_library_thread, require_memory
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import ArrayLike, boolean, points_grid
@@ -224,6 +225,31 @@ class SimulatedPropagator:
         if not is_picture:
             self._notices.of_cavities(points, result.matrix)
         return field.reshape(*drive.shape[:-1], *grid)
+
+    @one_library_thread()
+    def absorbed_power(self, drive: torch.Tensor) -> AbsorbedPower:
+        """Return the power that each obstacle and each reflector absorbs, from a simulation for each drive.
+
+        Args:
+            drive: (..., M) complex, |q| <= 1, on any device.
+
+        Returns:
+            The power [W], float64, of the obstacles (..., K) and the reflectors (..., J). That of the medium
+            around them is not counted.
+
+        Raises:
+            ValueError: a drive of another shape or out of range, or a reflector that absorbs and has a
+                complex reflection or faces another.
+        """
+        drive = validate_drive(drive, len(self.scene.array)).cpu().detach()
+        flat = drive.reshape(-1, drive.shape[-1])
+        loud = flat.any(dim=1)
+        counts = len(self.scene.obstacles), len(self.scene.reflectors)
+        power = [torch.zeros((len(flat), count), **REAL) for count in counts]
+        if loud.any():
+            for whole, part in zip(power, self.simulation.absorbed_power(flat[loud]), strict=True):
+                whole[loud] = part
+        return AbsorbedPower(*(part.reshape(*drive.shape[:-1], part.shape[1]) for part in power))
 
     def _places(self, points: ArrayLike | None) -> torch.Tensor:
         """Return points (P, 3) after checking them, by default the control points."""

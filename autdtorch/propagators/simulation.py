@@ -5,25 +5,35 @@ from __future__ import annotations
 import logging
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import NamedTuple, Self, TypeVar, cast
 
 import torch
 
+from autdtorch.fdtd.absorption import Absorption
 from autdtorch.fdtd.grouping import USUAL_PERIODS
 from autdtorch.fdtd.kernels.choice import make_kernel
+from autdtorch.fdtd.reflection import with_images
+from autdtorch.fdtd.region import Body
 from autdtorch.fdtd.steady_state import SILENCE, SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_points, orbits_of_transducers, symmetries
+from autdtorch.propagators.absorbed_power import (
+    AbsorbedPower,
+    Radiators,
+    power_into_reflectors,
+    radiators_of_array,
+)
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.store import Store
 from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.apertures import Apertures
-from autdtorch.utils.array_types import COMPLEX
+from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.digest import digest_of
+from autdtorch.utils.images import Mirror
 from autdtorch.utils.process import cached_property
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.text import counted
@@ -88,6 +98,36 @@ class PressureMap:
         return cls(matrix, residual, periods, tuple(runs), from_points)
 
 
+class AbsorbingCells(NamedTuple):
+    """The cells of a grid that absorb.
+
+    Attributes:
+        form: the power as a form of their pressure.
+        places: of these cells (k, 3) [m].
+        owners: the obstacle that each body of the grid is, or is an image of.
+        share: what falls to an obstacle, and not to its images.
+    """
+
+    form: Absorption
+    places: torch.Tensor
+    owners: Sequence[int]
+    share: float
+
+    @classmethod
+    def of(
+        cls,
+        form: Absorption,
+        places: torch.Tensor,
+        numbers: Iterable[int],
+        bodies: Sequence[Body],
+        mirrors: Sequence[Mirror],
+    ) -> Self:
+        """Return the cells of a grid of bodies, with `numbers`, and their images in mirrors."""
+        pairs = zip(numbers, bodies, strict=True)
+        owners = [number for number, body in pairs for _ in with_images([body], mirrors)]
+        return cls(form, places, owners, 0.5 ** len(mirrors))
+
+
 class Simulation(ABC):
     """A plan's grids, which are assembled at first use, and the runs on them.
 
@@ -121,11 +161,20 @@ class Simulation(ABC):
     def _check(self, points: torch.Tensor) -> None:
         """Refuse points (P, 3) whose pressure cannot be computed."""
 
+    @property
+    @abstractmethod
+    def absorptions(self) -> Sequence[AbsorbingCells]:
+        """The cells of each grid that absorb."""
+
+    @abstractmethod
+    def radiators(self, drive: torch.Tensor) -> list[Radiators]:
+        """Return what radiates instead of the obstacles, in runs of drives (R, M)."""
+
     @abstractmethod
     def _simulate(
         self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures, stepped: Stepped
     ) -> tuple[torch.Tensor, list[Run]]:
-        """Do the work of `_run`; `stepped` is called with numbers of periods."""
+        """Do the work of `_run`, also in obstacles; `stepped` is called with numbers of periods."""
 
     def checked(self, points: ArrayLike) -> torch.Tensor:
         """Return points (P, 3) after checking them; a `ValueError` names one that cannot be computed."""
@@ -142,6 +191,25 @@ class Simulation(ABC):
         """Return the pressure (P, R) of drives (R, M), none of them silent, at points (P, 3)."""
         key = digest_of(self.plan.key, points, drive)
         return self._store.get(key, lambda: self._audible_fields(drive, points))
+
+    def absorbed_power(self, drive: torch.Tensor) -> AbsorbedPower:
+        """Simulate drives (R, M), none of them silent; return the power [W] by obstacle and reflector."""
+        scene = self.plan.scene
+        obstacles = torch.zeros((len(drive), len(scene.obstacles)), **REAL)
+        places = torch.cat([each.places for each in self.absorptions])
+        if len(places):
+            sources = [apertures_of(scene.array)] * len(drive), strengths_of(scene.array) * drive
+            receivers = Apertures.of_points(places)
+            pressure, _ = self._recorded(
+                len(drive), lambda stepped: self._simulate(*sources, receivers, stepped)
+            )
+            parts = torch.split(pressure.mT, [len(each.places) for each in self.absorptions])
+            for each, part in zip(self.absorptions, parts, strict=True):
+                for owner, power in zip(each.owners, each.form.power(part), strict=True):
+                    obstacles[:, owner] += each.share * power
+        absorbing = any(abs(reflector.reflection) < 1 for reflector in scene.reflectors)
+        parts_of = [radiators_of_array(scene, drive), *self.radiators(drive)] if absorbing else []
+        return AbsorbedPower(obstacles, power_into_reflectors(scene, parts_of, len(drive)))
 
     def matrix_runs(self, points: torch.Tensor) -> int:
         """Return the number of runs that the transfer matrix of points (P, 3) takes."""
@@ -262,9 +330,10 @@ class Simulation(ABC):
 
         The strengths (R, N) [Pa m] of a run are not all zero; receivers take the mean over their nodes.
         """
-        return self._recorded(
+        pressure, runs = self._recorded(
             len(sources), lambda stepped: self._simulate(sources, strength, receivers, stepped)
         )
+        return pressure.masked_fill(self.silent(receivers.positions), 0), runs
 
     def _recorded(
         self, count: int, simulate: Callable[[Stepped], tuple[ResultT, list[Run]]]

@@ -13,6 +13,7 @@ import torch
 
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.grid_errors import grid_errors, rigid_errors, shape_errors, sizes
+from autdtorch.propagators.absorbed_power import AbsorbedPower
 from autdtorch.propagators.behind import silent_behind
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulated import SimulatedPropagator
@@ -197,6 +198,10 @@ class TMatrixPropagator:
             near = near if len(grid) == 1 else near[None]  # those of a picture may be in obstacles
             field[..., ~served] = self._box.field(drive, near).reshape(*drive.shape[:-1], -1)
         return field.reshape(*drive.shape[:-1], *grid)
+
+    def absorbed_power(self, drive: torch.Tensor) -> AbsorbedPower:
+        """Return the power [W] absorbed; see `SimulatedPropagator.absorbed_power`, which serves it."""
+        return self._box.absorbed_power(drive)
 
     @cached_property
     def _box(self) -> SimulatedPropagator:
