@@ -1,4 +1,4 @@
-"""Exact fields in front of reflecting planes: spheres, corners, waveguides, panels and impedance planes.
+"""Exact fields in front of reflecting planes: spheres, corners, waveguides and panels.
 
 Fields are those of point sources in units of `analytic.green`, e^{ikr} / (4 pi r), complex128 (P, M), with
 e^{-i w t}. A plane with a reflection factor R multiplies every wave by R when it reflects it: the field is
@@ -230,37 +230,6 @@ def waveguide(points, sources, wavenumber, height, reflection=1.0):
         shape = profile(vertical * points[:, None, 2]) * profile(vertical * sources[:, 2])
         total += (2 if n else 1) * shape * 0.25j / height * hankel1(0, along * apart)
     return torch.from_numpy(total)
-
-
-def impedance_plane(points, sources, wavenumber, plane, impedance):
-    """Return the field of monopoles in front of a locally reacting plane, an integral over complex images.
-
-    The images lie on a line from the mirror image into imaginary heights:
-
-        e^(ikR) / R - 2 k b int_0^inf e^(-k b q) e^(ik R(q)) / R(q) dq,  R(q)^2 = r^2 + (z + z' + iq)^2
-
-    with the admittance b = 1 / impedance (Thomasson 1976, J. Acoust. Soc. Am. 59, 780; Di & Gilbert 1993,
-    93, 714). `impedance` is the ratio to rho c, with a real part > 0; the reflection of `plane` is not used.
-    """
-    points, sources = np.asarray(points, float), np.asarray(sources, float)
-    vertical = plane.heights(points)[:, None] + plane.heights(sources)
-    images = plane.mirrored(sources)
-    lateral = np.linalg.norm(np.cross(points[:, None] - images, plane.axes[2]), axis=-1)
-    admittance = wavenumber / impedance
-    nodes, weights = _semi_infinite(wavenumber * (1 + (1 / complex(impedance)).real))
-    distance = np.sqrt(lateral[..., None] ** 2 + (vertical[..., None] + 1j * nodes) ** 2)
-    line = np.exp(-admittance * nodes + 1j * wavenumber * distance) / distance @ weights
-    image = monopoles(points, images, wavenumber) - 2 * admittance * line / (4 * math.pi)
-    return torch.from_numpy(monopoles(points, sources, wavenumber) + image)
-
-
-def _semi_infinite(rate):
-    """Nodes and weights over q from 0 to infinity of what decays as e^(-rate q), on panels that double."""
-    edges = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 60)]) * 60 / rate
-    edges = np.unique(np.concatenate([edges, np.linspace(0, edges[-1], 200)]))
-    nodes, weights = np.polynomial.legendre.leggauss(16)
-    half = np.diff(edges)[:, None] / 2
-    return (edges[:-1, None] + half * (1 + nodes)).ravel(), (half * weights).ravel()
 
 
 def pistons_in_panel(points, array, wavenumber, radius):

@@ -6,6 +6,7 @@ They are complex where the obstacle absorbs.
 """
 
 from autdtorch.analytic.green import green, piston_directivity, piston_field, piston_on_axis
+from autdtorch.analytic.impedance_plane import impedance_plane
 from autdtorch.analytic.planes import (
     fluid_half_space,
     fluid_slab,
@@ -21,6 +22,7 @@ __all__ = [
     "fluid_slab",
     "fluid_sphere",
     "green",
+    "impedance_plane",
     "impedance_sphere",
     "piston_directivity",
     "piston_field",

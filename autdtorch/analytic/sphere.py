@@ -20,16 +20,14 @@ import torch
 
 from autdtorch.analytic.green import green
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.fluids import fluid_ratios
+from autdtorch.utils.fluids import fluid_ratios, passive_impedance
 from autdtorch.utils.units import real_wavenumber
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
     Vector,
     boolean,
-    complex_number,
     finite_vector,
-    invalid,
     points_tensor,
     positive,
 )
@@ -43,7 +41,6 @@ _BLOCK = 256  # points summed at a time, to limit memory
 _NEGLIGIBLE = 1e-17  # fraction of the largest term at which a series ends
 _MOST_ORDERS = 2**16  # enough for a point on the surface and a source 6e-4 radii off it
 _SOFT = 1e20  # admittance of a surface without pressure
-_LEAST_IMPEDANCE = 1 / _SOFT
 _CENTER = 1e-100  # replacement for k r = 0, where the field has a limit but its factors do not
 
 
@@ -117,9 +114,7 @@ def impedance_sphere(
 
     Source: Morse & Ingard, Theoretical Acoustics (1968), section 8.2.
     """
-    ratio = complex_number("impedance", impedance)
-    if ratio.real < 0 or abs(ratio) < _LEAST_IMPEDANCE:
-        raise invalid("impedance", impedance, "must have a real part >= 0, and not be 0")
+    ratio = passive_impedance("impedance", impedance)
     setup = _setup(points, sources, wavenumber, center, radius)
     admittance = torch.tensor(1j / ratio, **COMPLEX).to(setup.points.device)
     return _field_outside(setup, lambda _: admittance, boolean("scattered", scattered))

@@ -1,4 +1,4 @@
-"""Checks of fluids, with and without absorption; the time factor is e^(-i w t)."""
+"""Checks of fluids and surfaces, with and without absorption; the time factor is e^(-i w t)."""
 
 from __future__ import annotations
 
@@ -51,3 +51,13 @@ def require_passive(density_field: str, density: complex, speed_field: str, spee
             "must give the bulk modulus, density * speed**2, a real part > 0 and an imaginary part <= 0"
         )
         raise invalid(speed_field, speed, f"{accepted}; it is {modulus:.4g}")
+
+
+def passive_impedance(name: str, value: object) -> complex:
+    """Return the impedance of a surface that adds no energy, and has a pressure."""
+    impedance = complex_number(name, value)
+    if impedance.real < 0:
+        raise invalid(name, value, "must have a real part >= 0: a negative one adds energy")
+    if impedance == 0:
+        raise invalid(name, value, "must not be 0, of a surface without pressure")
+    return impedance

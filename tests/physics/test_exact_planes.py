@@ -8,7 +8,6 @@ from exact_planes import (
     Ball,
     Plane,
     corner,
-    impedance_plane,
     monopoles,
     pistons_in_panel,
     sphere_before_plane,
@@ -93,27 +92,62 @@ def test_modes_between_two_planes_are_the_sum_of_images(reflection):
     assert apart(modes, torch.from_numpy(images)) < ROUNDING
 
 
-@pytest.mark.parametrize("impedance", [1.5 + 1j, 5 - 3j, 0.3 + 0.1j, 20 + 10j])
+IMPEDANCES = [1.5 + 1j, 5 - 3j, 0.3 + 0.1j, 0.01 - 0.01j, 0.1 + 2j, -2j, 100 + 0j]
+
+
+def before_impedance(points, impedance, sources=SOURCE, **options):
+    return analytic.impedance_plane(points, sources, K, PLANE.point, PLANE.normal, impedance, **options)
+
+
+@pytest.mark.parametrize("impedance", IMPEDANCES)
 def test_impedance_plane_meets_its_condition(impedance):
-    def field(points):
-        return impedance_plane(points, SOURCE, K, PLANE, impedance)
+    on_plane = np.array(PLANE.point) + 0.02 * PLANE.axes[:1]
+    for sources in (SOURCE, on_plane):
+        for place in (0.01, -0.3):  # near, and far along the plane
+            start = np.array(PLANE.point) + place * PLANE.axes[1]
+            here = slope(lambda at: before_impedance(at, impedance, sources), start, PLANE.axes[2])  # noqa: B023
+            steepest = max(1, 1 / abs(impedance)) ** 3
+            assert abs(here + 1j / impedance) < SLOPE_TOLERANCE * steepest
 
-    start = np.array(PLANE.point) + 0.01 * PLANE.axes[0]
-    expected = -1j / impedance  # b times as steep
-    assert abs(slope(field, start, PLANE.axes[2]) - expected) < SLOPE_TOLERANCE * max(1, abs(expected)) ** 3
 
-
-def test_impedance_plane_between_rigid_and_matched():
-    points = np.array(PLANE.point) + np.array([[0.05, 0.0, 0.02]]) @ PLANE.axes
-    rigid = analytic.rigid_plane(points, SOURCE, K, PLANE.point, PLANE.normal)
-    assert apart(impedance_plane(points, SOURCE, K, PLANE, 1e9), rigid) < 1e-7  # k r / impedance
+def test_impedance_plane_between_rigid_and_soft():
+    points = np.array(PLANE.point) + np.array([[0.05, 0.0, 0.02], [0.0, 0.3, 0.0]]) @ PLANE.axes
+    plane = SOURCE, K, PLANE.point, PLANE.normal
+    assert (
+        apart(before_impedance(points, 1e9), analytic.rigid_plane(points, *plane)) < 1e-6
+    )  # k r / impedance
+    soft = analytic.soft_plane(points[:1], *plane)
+    assert apart(before_impedance(points[:1], 1e-9), soft) < 1e-7
     # Far away a plane wave at the angle of incidence is reflected by (cos - b) / (cos + b).
     above = np.array(PLANE.point) + np.array([[3.0, 0.0, 4.0]]) @ PLANE.axes
     high = np.array(PLANE.point) + np.array([[-3.0, 0.0, 4.0]]) @ PLANE.axes
-    reflected = impedance_plane(above, high, K, PLANE, 2 + 1j) - torch.from_numpy(monopoles(above, high, K))
-    image = torch.from_numpy(monopoles(above, PLANE.mirrored(high), K))
-    expected = (0.8 - 1 / (2 + 1j)) / (0.8 + 1 / (2 + 1j))
-    assert abs(complex(reflected / image) - expected) < 1 / (K * 10)  # next order in 1 / (k R)
+    for impedance in IMPEDANCES:
+        reflected = before_impedance(above, impedance, high, scattered=True)
+        image = torch.from_numpy(monopoles(above, PLANE.mirrored(high), K))
+        expected = (0.8 * impedance - 1) / (0.8 * impedance + 1)
+        assert abs(complex(reflected / image) - expected) < 10 / (K * 10)  # next order in 1 / (k R)
+
+
+def test_impedance_plane_is_a_half_space_of_a_very_slow_fluid():
+    points = np.array(PLANE.point) + np.array([[0.05, 0.0, 0.02], [0.02, 0.01, 0.005]]) @ PLANE.axes
+    speed = 1e-3 - 0.4e-3j
+    slow = analytic.fluid_half_space(points, SOURCE, K, PLANE.point, PLANE.normal, 2000.0, speed)
+    assert apart(before_impedance(points, 2000.0 * speed), slow) < 1e-5  # (c_1 / c)^2
+
+
+def test_a_constant_reflection_factor_is_an_approximation():
+    """That of the normal serves walls that the sound meets head on, and not those that it passes along.
+
+    `python scripts/benchmark.py reflection` has a table.
+    """
+    points = np.array([[0.0, 0.0, 0.12], [0.02, -0.01, 0.16]])
+    sources = np.array([[x, y, 0.0] for x in (-0.07, 0.0, 0.07) for y in (-0.05, 0.05)])
+    factor = (5 - 1) / (5 + 1)
+    errors = []
+    for plane in (Plane((0, 0, 0.3), (0, 0, -1), factor), Plane((-0.095, 0, 0), (1, 0, 0), factor)):
+        exact = analytic.impedance_plane(points, sources, K, plane.point, plane.normal, 5.0)
+        errors.append(float((corner(points, sources, K, [plane]) - exact).norm() / exact.norm()))
+    assert errors[0] < 0.01 < 0.03 < errors[1] < 0.2
 
 
 def test_pistons_in_a_panel_are_twice_the_discs():

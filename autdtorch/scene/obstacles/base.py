@@ -13,14 +13,13 @@ from typing import Any, ClassVar, Self
 import torch
 
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.fluids import equivalent_fluid
+from autdtorch.utils.fluids import equivalent_fluid, passive_impedance
 from autdtorch.utils.units import DECIBELS
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
     Vector,
     boolean,
-    complex_number,
     invalid,
     not_negative,
     positive,
@@ -251,10 +250,8 @@ def shared_box(
 
 
 def _impedance(name: str, value: object) -> complex:
-    """Return the impedance of a passive surface, a ratio to that of the medium."""
-    impedance = complex_number(name, value)
-    if impedance.real < 0:
-        raise invalid(name, value, "must have a real part >= 0: a negative one adds energy")
+    """Return the impedance of a surface, a ratio to that of the medium."""
+    impedance = passive_impedance(name, value)
     least, most = _IMPEDANCES
     if not least <= abs(impedance) <= most:
         ratio = "density times sound speed of the medium, some 413 Pa s/m in air"

@@ -1,0 +1,63 @@
+"""A constant reflection factor against the exact field before a plane with an impedance.
+
+A plane of impedance Z, as a ratio to that of air, reflects a plane wave at the angle t from its normal by
+(Z cos t - 1) / (Z cos t + 1). `at.Reflector` has one factor for all angles. Prints the rms error of a
+transfer matrix for the factor of the normal, for the best constant, and for the factor at the angle of each
+mirror image.
+"""
+
+from collections.abc import Iterator
+
+import torch
+from shared.document import percent, printed, table
+
+import autdtorch as at
+
+AIR, FREQUENCY = at.Medium(1.2, 343.0), 40e3
+PLANES = {  # a point and the normal of each, about an array of 160 mm in z = 0 that faces z
+    "wall opposite, 300 mm away": ((0.0, 0.0, 0.3), (0.0, 0.0, -1.0)),
+    "wall at 45 degrees": ((-0.2, 0.0, 0.2), (1.0, 0.0, -1.0)),
+    "panel, 5 mm behind": ((0.0, 0.0, -5e-3), (0.0, 0.0, 1.0)),
+    "table beside, 20 mm away": ((-0.095, 0.0, 0.0), (1.0, 0.0, 0.0)),
+}
+IMPEDANCES = (1000.0, 100.0, 20.0, 5.0, 2.0, 1.5 + 1j)
+
+
+def main() -> None:
+    """Print the table."""
+    header = ["plane", "Z", "factor of the normal", "its error", "best constant", "factor by angle"]
+    print("", table(header, printed(rows())), sep="\n")
+
+
+def rows() -> Iterator[list[str]]:
+    """Compare the factors for every plane and impedance."""
+    array = at.TransducerArray.grid((16, 16), 10e-3, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    sources = array.positions[::5]
+    points = at.Plane((0.0, 0.0, 0.15), (0.0, 1.0, 0.0), (0.08, 0.08)).points(0.02).flatten(0, 1)
+    wavenumber = at.Scene(array, AIR, FREQUENCY, points).wavenumber
+    direct = at.green(points, sources, wavenumber)
+    for name, (origin, normal) in PLANES.items():
+        where = points, sources, wavenumber, origin, normal
+        image = at.analytic.rigid_plane(*where, scattered=True)
+        cosine = angle_cosines(points, sources, origin, normal)
+        for impedance in IMPEDANCES:
+            reflected = at.analytic.impedance_plane(*where, impedance, scattered=True)
+            size = (direct + reflected).norm()
+            best = (image.conj() * reflected).sum() / image.norm() ** 2
+            factor = (impedance - 1) / (impedance + 1)
+            by_angle = (impedance * cosine - 1) / (impedance * cosine + 1)
+            errors = [(each * image - reflected).norm() / size for each in (factor, best, by_angle)]
+            yield [name, f"{impedance:g}", f"{factor:.3f}", *(percent(float(error)) for error in errors)]
+
+
+def angle_cosines(
+    points: torch.Tensor,
+    sources: torch.Tensor,
+    origin: tuple[float, float, float],
+    normal: tuple[float, float, float],
+) -> torch.Tensor:
+    """Return the cosines (P, M) of the angles from the normal at which rays are reflected."""
+    axis = torch.nn.functional.normalize(points.new_tensor(normal), dim=0)
+    heights = [(places - points.new_tensor(origin)) @ axis for places in (points, sources)]
+    images = sources - 2 * heights[1][:, None] * axis
+    return (heights[0][:, None] + heights[1]) / (points[:, None] - images).norm(dim=-1)
