@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 
 from autdtorch.propagators.free_space import FreeSpacePropagator
-from autdtorch.propagators.notices import warn_of_scene
+from autdtorch.propagators.notices import warn_of_resonant_planes, warn_of_scene
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.refinement import Budget, refined
 from autdtorch.propagators.simulated import SimulatedPropagator
@@ -86,6 +86,7 @@ def make_propagator(
     if spacing is not None and (seconds, memory) != (None, None):
         raise invalid("spacing", spacing, "must be None where seconds or memory limit its choice", "m")
     store = store_in(cache)
+    warn_of_resonant_planes(scene)
     if planned.method == "free_space":
         return FreeSpacePropagator(scene)
 

@@ -108,6 +108,12 @@ def images_of(mirrors: Sequence[Mirror], wavenumber: complex, size: float) -> tu
     return tuple(images)
 
 
+def resonates(first: Mirror, second: Mirror, wavenumber: complex) -> bool:
+    """Return whether the series of images in two facing planes ends before it has converged to 1e-4."""
+    fading = _decay(first, second, wavenumber) ** _MOST > _NEGLIGIBLE
+    return fading and _MOST * series_phase(first, second, wavenumber) < _CYCLES
+
+
 def series_phase(first: Mirror, second: Mirror, wavenumber: complex) -> float:
     """Return the phase [turns, 0 to 0.5] by which a round trip between two facing planes misses a resonance.
 
@@ -122,10 +128,15 @@ def _gap(first: Mirror, second: Mirror) -> float:
     return abs(float(first.height(torch.tensor(second.point, **REAL))))
 
 
+def _decay(first: Mirror, second: Mirror, wavenumber: complex) -> float:
+    """Return the ratio of pressures before and after a round trip between two facing planes."""
+    return abs(first.reflection * second.reflection) * math.exp(-2 * wavenumber.imag * _gap(first, second))
+
+
 def _between(first: Mirror, second: Mirror, wavenumber: complex, size: float) -> list[Image]:
     """Return the images of the space between two parallel planes, whose weights fade out."""
     gap = _gap(first, second)
-    decay = abs(first.reflection * second.reflection) * math.exp(-2 * wavenumber.imag * gap)
+    decay = _decay(first, second, wavenumber)
     trips = _CYCLES / max(series_phase(first, second, wavenumber), _CYCLES / _MOST)
     trips = max(trips, _REACH * size / gap)
     if decay < 1:
@@ -162,13 +173,11 @@ def distinct(images: Sequence[Image], places: torch.Tensor) -> tuple[Image, ...]
     _, sizes, directions = torch.linalg.svd(flat - middle, full_matrices=False)
     spanned = directions[sizes > LENGTH_TOLERANCE * math.sqrt(len(flat))] * flat.sub(middle).norm(dim=1).max()
     frame = torch.cat([middle[None], middle + spanned])
-    merged: list[tuple[Image, torch.Tensor]] = []
-    for image in images:
-        moved = image.of(frame)
-        for number, (other, there) in enumerate(merged):
-            if (moved - there).abs().max() < LENGTH_TOLERANCE:
-                merged[number] = other._replace(weight=other.weight + image.weight), there
-                break
-        else:
-            merged.append((image, moved))
-    return tuple(image for image, _ in merged)
+    moved = torch.stack([image.of(frame) for image in images]).reshape(len(images), -1)
+    rounded = (moved.numpy() / (2 * LENGTH_TOLERANCE)).round()
+    _, first, kind = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+    weights = np.array([image.weight for image in images])
+    return tuple(
+        images[index]._replace(weight=weights[kind.reshape(-1) == kind.reshape(-1)[index]].sum().item())
+        for index in np.sort(first).tolist()
+    )
