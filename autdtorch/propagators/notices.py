@@ -102,7 +102,7 @@ def warn_of_resonant_planes(scene: Scene) -> None:
         mirrors = one.mirror, other.mirror
         if mirrors[0].is_parallel(mirrors[1]) and resonates(*mirrors, scene.complex_wavenumber):
             logger.warning(
-                "reflectors %d and %d are next to a resonance of the air between them: their images are summed"
+                "reflectors %d and %d are next to a resonance of the air between them: images are summed"
                 " with an error above 1e-4, and a small shift of either changes the field", first, second,
             )  # fmt: skip
 
