@@ -29,6 +29,7 @@ from autdtorch.utils.validation import (
 )
 
 PAIR_BYTES = 80.0  # Memory for each entry of a transfer matrix while it is computed [bytes]
+_SMALL = 1e-8  # Argument up to which 2 J_1(v) / v is 1; J_1 of the least numbers is 0
 _HALVINGS = 30  # Halvings of the angle along the rim of a piston towards the point nearest to the receiver
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _PANEL_PHASE = 6.0  # Phase of a panel that 16 Gauss nodes integrate with errors below 1e-13 [rad]
@@ -157,8 +158,9 @@ def piston_directivity(angle: ArrayLike, wavenumber: float, radius: float) -> to
     angles = real_tensor("angle", angle, "rad").detach()
     reach = real_wavenumber(wavenumber) * positive("radius", radius, "m")
     argument = reach * np.sin(angles.cpu().numpy())
-    safe = np.where(argument == 0, 1, argument)
-    ratio = np.where(argument == 0, 1, 2 * j1(safe) / safe)
+    small = np.abs(argument) < _SMALL
+    safe = np.where(small, 1, argument)
+    ratio = np.where(small, 1, 2 * j1(safe) / safe)
     return torch.as_tensor(ratio, **COMPLEX).to(angles.device)
 
 
