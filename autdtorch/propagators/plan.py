@@ -79,6 +79,12 @@ class Plan:
         return plan.at(self.spacing, self.tolerance, self.time_step)
 
     @property
+    def hides_losses(self) -> bool:
+        """Whether bodies that absorb are taken as rigid."""
+        bodies = zip(self.region.bodies, self.scene.obstacles, strict=True)
+        return any(body.rigid_error and obstacle.is_lossy for body, obstacle in bodies)
+
+    @property
     def second(self) -> Self:
         """The plan on a second grid, for an estimate of the grid's error."""
         return self.at(second_spacing(self.region, self.spacing), self.tolerance)

@@ -247,7 +247,10 @@ class SimulatedPropagator:
         counts = len(self.scene.obstacles), len(self.scene.reflectors)
         power = [torch.zeros((len(flat), count), **REAL) for count in counts]
         if loud.any():
-            for whole, part in zip(power, self.simulation.absorbed_power(flat[loud]), strict=True):
+            simulation = self.simulation
+            if self.plan.hides_losses:
+                simulation = simulation_of(self.plan.with_materials, self._store)
+            for whole, part in zip(power, simulation.absorbed_power(flat[loud]), strict=True):
                 whole[loud] = part
         return AbsorbedPower(*(part.reshape(*drive.shape[:-1], part.shape[1]) for part in power))
 
