@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.special import spherical_jn, spherical_yn
+from scipy.special import jve, spherical_jn, spherical_yn
 
 from autdtorch.utils.array_types import COMPLEX, REAL, AnyArray, ComplexArray
 
@@ -172,7 +172,13 @@ def sphere_coefficients(
         inner_slope = np.full(degree + 1, -1j / impedance)
     elif not cmath.isinf(density_ratio):
         inside = size / speed_ratio
-        inner, slope_inside = spherical_jn(order, inside), spherical_jn(order, inside, derivative=True)
+        if isinstance(
+            inside, complex
+        ):  # the ratio of Bessel functions that are scaled, so as not to overflow
+            scaled = jve(np.arange(-1, degree + 1) + 0.5, inside)
+            inner, slope_inside = scaled[1:], scaled[:-1] - (order + 1) / inside * scaled[1:]
+        else:
+            inner, slope_inside = spherical_jn(order, inside), spherical_jn(order, inside, derivative=True)
         lost = np.abs(inner) < _LOST  # j_l is proportional to x^l there
         inner, slope_inside = np.where(lost, 1.0, inner), np.where(lost, order / inside, slope_inside)
         inner_slope = slope_inside / (density_ratio * speed_ratio)

@@ -1,11 +1,14 @@
 """The scattering operator: against exact series of spheres, the box solver, and finite differences."""
 
+import cmath
 import math
 
 import numpy as np
 import pytest
 import torch
 from exact_planes import Ball, Plane, sphere_before_plane
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.special import sph_harm_y
 from small_scenes import assert_slopes, relative_error
 
@@ -197,6 +200,24 @@ def test_coefficients_conserve_energy_and_degrees_suffice():
     for size in (1.0, 6.0, 15.0):
         enough = enough_degrees(size, 1e-3)
         assert abs(sphere_coefficients(enough + 1, size)[-1]) < 1e-3
+
+
+@given(
+    st.floats(0.3, 20),
+    st.floats(1e-3, 1e4),
+    st.floats(0, 0.999),
+    st.floats(1e-3, 1e3),
+    st.floats(0, 0.999),
+    st.floats(0.5, 90),
+)
+def test_coefficients_of_spheres_that_absorb_are_passive(size, density, dense, stiffness, stiff, angle):
+    """Density in the first quadrant, bulk modulus in the fourth; and impedances in the right half-plane."""
+    density = cmath.rect(density, dense * math.pi / 2)
+    modulus = cmath.rect(stiffness, -stiff * math.pi / 2)
+    fluid = sphere_coefficients(30, size, density, complex(cmath.sqrt(modulus / density)))
+    surface = sphere_coefficients(30, size, impedance=cmath.rect(stiffness, math.radians(2 * angle - 90)))
+    for coefficients in (fluid, surface):
+        assert (np.abs(1 + 2 * coefficients) < 1 + 1e-9).all()  # rounding at resonances
 
 
 SPHERES = (
