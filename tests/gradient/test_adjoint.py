@@ -29,6 +29,12 @@ WALL = Box((4e-3, 4e-3, 7.4e-3), (40e-3, 40e-3, 1e-3), density=5.0, sound_speed=
 STEPS = 24
 
 
+LOSSY = (
+    Sphere((4.7e-3, 4.2e-3, 4.6e-3), 1.7e-3, density=20 + 1j, sound_speed=300 - 20j),
+    Sphere((3.2e-3, 7e-3, 7e-3), 1.2e-3, impedance=2 - 1j),
+)
+
+
 def parts(dtype, *obstacles):
     """Return a 2 x 2 array in absorbing air, three receivers, and a random signal."""
     signal = torch.randn((STEPS, 2), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -37,8 +43,9 @@ def parts(dtype, *obstacles):
 
 
 def differentiable(assembly, sources):
-    weight = assembly.coefficients.heterogeneous_weight.clone().requires_grad_()
-    coefficients = replace(assembly.coefficients, heterogeneous_weight=weight)
+    names = "heterogeneous_weight", "loss_weight", "loss_ground"
+    rows = {name: getattr(assembly.coefficients, name).clone().requires_grad_() for name in names}
+    coefficients = replace(assembly.coefficients, **rows)
     force = sources.force.clone().requires_grad_()
     return replace(assembly, coefficients=coefficients), replace(sources, force=force)
 
@@ -54,13 +61,16 @@ def gradients(case, kernel):
         record = recorded(kernel, assembly, sources, receivers, signal)
     slope = torch.randn(record.shape, generator=torch.Generator().manual_seed(0), dtype=record.dtype)
     (slope * record).sum().backward()
-    return record.detach(), sources.force.grad, assembly.coefficients.heterogeneous_weight.grad
+    c = assembly.coefficients
+    rows = [c.heterogeneous_weight, *([c.loss_weight, c.loss_ground] if len(c.loss_index) else [])]
+    return record.detach(), sources.force.grad, *(row.grad for row in rows)
 
 
 # float64: rounding over the steps; float32: the design's parity figure, of which rounding takes a tenth
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
-def test_gradients_are_those_of_the_reference_kernel(dtype, tolerance):
-    case = parts(dtype, HEAVY, RIGID)
+@pytest.mark.parametrize("obstacles", [(HEAVY, RIGID), LOSSY], ids=["loss-free", "lossy"])
+def test_gradients_are_those_of_the_reference_kernel(dtype, tolerance, obstacles):
+    case = parts(dtype, *obstacles)
     for value, oracle in zip(gradients(case, CpuKernel()), gradients(case, None), strict=True):
         assert (value - oracle).abs().max() <= tolerance * oracle.abs().max()
 
@@ -100,9 +110,10 @@ def test_cuts_bound_the_memory():
 
 
 @pytest.mark.parametrize("kernel", [CpuKernel(), ReferenceKernel()], ids=["cpu", "reference"])
-def test_adjoint_dot_product(kernel):
+@pytest.mark.parametrize("obstacles", [(HEAVY, RIGID), LOSSY], ids=["loss-free", "lossy"])
+def test_adjoint_dot_product(kernel, obstacles):
     """<c, J f> = <J^T c, f> for forces f and weights c of the record."""
-    assembly, sources, receivers, signal = parts(torch.float64, HEAVY, RIGID)
+    assembly, sources, receivers, signal = parts(torch.float64, *obstacles)
     generator = torch.Generator().manual_seed(3)
     force = torch.randn(sources.force.shape, generator=generator, dtype=torch.float64).requires_grad_()
     record = recorded(kernel, assembly, Sources(sources.index, force), receivers, signal)

@@ -65,17 +65,32 @@ def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
     whole = np.where(cut, -1, material)
     index = np.flatnonzero(cut & ~beside), np.flatnonzero(cut & beside)
     parts = (
-        with_losses(
-            lambda kinds: aligned_elements(places_of(index[0], cut.shape), blocks, kinds, stencil),
-            materials,
-            stencil,
-        ),
+        _aligned(bodies, places_of(index[0], cut.shape), blocks, grid, materials, stencil),
         _interface(bodies, index[1], whole, grid, materials, stencil),
     )
     order = np.argsort(np.concatenate(index))
     return Elements(
         materials, material, np.concatenate(index)[order], InterfaceElements.joined(parts).chosen(order)
     )
+
+
+def _aligned(
+    bodies: list[Union], first: Index, blocks: Blocks, grid: Grid, materials: Materials, stencil: Stencil
+) -> InterfaceElements:
+    """Return the elements, by their first cells (n, 3), that vary among blocks."""
+    elements = with_losses(lambda kinds: aligned_elements(first, blocks, kinds, stencil), materials, stencil)
+    if not materials.reacting.any():
+        return elements
+    numbers = np.array([body.material for body in bodies], np.int64)
+    parts = [slice(begin, begin + _CHUNK) for begin in range(0, len(first), _CHUNK)]
+    reacting = [
+        with_impedance(
+            elements.chosen(np.arange(len(first))[part]), _distances(bodies, first[part], grid), numbers,
+            materials, stencil,
+        )
+        for part in parts
+    ]  # fmt: skip
+    return InterfaceElements.joined([elements.chosen(np.arange(0)), *reacting])
 
 
 def _blocks(bodies: Sequence[Union], grid: Grid) -> Blocks:

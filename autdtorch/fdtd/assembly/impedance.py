@@ -30,10 +30,11 @@ from autdtorch.fdtd.assembly.element import (
     volume_coverage,
 )
 from autdtorch.fdtd.stencil import Stencil
-from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.array_types import Array, ComplexArray, Index
 
 _GROWTH = 1e-3  # Distance [cells] by which a body grows and shrinks for the area of its surface
 _CENTERS = (np.array(list(np.ndindex((SUBCELLS,) * 3))) + 0.5) / SUBCELLS  # of the sub-cells (64, 3)
+_LARGEST_PHASE = 1.2  # Largest phase between a vertex and a surface [rad]
 _LEAST_GRADIENT = 0.3  # Least gradient of a signed distance with which a place is moved to the surface
 
 
@@ -42,6 +43,11 @@ class Facets(NamedTuple):
 
     area: Array  # (n, 64) [cells^2]
     place: Array  # from the first vertex (n, 64, 3) [cells]
+    normal: Array  # outwards (n, 64, 3)
+
+    def chosen(self, some: NDArray[np.bool_]) -> Facets:
+        """Return the surface in some of the elements."""
+        return Facets(*(part[some] for part in self))
 
 
 def facets(distance: Array, material: Index, number: int, materials: Materials) -> Facets:
@@ -54,10 +60,10 @@ def facets(distance: Array, material: Index, number: int, materials: Materials) 
 
     area = (fluid(-_GROWTH) - fluid(_GROWTH)) / (2 * _GROWTH) / SUBCELLS**3
     level = np.where(same, distance, FAR).min(axis=0)
-    normal = subcell_gradients(level)
-    steep = np.linalg.norm(normal, axis=2, keepdims=True)
-    depth = subcell_means(level)[..., None] / np.maximum(steep, _LEAST_GRADIENT) ** 2
-    return Facets(np.maximum(area, 0), np.clip(_CENTERS - depth * normal, 0, 1))
+    gradient = subcell_gradients(level)
+    steep = np.maximum(np.linalg.norm(gradient, axis=2, keepdims=True), _LEAST_GRADIENT)
+    place = _CENTERS - subcell_means(level)[..., None] * gradient / steep**2
+    return Facets(np.maximum(area, 0), np.clip(place, 0, 1), gradient / steep)
 
 
 def with_impedance(
@@ -76,10 +82,12 @@ def with_impedance(
     for number in np.flatnonzero(admittance).tolist():
         some = np.flatnonzero(near[material == number].any(axis=0))
         surface = facets(distance[:, some], material, number, materials)
-        open_vertices = ~materials.rigid[elements.material[some]] | elements.finite[some, None]
-        added = _added(surface, open_vertices, elements.finite[some])
-        for total, part in zip((coupling, mass), added, strict=True):
-            total[some] += admittance[number] * part
+        finite = elements.finite[some]
+        for make, part in ((_consistent, finite), (_lumped, ~finite)):
+            chosen, solid = some[part], materials.rigid[elements.material[some[part]]]
+            added = make(surface.chosen(part), solid, admittance[number], stencil.kappa)
+            for total, each in zip((coupling, mass), added, strict=True):
+                total[chosen] += each
     factor = 0.5j * stencil.slope.real
     coupling, mass = factor * coupling, factor * mass
     loss = -coupling.imag, mass.imag, np.maximum(-mass.real, 0)
@@ -90,18 +98,39 @@ def with_impedance(
     )
 
 
-def _added(
-    surface: Facets, open_vertices: NDArray[np.bool_], finite: NDArray[np.bool_]
-) -> tuple[Array, Array]:
-    """Return T of a unit admittance: off its diagonal (n, 28), and sums of its rows (n, 8).
+def _consistent(
+    surface: Facets, solid: NDArray[np.bool_], admittance: complex, kappa: float
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return T of finite elements: off its diagonal (n, 28), and sums of its rows (n, 8).
 
-    Only finite elements have pressures on both sides of the surface. Others share it among their open
-    vertices.
+    Linear interpolation underestimates the pressure of a wave between the vertices, along the normal by half
+    the square of its phase times x (1 - x).
     """
-    place = surface.place[:, :, None]
-    hats = np.where(VERTICES == 1, place, 1 - place).prod(axis=3) * open_vertices[:, None]
+    hats = _hats(surface.place)
+    bulge = kappa**2 * (surface.normal**2 * surface.place * (1 - surface.place)).sum(axis=2)
+    weighted = (surface.area * (1 + bulge))[:, :, None] * hats
+    both = admittance * weighted.transpose(0, 2, 1) @ hats
+    return both[:, PAIRS[:, 0], PAIRS[:, 1]], admittance * weighted.sum(axis=1)
+
+
+def _lumped(
+    surface: Facets, solid: NDArray[np.bool_], admittance: complex, kappa: float
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return T of other elements, at the vertices in fluids on the surface's outer side; see `_consistent`.
+
+    The air between a vertex and the surface, a distance d away, is in the element's mass. With t = tan(k d),
+    the admittance Y behind it acts as Y (1 + t^2) / (1 - i Y t).
+    """
+    depth = ((VERTICES - surface.place[:, :, None]) * surface.normal[:, :, None]).sum(axis=3)
+    hats = _hats(surface.place) * (~solid[:, None] & (depth > 0))
     whole = hats.sum(axis=2, keepdims=True)
     hats = np.divide(hats, whole, out=np.zeros_like(hats), where=whole > 0)
-    weighted = surface.area[:, :, None] * hats
-    both = np.where(finite[:, None, None], weighted.transpose(0, 2, 1) @ hats, 0)
-    return both[:, PAIRS[:, 0], PAIRS[:, 1]], weighted.sum(axis=1)
+    slope = np.tan(np.minimum(kappa * depth, _LARGEST_PHASE))
+    behind = admittance * (1 + slope**2) / (1 - 1j * admittance * slope)
+    return np.zeros((len(hats), 28), complex), (surface.area[:, :, None] * hats * behind).sum(axis=1)
+
+
+def _hats(place: Array) -> Array:
+    """Return the trilinear functions (n, q, 8) of the vertices at places (n, q, 3)."""
+    place = place[:, :, None]
+    return np.asarray(np.where(VERTICES == 1, place, 1 - place).prod(axis=3))

@@ -97,7 +97,7 @@ def unions_of(region: Region, grid: Grid, stencil: Stencil) -> tuple[list[Union]
         kind = Kind(body.fluid, body.impedance)
         if kind not in kinds:
             kinds.append(kind)
-        aligned = body.impedance is None and is_along(body.shape, np.eye(3), grid.spacing)
+        aligned = is_along(body.shape, np.eye(3), grid.spacing)
         union = Union(
             (body.shape,),
             kinds.index(kind),
