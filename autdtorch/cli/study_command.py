@@ -186,7 +186,8 @@ def _draw_plane(results: StudyResult, scenes: Mapping[str, Scene], folder: Path)
     (method,) = result.methods.values()
     if method.plane_pressure is not None and scene.observation_plane is not None:
         seen = scene.observation_plane, scene.control_points, scene.obstacles
-        plot_plane(method.plane_pressure, *seen).savefig(folder / "plane.png")
+        figure = plot_plane(method.plane_pressure, *seen, reflectors=scene.reflectors)
+        figure.savefig(folder / "plane.png")
 
 
 def _draw_poses(results: StudyResult, poses: Poses, folder: Path) -> None:

@@ -7,9 +7,11 @@ TRANSDUCER_COLOUR = "#0072B2"
 FOCUS_COLOUR = "#D55E00"
 PLANE_COLOUR = "#56B4E9"
 OBSTACLE_COLOUR = "#B0B0B0"
+REFLECTOR_COLOUR = "#8A6D3B"
 EDGE_COLOUR = "#222222"
 
 SHARP_ANGLE = np.radians(30)  # between two faces; sharper edges of obstacles are drawn
+REFLECTOR_OPACITY = 0.3
 MOST_EDGES = 500  # of one obstacle; more, as those of voxels, would blacken it and are not drawn
 
 PHASE_MAP = "twilight"  # cyclic: 0 and 2 pi have one colour

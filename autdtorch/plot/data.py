@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -11,6 +11,7 @@ from autdtorch.scene.drive import phases_of, validate_single_drive
 from autdtorch.scene.geometry import Plane, cell_centers_of
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.base import inside_any
+from autdtorch.scene.reflectors import Reflector, are_in_front
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import (
     ArrayLike,
@@ -96,13 +97,16 @@ def plane_magnitude(name: str, pressure: ArrayLike) -> Array:
     return magnitude
 
 
-def outside_on_plane(magnitude: Array, plane: Plane, obstacles: Iterable[Obstacle]) -> Array:
-    """Return |p| (Nu, Nv) on a plane, NaN in cells with centres inside obstacles.
+def outside_on_plane(
+    magnitude: Array, plane: Plane, obstacles: Iterable[Obstacle], reflectors: Sequence[Reflector] = ()
+) -> Array:
+    """Return |p| (Nu, Nv) on a plane, NaN in cells with centres inside obstacles or behind reflectors.
 
     The field in a body may be many times stronger than in air, and would determine the colour scale.
     """
     points = cell_centers_of(plane, (magnitude.shape[0], magnitude.shape[1]))
-    return np.where(inside_any(points, obstacles).numpy(), np.nan, magnitude)
+    hidden = inside_any(points, obstacles) | ~are_in_front(reflectors, points)
+    return np.where(hidden.numpy(), np.nan, magnitude)
 
 
 def largest(magnitude: Array) -> float:

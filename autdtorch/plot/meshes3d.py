@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,11 +14,13 @@ from PIL import ImageFont
 
 from autdtorch.plot import colours
 from autdtorch.plot.data import MM, outside_on_plane, plane_magnitude, single_drive_phases
+from autdtorch.plot.polygons import parts_of_reflectors
 from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.drive import amplitudes_of
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.base import inside_any
+from autdtorch.scene.reflectors import Reflector, are_in_front
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.spatial import closest_pair, distances
@@ -136,7 +139,8 @@ def new_plotter(scene: Scene, off_screen: bool, bars: tuple[bool, bool]) -> pyvi
         left, right = (margin * bar for margin, bar in zip(_MARGINS, bars, strict=True))
         add_still_axes(plotter, scene.domain, _CAMERA, (left, right))
     for obstacle in scene.obstacles:
-        add_obstacle(plotter, obstacle, scene.domain)
+        add_obstacle(plotter, obstacle, scene.domain, scene.reflectors)
+    add_reflectors(plotter, scene)
     points = pyvista.PolyData(MM * scene.control_points.numpy())
     sphere = pyvista.Sphere(radius=MM * scene.wavelength / 5)
     spheres = points.glyph(orient=False, scale=False, geom=sphere)
@@ -265,17 +269,28 @@ def add_caption(plotter: pyvista.Plotter, *lines: str) -> None:
 
 
 def add_obstacle(
-    plotter: pyvista.Plotter, obstacle: Obstacle, domain: tuple[Vector, Vector] | None = None
+    plotter: pyvista.Plotter,
+    obstacle: Obstacle,
+    domain: tuple[Vector, Vector] | None = None,
+    reflectors: Iterable[Reflector] = (),
 ) -> list[pyvista.Actor]:
-    """Draw the obstacle's surface and its sharp edges, cut at the boundary of a domain [m]; return both."""
+    """Draw the obstacle's surface and its sharp edges; return both.
+
+    They are cut at the boundary of a domain [m] and at reflectors.
+    """
     import pyvista
 
     vertices, faces = obstacle.surface()
     surface = pyvista.PolyData.from_regular_faces(MM * vertices.numpy(), faces.numpy())
-    for outwards, corner in zip((-1.0, 1.0), domain or (), strict=False):
-        for normal in outwards * np.eye(3):
-            if (((surface.points - MM * np.array(corner)) @ normal) > 0).any():
-                surface = surface.clip(normal=normal, origin=MM * np.array(corner))
+    sides = [
+        (normal, np.array(corner))
+        for outwards, corner in zip((-1.0, 1.0), domain or (), strict=False)
+        for normal in outwards * np.eye(3)
+    ]
+    sides += [(-np.array(one.normal), np.array(one.point)) for one in reflectors]
+    for normal, corner in sides:
+        if (((surface.points - MM * corner) @ normal) > 0).any():
+            surface = surface.clip(normal=normal, origin=MM * corner)
     if surface.n_cells == 0:  # only its bounding box reaches into the domain
         return []
     sharp = math.degrees(colours.SHARP_ANGLE)
@@ -287,6 +302,18 @@ def add_obstacle(
         look = {"color": colours.EDGE_COLOUR, "line_width": 2, "lighting": False}
         actors.append(plotter.add_mesh(edges, **look, reset_camera=False))
     return actors
+
+
+def add_reflectors(plotter: pyvista.Plotter, scene: Scene) -> None:
+    """Draw the parts of the reflectors that are in the domain, translucent, and their edges."""
+    import pyvista
+
+    for corners in parts_of_reflectors(scene.reflectors, scene.domain):
+        if len(corners):
+            sheet = pyvista.PolyData(MM * corners, faces=[len(corners), *range(len(corners))])
+            look = {"color": colours.REFLECTOR_COLOUR, "lighting": False, "reset_camera": False}
+            plotter.add_mesh(sheet, opacity=colours.REFLECTOR_OPACITY, **look)
+            plotter.add_mesh(sheet.extract_feature_edges(), line_width=2, **look)
 
 
 def add_plane(plotter: pyvista.Plotter, plane: Plane, level: Array | None) -> None:
@@ -365,11 +392,13 @@ def plane_pressure(scene: Scene, field: ArrayLike) -> tuple[Plane, Array]:
     magnitude = plane_magnitude("field", field)
     if scene.observation_plane is None:
         raise ValueError("field: given for a scene without observation plane; must be None")
-    return scene.observation_plane, outside_on_plane(magnitude, scene.observation_plane, scene.obstacles)
+    return scene.observation_plane, outside_on_plane(
+        magnitude, scene.observation_plane, scene.obstacles, scene.reflectors
+    )
 
 
 def volume_magnitude(scene: Scene, volume: ArrayLike) -> Array:
-    """Return |p| (Nx, Ny, Nz) in the domain, NaN where it is unknown and inside obstacles."""
+    """Return |p| (Nx, Ny, Nz) in the domain, NaN where unknown, inside obstacles and behind reflectors."""
     magnitude: Array = magnitude_tensor("volume", volume, "Pa").detach().cpu().numpy()
     if magnitude.ndim != 3 or min(magnitude.shape) < 2:
         raise ValueError(f"volume: shape {magnitude.shape}; must be (Nx, Ny, Nz), each at least 2")
@@ -381,7 +410,8 @@ def volume_magnitude(scene: Scene, volume: ArrayLike) -> Array:
         for low, high, count in zip(lower, upper, magnitude.shape, strict=True)
     )
     points = torch.from_numpy(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
-    return np.where(inside_any(points, scene.obstacles).numpy(), np.nan, magnitude)
+    hidden = inside_any(points, scene.obstacles) | ~are_in_front(scene.reflectors, points)
+    return np.where(hidden.numpy(), np.nan, magnitude)
 
 
 def map_colours(name: str, count: int) -> list[str]:

@@ -1,8 +1,9 @@
-"""Maps of the pressure on observation planes, outside obstacles."""
+"""Maps of the pressure on observation planes, outside obstacles and in front of reflectors."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -12,16 +13,19 @@ from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
+from matplotlib.patheffects import withStroke, withTickedStroke
 
 from autdtorch.plot import data
-from autdtorch.plot.colours import FLOOR, OBSTACLE_COLOUR, PRESSURE_MAP
+from autdtorch.plot.colours import EDGE_COLOUR, FLOOR, OBSTACLE_COLOUR, PRESSURE_MAP
 from autdtorch.plot.data import MM, ByMethod, outside_on_plane, plane_magnitude, require_each
+from autdtorch.plot.polygons import clipped
 from autdtorch.plot.style import TICK_SIZE, label_of, new_figure, readable, set_ticks, styled, wrapped
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.reflectors import Reflector, are_in_front
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import (
+    LENGTH_TOLERANCE,
     ArrayLike,
     boolean,
     finite_number,
@@ -58,6 +62,7 @@ def plot_plane(
     vmin: float | None = None,
     vmax: float | None = None,
     reference: float | None = None,
+    reflectors: Iterable[Reflector] = (),
 ) -> Figure:
     """Plot the pressure magnitude on a plane over the coordinates along its edges.
 
@@ -75,6 +80,8 @@ def plot_plane(
         vmax: upper end of the colours, > `vmin`, in the same unit; by default the largest |p| or 0 dB.
         reference: the pressure of 0 dB [Pa], > 0; by default the largest |p|. Pictures with equal references
             can be compared.
+        reflectors: reflectors, drawn where they cross the plane, hatched on their backs; cells behind are
+            grey.
 
     Raises:
         ValueError: an argument of another shape or out of range, `pressure` of 0 everywhere with `decibels`
@@ -84,7 +91,8 @@ def plot_plane(
     if ax is not None:
         require_kind("ax", ax, Axes)
     obstacles, decibels = members("obstacles", obstacles, Obstacle), boolean("decibels", decibels)
-    values = outside_on_plane(plane_magnitude("pressure", pressure), plane, obstacles)
+    walls = members("reflectors", reflectors, Reflector)
+    values = outside_on_plane(plane_magnitude("pressure", pressure), plane, obstacles, walls)
     points = None if control_points is None else points_tensor("control_points", control_points)
     if decibels:
         zero = data.zero_level(reference, "pressure", values)
@@ -102,7 +110,7 @@ def plot_plane(
         figure.set_layout_engine("compressed")  # "constrained" cuts off labels beside a square
         ax = figure.add_subplot()
     figure = cast(Figure, ax.get_figure(root=True))
-    mesh = _draw_plane(ax, values, plane, points, obstacles, size)
+    mesh = _draw_plane(ax, values, plane, points, (obstacles, walls), size)
     mesh.set_clim(*limits)
     length, across = size if flat else (height, width)
     shape: Any = {"orientation": "horizontal" if flat else "vertical", "extend": _beyond([values], limits)}
@@ -120,6 +128,7 @@ def plot_planes(
     *,
     vmin: float | None = None,
     vmax: float | None = None,
+    reflectors: Mapping[str, Iterable[Reflector]] | Iterable[Reflector] | None = None,
 ) -> Figure:
     """Plot pressure maps, one row per method and one column per scene (the paper's Fig. 2).
 
@@ -136,12 +145,13 @@ def plot_planes(
         obstacles: obstacles of each scene, masked and outlined in the plane.
         vmin: lower end of the colours of all maps [Pa], >= 0; by default 0.
         vmax: upper end of them [Pa], > `vmin`; by default the largest |p| of each scene.
+        reflectors: reflectors of each scene, as in `plot_plane`.
 
     Raises:
         ValueError: no scene, a scene without plane, an argument of another shape, or ends of the colours that
             are out of range.
     """
-    arguments: tuple[Any, ...] = pressure, planes, control_points, obstacles
+    arguments: tuple[Any, ...] = pressure, planes, control_points, obstacles, reflectors
     if isinstance(planes, Plane):
         arguments = _as_one_scene(*arguments)
     return _rows_of_maps(*arguments, vmin=vmin, vmax=vmax)
@@ -152,6 +162,7 @@ def _rows_of_maps(
     planes: Mapping[str, Plane],
     control_points: Mapping[str, ArrayLike] | None,
     obstacles: Mapping[str, Iterable[Obstacle]] | None,
+    reflectors: Mapping[str, Iterable[Reflector]] | None,
     *,
     vmin: float | None,
     vmax: float | None,
@@ -165,6 +176,8 @@ def _rows_of_maps(
         require_each("control_points", control_points, pressure)
     if obstacles is not None:
         require_each("obstacles", obstacles, pressure)
+    if reflectors is not None:
+        require_each("reflectors", reflectors, pressure)
     methods = data.methods_of(pressure.values())
     full = all(method in maps for method in methods for maps in pressure.values())
     alike = full and len({planes[scene] for scene in pressure}) == 1
@@ -186,10 +199,11 @@ def _rows_of_maps(
     )
     for column, size, width, (scene, maps) in zip(axes.T, sizes, widths, pressure.items(), strict=True):
         bodies = () if obstacles is None else members(f"obstacles[{scene!r}]", obstacles[scene], Obstacle)
+        walls = () if reflectors is None else members(f"reflectors[{scene!r}]", reflectors[scene], Reflector)
         magnitudes = {}
         for method, field in maps.items():
             magnitude = plane_magnitude(f"pressure[{scene!r}][{method!r}]", field)
-            magnitudes[method] = outside_on_plane(magnitude, planes[scene], bodies)
+            magnitudes[method] = outside_on_plane(magnitude, planes[scene], bodies, walls)
         limits = _limits(vmin, vmax, 0.0, max(map(data.largest, magnitudes.values())), "Pa")
         points = None
         if control_points is not None:
@@ -198,7 +212,7 @@ def _rows_of_maps(
             if method not in magnitudes:
                 ax.set_axis_off()
                 continue
-            mesh = _draw_plane(ax, magnitudes[method], planes[scene], points, bodies, size)
+            mesh = _draw_plane(ax, magnitudes[method], planes[scene], points, (bodies, walls), size)
             mesh.set_clim(*limits)
             if alike and ax is not column[-2]:
                 ax.set_xlabel("")
@@ -271,16 +285,19 @@ def _draw_plane(
     values: Array,
     plane: Plane,
     points: torch.Tensor | None,
-    obstacles: Iterable[Obstacle],
+    parts: tuple[Iterable[Obstacle], Sequence[Reflector]],
     size: tuple[float, float],
 ) -> QuadMesh:
-    """Draw |p| or its level (Nu, Nv), points and outlines of obstacles into axes of a size [inch]."""
+    """Draw |p| or its level (Nu, Nv), points, obstacles and reflectors into axes of a size [inch]."""
+    obstacles, reflectors = parts
     axes = (_plane_axis(plane, side, cells) for side, cells in enumerate(values.shape))
     (label_u, edges_u), (label_v, edges_v) = axes
     colours = colormaps[PRESSURE_MAP].with_extremes(bad=OBSTACLE_COLOUR)  # of NaN
     mesh = ax.pcolormesh(edges_u, edges_v, values.T, cmap=colours, rasterized=True)
     for obstacle in obstacles:
-        _outline(ax, plane, obstacle)
+        _outline(ax, plane, obstacle, reflectors)
+    for reflector in reflectors:
+        _hatch(ax, plane, reflector, [other for other in reflectors if other is not reflector])
     if points is not None:
         _circle_points(ax, plane, points, max(values.shape))
     ax.set(xlabel=label_u, ylabel=label_v, aspect="equal")
@@ -303,10 +320,12 @@ def _plane_axis(plane: Plane, side: int, cells: int) -> tuple[str, Array]:
     return f"{'xyz'[axis]} [mm]", MM * plane.center[axis] + float(direction[axis]) * along
 
 
-def _outline(ax: Axes, plane: Plane, obstacle: Obstacle) -> None:
-    """Draw the intersection of an obstacle's surface with the plane."""
-    distance = obstacle.signed_distance(plane.points(max(plane.size) / _OUTLINE_CELLS)).numpy()
-    if not distance.min() < 0 < distance.max():
+def _outline(ax: Axes, plane: Plane, obstacle: Obstacle, reflectors: Sequence[Reflector]) -> None:
+    """Draw the intersection of an obstacle's surface, in front of reflectors, with the plane."""
+    points = plane.points(max(plane.size) / _OUTLINE_CELLS)
+    distance = obstacle.signed_distance(points).numpy()
+    distance[~are_in_front(reflectors, points).numpy()] = np.nan
+    if not np.nanmin(distance, initial=np.inf) < 0 < np.nanmax(distance, initial=-np.inf):
         return
     edges = (_plane_axis(plane, side, cells)[1] for side, cells in enumerate(distance.shape))
     centers = ((along[:-1] + along[1:]) / 2 for along in edges)
@@ -314,14 +333,44 @@ def _outline(ax: Axes, plane: Plane, obstacle: Obstacle) -> None:
     lines.set_path_effects([withStroke(linewidth=2.2, foreground="black")])
 
 
+def _hatch(ax: Axes, plane: Plane, reflector: Reflector, others: Iterable[Reflector]) -> None:
+    """Draw the line where a reflector crosses the plane in front of the others, with strokes on its back."""
+    corners = plane.corners[[0, 1, 3, 2]]
+    height = reflector.mirror.height(corners).numpy()
+    height[np.abs(height) < LENGTH_TOLERANCE] = 0.0
+    ends = list(corners[height == 0].numpy())
+    for here, there in zip(range(4), (1, 2, 3, 0), strict=True):
+        if height[here] * height[there] < 0:
+            share = height[here] / (height[here] - height[there])
+            ends.append((corners[here] + share * (corners[there] - corners[here])).numpy())
+    if len(ends) != 2:  # it misses the plane, or touches a corner
+        return
+    ends = list(clipped(np.array(ends), (-math.inf,) * 3, (math.inf,) * 3, others)[:2])
+    if len(ends) != 2:
+        return
+    here, there = _coordinates(plane, torch.from_numpy(np.array(ends))).numpy()
+    far = int(np.abs(height).argmax())
+    aside = _coordinates(plane, corners)[far].numpy() - here
+    line = MM * np.array([here, there])
+    if ((there - here)[0] * aside[1] - (there - here)[1] * aside[0]) * height[far] > 0:
+        line = line[::-1]  # strokes are on the left
+    style: Any = {"color": EDGE_COLOUR, "linewidth": 1.4, "clip_on": False}
+    ax.plot(*line.T, path_effects=[withTickedStroke(spacing=4.5, angle=135, length=0.7)], **style)
+
+
+def _coordinates(plane: Plane, points: torch.Tensor) -> torch.Tensor:
+    """Return the coordinates (P, 2) [m] of points (P, 3) in a map of the plane, as of `_plane_axis`."""
+    sides = torch.stack(plane.basis).to(points)
+    axes = sides.abs().argmax(dim=1)
+    along_axis = sides.abs().amax(dim=1) > 1 - _AXIS_TOLERANCE
+    return torch.where(along_axis, points[:, axes], (points - points.new_tensor(plane.center)) @ sides.T)
+
+
 def _circle_points(ax: Axes, plane: Plane, points: torch.Tensor, cells: int) -> None:
     """Circle the `points` (P, 3) [m] that are less than one cell away from the plane."""
     center = points.new_tensor(plane.center)
     near = ((points - center) @ points.new_tensor(plane.normal)).abs() < max(plane.size) / cells
-    sides = torch.stack(plane.basis).to(points)
-    axes = sides.abs().argmax(dim=1)
-    along_axis = sides.abs().amax(dim=1) > 1 - _AXIS_TOLERANCE
-    coordinates = torch.where(along_axis, points[:, axes], (points - center) @ sides.T)[near]
+    coordinates = _coordinates(plane, points[near])
     style: Any = {"marker": "o", "ms": 9, "mfc": "none", "mec": "white", "mew": 1.2, "linestyle": "none"}
     outline = [withStroke(linewidth=2.6, foreground="black")]
     ax.plot(*(MM * coordinates.T.cpu().numpy()), path_effects=outline, **style)

@@ -6,7 +6,8 @@ import math
 from typing import Any, cast
 
 import numpy as np
-from matplotlib.colors import to_rgb
+import torch
+from matplotlib.colors import to_rgb, to_rgba
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
@@ -16,8 +17,10 @@ from numpy.typing import NDArray
 from autdtorch.plot import colours
 from autdtorch.plot.axes3d import axes_of, grid_lines, view_from
 from autdtorch.plot.data import MM, single_drive_phases
+from autdtorch.plot.polygons import clipped, parts_of_reflectors
 from autdtorch.plot.style import TICK_SIZE, new_figure, styled, text_width
 from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.reflectors import are_in_front
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.spatial import doubled_normals, sides_of
@@ -46,7 +49,8 @@ _LIGHT = _direction(50.0, -160.0)
 def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
     """Draw a scene in 3D (the paper's Fig. 1), for machines on which `view3d` cannot render.
 
-    The drawing order is fixed: from the plane to obstacles and points.
+    The drawing order is fixed: from the plane to obstacles and points. Reflectors are translucent, as far as
+    the domain goes.
 
     Args:
         scene: scene to draw.
@@ -60,16 +64,18 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
     figure = new_figure(*_SIZE)
     figure.set_layout_engine("none")  # all places are set here
     ax = _new_axes(figure, scene.domain, 0.0 if phases is None else _BAR_ROOM)
+    _add_reflectors(ax, scene)
     if scene.observation_plane is not None:
         corners = MM * scene.observation_plane.corners[[0, 1, 3, 2]].numpy()
         ax.add_collection3d(Poly3DCollection([corners], facecolor=colours.PLANE_COLOUR, alpha=0.3, zorder=1))
     # From far to near: the order of drawing is fixed, and later obstacles cover earlier ones.
     for obstacle in sorted(scene.obstacles, key=lambda one: (np.array(one.lower) + one.upper) @ _TO_VIEWER):
-        _add_obstacle(ax, obstacle, scene.domain)
+        _add_obstacle(ax, obstacle, scene)
     foci = MM * scene.control_points.numpy()
     ax.scatter(*foci.T, color=colours.FOCUS_COLOUR, s=22, depthshade=False, label="control points", zorder=3)
     _scatter_transducers(ax, scene, phases)
-    figure.legend(handles=ax.get_legend_handles_labels()[0], loc="upper center", ncols=2)
+    handles = ax.get_legend_handles_labels()[0]
+    figure.legend(handles=handles, loc="upper center", ncols=len(handles), columnspacing=1.2)
     return figure
 
 
@@ -117,21 +123,36 @@ def _place(ax: Axes3D, point: Array) -> Array:
     return place
 
 
-def _add_obstacle(ax: Axes3D, obstacle: Obstacle, domain: tuple[Vector, Vector]) -> None:
+def _add_reflectors(ax: Axes3D, scene: Scene) -> None:
+    """Draw the reflectors, below everything else or, if the viewer looks at their backs, above."""
+    style: Any = {"edgecolor": colours.REFLECTOR_COLOUR, "lw": 0.8, "label": "reflectors"}
+    style["facecolor"] = to_rgba(colours.REFLECTOR_COLOUR, colours.REFLECTOR_OPACITY)
+    for one, corners in zip(
+        scene.reflectors, parts_of_reflectors(scene.reflectors, scene.domain), strict=True
+    ):
+        if len(corners):
+            order = 0.5 if np.array(one.normal) @ _TO_VIEWER > 0 else 4
+            ax.add_collection3d(Poly3DCollection([MM * corners], zorder=order, **style))
+            style["label"] = None  # one entry in the legend
+
+
+def _add_obstacle(ax: Axes3D, obstacle: Obstacle, scene: Scene) -> None:
     """Draw the triangles that face the viewer, shaded, and their sharp edges.
 
-    An obstacle is cut at the domain's edge; its far side, visible there, is drawn first.
+    An obstacle is cut at reflectors and at the domain's edge; its far side, visible there, is drawn first.
     """
+    domain, reflectors = scene.domain, scene.reflectors
     vertices, faces = (part.numpy() for part in obstacle.surface())
     corners = vertices[faces]
     normals = doubled_normals(corners)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
     front = normals @ _TO_VIEWER > 0
     leaves = (vertices < domain[0]).any() or (vertices > domain[1]).any()
+    leaves |= not are_in_front(reflectors, torch.from_numpy(vertices)).all()
     for side in (~front, front) if leaves else (front,):
         light = 0.7 + 0.3 * normals[side] @ _LIGHT
         shades = np.clip(light[:, None] * to_rgb(colours.OBSTACLE_COLOUR), 0, 1)
-        polygons = [clipped(triangle, *domain) for triangle in corners[side]]
+        polygons = [clipped(triangle, *domain, reflectors) for triangle in corners[side]]
         if inside := [index for index, polygon in enumerate(polygons) if len(polygon)]:
             # Edges in the colours of the faces close the seams between them.
             style: Any = {"facecolor": shades[inside], "edgecolor": shades[inside], "lw": 0.3, "zorder": 2}
@@ -139,7 +160,7 @@ def _add_obstacle(ax: Axes3D, obstacle: Obstacle, domain: tuple[Vector, Vector])
     edges = vertices[_sharp_edges(faces, normals, front)]
     if len(edges) > colours.MOST_EDGES:
         return
-    lines = [clipped(edge, *domain) for edge in edges[~_hidden(obstacle, edges.mean(axis=1))]]
+    lines = [clipped(edge, *domain, reflectors) for edge in edges[~_hidden(obstacle, edges.mean(axis=1))]]
     if lines := [MM * line for line in lines if len(line)]:  # Matplotlib refuses a collection of none
         ax.add_collection3d(Line3DCollection(lines, colors=colours.EDGE_COLOUR, lw=0.8, zorder=2))
 
@@ -176,22 +197,3 @@ def _scatter_transducers(ax: Axes3D, scene: Scene, phases: Array | None) -> None
     bar = figure.colorbar(dots, cax=figure.add_axes(_BAR))
     bar.set_ticks([0, np.pi, 2 * np.pi], labels=["0", "π", "2π"])
     bar.set_label("phase [rad]")
-
-
-def clipped(corners: Array, lower: Vector, upper: Vector) -> Array:
-    """Clip a convex polygon or a line (K, 3) to a box (Sutherland & Hodgman 1974), to L >= 0 corners (L, 3).
-
-    A clipped line may run back to its start.
-    """
-    for side in range(6):
-        axis, sign, bound = side // 2, (1, -1)[side % 2], (lower, upper)[side % 2][side // 2]
-        height = sign * (corners[:, axis] - bound)
-        inside = []
-        for here, there in enumerate(np.roll(np.arange(len(corners)), -1)):
-            if height[here] >= 0:
-                inside.append(corners[here])
-            if height[here] * height[there] < 0:
-                share = height[here] / (height[here] - height[there])
-                inside.append(corners[here] + share * (corners[there] - corners[here]))
-        corners = np.array(inside).reshape(-1, 3)
-    return corners

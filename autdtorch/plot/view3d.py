@@ -116,7 +116,7 @@ def view3d(
     save: str | Path | None = None,
     off_screen: bool = True,
 ) -> pyvista.Plotter:
-    """Render transducers, obstacles, control points, observation plane and field, in millimetres.
+    """Render transducers, obstacles, reflectors, control points, plane and field, in millimetres.
 
     Pressures outside the obstacles are shown as levels 20 lg(|p| / reference) from -30 to 0 dB. A caption
     gives the reference.

@@ -18,8 +18,9 @@ from small_scenes import scene_of_all_kinds, small_scene
 
 import autdtorch as at
 from autdtorch.plot.costs import plot_pareto, plot_scaling
+from autdtorch.plot.polygons import clipped
 from autdtorch.plot.pressure_maps import plot_plane, plot_planes
-from autdtorch.plot.scene_figure import clipped, plot_scene
+from autdtorch.plot.scene_figure import plot_scene
 from autdtorch.plot.style import looks_of
 from autdtorch.plot.trials import plot_convergence, plot_poses, plot_trials
 

@@ -183,7 +183,8 @@ def _draw_planes(
         points = {one: scenes[one].control_points for one in part}
         obstacles = {one: scenes[one].obstacles for one in part}
         file = _numbered(name, pictures)
-        plot_planes(part, planes, points, obstacles).savefig(folder / file)
+        reflectors = {one: scenes[one].reflectors for one in part}
+        plot_planes(part, planes, points, obstacles, reflectors=reflectors).savefig(folder / file)
         pictures.append(picture(file, alt_texts.of_planes(part)))
     return pictures
 
