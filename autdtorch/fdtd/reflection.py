@@ -111,15 +111,15 @@ def require_sharp(region: Region, near: Sequence[int], spacing: float) -> None:
             raise invalid(f"reflectors[{number}].reflection", region.mirrors[number].reflection, accepted)
 
 
-def require_domain(region: Region) -> None:
-    """Refuse mirrors that a grid of the whole domain cannot have."""
+def require_domain(region: Region, name: str = "method", value: str = "full") -> None:
+    """Refuse mirrors that a grid of the whole domain cannot have; the message names what asks for it."""
     for number, mirror in enumerate(region.mirrors):
         if np.abs(mirror.normal).max() < 1 or mirror.reflection not in (1, -1):
             plane = f"reflector {number}, of normal {mirror.normal} and reflection {mirror.reflection}"
             accepted = f"cannot have {plane}: it must be along an axis, and its reflection 1 or -1; take box"
-            raise invalid("method", "full", accepted)
+            raise invalid(name, value, accepted)
         if any(mirror.is_parallel(other) for other in region.mirrors[:number]):
-            raise invalid("method", "full", f"cannot have parallel reflectors, such as {number}; take box")
+            raise invalid(name, value, f"cannot have parallel reflectors, such as {number}; take box")
 
 
 def with_images(bodies: Sequence[Body], mirrors: Sequence[Mirror]) -> tuple[Body, ...]:

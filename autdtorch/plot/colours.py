@@ -11,7 +11,7 @@ REFLECTOR_COLOUR = "#8A6D3B"
 EDGE_COLOUR = "#222222"
 
 SHARP_ANGLE = np.radians(30)  # between two faces; sharper edges of obstacles are drawn
-REFLECTOR_OPACITY = 0.3
+REFLECTOR_OPACITY, BACK_OPACITY = 0.3, 0.08  # of reflectors seen from the front, and from the back
 MOST_EDGES = 500  # of one obstacle; more, as those of voxels, would blacken it and are not drawn
 
 PHASE_MAP = "twilight"  # cyclic: 0 and 2 pi have one colour

@@ -305,15 +305,30 @@ def add_obstacle(
 
 
 def add_reflectors(plotter: pyvista.Plotter, scene: Scene) -> None:
-    """Draw the parts of the reflectors that are in the domain, translucent, and their edges."""
+    """Draw the parts of the reflectors that are in the domain, and their edges.
+
+    They are translucent from the front and open from the back, so that they do not tint a field behind.
+    """
     import pyvista
 
     for corners in parts_of_reflectors(scene.reflectors, scene.domain):
         if len(corners):
             sheet = pyvista.PolyData(MM * corners, faces=[len(corners), *range(len(corners))])
             look = {"color": colours.REFLECTOR_COLOUR, "lighting": False, "reset_camera": False}
-            plotter.add_mesh(sheet, opacity=colours.REFLECTOR_OPACITY, **look)
+            plotter.add_mesh(sheet, opacity=colours.REFLECTOR_OPACITY, culling="back", **look)
             plotter.add_mesh(sheet.extract_feature_edges(), line_width=2, **look)
+
+
+def cut_at_reflectors(actors: Iterable[pyvista.Actor], reflectors: Iterable[Reflector]) -> None:
+    """Hide what of the actors is behind reflectors, wherever they are moved."""
+    from vtkmodules.vtkCommonDataModel import vtkPlane
+
+    for one in reflectors:
+        plane = vtkPlane()
+        plane.SetOrigin(*(MM * coordinate for coordinate in one.point))
+        plane.SetNormal(*one.normal)
+        for actor in actors:
+            actor.mapper.AddClippingPlane(plane)
 
 
 def add_plane(plotter: pyvista.Plotter, plane: Plane, level: Array | None) -> None:

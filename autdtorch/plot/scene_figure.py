@@ -126,12 +126,13 @@ def _place(ax: Axes3D, point: Array) -> Array:
 def _add_reflectors(ax: Axes3D, scene: Scene) -> None:
     """Draw the reflectors, below everything else or, if the viewer looks at their backs, above."""
     style: Any = {"edgecolor": colours.REFLECTOR_COLOUR, "lw": 0.8, "label": "reflectors"}
-    style["facecolor"] = to_rgba(colours.REFLECTOR_COLOUR, colours.REFLECTOR_OPACITY)
     for one, corners in zip(
         scene.reflectors, parts_of_reflectors(scene.reflectors, scene.domain), strict=True
     ):
         if len(corners):
-            order = 0.5 if np.array(one.normal) @ _TO_VIEWER > 0 else 4
+            in_front = np.array(one.normal) @ _TO_VIEWER > 0
+            order, opacity = (0.5, colours.REFLECTOR_OPACITY) if in_front else (4, colours.BACK_OPACITY)
+            style["facecolor"] = to_rgba(colours.REFLECTOR_COLOUR, opacity)
             ax.add_collection3d(Poly3DCollection([MM * corners], zorder=order, **style))
             style["label"] = None  # one entry in the legend
 

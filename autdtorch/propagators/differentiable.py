@@ -10,12 +10,14 @@ from autdtorch.fdtd.adjoint import recorded
 from autdtorch.fdtd.grid import make_grid, require_fine, warn_if_coarse
 from autdtorch.fdtd.kernels.choice import available_kernel, make_kernel, precision_of
 from autdtorch.fdtd.material_gradients import cells_of_maps, cells_of_obstacles, domain_cells
+from autdtorch.fdtd.reflection import require_domain, whole_region, with_images
+from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import block_of, fewest_periods
 from autdtorch.fdtd.stepping import drive_dft, drive_signal
 from autdtorch.propagators.scene_region import region_of, warn_of_ending_walls, warn_of_near_points
-from autdtorch.scene.arrays import strengths_of
+from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.scene.drive import validate_drive
-from autdtorch.scene.scene import Scene, require_inside
+from autdtorch.scene.scene import Scene, require_in_front, require_inside
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.validation import (
     ArrayLike,
@@ -45,9 +47,9 @@ def differentiable_field(
     """Return the pressure of drives at points, differentiable by every tensor given, on the whole domain.
 
     The gradient is computed by an adjoint run of the same kernel, in bounded memory. Density and sound speed
-    are those of the scene's K obstacles or, in a scene without obstacles, maps of the domain's cells at
-    `cell_centers`. Maps have no surfaces between cells and are less accurate. The field changes smoothly with
-    a map that changes smoothly, but not with an obstacle that is moved across the grid
+    are those of the scene's K obstacles or, in a scene without obstacles and reflectors, maps of the domain's
+    cells at `cell_centers`. Maps have no surfaces between cells and are less accurate. The field changes
+    smoothly with a map that changes smoothly, but not with an obstacle that is moved across the grid
     (docs/decisions/gradients.md).
 
     Args:
@@ -71,19 +73,27 @@ def differentiable_field(
 
     Raises:
         ValueError: an argument has another shape or is out of range, maps are given in a scene with
-            obstacles, or a differentiated obstacle reaches into the boundary layers.
+            obstacles or reflectors, a reflector is neither rigid nor soft or not along an axis, or a
+            differentiated obstacle reaches into the boundary layers.
     """
     require_kind("scene", scene, Scene)
     kernel, precision = available_kernel(kernel, device), precision_of(dtype)
     drive = validate_drive(drive, len(scene.array))
     targets = scene.control_points if points is None else points_tensor("points", points).cpu()
     require_inside(scene.domain, "points", targets)
+    require_in_front(scene.reflectors, "points", targets)
     given = _material("density", density, scene), _material("sound_speed", sound_speed, scene)
-    region = region_of(scene)
+    region, given_speed = region_of(scene), given[1]
+    if region.mirrors:
+        require_domain(region, "scene", scene.name)
+        given = _of_images(given[0], region), _of_images(given[1], region)
+        region = whole_region(region)
     grid = make_grid(region, positive("spacing", spacing, "m"))
-    speeds, given_speed = region.sound_speeds, given[1]
+    speeds = region.sound_speeds
     if given_speed is not None:
-        rigid = torch.tensor([one.rigid for one in scene.obstacles], dtype=torch.bool, device="cpu")
+        rigid = torch.tensor(
+            [one.sound_speed is None for one in scene.obstacles], dtype=torch.bool, device="cpu"
+        )
         effective = given_speed.detach() if given_speed.ndim == 3 else given_speed.detach()[~rigid]
         speeds = speeds | ({"the medium given": float(effective.min())} if effective.numel() else {})
     require_fine(speeds, scene.frequency, spacing)
@@ -97,12 +107,14 @@ def differentiable_field(
     by_maps = any(one is not None and one.ndim == 3 for one in given)
     cells = (cells_of_maps if by_maps else cells_of_obstacles)(region, grid, *given)
     assembly = cells.assembly(grid, region, precision, time_step)
-    receivers, nodes, stepper = assembly.receivers(targets), scene.array.nodes, make_kernel(kernel)
+    receivers, stepper = assembly.receivers(targets), make_kernel(kernel)
+    nodes, weights = apertures_of(scene.array).with_images(scene.images)
+    images = len(weights) // len(scene.array)
     steps, block = block_of(assembly.steps_per_period)
     signal = drive_signal(assembly.steps_per_period, 0, steps * math.ceil(periods / block)).to(precision)
     fields = [torch.zeros((0, len(targets)), **COMPLEX)]
     for row in drive.reshape(-1, drive.shape[-1]):
-        strength = strengths_of(scene.array) * row.cpu()
+        strength = weights * (strengths_of(scene.array) * row.cpu()).repeat(images)
         sources = cells.driven(assembly.sources(nodes.positions, strength, nodes.weights), assembly)
         record = recorded(stepper, assembly, sources, receivers, signal)
         fields.append(drive_dft(record[-steps:], block)[None])  # the last block
@@ -127,6 +139,14 @@ def cell_centers(scene: Scene, spacing: float = 1e-3) -> torch.Tensor:
     return torch.stack(axes, dim=-1)
 
 
+def _of_images(values: torch.Tensor | None, region: Region) -> torch.Tensor | None:
+    """Return values (K,) of bodies for these and their images, as `whole_region` has them."""
+    if values is None:
+        return None
+    copies = [len(with_images([body], region.mirrors)) for body in region.bodies]
+    return values.repeat_interleave(torch.tensor(copies, dtype=torch.int64, device="cpu"))
+
+
 def _material(name: str, given: ArrayLike | None, scene: Scene) -> torch.Tensor | None:
     """Return values (K,) of the obstacles or (nx, ny, nz) of the cells, after checking them."""
     if given is None:
@@ -135,6 +155,11 @@ def _material(name: str, given: ArrayLike | None, scene: Scene) -> torch.Tensor 
     if values.shape != (count,) and (values.ndim != 3 or count > 0):
         accepted = f"must be ({count},)" if count else "must be (nx, ny, nz), in a scene without obstacles"
         raise ValueError(f"{name}: shape {tuple(values.shape)}; {accepted}")
+    if values.ndim == 3 and scene.reflectors:
+        accepted = "maps must be of a scene without reflectors"
+        raise ValueError(
+            f"{name}: shape {tuple(values.shape)}, {len(scene.reflectors)} reflectors; {accepted}"
+        )
     if values.numel() and values.detach().min() <= 0:
         raise invalid(name, float(values.detach().min()), "every entry must be > 0")
     return values

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import cmath
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Self
@@ -110,6 +111,13 @@ def are_in_front(reflectors: Sequence[Reflector], points: torch.Tensor) -> torch
     for reflector in reflectors:
         front &= reflector.mirror.height(points) >= -LENGTH_TOLERANCE
     return front
+
+
+def kinds_of(reflectors: Iterable[Reflector]) -> list[str]:
+    """Return the number of reflectors of each factor as texts."""
+    names: dict[complex, str] = {1: "rigid", -1: "soft"}
+    counts = Counter(names.get(one.reflection, f"reflection {one.reflection:.3g}") for one in reflectors)
+    return [f"{count} x {kind}" for kind, count in counts.items()]
 
 
 def _factor(value: object) -> float | complex:

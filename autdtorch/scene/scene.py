@@ -17,7 +17,7 @@ from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.base import overlap, shared_box
 from autdtorch.scene.obstacles.moving import moved
 from autdtorch.scene.plausibility import extent_of, unit_hint, warn_of_implausible
-from autdtorch.scene.reflectors import Reflector, require_arrangement
+from autdtorch.scene.reflectors import Reflector, kinds_of, require_arrangement
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.images import Image, images_of
@@ -243,8 +243,8 @@ class Scene:
                 f"{len(self.array)}, of source strength {range_text(strengths_of(self.array))} Pa m",
             ),
             ("control points", str(len(self.control_points))),
-            ("obstacles", ", ".join(_kinds(self.obstacles)) or "none"),
-            ("reflectors", str(len(self.reflectors))),
+            ("obstacles", ", ".join(obstacle_kinds(self.obstacles)) or "none"),
+            ("reflectors", ", ".join(kinds_of(self.reflectors)) or "none"),
             ("domain", f"{self._size()} mm, {self._size(self.wavelength, 3)} wavelengths"),
         ]
         return html_facts(f"Scene {self.name!r}", facts)
@@ -260,7 +260,7 @@ class Scene:
         return _corners(torch.stack([points.amin(dim=0) - margin, points.amax(dim=0) + margin]))
 
 
-def _kinds(obstacles: tuple[Obstacle, ...]) -> list[str]:
+def obstacle_kinds(obstacles: tuple[Obstacle, ...]) -> list[str]:
     """Return the number of obstacles of each kind and material as texts."""
     counts = Counter(f"{type(obstacle).__name__} ({_material(obstacle)})" for obstacle in obstacles)
     return [f"{count} x {kind}" for kind, count in counts.items()]

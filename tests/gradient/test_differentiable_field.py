@@ -207,3 +207,44 @@ def test_images_of_the_two_cubes_are_one_pose():
         assert pose_errors(pose_of(1e-3, (90.0 * turns, 0, 0)), pose_of(1e-3, 0.0))[1] < 1e-3
     place, turn = pose_errors(pose_of((3e-3, 0, 4e-3), (80.0, 0, 0)), pose_of(0.0, 0.0))
     assert (place, turn) == pytest.approx((5.0, 10.0), rel=1e-5)
+
+
+def in_a_corner(*bodies, **changes):
+    array = at.TransducerArray.grid((2, 2), 8e-3, (0, 0, 0), (0, 0, 1), radius=3e-3)
+    corner = [at.Reflector.behind(array), at.Reflector((-12e-3, 0, 0), (1, 0, 0), -1.0)]
+    parts = {"control_points": [(2e-3, 0, 20e-3)], "obstacles": bodies, "reflectors": corner} | changes
+    return at.Scene(array, at.Medium.air(), 40e3, **parts)
+
+
+def test_reflectors_are_in_field_and_gradient():
+    """Panel and soft wall: the field is that of `full`; bodies beside their images have one derivative."""
+    scene = in_a_corner(at.Sphere((0, 0, 10e-3), 3e-3, density=3.0, sound_speed=300.0))
+    drive = at.drive_from_phases(torch.arange(4.0))
+    speed = torch.tensor([300.0], dtype=torch.float64)
+
+    def field(density):
+        return at.differentiable_field(
+            scene, drive, density=density, sound_speed=speed, spacing=2e-3, dtype="float64", periods=40
+        )
+
+    density = torch.tensor([3.0], dtype=torch.float64, requires_grad=True)
+    pressure = field(density)
+    whole = at.make_propagator(scene, method="full", spacing=2e-3, dtype="float64", tolerance=1e-4)
+    expected = whole.transfer_matrix() @ drive
+    # both end within 1e-4 of the steady state
+    assert (pressure - expected).abs().max() < 3e-4 * expected.abs().max()
+    (slope,) = torch.autograd.grad(pressure.abs().square().sum(), density)
+    with torch.no_grad():
+        ends = [float(field(density + step).abs().square().sum()) for step in (1e-3, -1e-3)]
+    assert float(slope) == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=1e-3)
+
+
+def test_reflectors_that_the_domain_cannot_have_are_refused():
+    drive = torch.ones(4, dtype=torch.complex128)
+    tilted = in_a_corner(reflectors=[at.Reflector((0, 0, -5e-3), (0.1, 0, 1))])
+    with pytest.raises(ValueError, match=r"^scene: 'scene'; cannot have reflector 0.*along an axis"):
+        at.differentiable_field(tilted, drive, spacing=2e-3)
+    with pytest.raises(ValueError, match=r"density: shape.*2 reflectors; maps must be of a scene without"):
+        at.differentiable_field(in_a_corner(), drive, density=torch.ones(4, 4, 4), spacing=2e-3)
+    with pytest.raises(ValueError, match=r"points\[0\].*behind reflector 0"):
+        at.differentiable_field(in_a_corner(), drive, [(0, 0, -1e-3)], spacing=2e-3)

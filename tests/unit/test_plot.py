@@ -14,11 +14,11 @@ from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
-from small_scenes import scene_of_all_kinds, small_scene
+from small_scenes import AIR, scene_of_all_kinds, small_scene
 
 import autdtorch as at
 from autdtorch.plot.costs import plot_pareto, plot_scaling
-from autdtorch.plot.polygons import clipped
+from autdtorch.plot.polygons import clipped, parts_of_reflectors
 from autdtorch.plot.pressure_maps import plot_plane, plot_planes
 from autdtorch.plot.scene_figure import plot_scene
 from autdtorch.plot.style import looks_of
@@ -370,3 +370,60 @@ def test_scene_draws_everything_in_mm() -> None:
     np.testing.assert_allclose(transducers.get_array(), [0, 1, 2, 3])
     with pytest.raises(ValueError, match="a single drive"):
         plot_scene(scene, drive.expand(3, 4))
+
+
+def room(**changes):
+    """A panel, a wall, and a box that leans on the panel."""
+    array = at.TransducerArray.grid((2, 2), 8e-3, (0, 0, 0), (0, 0, 1))
+    parts = {
+        "obstacles": [at.Box((20e-3, 0, 0), (10e-3, 10e-3, 10e-3), (0, 0.5, 0), rigid=True)],
+        "reflectors": [at.Reflector.behind(array), at.Reflector((-12e-3, 0, 0), (1, 0, 0))],
+    }
+    return at.Scene(array, AIR, 40e3, [(0, 0, 20e-3)], **parts | changes)
+
+
+def test_reflectors_are_drawn_in_the_domain_and_cut_obstacles() -> None:
+    scene = room()
+    figure = plot_scene(scene)
+    figure.canvas.draw()
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        "reflectors", "control points", "transducers"
+    ]  # fmt: skip
+    parts = parts_of_reflectors(scene.reflectors, scene.domain)
+    assert [len(part) for part in parts] == [4, 4]
+    lower, upper = map(np.array, scene.domain)
+    for part, plane in zip(parts, scene.reflectors, strict=True):
+        assert ((part >= lower - 1e-9) & (part <= upper + 1e-9)).all()
+        assert np.allclose((part - plane.point) @ plane.normal, 0, atol=1e-12)
+    assert parts[1][:, 2].min() == pytest.approx(0, abs=1e-12)  # the wall ends at the panel
+    vertices, faces = (part.numpy() for part in scene.obstacles[0].surface())
+    cut = [clipped(each, *scene.domain, scene.reflectors) for each in vertices[faces]]
+    heights = np.concatenate(cut)[:, 2]
+    assert vertices[:, 2].min() < -5e-3
+    assert heights.min() == pytest.approx(0, abs=1e-12)
+
+
+def test_a_map_is_grey_behind_reflectors_with_strokes_on_their_backs() -> None:
+    scene = room()
+    plane = at.Plane((0, 0, 5e-3), (0, -1, 0), (30e-3, 40e-3))  # over z and x
+    figure = at.plot_plane(np.ones((15, 20)), plane, reflectors=scene.reflectors)
+    ax = figure.axes[0]
+    values = ax.collections[0].get_array()
+    assert values.mask.sum() == 20 * 5 + 10 * 4
+    panel, wall = (line.get_xydata() for line in ax.lines)
+    assert np.allclose(panel[:, 0], 0)
+    assert np.allclose(wall[:, 1], -12)
+    assert sorted(panel[:, 1]) == pytest.approx([-12, 20])  # where the wall is
+    assert panel[1, 1] > panel[0, 1]  # strokes are on the left: at z < 0
+    assert wall[1, 0] < wall[0, 0]  # at x < -12 mm
+    aside = at.Plane((0, 0, 60e-3), (0, 0, 1), (10e-3, 10e-3))
+    assert not at.plot_plane(np.ones((5, 5)), aside, reflectors=scene.reflectors).axes[0].lines
+    with pytest.raises(ValueError, match=r"reflectors\[0\].*must be a Reflector"):
+        at.plot_plane(np.ones((5, 5)), aside, reflectors=[{"point": (0, 0, 0)}])
+
+
+def test_maps_of_several_methods_share_the_reflectors() -> None:
+    scene = room()
+    plane = at.Plane((0, 0, 5e-3), (0, -1, 0), (30e-3, 40e-3))
+    figure = at.plot_planes({"a": np.ones((6, 8))}, plane, reflectors=scene.reflectors)
+    assert len(figure.axes[0].lines) == 2

@@ -169,7 +169,7 @@ def four_digits(value: float) -> float:
 def refusal(error: Exception) -> str:
     """Return the message of an error with the names and units of the page."""
     text = str(error) or repr(error)
-    for field, name in (("control_points", "focus"), ("obstacles", "obstacle")):
+    for field, name in (("control_points", "focus"), ("obstacles", "obstacle"), ("reflectors", "reflector")):
         text = re.sub(rf"Scene\.{field}\[(\d+)\]:?", rf"{name} \1:", text)
     return re.sub(r"\(([^()]*)\) m\b", _point_in_mm, text)
 

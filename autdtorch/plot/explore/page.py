@@ -110,7 +110,7 @@ def page(view: str) -> str:
     <p id="message" role="alert">{{{{ message }}}}</p>
     <div class="view" role="img" :aria-label="summary">{view}</div>
     <div class="legends">
-      <div class="legend" title="grey: in obstacles and next to transducers">
+      <div class="legend" title="grey: in obstacles, behind reflectors and next to transducers">
         <span>{{{{ scale_low }}}}</span><span class="bar" :style="scale_style"></span>
         <span>{{{{ scale_high }}}}</span>
       </div>
@@ -122,7 +122,8 @@ def page(view: str) -> str:
     <p id="summary" aria-live="polite">{{{{ summary }}}}</p>
     <p class="hint">Drag an obstacle or a focus to move it at its height, with Ctrl or Alt to lift it, an
       obstacle with Shift to turn it. Click a transducer to choose it. Drag elsewhere to look around, scroll
-      to zoom. Grey is in obstacles and next to transducers; light grey transducers are silent.</p>
+      to zoom. Grey is in obstacles, behind reflectors and next to transducers; light grey transducers are
+      silent.</p>
     <div class="scroll" tabindex="0" role="region" aria-label="pressures">
       <table>
         <caption>Pressure at the foci</caption>

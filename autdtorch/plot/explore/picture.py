@@ -77,17 +77,20 @@ class Picture:
         self.plotter.render_window.AddObserver("WindowResizeEvent", lambda *_: self._fit())
 
     def shows(self, situation: Situation) -> bool:
-        """Return whether bodies, array and domain of a situation are those of the picture."""
+        """Return whether bodies, array, domain and reflectors of a situation are those of the picture."""
         scene, drawn = situation.scene, self._situation
         bodies, others = ([body.original for body in each.bodies] for each in (situation, drawn))
         same_bodies = len(bodies) == len(others) and all(map(operator.is_, bodies, others))
-        return same_bodies and scene.array is drawn.scene.array and scene.domain == drawn.scene.domain
+        same_room = scene.domain == drawn.scene.domain and scene.reflectors == drawn.scene.reflectors
+        return same_bodies and same_room and scene.array is drawn.scene.array
 
     def draw(self, situation: Situation) -> None:
         """Draw another situation, as yet without a field. The camera stays if the domain is equal."""
         scene, self._situation = situation.scene, situation
         self.plotter.clear_actors()
         self._bodies = [meshes3d.add_obstacle(self.plotter, body.original) for body in situation.bodies]
+        meshes3d.cut_at_reflectors([actor for actors in self._bodies for actor in actors], scene.reflectors)
+        meshes3d.add_reflectors(self.plotter, scene)
         self._foci: list[Any] = []
         self._faces = meshes3d.add_transducers(
             self.plotter, scene, meshes3d.emitted_phases(situation.drive, len(scene.array)), bar=False

@@ -11,6 +11,7 @@ import torch
 
 from autdtorch.methods.catalogue import label_of
 from autdtorch.methods.solution import Solution
+from autdtorch.scene.scene import Scene
 from autdtorch.study.report.findings import MOST_NAMED
 from autdtorch.study.report.tables import competitors, median_score
 from autdtorch.study.results import SceneResult
@@ -22,12 +23,13 @@ Spread = Mapping[str, Mapping[str, torch.Tensor]]
 _ZERO = 1e-4  # share of the largest value, below which a value is shown as 0
 
 
-def of_scene(name: str, scene: SceneResult) -> str:
+def of_scene(name: str, scene: Scene) -> str:
     """Return the text of the drawing of a scene."""
-    points, transducers = scene.transfer_matrix.shape
-    count = scene.obstacles
-    obstacles = counted(count, "obstacle") if count else "no obstacles"
-    shown = f"{counted(transducers, 'transducer')}, {obstacles}, {counted(points, 'control point')}"
+    obstacles = counted(len(scene.obstacles), "obstacle") if scene.obstacles else "no obstacles"
+    points = counted(len(scene.control_points), "control point")
+    shown = f"{counted(len(scene.array), 'transducer')}, {obstacles}, {points}"
+    if scene.reflectors:
+        shown += f", {counted(len(scene.reflectors), 'reflector')}"
     return f"Scene {name} in 3D: {shown}"
 
 

@@ -95,9 +95,10 @@ def _markdown(
         fewest_trials=FEWEST_TRIALS,
         rendering_problem=_draw_scenes(scenes, folder),
         scenes=[
-            (name, picture(f"fig1_{name}.png", alt_texts.of_scene(name, results.scenes[name])))
-            for name in scenes
+            (name, picture(f"fig1_{name}.png", alt_texts.of_scene(name, scenes[name]))) for name in scenes
         ],
+        room=tables.room_rows(scenes),
+        reflecting=any(scene.reflectors for scene in scenes.values()),
         planes=_draw_planes(results, scenes, folder, "fig2", shown),
         alike=[label_of(name) for name in counts if name not in shown],
         alike_planes=_draw_planes(

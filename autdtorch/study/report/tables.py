@@ -12,6 +12,8 @@ import torch
 
 from autdtorch.methods.catalogue import label_of
 from autdtorch.propagators import Run
+from autdtorch.scene.reflectors import kinds_of
+from autdtorch.scene.scene import Scene, obstacle_kinds
 from autdtorch.study.report.claims import Claim, Verdict
 from autdtorch.study.results import MethodResult, SceneResult, StudyResult, column_decimals
 from autdtorch.study.statistics import NEAR_BOUND, Interval, bound_gap, has_shares
@@ -57,6 +59,17 @@ def evidence_rows(judged: Iterable[tuple[Claim, Verdict | None]]) -> list[list[s
     for number, (claim, verdict) in enumerate(judged, start=1):
         if verdict is not None:
             rows.append([str(number), claim.reading, "<br>".join(verdict.evidence)])
+    return rows
+
+
+def room_rows(scenes: Mapping[str, Scene]) -> list[list[str]]:
+    """Return obstacles and reflectors of every scene; nothing where none reflects or absorbs."""
+    if not any(one.reflectors or any(body.is_lossy for body in one.obstacles) for one in scenes.values()):
+        return []
+    rows = [["scene", "obstacles", "reflectors"]]
+    for name, scene in scenes.items():
+        kinds = obstacle_kinds(scene.obstacles), kinds_of(scene.reflectors)
+        rows.append([name, *(", ".join(each) or "none" for each in kinds)])
     return rows
 
 
