@@ -1,9 +1,11 @@
 """Random scenes for stress tests: small domains, obstacles of every kind, contrast and position.
 
 A scene is 6 to 12 cells across at 3 to 20 cells per wavelength. It holds one to four obstacles, which may be
-rigid, thin, touching or overlapping, with sources and control points close to them.
+rigid, absorbing, thin, touching or overlapping, with sources and control points close to them. Some have
+reflectors, which may cut obstacles.
 """
 
+import cmath
 import math
 import warnings
 from dataclasses import dataclass
@@ -13,9 +15,11 @@ import numpy as np
 import torch
 
 from autdtorch.fdtd.grid import MIN_CELLS_PER_WAVELENGTH, make_grid
+from autdtorch.fdtd.reflection import whole_region
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
+from autdtorch.scene.reflectors import Reflector
 from autdtorch.scene.scene import Medium, OverlapWarning, ScaleWarning, Scene
 from autdtorch.utils.array_types import Array
 
@@ -33,6 +37,10 @@ KINDS = {
     **{"shell": 0.05, "voxels": 0.05, "mesh": 0.05, "wall": 0.15},
 }
 """Kinds of obstacles and their shares; walls are unbounded, in the scenes that allow it."""
+MATERIALS = {"fluid": 0.5, "rigid": 0.15, "absorbing": 0.2, "impedance": 0.15}
+"""Materials of obstacles and their shares."""
+REFLECTOR_SHARE = 0.2
+"""Share of the scenes with a reflector, and of these with a second one."""
 
 UNBOUNDED = 1e3
 """Extent of a wall [cells]."""
@@ -52,7 +60,7 @@ class Trial:
     steps: int  # of each run, at least; the driven run takes `FEWEST_PERIODS` if these are more
     labels: tuple[str, ...]
     inside: bool  # whether all obstacles are inside the domain; else some may reach into the boundary layer
-    refused: int  # scenes drawn before it with obstacles too slow for the spacing
+    refused: int  # scenes drawn before it that are refused
 
     def __str__(self) -> str:
         """Describe the scene."""
@@ -84,9 +92,13 @@ def draw_trial(seed: int, number: int, long_share: float = LONG_SHARE) -> Trial:
 
 
 def _refused(scene: Scene, spacing: float) -> bool:
-    """Return whether an obstacle is too slow for the spacing, the only valid error here."""
+    """Return whether an obstacle is too slow for the spacing, or a wall that reacts: all errors here."""
+    region = whole_region(region_of(scene))
+    for wall in (body for body in region.bodies if body.continued):
+        if wall.impedance is not None or (wall.fluid is not None and wall.fluid.density.imag):
+            return True
     try:
-        make_grid(region_of(scene), spacing)
+        make_grid(region, spacing)
     except ValueError as error:
         if "cells per wavelength in obstacle" not in str(error):
             raise
@@ -106,7 +118,14 @@ class _Draft:
 
     def scene(self) -> Scene | None:
         """Return the scene, with points in its air; None if the obstacles leave too little air."""
+        reflectors = self._reflectors()
         candidates = self.spacing * self.domain * self.rng.uniform(0.02, 0.98, (512, 3))
+        for reflector in reflectors:
+            height = reflector.mirror.height(torch.from_numpy(candidates)).numpy()
+            candidates = candidates[height > 0.1 * self.spacing]
+            surfaces = [obstacle.surface()[0] for obstacle in self.obstacles]
+            if min(reflector.mirror.height(surface).max() for surface in surfaces) < 0.1 * self.spacing:
+                return None  # an obstacle is behind it
         gap = np.min([o.signed_distance(candidates).numpy() for o in self.obstacles], axis=0) / self.spacing
         # the distance to voxels is not exact between their centres
         inside = np.any([o.contains(candidates, margin=1e-6).numpy() for o in self.obstacles], axis=0)
@@ -127,7 +146,20 @@ class _Draft:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", OverlapWarning)
             warnings.simplefilter("ignore", ScaleWarning)  # points behind sources that face anywhere
-            return Scene(array, AIR, FREQUENCY, candidates[chosen[2:]], self.obstacles, domain=corners)
+            return Scene(
+                array, AIR, FREQUENCY, candidates[chosen[2:]], self.obstacles, domain=corners,
+                reflectors=reflectors,
+            )  # fmt: skip
+
+    def _reflectors(self) -> list[Reflector]:
+        """Return up to two planes at right angles, in the first third of the domain from a side."""
+        reflectors, rng = [], self.rng
+        for axis in rng.permutation(3)[: (rng.uniform(size=2) < REFLECTOR_SHARE).cumprod().sum()]:
+            sign, place = rng.choice((-1.0, 1.0)), rng.choice((0.0, rng.uniform(0, 0.33)))
+            point = np.where(sign > 0, place, 1 - place) * self.domain * self.spacing
+            reflectors.append(Reflector(point, sign * np.eye(3)[axis], rng.choice((-1.0, 1.0))))
+            self.labels.add("reflector")
+        return reflectors
 
     def add_obstacle(self, inside: bool) -> None:
         """Draw one more, fully `inside` the domain or partly."""
@@ -164,8 +196,8 @@ class _Draft:
         center, place = self._center(size)
         if aligned and place == "apart":
             center = np.rint(2 * center) / 2
-        material, names = _material(rng)
-        obstacle = _make(kind, self.spacing * center, self.spacing * size, axis, turn, rng, material)
+        material, names = draw_material(rng)
+        obstacle = make_obstacle(kind, self.spacing * center, self.spacing * size, axis, turn, rng, material)
         names |= {kind, place} | ({"aligned"} if aligned else set()) | ({"thin"} if thin else set())
         return obstacle, names
 
@@ -184,13 +216,26 @@ class _Draft:
         return middle + rng.uniform(-0.5, 0.5, 3) * extent, "overlapping"
 
 
-def _material(rng: np.random.Generator) -> tuple[dict[str, Any], set[str]]:
-    """Return the material arguments of an obstacle, and labels."""
-    if rng.uniform() < 0.2:
-        return {"rigid": True}, {"rigid"}
-    density, speed = log_uniform(rng, 1e-3, 1e4), log_uniform(rng, 0.2, 17.0)
-    labels = {"light" if density < 1 else "heavy", "slow" if speed < 1 else "fast"}
-    return {"density": AIR.density * density, "sound_speed": AIR.sound_speed * speed}, labels
+def draw_material(
+    rng: np.random.Generator, slowest: float = 0.2, most_dense: float = 1e4
+) -> tuple[dict[str, Any], set[str]]:
+    """Return the material arguments of an obstacle, and labels; limits are relative to air."""
+    kind = str(rng.choice(list(MATERIALS), p=list(MATERIALS.values())))
+    if kind == "rigid":
+        return {"rigid": True}, {kind}
+    if kind == "impedance":
+        turn = cmath.exp(0.5j * math.pi * rng.uniform(-1, 1))
+        return {"impedance": log_uniform(rng, 0.03, 1e3) * turn}, {kind}
+    density = AIR.density * log_uniform(rng, 1e-3, most_dense)
+    speed = AIR.sound_speed * log_uniform(rng, slowest, 17.0)
+    labels = {"light" if density < AIR.density else "heavy", "slow" if speed < AIR.sound_speed else "fast"}
+    material: dict[str, Any] = {"density": density, "sound_speed": speed}
+    if kind == "absorbing":  # the phases of the density and of the bulk modulus, up to 80 degrees
+        inertia, compression = (log_uniform(rng, 1e-4, 1.4) * (rng.uniform() < 0.7) for _ in range(2))
+        material["density"] *= cmath.exp(1j * inertia)
+        material["sound_speed"] *= cmath.exp(-0.5j * (inertia + compression))
+        labels.add(kind)
+    return material, labels
 
 
 def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
@@ -198,7 +243,7 @@ def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return float(math.exp(rng.uniform(math.log(low), math.log(high))))
 
 
-def _make(
+def make_obstacle(
     kind: str, center: Array, size: Array, axis: Array, turn: Array, rng: np.random.Generator, material: Any
 ) -> Obstacle:
     """Return an obstacle with its centre and size (3,) [m], axis (3,) and rotation (3,) [rad]."""

@@ -234,9 +234,16 @@ def test_areas_of_surfaces_are_true():
         assert cells.loss_rows[:, 27].sum() == pytest.approx(stencil.slope.real / 2 * area, rel=0.01)
 
 
-def test_fluids_of_complex_density_end_inside_the_domain():
-    wall = Body(Box((0, 0, 0), (1.0, 1.0, 4e-3), rigid=True), FOAM, continued=True)
+@pytest.mark.parametrize(
+    ("material", "what"),
+    [
+        ({"fluid": FOAM}, "a fluid of complex density"),
+        ({"fluid": None, "impedance": 2 + 1j}, "a surface with"),
+    ],
+)
+def test_what_would_grow_in_the_layers_ends_inside_the_domain(material, what):
+    wall = Body(Box((0, 0, 0), (1.0, 1.0, 4e-3), rigid=True), continued=True, **material)
     region = region_of_bodies(wall)
     grid = make_grid(region, 2e-3)
-    with pytest.raises(ValueError, match=r"obstacles\[0\]: a fluid of complex density .* end inside"):
+    with pytest.raises(ValueError, match=rf"obstacles\[0\]: {what} .* end inside"):
         elements_of(region, grid, air_stencil(grid, region))

@@ -25,6 +25,7 @@ from autdtorch.fdtd.assembly.heterogeneous import heterogeneous_cells
 from autdtorch.fdtd.grid import make_grid
 from autdtorch.fdtd.kernels.contract import uniform_state
 from autdtorch.fdtd.kernels.cpu import CpuKernel
+from autdtorch.fdtd.reflection import whole_region
 from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
 from autdtorch.fdtd.stepping import assemble, drive_dft, drive_signal
@@ -114,7 +115,10 @@ SCENES = range(12)
 
 
 def operator_of(cells, shape):
-    """M^-1/2 K M^-1/2 of the heterogeneous cells that are not rigid; all others are held at zero."""
+    """M^-1/2 K M^-1/2 of the heterogeneous cells that are not rigid; all others are held at zero.
+
+    K includes the stiffness of surfaces against silence.
+    """
     place = np.full(math.prod(shape), -1)
     open_cells = np.flatnonzero(~np.isin(cells.index, cells.rigid))
     place[cells.index[open_cells]] = np.arange(len(open_cells))
@@ -124,7 +128,8 @@ def operator_of(cells, shape):
     other = neighbour[row, column]
     coupling = weight[row, column] * root[row] / root[other]
     size = (len(open_cells),) * 2
-    return sparse.diags_array(weight.sum(axis=1)) - sparse.csc_array((coupling, (row, other)), size)
+    ground = cells.loss_rows[open_cells, 28] / cells.mass[open_cells]
+    return sparse.diags_array(weight.sum(axis=1) + ground) - sparse.csc_array((coupling, (row, other)), size)
 
 
 def assert_not_negative(matrix, largest):
@@ -139,9 +144,10 @@ def assert_not_negative(matrix, largest):
 @pytest.mark.parametrize("number", SCENES)
 def test_energy_is_symmetric_positive_and_bounded(number):
     trial = draw_trial(0, number, long_share=1.0)
-    grid = make_grid(region_of(trial.scene), trial.spacing)
+    region = whole_region(region_of(trial.scene))
+    grid = make_grid(region, trial.spacing)
     stencil = tuned_stencil(grid.kappa)
-    elements = elements_of(region_of(trial.scene), grid, stencil)
+    elements = elements_of(region, grid, stencil)
 
     # each element by itself, which is sufficient; rounding
     eigenvalues = np.linalg.eigvalsh(stiffness_matrix(elements.interface.coupling))
@@ -152,7 +158,9 @@ def test_energy_is_symmetric_positive_and_bounded(number):
     cells = heterogeneous_cells(elements, stencil)
     assert (cells.mass > 0).all()
     matrix = operator_of(cells, grid.shape)
-    largest = largest_eigenvalue(cells.index, cells.weight, stencil, grid.shape)
+    rows = cells.weight.copy()
+    rows[:, 13] = cells.loss_rows[:, 28] / cells.mass
+    largest = largest_eigenvalue(cells.index, rows, stencil, grid.shape)
     assert np.abs(matrix - matrix.T).max() <= 1e-12 * largest
     assert_not_negative(matrix, largest)
     assert_not_negative(largest * sparse.eye_array(matrix.shape[0]) - matrix, largest)

@@ -55,6 +55,8 @@ def with_losses(
     tangent = LARGEST_TANGENT / max(materials.losses.tangent, LARGEST_TANGENT)
     stable = ~_negative(stiffness_matrix(coupling.real + tangent * coupling.imag))[:, None]
     air = stencil.loss * still.mass  # all cells absorb as air does
+    # some masses have kinks, beyond which nothing continues them
+    mass = np.where((mass.real >= 0).all(axis=1, keepdims=True), mass, still.mass)
     loss = _passive(np.where(stable, -coupling.imag, 0), stencil.symbol * mass.imag, air)
     real = np.where(stable, coupling.real, still.coupling)
     return still._replace(coupling=real, mass=np.asarray(mass.real), loss=loss)

@@ -116,8 +116,14 @@ def unions_of(region: Region, grid: Grid, stencil: Stencil) -> tuple[list[Union]
 def _require_continuable(number: int, body: Body) -> None:
     """Refuse bodies through the boundary layers that these do not absorb waves in.
 
-    Layers stretch the coupling of cells, and not the damping of it by a complex density.
+    Layers stretch the coupling of cells, and not the damping of it by a complex density. Along a surface with
+    an impedance waves grow in them.
     """
+    if body.continued and body.impedance is not None:
+        raise ValueError(
+            f"obstacles[{number}]: a surface with an impedance ({body.impedance:.3g}) crosses the whole"
+            " domain; must end inside it, or be a reflector"
+        )
     if body.continued and body.fluid is not None and body.fluid.density.imag:
         raise ValueError(
             f"obstacles[{number}]: a fluid of complex density ({body.fluid.density:.3g} kg/m^3) crosses the"
