@@ -36,7 +36,7 @@ BEYOND, MOST_BEYOND = 3.0, 0.05
 CLEARANCE = 3e-3
 """Distance [m] of points and transducers from surfaces: three cells, with which either way is accurate."""
 KINDS = ("sphere", "box", "rotated box", "cylinder", "plate", "voxels", "mesh")
-MOST_WAVES = 60
+MOST_WAVES = 12
 """Most simulations of T-matrices."""
 TOLERANCE = 2e-4
 """Distance to the steady state at which runs end: a fifth of what reciprocity may be off."""
