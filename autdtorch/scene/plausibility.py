@@ -75,6 +75,13 @@ def _too_large(scene: Scene) -> Iterator[tuple[str, str]]:
             kind = type(obstacle).__name__
             yield f"obstacles[{index}]", f": {kind} of {extent_of(obstacle)}; {obstacle.unit_question}"
     ask = "is it in m, 100 mm as 100e-3?"
+    for index, reflector in enumerate(scene.reflectors):
+        gap = float(reflector.mirror.height(points).min())
+        if gap > max(_usual_reach(scene, points), _FAR):
+            yield (
+                f"reflectors[{index}]",
+                f": {gap:.3g} m from everything; is its point in m, 100 mm as 100e-3?",
+            )
     if (plane := scene.observation_plane) is not None:
         everything.append(plane.corners)
         if _is_too_large(scene, points, plane.corners):

@@ -99,9 +99,8 @@ def require_arrangement(reflectors: Sequence[Reflector], wavelength: float) -> N
         if np.dot(one.normal, other.normal) > 0:
             raise invalid(name, other.normal, f"must be against that of {plane}, which is parallel")
         if gap < wavelength:
-            accepted = (
-                f"is {gap:.4g} m in front of {plane}, must be at least a wavelength, {wavelength:.4g} m"
-            )
+            place = f"{abs(gap):.4g} m {'in front of' if gap >= 0 else 'behind'} {plane}"
+            accepted = f"is {place}, must be in front of it by at least a wavelength, {wavelength:.4g} m"
             raise invalid(f"Scene.reflectors[{second}].point", other.point, accepted, "m")
 
 

@@ -338,8 +338,8 @@ def _require_in_front(scene: Scene) -> None:
         for index, obstacle in enumerate(scene.obstacles):
             highest = float(reflector.mirror.height(obstacle.surface()[0]).max())
             if highest <= LENGTH_TOLERANCE:
-                accepted = f"is wholly behind reflector {number}, must be in front of it"
-                raise invalid(f"Scene.obstacles[{index}]", extent_of(obstacle), accepted)
+                accepted = f"is wholly behind reflector {number}, must be in front of it, at least in part"
+                raise ValueError(f"Scene.obstacles[{index}]: {extent_of(obstacle)}; {accepted}")
 
 
 def require_in_front(
@@ -350,9 +350,10 @@ def require_in_front(
         height = reflector.mirror.height(points)
         if (height < -LENGTH_TOLERANCE).any():
             lowest = int(height.argmin())
-            accepted = (
-                f"is {-1e3 * float(height[lowest]):.4g} mm behind reflector {number}, must be in front of it"
-            )
+            accepted = f"is {-1e3 * float(height[lowest]):.4g} mm behind reflector {number}"
+            accepted += ", must be in front of it"
+            if (height < 0).all():
+                accepted += "; its normal points into the space that is simulated"
             raise invalid(f"{name}[{lowest}]", points[lowest], accepted, "m")
 
 

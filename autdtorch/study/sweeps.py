@@ -229,7 +229,9 @@ def _name(name: str, swept: Settings) -> str:
     ends = [key.rpartition(".")[2] for key in shown]
     alone = [ends.count(end) == 1 and end != "method" for end in ends]  # the solver has a method too
     keys = [end if short else key for key, end, short in zip(shown, ends, alone, strict=True)]
-    values = ("x".join(map(str, value)) if isinstance(value, list) else value for value in shown.values())
+    values = (
+        "x".join(map(str, value)) or "none" if isinstance(value, list) else value for value in shown.values()
+    )
     swept_to = (f"{_word(key)}={_word(value)}" for key, value in zip(keys, values, strict=True))
     return ",".join([name, *swept_to])
 

@@ -1,10 +1,15 @@
 """Grids of points that reach behind a reflector: pictures, which are silent there."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 import autdtorch as at
+from autdtorch.plot.explore.display import refusal
+from autdtorch.plot.explore.situation import Situation
 from autdtorch.propagators.volume import are_shown
+from autdtorch.study.report.tables import room_rows
 
 ARRAY = at.TransducerArray.grid((2, 2), 10e-3, (0, 0, 0), (0, 0, 1), radius=4e-3)
 DRIVE = at.drive_from_phases(torch.tensor([[0.0, 1.0, 2.0, 3.0], [0.5, 0.5, 0.0, 0.0]]))
@@ -43,3 +48,33 @@ def test_a_volume_is_unknown_behind_and_the_plane_itself_is_in_front():
     assert not volume[:, :, heights > 6e-3].isnan().any()
     on_plane = torch.tensor([[0.5, 0.0, 0.0], [0.5, 0.0, -1e-6]], dtype=torch.float64)
     assert are_shown(place, on_plane).tolist() == [True, False]
+
+
+def test_obstacles_move_in_front_of_reflectors_that_stay():
+    place = scene(at.Sphere((0, 0, 12e-3), 3e-3, rigid=True))
+    moved = place.moved((0, 0, 3e-3))
+    assert moved.reflectors == place.reflectors
+    assert not replace(place, reflectors=()).equals(place)
+    situation = Situation.of(place, DRIVE[0])
+    cut = situation.with_body(0, (20e-3, 0, 1e-3), (0, 0, 0))
+    assert cut.scene.obstacles[0].lower[2] < 0
+    with pytest.raises(ValueError, match="wholly behind") as caught:
+        situation.with_body(0, (20e-3, 0, -4e-3), (0, 0, 0))
+    told = refusal(caught.value)
+    assert told.startswith(
+        "obstacle 0: (17.0, -3.0, -7.0) mm to (23.0, 3.0, -1.0) mm; is wholly behind reflector 0"
+    )
+
+
+def test_a_report_lists_what_reflects_and_absorbs():
+    felt = at.Sphere((0, 0, 12e-3), 3e-3, density=20.0, sound_speed=300.0, absorption=100.0)
+    soft = [at.Reflector.behind(ARRAY, -1), at.Reflector((0, -0.1, 0), (0, 1, 0), 0.5 + 0.25j)]
+    rows = room_rows({"felt": scene(felt, reflectors=soft), "bare": scene(reflectors=())})
+    assert rows[1] == [
+        "felt",
+        "1 x Sphere (20 kg/m³, 300 m/s, 100 dB/m)",
+        "1 x soft, 1 x reflection 0.5+0.25j",
+    ]
+    assert rows[2] == ["bare", "none", "none"]
+    assert room_rows({"bare": scene(reflectors=())}) == []
+    assert "1 x soft" in scene(reflectors=soft)._repr_html_()

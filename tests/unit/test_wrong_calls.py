@@ -45,6 +45,14 @@ def wall(x=0.2, size=(0.05, 10.0, 10.0), **changes):
     return box(center=(x, 50e-3, 50e-3), size=size, **changes)
 
 
+def room(*reflectors, obstacles=(), **changes):
+    return scene(*obstacles, reflectors=reflectors, **changes)
+
+
+def wall_at(x, normal=(1, 0, 0), reflection=1.0, y=0.0):
+    return at.Reflector((x, y, 0), normal, reflection)
+
+
 @pytest.fixture(scope="module")
 def objective():
     free = scene()
@@ -80,6 +88,7 @@ WARNED = {
     "mm of wall": (lambda: scene(wall(200.0, (50.0, 600.0, 400.0))), r"obstacles\[0\].*in m"),
     "mm/s": (lambda: at.Medium(1.2, 340e3), "sound_speed.*other units"),
     "swapped": (lambda: at.Medium(340.0, 1.2), "sound_speed.*swapped"),
+    "mm of a reflector": (lambda: room(wall_at(-200.0)), r"reflectors\[0\].*m from everything.*in m"),
     "points that face away": (lambda: scene(array=grid(0.2)), "control_points.*behind.*normal"),
     "MHz": (lambda: scene(frequency=40e6), "frequency in Hz"),
     "mm of pitch": (lambda: scene(array=grid(1e-3, pitch=10)), "array.*10 m apart.*in m"),
@@ -137,6 +146,10 @@ MEANT = {
     "a tank at 2 MHz": lambda: in_water(2e6),
     "a plane of 3 m": lambda: scene(observation_plane=replace(PLANE, size=(3, 3))),
     "a domain of 3 m": lambda: scene(domain=((-1.5,) * 3, (1.5,) * 3)),
+    "a hand on the panel": lambda: room(
+        at.Reflector.behind(ARRAY), obstacles=[at.Sphere((1e-3, 0, 0), 8e-3, rigid=True)]
+    ),
+    "a wall of the lab": lambda: room(wall_at(-2.0), wall_at(3.0, (-1, 0, 0))),
     "a scene that is moved, replaced, read": moved_and_read,
     "some foci behind": lambda: facing(1e-3, (1, 0, 0), control_points=at.sphere_points(MIDDLE, 0.1, 9)),
     "sources without direction": lambda: lone(-0.05),
@@ -205,6 +218,58 @@ REFUSED = {
     "maps": (lambda _: at.plot_planes({"a": {"b": MAP}}, PLANE), "pressure.*by name"),
     "map": (lambda _: at.plot_planes(MAP, PLANE), "pressure.*plot_plane"),
 }
+
+
+PANEL = at.Reflector.behind(ARRAY)
+REFUSED |= {
+    "negative resistance": (lambda _: box(rigid=False, impedance=-2), r"Box\.impedance: -2; .*adds energy"),
+    "impedance beside density": (
+        lambda _: box(rigid=False, impedance=2, density=2.0, sound_speed=340.0), r"impedance: 2; .*either",
+    ),
+    "absorption of what is rigid": (lambda _: box(absorption=3), r"Box\.absorption: 3.*rigid.*impedance="),
+    "a gain of sound": (lambda _: box(rigid=False, density=2 - 1j, sound_speed=300), "density.*conjugate"),
+    "foam too dense": (lambda _: at.porous(1e9, frequency=40e3), r"flow_resistivity: 1000000000\.0 .*in 4"),
+    "more than all reflected": (lambda _: wall_at(0, reflection=1.5), r"reflection: 1\.5; its magnitude"),
+    "a normal of nothing": (lambda _: wall_at(0, (0, 0, 0)), r"normal: \(0, 0, 0\).*length"),
+    "array behind": (lambda _: room(wall_at(2e-3)), r"array\.positions\[0\].*1 mm behind.*its normal points"),
+    "a normal turned away": (
+        lambda _: room(wall_at(1e-3, (-1, 0, 0))), r"control_points\[.*79 mm behind.*its normal",
+    ),
+    "points behind": (lambda _: room(wall_at(40e-3, (-1, 0, 0))), r"control_points.*40 mm behind refl"),
+    "plane behind": (
+        lambda _: room(PANEL, observation_plane=at.Plane(MIDDLE, (0, 0, 1), (0.1, 0.1))),
+        r"observation_plane corner\[\d\].*mm behind reflector 0",
+    ),
+    "obstacle behind": (
+        lambda _: room(PANEL, obstacles=[box(center=(-30e-3, 0, 0))]),
+        r"obstacles\[0\]: \(.*\) m; is wholly behind reflector 0, must be in front",
+    ),
+    "planes too near": (
+        lambda _: room(PANEL, wall_at(5e-3, (-1, 0, 0))), r"\[1\]\.point.*0\.004 m in front.*wavelength",
+    ),
+    "planes back to back": (
+        lambda _: room(PANEL, wall_at(-1, (-1, 0, 0))), r"\[1\]\.point.*1\.001 m behind.*must",
+    ),
+    "planes at 60 degrees": (lambda _: room(PANEL, wall_at(-1, (1, 2, 0))), r"\[1\]\.normal.*right angle"),
+    "planes of one direction": (lambda _: room(PANEL, wall_at(-1)), r"\[1\]\.normal.*be against"),
+    "a tilted plane in full": (
+        lambda _: at.make_propagator(room(wall_at(-0.1, (1, 0.1, 0))), method="full"), "'full'.*along an a",
+    ),
+    "half reflected in full": (
+        lambda _: at.make_propagator(room(wall_at(0, reflection=0.5)), method="full"), "'full'.*1 or -1.*box",
+    ),
+    "half reflected under an obstacle": (
+        lambda _: at.make_propagator(room(wall_at(0, reflection=0.5), obstacles=[box(center=(8e-3, 0, 0))])),
+        r"reflectors\[0\]\.reflection: 0\.5; must be 1 or -1 where an obstacle",
+    ),
+    "a mapping": (lambda _: room({"point": (0, 0, 0), "normal": (1, 0, 0)}), r"reflectors\[0\].*a Reflector"),
+    "no list": (lambda _: scene(reflectors=PANEL), r"reflectors.*sequence, each entry of class Reflector"),
+    "two boards": (lambda _: at.Reflector.behind(ARRAY + grid(0.2, (-1, 0, 0))), "array.*flat array"),
+    "heard behind": (
+        lambda _: at.make_propagator(room(PANEL)).field(torch.ones(16) + 0j, [(0, 0.05, 0.05)]),
+        r"points\[0\].*1 mm behind reflector 0",
+    ),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", REFUSED)

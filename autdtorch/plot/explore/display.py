@@ -171,6 +171,7 @@ def refusal(error: Exception) -> str:
     text = str(error) or repr(error)
     for field, name in (("control_points", "focus"), ("obstacles", "obstacle"), ("reflectors", "reflector")):
         text = re.sub(rf"Scene\.{field}\[(\d+)\]:?", rf"{name} \1:", text)
+    text = re.sub(r"\(([^()]*)\) to (?=\([^()]*\) m\b)", lambda corner: f"{_point_in_mm(corner)} to ", text)
     return re.sub(r"\(([^()]*)\) m\b", _point_in_mm, text)
 
 
