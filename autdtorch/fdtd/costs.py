@@ -36,8 +36,9 @@ _ELEMENTS, _MOST_ELEMENTS = 1.4, 4096
 _RECORDED = 44
 """Memory [bytes] of a recorded number, and of what is made of it for the Fourier sums."""
 
-_CELL_STEPS, _COLUMN_STEPS = 15.0, 150.0
-"""Time of a step of a heterogeneous cell, and of one that a surface cuts in a boundary layer. This and the
+_CELL_STEPS, _COLUMN_STEPS, _LOSSY = 15.0, 150.0, 2.0
+"""Time of a step of a heterogeneous cell, and of one that a surface cuts in a boundary layer, and the factor
+on the former for bodies that absorb, whose cells have two rows. This and the
 following times are in steps of a cell of air."""
 
 _PAIR_STEPS, _ASSEMBLY_STEPS, _MESH_STEPS = 11.0, 60_000.0, 60_000.0
@@ -136,12 +137,14 @@ class Costs:
             cut += float(np.abs(doubled).sum()) / 2 / spacing**2
             columns += (float(np.linalg.norm(continued, axis=1).sum()) / 2 - area) / spacing**2
             beside = _BESIDE * area / spacing**2
-            cells += beside
+            absorbs = body.impedance is not None or (body.fluid is not None and body.fluid.is_lossy)
+            rows = _LOSSY if absorbs else 1.0
+            cells += rows * beside
             meshed += beside if is_mesh else 0.0
             assembled += beside * (_ALIKE if self.grouping.aligned else _FORCES if body.fluid else 1)
-            if body.fluid and (body.fluid.is_lossy or body.fluid.sound_speed != region.fluid.sound_speed):
+            if body.fluid and (absorbs or body.fluid.sound_speed != region.fluid.sound_speed):
                 box = np.clip([body.shape.lower, body.shape.upper], *inner)
-                cells += _SHARE_INSIDE * float(np.prod(box[1] - box[0])) / spacing**3
+                cells += rows * _SHARE_INSIDE * float(np.prod(box[1] - box[0])) / spacing**3
         return Heterogeneity(cut, cells, columns, meshed, assembled)
 
     @property

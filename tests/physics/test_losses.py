@@ -19,7 +19,9 @@ from lossy_bodies import (
     sphere_series,
 )
 from scipy.sparse import coo_array
+from small_scenes import relative_error, small_scene
 
+from autdtorch.analytic import fluid_slab
 from autdtorch.fdtd.absorption import absorption
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import heterogeneous_cells
@@ -27,6 +29,9 @@ from autdtorch.fdtd.grid import make_box, make_grid
 from autdtorch.fdtd.region import Body, Fluid
 from autdtorch.fdtd.stencil import OFFSETS, flat_offsets
 from autdtorch.fdtd.stepping import air_stencil, assemble_on
+from autdtorch.propagators import make_propagator
+from autdtorch.propagators.scene_region import region_of
+from autdtorch.scene.arrays import strengths_of
 from autdtorch.scene.obstacles import Box, Sphere
 
 CENTER = np.array([0.13e-3, 0.21e-3, -0.32e-3])
@@ -232,6 +237,26 @@ def test_areas_of_surfaces_are_true():
         cells = heterogeneous_cells(elements_of(region, grid, stencil), stencil)
         # edges of a box are rounded by an element's share: 1 %
         assert cells.loss_rows[:, 27].sum() == pytest.approx(stencil.slope.real / 2 * area, rel=0.01)
+
+
+def test_a_lossy_plate_continues_through_the_boundary_layers():
+    """Behind it the field is that of an infinite slab."""
+    plate = Box((14e-3, 12e-3, 12e-3), (3e-3, 90e-3, 90e-3), density=3.0, sound_speed=300.0, absorption=300.0)
+    scene = small_scene((plate,))
+    fluid = region_of(scene).bodies[0].fluid
+    ratios = fluid.density / scene.medium.density, fluid.sound_speed / scene.medium.sound_speed
+    exact = fluid_slab(
+        scene.control_points,
+        scene.array.positions,
+        scene.wavenumber,
+        (12.5e-3, 0, 0),
+        (-1, 0, 0),
+        3e-3,
+        *ratios,
+    )
+    exact = 4 * math.pi * exact * strengths_of(scene.array)
+    # five times what is found
+    assert relative_error(make_propagator(scene, "full", spacing=1e-3).transfer_matrix(), exact) < 2.5e-3
 
 
 @pytest.mark.parametrize(
