@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 
 from autdtorch.propagators.free_space import FreeSpacePropagator
-from autdtorch.propagators.notices import warn_of_resonant_planes, warn_of_scene
+from autdtorch.propagators.notices import warn_of_scene
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.refinement import Budget, refined
 from autdtorch.propagators.simulated import SimulatedPropagator
@@ -86,26 +86,22 @@ def make_propagator(
     if spacing is not None and (seconds, memory) != (None, None):
         raise invalid("spacing", spacing, "must be None where seconds or memory limit its choice", "m")
     store = store_in(cache)
-    warn_of_resonant_planes(scene)
     if planned.method == "free_space":
         return FreeSpacePropagator(scene)
 
-    @functools.cache  # T-matrices need it for some points only
-    def simulated() -> SimulatedPropagator:
-        on_grids = planned.on_grids
-        if spacing is None:
-            return refined(on_grids, Budget(seconds, memory), store)
-        on_grids.require_feasible()
-        return SimulatedPropagator(on_grids, store)
+    @functools.cache  # T-matrices need it for some points only; its time begins then
+    def on_grids() -> SimulatedPropagator:
+        budget = Budget(seconds, memory) if spacing is None else None
+        return refined(planned.on_grids, budget, store)
 
     propagator: TMatrixPropagator | SimulatedPropagator
     if planned.method == "tmatrix" and not planned.runs:
-        return TMatrixPropagator(planned, store, simulated)
+        return TMatrixPropagator(planned, store, on_grids)
     if planned.method == "tmatrix":
-        settled = planned if spacing else planned.at(simulated().spacing, tolerance, time_step)
-        propagator = TMatrixPropagator(settled, store, simulated)
+        settled = planned if spacing else planned.at(on_grids().spacing, tolerance, time_step)
+        propagator = TMatrixPropagator(settled, store, on_grids)
     else:
-        propagator = simulated()
+        propagator = on_grids()
     if time_step is not None:
         logger.debug("time step %.4g us", 1e6 * propagator.time_step)  # refuses one that is not stable
     warn_of_scene(propagator.plan)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 from collections.abc import Iterable, Sequence
 
@@ -14,9 +13,7 @@ from autdtorch.fdtd.turning import axes_along, flat_faces
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.scene_region import warn_of_ending_walls, warn_of_near_points
 from autdtorch.propagators.simulation import PressureMap, Run, Simulation
-from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.images import resonates
 from autdtorch.utils.text import counted
 from autdtorch.utils.units import warn_user
 
@@ -94,17 +91,6 @@ class Notices:
         if kind not in self._logged:
             self._logged.add(kind)
             logger.warning(text, *values)
-
-
-def warn_of_resonant_planes(scene: Scene) -> None:
-    """Log reflectors that face each other at a distance where the space between them resonates."""
-    for (first, one), (second, other) in itertools.combinations(enumerate(scene.reflectors), 2):
-        mirrors = one.mirror, other.mirror
-        if mirrors[0].is_parallel(mirrors[1]) and resonates(*mirrors, scene.complex_wavenumber):
-            logger.warning(
-                "reflectors %d and %d are next to a resonance of the air between them: images are summed"
-                " with an error above 1e-4, and a small shift of either changes the field", first, second,
-            )  # fmt: skip
 
 
 def warn_of_scene(plan: Plan) -> None:

@@ -69,28 +69,34 @@ class Budget:
         return in_time and (self.memory is None or plan.memory <= self.memory) and plan.is_feasible()
 
 
-def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
-    """Return a propagator whose estimated error is within the tolerance of a plan.
+def refined(plan: Plan, budget: Budget | None, store: Store) -> SimulatedPropagator:
+    """Return the propagator of a plan, or with a budget one whose estimated error is within its tolerance.
 
     Where the budget does not suffice, it is the finest that fits. Where the surface of an obstacle is not
     known well enough, it is one that does not add to that error. Warnings name the error, and resonances.
     """
-    propagator = _refined(pilot, budget, store)
+    if budget is None:
+        return _chosen(plan, plan, None, store)
+    law, region, spacing = plan.law, plan.region, coarsest_spacing(plan.region)
+    if budget.is_unlimited:
+        spacing /= min(region.wavelength / region.shortest_wavelength, _FINER_IF_SLOW)
+        spacing = min(spacing, law.spacing_of(plan.tolerance / _FIRST_ERROR))
+    first = plan.at(spacing, _SETTLED * plan.tolerance, plan.time_step)
+    propagator = _chosen(plan, first, budget, store)
     propagator.warn_of_ringing()
     return propagator
 
 
-def _refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
+def _chosen(pilot: Plan, plan: Plan, budget: Budget | None, store: Store) -> SimulatedPropagator:
+    """Return the propagator of a plan, or with a budget of a finer one; `pilot` has the tolerance."""
     tolerance, region, law = pilot.tolerance, pilot.region, pilot.law
+    blamed = ("spacing", None) if budget is None else ("tolerance", tolerance)
     others: list[Simulation] = []
-    spacing = coarsest_spacing(region)
-    if budget.is_unlimited:
-        spacing /= min(region.wavelength / region.shortest_wavelength, _FINER_IF_SLOW)
-        spacing = min(spacing, law.spacing_of(tolerance / _FIRST_ERROR))
-    plan = pilot.at(spacing, _SETTLED * tolerance, pilot.time_step)
     while True:
-        plan.require_feasible("tolerance", tolerance)
+        plan.require_feasible(*blamed)
         begin, propagator = time.perf_counter(), SimulatedPropagator(plan, store, others)
+        if budget is None:
+            return propagator
         error, shape, rigid_error = propagator.known_errors()
         taken = time.perf_counter() - begin
         logger.debug("spacing %.3g mm: estimated error %.2g", 1e3 * plan.spacing, error)
@@ -98,7 +104,7 @@ def _refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
             logger.debug(
                 "obstacles taken as rigid would leave an error of %.2g: their materials count", rigid_error
             )
-            return _refined(pilot.with_materials, budget, store)
+            return refined(pilot.with_materials, budget, store)
         step = _LARGEST_STEP
         if others:
             accepted = tolerance * (_BY_TWO_GRIDS if len(others) == 1 else _BY_THREE_GRIDS)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import cmath
+import logging
+import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -13,7 +15,7 @@ import numpy as np
 import torch
 
 from autdtorch.scene.arrays import TransducerArray
-from autdtorch.utils.images import Mirror
+from autdtorch.utils.images import Mirror, resonates
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
@@ -24,6 +26,8 @@ from autdtorch.utils.validation import (
     require_kind,
     unit_vector,
 )
+
+logger = logging.getLogger(__name__)
 
 _FLAT = 1e-6
 """Distance [m] by which transducers may be off the plane of their panel."""
@@ -86,8 +90,12 @@ class Reflector:
         return Mirror(self.point, self.normal, self.reflection)
 
 
-def require_arrangement(reflectors: Sequence[Reflector], wavelength: float) -> None:
-    """Refuse planes that are neither at right angles nor facing each other, at least a wavelength apart."""
+def require_arrangement(reflectors: Sequence[Reflector], wavenumber: complex) -> None:
+    """Refuse planes that are neither at right angles nor facing each other, at least a wavelength apart.
+
+    Those that face each other where the air between them resonates are logged.
+    """
+    wavelength = 2 * math.pi / wavenumber.real
     for (first, one), (second, other) in combinations(enumerate(reflectors), 2):
         name, plane = f"Scene.reflectors[{second}].normal", f"reflector {first}"
         if one.mirror.is_perpendicular(other.mirror):
@@ -102,6 +110,11 @@ def require_arrangement(reflectors: Sequence[Reflector], wavelength: float) -> N
             place = f"{abs(gap):.4g} m {'in front of' if gap >= 0 else 'behind'} {plane}"
             accepted = f"is {place}, must be in front of it by at least a wavelength, {wavelength:.4g} m"
             raise invalid(f"Scene.reflectors[{second}].point", other.point, accepted, "m")
+        if resonates(one.mirror, other.mirror, wavenumber):
+            logger.warning(
+                "%s and reflector %d are next to a resonance of the air between them: their images are summed"
+                " with an error above 1e-4, and a small shift of either changes the field", plane, second,
+            )  # fmt: skip
 
 
 def are_in_front(reflectors: Sequence[Reflector], points: torch.Tensor) -> torch.Tensor:

@@ -142,7 +142,7 @@ class Scene:
             raise invalid("Scene.medium.absorption", medium.absorption, accepted, "dB/m")
         _require_waves_inside(self)
         object.__setattr__(self, "reflectors", members("Scene.reflectors", reflectors, Reflector))
-        require_arrangement(self.reflectors, self.wavelength)
+        require_arrangement(self.reflectors, self.complex_wavenumber)
         _require_in_front(self)
         _require_separate_points(self)
         _require_in_domain(self)

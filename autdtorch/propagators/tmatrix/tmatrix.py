@@ -233,7 +233,7 @@ class TMatrixCluster:
                     raise invalid(f"bodies[{number}].center", f"{apart:.4g} m apart", accepted)
         object.__setattr__(self, "bodies", bodies)
         reflectors = members("reflectors", reflectors, Reflector)
-        require_arrangement(reflectors, 2 * math.pi / bodies[0].wavenumber.real)
+        require_arrangement(reflectors, bodies[0].wavenumber)
         for number, body in enumerate(bodies):
             for index, reflector in enumerate(reflectors):
                 height = float(reflector.mirror.height(body.center.detach()))
