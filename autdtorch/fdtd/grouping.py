@@ -21,7 +21,7 @@ from autdtorch.fdtd.grid import (
     crossing_time,
     domain_extent,
 )
-from autdtorch.fdtd.reflection import near_mirrors, whole_region, with_images
+from autdtorch.fdtd.reflection import can_hold, near_mirrors, whole_region, with_images
 from autdtorch.fdtd.region import Region, bounds
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
@@ -162,7 +162,8 @@ def cheapest_boxes(region: Region, spacing: float, tolerance: float, runs: int) 
     choices = [
         _grids(region, spacing, boxes, passes) for boxes, passes in _partitions(region, spacing, tolerance)
     ]
-    return min(choices, key=lambda grouping: grouping.box_cost(runs))
+    possible = [choice for choice in choices if all(can_hold(region, near) for near in choice.mirrors)]
+    return min(possible or choices, key=lambda grouping: grouping.box_cost(runs))
 
 
 def _partitions(region: Region, spacing: float, tolerance: float) -> Iterator[tuple[Sequence[_Outline], int]]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 import torch
@@ -103,12 +104,24 @@ def near_mirrors(region: Region, lower: Array, upper: Array, axes: Array, spacin
     return tuple(number for number, height in enumerate(heights) if height < 0)
 
 
+def can_hold(region: Region, near: Sequence[int]) -> bool:
+    """Return whether a grid can hold the images in some mirrors: rigid or soft ones, none facing another."""
+    mirrors = [region.mirrors[number] for number in near]
+    facing = any(one.is_parallel(other) for one, other in combinations(mirrors, 2))
+    return not facing and all(mirror.reflection in (1, -1) for mirror in mirrors)
+
+
 def require_sharp(region: Region, near: Sequence[int], spacing: float) -> None:
-    """Refuse mirrors next to bodies that are neither rigid nor soft: those have no common grid of images."""
+    """Refuse mirrors next to bodies whose images no grid can hold; see `can_hold`."""
+    if can_hold(region, near):
+        return
+    beside = f"{1e3 * CLEARANCE * spacing:.3g} mm"
     for number in near:
         if region.mirrors[number].reflection not in (1, -1):
-            accepted = f"must be 1 or -1 where an obstacle is within {1e3 * CLEARANCE * spacing:.3g} mm"
+            accepted = f"must be 1 or -1 where an obstacle is within {beside}"
             raise invalid(f"reflectors[{number}].reflection", region.mirrors[number].reflection, accepted)
+    accepted = f"must be {beside} or more from one of reflectors {list(near)}, of which two face each other"
+    raise invalid("obstacles", "one grid next to both", accepted)
 
 
 def require_domain(region: Region, name: str = "method", value: str = "full") -> None:
@@ -161,6 +174,6 @@ def other_images(region: Region, near: Sequence[int], images: Sequence[Image]) -
     """Return the images that a grid does not hold: one for each of its own copies in all other mirrors."""
     if not near:
         return tuple(images)
-    rest = [mirror for number, mirror in enumerate(region.mirrors) if number not in near]
+    held = [region.mirrors[number] for number in near]
     size = float(np.linalg.norm(np.subtract(*region.domain)))
-    return images_of(rest, complex(region.wavenumber, region.attenuation), size)
+    return images_of(region.mirrors, complex(region.wavenumber, region.attenuation), size, held)

@@ -84,7 +84,9 @@ class Mirror:
         return abs(float(np.dot(self.normal, other.normal))) < _RIGHT_ANGLE
 
 
-def images_of(mirrors: Sequence[Mirror], wavenumber: complex, size: float) -> tuple[Image, ...]:
+def images_of(
+    mirrors: Sequence[Mirror], wavenumber: complex, size: float, held: Sequence[Mirror] = ()
+) -> tuple[Image, ...]:
     """Return the images of a space in mirrors, the space itself first.
 
     Mirrors are perpendicular, or pairs of parallel ones that face each other. Those have an infinite series
@@ -94,16 +96,18 @@ def images_of(mirrors: Sequence[Mirror], wavenumber: complex, size: float) -> tu
         mirrors: the mirrors.
         wavenumber: k + i alpha of the medium [rad/m].
         size: diameter of the scene [m].
+        held: mirrors, never two that face each other, in which the places are with their images already. Of
+            each pair of images that differ by these, there is one.
     """
     images, rest = [SPACE_ITSELF], list(mirrors)
     while rest:
         first = rest.pop(0)
         facing = next((other for other in rest if first.is_parallel(other)), None)
         if facing is None:
-            copies = [SPACE_ITSELF, first.image]
+            copies = [SPACE_ITSELF] if first in held else [SPACE_ITSELF, first.image]
         else:
             rest.remove(facing)
-            copies = _between(first, facing, wavenumber, size)
+            copies = _between(first, facing, wavenumber, size, held)
         images = [one.after(other) for other in images for one in copies]
     return tuple(images)
 
@@ -133,8 +137,10 @@ def _decay(first: Mirror, second: Mirror, wavenumber: complex) -> float:
     return abs(first.reflection * second.reflection) * math.exp(-2 * wavenumber.imag * _gap(first, second))
 
 
-def _between(first: Mirror, second: Mirror, wavenumber: complex, size: float) -> list[Image]:
-    """Return the images of the space between two parallel planes, whose weights fade out."""
+def _between(
+    first: Mirror, second: Mirror, wavenumber: complex, size: float, held: Sequence[Mirror]
+) -> list[Image]:
+    """Return the images of the space between two parallel planes, whose weights fade out; see `images_of`."""
     gap = _gap(first, second)
     decay = _decay(first, second, wavenumber)
     trips = _CYCLES / max(series_phase(first, second, wavenumber), _CYCLES / _MOST)
@@ -144,6 +150,8 @@ def _between(first: Mirror, second: Mirror, wavenumber: complex, size: float) ->
     count = min(max(math.ceil(trips), _FEWEST), _MOST)
     images = [SPACE_ITSELF]
     for mirrors in ((first, second), (second, first)):
+        if mirrors[0] in held:  # these are images of what the held mirror has made
+            continue
         image = SPACE_ITSELF
         for number in range(1, 2 * count):
             image = mirrors[(number - 1) % 2].image.after(image)
