@@ -278,6 +278,6 @@ def _degrees_between(
             apart = float((body.center - image.of(other.center)).norm())
             middle = (apart**2 + body.radius**2 - other.radius**2) / (2 * apart) / body.radius
             place = middle - math.sqrt(max(middle**2 - 1, 0.0))  # of the limit point, relative to the radius
-            trips = 2 if other is body else 1  # a wave of its image that comes back has gone both ways
-            fewest = max(fewest, math.ceil(math.log(error) / (trips * math.log(min(place, _NEAREST)))))
+            share = place**2 if other is body else place  # what comes back from a plane has gone both ways
+            fewest = max(fewest, math.ceil(math.log(error) / math.log(min(share, _NEAREST))))
     return fewest
