@@ -7,6 +7,7 @@ smaller; with an impedance up to 1.0 %.
 """
 
 import math
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -241,3 +242,85 @@ def test_a_column_between_two_planes_is_refused():
     scene = room([column], [FLOOR, roof], [[-30e-3, 3e-3, 12e-3]], [[30e-3, 5e-3, 10e-3]])
     with pytest.raises(ValueError, match="face each other"):
         make_propagator(scene, "box", 1e-3).transfer_matrix()
+
+
+FACTORS = st.sampled_from([1.0, -1.0, 0.5, 0.3 + 0.4j])
+
+
+@st.composite
+def rooms(draw):
+    """One to three planes at right angles or two facing ones, and one or two bodies, on a plane or apart."""
+    planes = draw(st.sampled_from(["xyz", "xy", "z", "facing"]))
+    corner = {"x": (-32e-3, 0.0, 0.0), "y": (0.0, -34e-3, 0.0), "z": (0.0, 0.0, 0.0)}
+    names = "z" if planes == "facing" else planes
+    reflectors = [at.Reflector(corner[name], np.eye(3)["xyz".index(name)], draw(FACTORS)) for name in names]
+    if planes == "facing":
+        reflectors.append(at.Reflector((0.0, 0.0, 47.5e-3), (0, 0, -1), draw(st.sampled_from([0.1, 0.3j]))))
+    sharp = "z" in names and reflectors[names.index("z")].reflection in (1, -1)
+    height = draw(st.sampled_from([0.0, 2e-3, 4e-3, 8e-3])) if sharp else 15e-3  # of the body's centre
+    turn = tuple(draw(st.floats(-0.5, 0.5)) for _ in range(3)) if draw(st.booleans()) else (0.0, 0.0, 0.0)
+    bodies = [at.Box((0.0, 0.0, height), (7e-3, 9e-3, 8e-3), turn, rigid=True)]
+    if draw(st.booleans()):
+        bodies.append(at.Sphere((3e-3, 18e-3, draw(st.floats(15e-3, 25e-3))), RADIUS, **BODIES["lossy"][0]))
+    return bodies, reflectors, sharp and any(turn)
+
+
+@settings(max_examples=5)
+@given(scene=rooms())
+def test_reciprocity(scene):
+    """Sources and points change places; relative to the field, or to that without bodies and planes.
+
+    Grids along the faces of a tilted body next to a plane are not their own mirror image: there, reciprocity
+    holds to the grid's error, 0.8 % at most were measured.
+    """
+    bodies, reflectors, uneven = scene
+    one, other = (
+        [[-25e-3, 3e-3, 12e-3], [-22e-3, -14e-3, 30e-3]],
+        [[25e-3, 5e-3, 10e-3], [20e-3, -18e-3, 22e-3]],
+    )
+    forth, back = (
+        make_propagator(room(bodies, reflectors, *places), "box", 1e-3).transfer_matrix()
+        for places in ((one, other), (other, one))
+    )
+    free = make_propagator(room([], [], one, other)).transfer_matrix()
+    assert (forth - back.mT).norm() < (1.5e-2 if uneven else 1e-3) * max(free.norm(), forth.norm())
+
+
+def test_scenes_that_differ_in_a_reflector_share_no_result(tmp_path):
+    sphere, facing = (
+        at.Sphere((0.0, 0.0, 9e-3), RADIUS, rigid=True),
+        at.Reflector((0, 0, 45e-3), (0, 0, -1), 0.1),
+    )
+    choices = [
+        (), (FLOOR,), (at.Reflector((0, 0, 0), (0, 0, 1), -1.0),), (at.Reflector((0, 0, -1e-3), (0, 0, 1)),),
+        (at.Reflector((0, 0, 0), (0, 0.01, 1)),), (FLOOR, facing),
+    ]  # fmt: skip
+    for method, planes in (("box", choices), ("tmatrix", choices[:3])):
+        kept, alone = (
+            [
+                make_propagator(room([sphere], each), method, 2e-3, cache=cache).transfer_matrix()
+                for each in planes
+            ]
+            for cache in (tmp_path, False)
+        )
+        assert all(torch.equal(one, other) for one, other in zip(kept, alone, strict=True))
+        assert all(relative_error(one, other) > 1e-3 for one, other in combinations(kept, 2))
+
+
+def test_methods_and_claims_before_a_panel():
+    """A tolerance without a spacing is kept, and methods do before a panel what they do elsewhere."""
+    scene, exact = before_plane("rigid", 2e-3)
+    propagator = make_propagator(scene, "box", spacing=None, tolerance=1e-2)
+    matrix, error = propagator.transfer_matrix(return_error=True)
+    true = relative_error(matrix, exact)
+    assert true < error < 1e-2
+    assert (propagator.point_errors() > 0.3 * (matrix - exact).norm(dim=1) / exact.norm(dim=1)).all()
+    array = at.TransducerArray.grid((4, 4), 10e-3, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), radius=4.5e-3)
+    plate = at.Box((0.0, 0.0, 30e-3), (12e-3, 12e-3, 3e-3), rigid=True)
+    panel = [at.Reflector.behind(array)]
+    above = at.Scene(array, AIR, 40e3, [[5e-3, 0.0, 50e-3], [-8e-3, 3e-3, 55e-3]], [plate], reflectors=panel)
+    objective = at.SimulatedObjective(above, make_propagator(above, "box", 1.5e-3))
+    bound = at.focus_bound(objective.transfer_matrix)
+    drives = [at.gabs(objective).drive, at.identify(objective).drive]
+    scores = [float(objective(drive).abs().min()) for drive in drives]
+    assert all(0.8 * bound < score <= bound for score in scores)
