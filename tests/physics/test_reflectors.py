@@ -265,7 +265,7 @@ def rooms(draw):
     return bodies, reflectors, sharp and any(turn)
 
 
-@settings(max_examples=5)
+@settings(max_examples=3)
 @given(scene=rooms())
 def test_reciprocity(scene):
     """Sources and points change places; relative to the field, or to that without bodies and planes.
