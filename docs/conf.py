@@ -16,7 +16,7 @@ version = release = autdtorch.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 nitpicky = True
-nitpick_ignore_regex = [("py:class", r"(?!autdtorch\.).*")]  # types of other packages
+nitpick_ignore_regex = [("py:class", r"(?!autdtorch\.).*|autdtorch\.utils\.images\..*")]  # not described here
 default_role = "py:obj"
 
 html_theme = "furo"

@@ -22,7 +22,7 @@ PLANES = {  # a point and the normal of each, about an array of 160 mm in z = 0 
     "panel, 5 mm behind": ((0.0, 0.0, -5e-3), (0.0, 0.0, 1.0)),
     "table beside, 20 mm away": ((-0.095, 0.0, 0.0), (1.0, 0.0, 0.0)),
 }
-IMPEDANCES = (100.0, 20.0, 5.0, 2.0, 1.5 + 1j)
+IMPEDANCES = (100.0, 20.0, 5.0, 1.5 + 1j)
 
 
 def main(page: Page) -> None:
