@@ -118,7 +118,7 @@ def require_sharp(region: Region, near: Sequence[int], spacing: float) -> None:
     beside = f"{1e3 * CLEARANCE * spacing:.3g} mm"
     for number in near:
         if region.mirrors[number].reflection not in (1, -1):
-            accepted = f"must be 1 or -1 where an obstacle is within {beside}"
+            accepted = f"must be 1 or -1 where an obstacle is within {beside}; or move the obstacle"
             raise invalid(f"reflectors[{number}].reflection", region.mirrors[number].reflection, accepted)
     accepted = f"must be {beside} or more from one of reflectors {list(near)}, of which two face each other"
     raise invalid("obstacles", "one grid next to both", accepted)

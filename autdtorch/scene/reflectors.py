@@ -91,11 +91,11 @@ class Reflector:
 
 
 def require_arrangement(reflectors: Sequence[Reflector], wavenumber: complex) -> None:
-    """Refuse planes that are neither at right angles nor facing each other, at least a wavelength apart.
+    """Refuse planes that are not at right angles, but for one pair that faces each other, a wavelength apart.
 
     Those that face each other where the air between them resonates are logged.
     """
-    wavelength = 2 * math.pi / wavenumber.real
+    wavelength, pairs = 2 * math.pi / wavenumber.real, 0
     for (first, one), (second, other) in combinations(enumerate(reflectors), 2):
         name, plane = f"Scene.reflectors[{second}].normal", f"reflector {first}"
         if one.mirror.is_perpendicular(other.mirror):
@@ -110,6 +110,9 @@ def require_arrangement(reflectors: Sequence[Reflector], wavenumber: complex) ->
             place = f"{abs(gap):.4g} m {'in front of' if gap >= 0 else 'behind'} {plane}"
             accepted = f"is {place}, must be in front of it by at least a wavelength, {wavelength:.4g} m"
             raise invalid(f"Scene.reflectors[{second}].point", other.point, accepted, "m")
+        pairs += 1
+        if pairs > 1:
+            raise invalid(name, other.normal, "must not face another: at most one pair of reflectors does")
         if resonates(one.mirror, other.mirror, wavenumber):
             logger.warning(
                 "%s and reflector %d are next to a resonance of the air between them: their images are summed"
