@@ -33,7 +33,14 @@ from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_array, orbits_of
 from autdtorch.fdtd.turning import is_turned, turned
 from autdtorch.propagators.absorbed_power import Radiators
 from autdtorch.propagators.multiple_scattering import Observe, iterated
-from autdtorch.propagators.simulation import AbsorbingCells, PressureMap, Run, Simulation, Stepped
+from autdtorch.propagators.simulation import (
+    AbsorbingCells,
+    PressureMap,
+    Run,
+    Simulation,
+    Stepped,
+    mean_of_images,
+)
 from autdtorch.propagators.store import BODIES, MOST_BYTES, key_of
 from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.scene.geometry import sphere_points
@@ -43,7 +50,7 @@ from autdtorch.scene.scene import require_clear, require_in_front
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL, Array, Index
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.images import Image
+from autdtorch.utils.images import Image, Mirror
 from autdtorch.utils.process import cached_property, one_library_thread, spread
 
 logger = logging.getLogger(__name__)
@@ -160,6 +167,12 @@ class BoxSimulation(Simulation):
         """The assembled grids of the boxes."""
         return [box.assembly for box in self.boxes]
 
+    @property
+    def held_mirrors(self) -> Sequence[Mirror]:
+        """The mirrors next to bodies."""
+        near = {number for numbers in self.plan.grouping.mirrors for number in numbers}
+        return [self.plan.region.mirrors[number] for number in sorted(near)]
+
     @cached_property
     def absorptions(self) -> Sequence[AbsorbingCells]:
         """The cells of each box that absorb."""
@@ -206,7 +219,7 @@ class BoxSimulation(Simulation):
             return self._matrix_of_orbits(points, orbits)
         key = digest_of(self.plan.key, "transducers")
         radiation = self._store.get(key, self._radiation_of_transducers)
-        if not radiation.reaches(points):  # the boxes were simulated as one
+        if not radiation.reaches(self._everywhere(points)):  # the boxes were simulated as one
             return self._matrix_of_orbits(points, orbits_of_transducers(points, self.symmetries))
         array = self.plan.scene.array
         alone = [apertures_of(array).chosen(slice(index, index + 1)) for index in range(len(array))]
@@ -217,7 +230,7 @@ class BoxSimulation(Simulation):
             array, key = self.plan.scene.array, digest_of(self.plan.key, "drives", drive)
             sources, strength = [apertures_of(array)] * len(drive), strengths_of(array) * drive
             radiation = self._store.get(key, lambda: self._radiation(sources, strength))
-            if radiation.reaches(points):
+            if radiation.reaches(self._everywhere(points)):
                 return self._total(radiation, sources, strength, points)
         return super()._fields(drive, points)
 
@@ -226,7 +239,13 @@ class BoxSimulation(Simulation):
 
         For sources next to an obstacle, runs that begin at points are more accurate.
         """
-        return self._keeps_surfaces and not any(box.inside(points).any() for box in self.boxes)
+        return self._keeps_surfaces and not any(
+            box.inside(self._everywhere(points)).any() for box in self.boxes
+        )
+
+    def _everywhere(self, points: torch.Tensor) -> torch.Tensor:
+        """Return points (P, 3) and their images on grids."""
+        return self.seen_twice(Apertures.of_points(points))[0].positions[:, 0]
 
     @cached_property
     def _keeps_surfaces(self) -> bool:
@@ -284,8 +303,9 @@ class BoxSimulation(Simulation):
         self, radiation: Radiation, sources: Sequence[Apertures], strength: torch.Tensor, points: torch.Tensor
     ) -> PressureMap:
         """Return the pressure of K drives at points (P, 3) that their radiation reaches."""
-        receivers = Apertures.of_points(points)
+        receivers, weights = self.seen_twice(Apertures.of_points(points))
         pressure = self._incident(sources, strength, receivers) + radiation.pressure(receivers)
+        pressure = mean_of_images(pressure, weights)
         return PressureMap.of_runs(pressure, radiation.runs, from_points=False)
 
     def _incident(

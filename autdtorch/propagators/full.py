@@ -18,6 +18,7 @@ from autdtorch.propagators.absorbed_power import Radiators
 from autdtorch.propagators.simulation import AbsorbingCells, Run, Simulation, Stepped
 from autdtorch.scene.scene import require_in_front, require_inside
 from autdtorch.utils.apertures import Apertures
+from autdtorch.utils.images import Mirror
 from autdtorch.utils.process import cached_property, one_library_thread
 
 
@@ -31,6 +32,11 @@ class DomainSimulation(Simulation):
         plan = self.plan
         plan.require_feasible()
         return (assemble(whole_region(plan.region), plan.spacing, plan.dtype, plan.time_step),)
+
+    @property
+    def held_mirrors(self) -> Sequence[Mirror]:
+        """All mirrors: the domain is joined with its images."""
+        return self.plan.region.mirrors
 
     @cached_property
     def absorptions(self) -> Sequence[AbsorbingCells]:

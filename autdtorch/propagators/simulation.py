@@ -33,7 +33,7 @@ from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.images import Mirror
+from autdtorch.utils.images import Mirror, images_of
 from autdtorch.utils.process import cached_property
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.text import counted
@@ -96,6 +96,13 @@ class PressureMap:
         """Return the map that runs gave."""
         residual, periods = max(run.remaining for run in runs), max(run.periods for run in runs)
         return cls(matrix, residual, periods, tuple(runs), from_points)
+
+
+def mean_of_images(pressure: torch.Tensor, weights: torch.Tensor | None) -> torch.Tensor:
+    """Return the pressure (P, R) from that of images (G P, R); see `Simulation.seen_twice`."""
+    if weights is None:
+        return pressure
+    return (weights[..., None] * pressure.reshape(*weights.shape, -1)).sum(dim=0)
 
 
 class AbsorbingCells(NamedTuple):
@@ -191,6 +198,22 @@ class Simulation(ABC):
         """Return the pressure (P, R) of drives (R, M), none of them silent, at points (P, 3)."""
         key = digest_of(self.plan.key, points, drive)
         return self._store.get(key, lambda: self._audible_fields(drive, points))
+
+    @property
+    @abstractmethod
+    def held_mirrors(self) -> Sequence[Mirror]:
+        """The mirrors whose images are on grids."""
+
+    def seen_twice(self, receivers: Apertures) -> tuple[Apertures, torch.Tensor | None]:
+        """Return P receivers and their images on grids, and the weights (G, P) of these; None without any.
+
+        A grid that follows tilted bodies is not its own image. The mean of both fields is reciprocal.
+        """
+        images = images_of(self.held_mirrors, self.plan.scene.complex_wavenumber, 0.0)
+        if len(images) == 1:
+            return receivers, None
+        everywhere, weights = receivers.with_images(images)
+        return everywhere, weights.reshape(-1, len(receivers.positions)) / len(images)
 
     def absorbed_power(self, drive: torch.Tensor) -> AbsorbedPower:
         """Simulate drives (R, M), none of them silent; return the power [W] by obstacle and reflector."""
@@ -330,9 +353,11 @@ class Simulation(ABC):
 
         The strengths (R, N) [Pa m] of a run are not all zero; receivers take the mean over their nodes.
         """
+        everywhere, weights = self.seen_twice(receivers)
         pressure, runs = self._recorded(
-            len(sources), lambda stepped: self._simulate(sources, strength, receivers, stepped)
+            len(sources), lambda stepped: self._simulate(sources, strength, everywhere, stepped)
         )
+        pressure = mean_of_images(pressure.mT, weights).mT
         return pressure.masked_fill(self.silent(receivers.positions), 0), runs
 
     def _recorded(
