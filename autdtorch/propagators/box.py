@@ -60,8 +60,6 @@ _CELL_BYTES = 20
 
 _ENTRY_BYTES = torch.complex128.itemsize
 
-_RESONANCE = "the echo between obstacles and reflectors does not decay: the scene resonates"
-
 
 class Judged(NamedTuple):
     """Receivers that decide when a run has converged: each `every`-th of some, in groups that all must."""
@@ -361,10 +359,8 @@ class BoxSimulation(Simulation):
             driving = [torch.stack([box.driving(*drive) for drive in drives], dim=1) for box in self.boxes]
             least = torch.tensor(floors, **REAL).mT.clamp(min=torch.finfo(torch.float64).tiny)
             observe_all = functools.partial(observed, runs=slice(None))
-            states = iterated(bodies, driving, observe_all, least, self.plan.tolerance)
-            if not states and len(bodies) == 1:
-                raise ValueError(_RESONANCE)
-            if not states:
+            states, settled = iterated(bodies, driving, observe_all, least, self.plan.tolerance)
+            if not settled and len(bodies) > 1:
                 logger.debug("the iteration between %d boxes does not converge: one box instead", len(bodies))
                 return self._in_one_box._solved(sources, strength, judged, stepped)
         steady, seconds = zip(*states, strict=True)

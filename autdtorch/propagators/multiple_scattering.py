@@ -29,8 +29,7 @@ _LOOSEST = 0.1
 _CAUTION = 2.0
 """Safety factor: what the orders so far leave is estimated as this many times their residual."""
 
-_SLOWEST = 0.9
-"""Largest ratio of successive orders at which their sum is extrapolated."""
+_TINY = torch.finfo(torch.float64).tiny
 
 _TOGETHER = 16
 """Most runs whose orders are combined."""
@@ -87,19 +86,19 @@ def iterated(
     observe: Observe,
     floors: torch.Tensor,
     tolerance: float,
-) -> list[tuple[SteadyState, float]]:
-    """Iterate until all that is observed of R runs has converged; return nothing without convergence.
+) -> tuple[list[tuple[SteadyState, float]], bool]:
+    """Iterate until all that is observed of R runs has converged, or `MOST_PASSES` have passed.
 
     `incident` are the waves (n, R) on each body. Half of the relative tolerance is for the runs, half for the
     iteration. `observe` maps the phasors (K, R) of all bodies to quantities (k, R), Q of them; changes are
     relative to their norms, or to `floors` (Q, R) if those are more. The result is the phasors and the
-    seconds of each run.
+    seconds of each run, and whether the iteration has converged.
     """
     begin, runs, incoming = time.perf_counter(), incident[0].shape[1], list(incident)
     largest = torch.stack([waves.norm(dim=0) for waves in incident]).amax(dim=0)
     periods, reached, unsettled = np.zeros(runs, np.int64), np.ones(runs, bool), torch.zeros(runs, **REAL)
     orders: list[torch.Tensor] = []
-    smaller: torch.Tensor | None = None
+    settled = False
     for number in range(1, MOST_PASSES + 1):
         parts, residuals = [], torch.zeros((len(bodies), runs), **REAL)
         for index, (body, waves) in enumerate(zip(bodies, incoming, strict=True)):
@@ -113,27 +112,27 @@ def iterated(
         unsettled += residuals.amax(dim=0)
         orders.append(torch.cat(parts))
         outgoing = [body.outgoing(part) for body, part in zip(bodies, parts, strict=True)]
-        size = torch.cat(outgoing).norm(dim=0)
-        if smaller is not None:
+        if number > 1:
             phasors, left = extrapolated(orders)
             values, silent = observe(phasors), observe(torch.zeros_like(phasors))
             missing = [
                 (part - nothing).norm(dim=0) / torch.maximum(value.norm(dim=0), floor)
                 for part, nothing, value, floor in zip(observe(left), silent, values, floors, strict=True)
             ]
-            echo = (size / smaller).clamp(max=_SLOWEST)
-            remaining = _CAUTION * torch.stack(missing).amax(dim=0) * echo / (1 - echo)
-            if (remaining <= tolerance / 2).all():
-                seconds = (time.perf_counter() - begin) / runs
-                logger.debug("%d boxes, %d passes of multiple scattering", len(bodies), number)
-                residual = (unsettled + remaining).tolist()
-                states = map(SteadyState, phasors.mT, periods.tolist(), residual, reached.tolist())
-                return [(state, seconds) for state in states]
-        smaller = size
+            # what K adds to the first order is a measure of what it adds to the residual
+            echo = (phasors - orders[0]).norm(dim=0) / orders[0].norm(dim=0).clamp_min(_TINY)
+            remaining = _CAUTION * torch.stack(missing).amax(dim=0) * echo
+            settled = bool((remaining <= tolerance / 2).all())
+            if settled or number == MOST_PASSES:
+                break
         sent = list(zip(bodies, outgoing, strict=True))
         parts_of = ([body.incoming(other, waves) for other, waves in sent] for body in bodies)
         incoming = [torch.stack([part for part in each if part is not None]).sum(dim=0) for each in parts_of]
-    return []
+    logger.debug("%d boxes, %d passes of multiple scattering", len(bodies), number)
+    seconds, residual = (time.perf_counter() - begin) / runs, (unsettled + remaining).tolist()
+    reached &= (remaining <= tolerance / 2).numpy()
+    states = map(SteadyState, phasors.mT, periods.tolist(), residual, reached.tolist())
+    return [(state, seconds) for state in states], settled
 
 
 def extrapolated(orders: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -150,7 +149,7 @@ def extrapolated(orders: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Te
         return torch.cat(sums, dim=1), torch.cat(left, dim=1)
     some = slice(None, None, -(-count // _MOST_FITTED))
     sources, answers = torch.cat(list(orders[:-1]), dim=1), torch.cat(list(orders[1:]), dim=1)
-    size = sources[some].norm(dim=0).clamp_min(torch.finfo(torch.float64).tiny)
+    size = sources[some].norm(dim=0).clamp_min(_TINY)
     change = (sources - answers) / size
     fitted = np.linalg.lstsq(change[some].numpy(), orders[0][some].numpy(), rcond=_NOISE)[0]
     weights = torch.from_numpy(fitted)

@@ -49,7 +49,7 @@ def with_rigid(region: Region, tolerance: float) -> Region:
     bodies, hard = [], []
     for index, body in enumerate(region.bodies):
         whole = not any(_overlap(body.shape, later.shape) for later in region.bodies[index + 1 :])
-        if body.fluid is not None and not body.fluid.is_lossy and whole:
+        if body.fluid is not None and whole:
             difference = difference_from_rigid(body, region)
             if difference <= tolerance:
                 hard.append(str(index))
