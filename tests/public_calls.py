@@ -318,6 +318,7 @@ OTHERS: dict[str, Any] = {
     "weakest_focus.pressure": torch.ones(2, 3),
     **{f"{kind}.device": hardware.SONICSURFACE for kind in ("EmulatedBench", "Link", "Played", "open_link")},
     "impedance_plane.impedance": 5.0,
+    "impedance_sphere.impedance": 5.0,
     **{f"{kind}_sphere.center": (0.0, 0.0, 0.0) for kind in ("fluid", "rigid", "soft")},
     **{
         f"{name}.{call}.state": Made(lambda _, name=name: state(name))

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from autdtorch.scene.arrays import TransducerArray
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.images import Mirror, resonates
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
@@ -103,7 +104,7 @@ def require_arrangement(reflectors: Sequence[Reflector], wavenumber: complex) ->
         if not one.mirror.is_parallel(other.mirror):
             accepted = f"must be at a right angle to that of {plane}, or against it"
             raise invalid(name, other.normal, accepted)
-        gap = float(one.mirror.height(torch.tensor(other.point, dtype=torch.float64)))
+        gap = float(one.mirror.height(torch.tensor(other.point, **REAL)))
         if np.dot(one.normal, other.normal) > 0:
             raise invalid(name, other.normal, f"must be against that of {plane}, which is parallel")
         if gap < wavelength:

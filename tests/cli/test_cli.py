@@ -125,7 +125,7 @@ WRONG = {
     "+goal.targets=[1]": "goal: unknown key 'targets'.*; allowed keys: name, weights",
     "+goal._target_=os.system": r"goal\._target_: 'os\.system'; must not be given",
     "goal=quiet_points  goal.goal={_target_:os.system}": r"goal\.goal\._target_: 'os\.system'; must not be",
-    "scene=two_cube": r"scene: 'two_cube'; must be one of homogeneous, .* \(did you mean 'two_cubes'\?\)",
+    "scene=two_cube": r"scene: 'two_cube'; must be one of .* \(did you mean 'two_cubes'\?\)",
     "method=GABS": r"method: 'GABS'; must be one of .* \(did you mean 'gabs'\?\)",
     "experiment=nature": "experiment: 'nature'; must be one of paper",
     "trails=3": r"trails: unknown key \(did you mean 'trials'\?\)",

@@ -350,6 +350,8 @@ def _regular_waves(body: TMatrix, other: TMatrix, images: Sequence[Image]) -> to
     The waves of the other are sampled on shells inside this body's sphere, where they are regular, and
     their harmonics are divided by j_l in the least-squares sense over shells.
     """
+    if not images:
+        return torch.zeros((len(body.matrix), len(other.matrix)), **COMPLEX)
     heights, weights = np.polynomial.legendre.leggauss(body.degree + other.degree + 1)
     count = 2 * (body.degree + other.degree + 1)
     turns = 2 * math.pi * torch.arange(count, **REAL) / count
@@ -362,8 +364,6 @@ def _regular_waves(body: TMatrix, other: TMatrix, images: Sequence[Image]) -> to
     radii = torch.tensor(_SHELLS, **REAL) * body.radius
     sizes = regular_radial(body.degree, body.wavenumber * radii[:, None])
     waves: torch.Tensor = torch.zeros((len(body.matrix), len(other.matrix)), **COMPLEX)
-    if not images:
-        return waves
     for radius, size in zip(radii, sizes, strict=True):
         shell = body.center + radius * directions @ body.axes.mT
         waves = waves + size.conj()[:, None] * (back @ _outgoing_waves(other, shell, images))
