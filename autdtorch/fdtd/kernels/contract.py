@@ -59,11 +59,11 @@ def _no_cells() -> Tensor:
 
 
 def _no_rows() -> Tensor:
-    return torch.zeros((0, 27), device="cpu")
+    return torch.zeros((0, 27), dtype=torch.float32, device="cpu")
 
 
 def _no_numbers() -> Tensor:
-    return torch.zeros(0, device="cpu")
+    return torch.zeros(0, dtype=torch.float32, device="cpu")
 
 
 @dataclass(frozen=True)
