@@ -160,7 +160,7 @@ def sphere_coefficients(
         size: k a, real.
         density_ratio: density ratio, sphere over medium; infinite if rigid.
         speed_ratio: ratio of sound speeds, sphere over medium.
-        impedance: of the surface, over that of the medium, in place of both ratios.
+        impedance: of the surface, as a ratio to the medium, in place of both ratios.
     """
     order = np.arange(degree + 1)
     regular, slope = spherical_jn(order, size), spherical_jn(order, size, derivative=True)

@@ -136,7 +136,7 @@ def cross_approximation(
 ) -> tuple[AnyArray, AnyArray] | None:
     """Return factors (n, rank) and (rank, m) of a matrix of `shape` from its rows and columns.
 
-    Each term removes a row and a column of what is left; the next row is that of the largest entry of the
+    Each term removes a row and a column of what is left; the next row goes through the largest entry of the
     column. The result is None if the rank is larger than `_MOST_RANK`.
     """
     most = min(_MOST_RANK, *shape)

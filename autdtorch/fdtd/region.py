@@ -26,7 +26,7 @@ class Fluid(NamedTuple):
 
     @property
     def is_lossy(self) -> bool:
-        """Whether it absorbs."""
+        """True if it absorbs."""
         return self.density.imag != 0 or self.sound_speed.imag != 0
 
     @property
@@ -73,7 +73,7 @@ class Body:
     continued: bool = False  # whether it continues through the boundary layers instead of ending before them
     uncertainty: float = 0.0  # distance [m] by which its surface may be off (rms)
     rigid_error: float = 0.0  # relative difference of the field in front of it, of a body taken as rigid
-    # impedance of its surface, locally reacting, over that of air (density times sound speed); None if rigid
+    # impedance of its surface, locally reacting, as a ratio to air (density times sound speed); None if rigid
     impedance: complex | None = None
 
 

@@ -172,7 +172,7 @@ def _part(
 
 
 def _reflectors(where: str, value: object, array: Any) -> list[Reflector]:
-    """Build the reflectors of a list of sections; a panel is that of the array."""
+    """Build the reflectors of a list of sections; a panel belongs to the array."""
     if not isinstance(value, list):
         raise invalid(where, value, "must be a list of reflectors, such as [{type: panel}]")
     builders: dict[str, Builder] = {"panel": partial(Reflector.behind, array=array), "plane": Reflector}

@@ -320,7 +320,7 @@ def add_reflectors(plotter: pyvista.Plotter, scene: Scene) -> None:
 
 
 def cut_at_reflectors(actors: Iterable[pyvista.Actor], reflectors: Iterable[Reflector]) -> None:
-    """Hide what of the actors is behind reflectors, wherever they are moved."""
+    """Hide the parts of actors behind reflectors, wherever they are moved."""
     from vtkmodules.vtkCommonDataModel import vtkPlane
 
     for one in reflectors:

@@ -19,7 +19,7 @@ Field = TypeVar("Field", bound=Callable[..., torch.Tensor])
 def silent_behind(field: Field) -> Field:
     """Decorate a propagator's `field`: a grid of points may reach behind reflectors, where it is 0.
 
-    A list of points (P, 3) may not, as they are meant to be heard.
+    A list of points (P, 3) may not: each is a receiver.
     """
 
     @functools.wraps(field)

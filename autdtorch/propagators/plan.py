@@ -80,7 +80,7 @@ class Plan:
 
     @property
     def hides_losses(self) -> bool:
-        """Whether bodies that absorb are taken as rigid."""
+        """True if bodies that absorb are taken as rigid."""
         bodies = zip(self.region.bodies, self.scene.obstacles, strict=True)
         return any(body.rigid_error and obstacle.is_lossy for body, obstacle in bodies)
 

@@ -137,7 +137,7 @@ class SimulatedPropagator:
             points: (P, 3) [m]; by default the scene's control points.
             return_error: also return the estimated relative error (L2 of the whole matrix), from a second
                 grid, which takes a fifth of the time where it is coarser, and the distance to the steady
-                state. `point_errors` has that of each point.
+                state. `point_errors` returns the error of each point.
 
         Returns:
             complex128 (P, M) [Pa], and the error if asked for.
@@ -234,8 +234,8 @@ class SimulatedPropagator:
             drive: (..., M) complex, |q| <= 1, on any device.
 
         Returns:
-            The power [W], float64, of the obstacles (..., K) and the reflectors (..., J). That of the medium
-            around them is not counted.
+            The power [W], float64, of the obstacles (..., K) and the reflectors (..., J). Power lost in the
+            medium is not counted.
 
         Raises:
             ValueError: a drive of another shape or out of range, or a reflector that absorbs and has a

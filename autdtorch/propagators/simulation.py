@@ -99,7 +99,7 @@ class PressureMap:
 
 
 def mean_of_images(pressure: torch.Tensor, weights: torch.Tensor | None) -> torch.Tensor:
-    """Return the pressure (P, R) from that of images (G P, R); see `Simulation.seen_twice`."""
+    """Return the pressure (P, R) from pressures at images (G P, R); see `Simulation.seen_twice`."""
     if weights is None:
         return pressure
     return (weights[..., None] * pressure.reshape(*weights.shape, -1)).sum(dim=0)

@@ -27,7 +27,7 @@ def porous(
 
     Args:
         flow_resistivity: static [Pa s/m^2], 1 to 100 times the frequency in Hz: 40e3 to 4e6 at 40 kHz.
-        frequency: drive frequency [Hz]; in a scene file, that of the scene.
+        frequency: drive frequency [Hz]; in a scene file, the scene's.
         medium: in the pores; air by default, and in a scene file the medium of the scene.
 
     Returns:
@@ -47,7 +47,7 @@ def porous(
         fix = "beyond, give measured complex density and sound_speed, or an impedance"
         raise invalid("flow_resistivity", flow_resistivity, f"{accepted}; {fix}", "Pa s/m^2")
     impedance = 1 + (0.070 + 0.107j) * math.pow(ratio, -0.632)  # over density times sound speed of the medium
-    wavenumber = 1 + (0.109 + 0.160j) * math.pow(ratio, -0.618)  # over that of the medium
+    wavenumber = 1 + (0.109 + 0.160j) * math.pow(ratio, -0.618)  # relative to the medium
     return {
         "density": medium.density * impedance * wavenumber,
         "sound_speed": medium.sound_speed / wavenumber,

@@ -92,7 +92,7 @@ class Reflector:
 
 
 def require_arrangement(reflectors: Sequence[Reflector], wavenumber: complex) -> None:
-    """Refuse planes that are not at right angles, but for one pair that faces each other, a wavelength apart.
+    """Refuse planes that are not at right angles; one pair may face each other, a wavelength apart.
 
     Those that face each other where the air between them resonates are logged.
     """

@@ -1,6 +1,6 @@
 """A constant reflection factor against the exact field before a plane with an impedance.
 
-A plane of impedance Z, as a ratio to that of air, reflects a plane wave at the angle t from its normal by
+A plane of impedance Z, as a ratio to air, reflects a plane wave at the angle t from its normal by
 (Z cos t - 1) / (Z cos t + 1). `at.Reflector` has one factor for all angles. Writes a block of the
 documentation, the rms error of a transfer matrix for the factor of the normal and for the best constant, and
 prints that for the factor at the angle of each mirror image.

@@ -175,7 +175,7 @@ def test_gradients_by_source_and_medium():
 
 
 def test_gradients_by_the_materials_of_a_lossy_body():
-    """Of the adjoint run and central differences of whole runs, at one time step."""
+    """The adjoint run against central differences of whole runs, at one time step."""
     scene = small_scene(LOSSY, extent=9e-3)
     region, generator = region_of(scene), torch.Generator().manual_seed(0)
     grid = make_grid(region, 1.4e-3)
@@ -197,5 +197,5 @@ def test_gradients_by_the_materials_of_a_lossy_body():
         step = torch.zeros_like(start)
         step[row, 0] = 1e-4 * start[row, 0]
         change = float(loss(start + step) - loss(start - step)) / float(2 * step[row, 0])
-        # truncation; the step is that of the gradients, as transfers of mass between cells have kinks
+        # truncation; one step for both, as transfers of mass between cells have kinks
         assert float(values.grad[row, 0]) == pytest.approx(change, rel=1e-4)

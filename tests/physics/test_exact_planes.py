@@ -136,7 +136,7 @@ def test_impedance_plane_is_a_half_space_of_a_very_slow_fluid():
 
 
 def test_a_constant_reflection_factor_is_an_approximation():
-    """That of the normal serves walls that the sound meets head on, and not those that it passes along.
+    """The factor of the normal serves walls that the sound meets head on, and not those that it passes along.
 
     `python scripts/benchmark.py reflection` has a table.
     """

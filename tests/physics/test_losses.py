@@ -126,7 +126,7 @@ def forms(cells, assembly):
     st.sampled_from([None, None, 1.0, 0.2 - 0.3j, 5 + 20j, 1e-3]),
 )
 def test_bodies_are_passive_and_stable(kind, density, speed, angle, loss, impedance):
-    """As forms: losses D + C / 2 and stiffness K are not negative, and leapfrog is stable with both."""
+    """Their forms: losses D + C / 2 and stiffness K are not negative, and leapfrog is stable with both."""
     size = 2.3e-3 if kind is Sphere else (5e-3, 3e-3, 4.2e-3)
     turn = {} if kind is Sphere else {"rotation": (0.4, 0.3, 0.2)}
     shape = kind(tuple(CENTER), size, rigid=True, **turn)
@@ -149,7 +149,7 @@ def test_bodies_are_passive_and_stable(kind, density, speed, angle, loss, impeda
 
 
 def chain(body, thickness):
-    """Return reflection and transmission of a plate, exact on the grid but for the cells of its faces.
+    """Return reflection and transmission of a plate, exact on the grid except in the cells of its faces.
 
     Along the middle of a wide plate the cells are a chain, solved here at the drive's frequency.
     """
@@ -214,7 +214,7 @@ def test_slabs_reflect_and_transmit_as_they_should(fluid, tolerance, thickness):
 @pytest.mark.parametrize("impedance", [1.0, 0.3, 2 + 2j, 0.5 - 1j])
 @pytest.mark.parametrize("thickness", [0.9e-3, 3.3e-3])
 def test_walls_with_an_impedance_reflect_as_they_should(impedance, thickness):
-    """Along the grid they are exact at normal incidence, but for terms of third order in the wavenumber."""
+    """Along the grid they are exact at normal incidence, up to terms of third order in the wavenumber."""
     reflected, transmitted = chain(Body(plate(thickness), None, impedance=impedance), thickness)
     assert abs(reflected - (impedance - 1) / (impedance + 1)) < 1e-3
     assert abs(transmitted) < 1e-6
@@ -240,7 +240,7 @@ def test_areas_of_surfaces_are_true():
 
 
 def test_a_lossy_plate_continues_through_the_boundary_layers():
-    """Behind it the field is that of an infinite slab."""
+    """The field behind it equals an infinite slab's."""
     plate = Box((14e-3, 12e-3, 12e-3), (3e-3, 90e-3, 90e-3), density=3.0, sound_speed=300.0, absorption=300.0)
     scene = small_scene((plate,))
     fluid = region_of(scene).bodies[0].fluid

@@ -286,5 +286,5 @@ def test_silence_on_one_grid_alone_is_not_exact():
     free = propagator._free(scene.control_points)
     faint, nothing = (PressureMap(share * free) for share in (1e-3, 0.0))
     assert not propagator._errors([nothing, nothing], free).any()
-    # the pressure is 10 times -80 dB; the error of the coarser grid is 2.3 to 5 times that of the finer one
+    # the pressure is 10 times -80 dB; the error of the coarser grid is 2.3 to 5 times the finer one's
     assert (propagator._errors([nothing, faint], free) > 1).all()

@@ -34,7 +34,7 @@ class MaterialLosses(NamedTuple):
     """Losses of materials relative to air, which is number 0; see `losses.py`."""
 
     coupling: Array  # damping coefficients over the coupling of air (m,)
-    mass: Array  # damping coefficient of a cell beyond that of air (m,)
+    mass: Array  # damping coefficient of a cell beyond air's (m,)
     tangent: float  # largest ratio of `coupling` to the coupling itself
     admittance: NDArray[np.complex128]  # of the surface (m,); zero where it is rigid or a fluid's
     variants: tuple[Materials, ...]  # materials without loss, from which elements are continued

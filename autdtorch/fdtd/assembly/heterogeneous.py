@@ -57,7 +57,7 @@ class LossyCells:
 
     place: Index  # places of the cells among the heterogeneous ones (l,), ascending
     coupling: Array  # c_ij with the 27 neighbours (l, 27)
-    mass: Array  # g_i beyond that of absorbing air (l,)
+    mass: Array  # g_i beyond absorbing air's (l,)
     ground: Array  # stiffness against silence (l,)
 
 

@@ -1,6 +1,6 @@
 """Surfaces that react locally: their admittance as mass and damping of the elements they cut.
 
-A surface of admittance Y, over that of air, takes the flow Y p. In the equation of a cell, divided by -i w,
+A surface of admittance Y, as a ratio to air, takes the flow Y p. In the equation of a cell, divided by -i w,
 it adds
 
     i slope / 2 sum_j T_ij p_j,    T_ij = integral of Y N_i N_j over the surface,

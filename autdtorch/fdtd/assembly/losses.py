@@ -35,7 +35,7 @@ from autdtorch.utils.array_types import Array
 COUPLING, MASS, GROUND = slice(0, 28), slice(28, 36), slice(36, 44)
 """Columns of the losses of an element: damping of its `PAIRS` and vertices, and the vertices' stiffness."""
 
-# Largest tangent of half the phase of a step, times that of the loss angle, with a positive stiffness
+# Largest tangent of half the phase of a step, times the tangent of the loss angle, with a positive stiffness
 LARGEST_TANGENT = 0.7
 _ROUNDING = 1e-9  # Negative power of a form, relative to its largest entry, that is rounding
 
@@ -78,7 +78,7 @@ def _continued(still: Array, ahead: Array, behind: Array) -> NDArray[np.complex1
 def _passive(coupling: Array, mass: Array, air: Array) -> Array:
     """Return losses (n, 44) that absorb at any pressure.
 
-    They are close to damping of coupling (n, 28) and of mass (n, 8), beside that of air (n, 8).
+    They are close to damping of coupling (n, 28) and of mass (n, 8), beside air's (n, 8).
     """
     form = stiffness_matrix(coupling)
     form[:, range(8), range(8)] += mass + air

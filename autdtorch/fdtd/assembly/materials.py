@@ -23,7 +23,7 @@ class Kind(NamedTuple):
     """A material."""
 
     fluid: Fluid | None  # None where no sound enters
-    impedance: complex | None  # of the surface, over that of air; None if it is rigid or a fluid's
+    impedance: complex | None  # of the surface, as a ratio to air; None if it is rigid or a fluid's
 
 
 def speed_factor(stencil: Stencil, speed_ratio: float) -> float:
@@ -90,7 +90,7 @@ def _lossless(kinds: Sequence[Kind], air: Fluid, stencil: Stencil, step: float) 
 
 
 def _complex(fluid: Fluid, air: Fluid, stencil: Stencil) -> tuple[complex, complex]:
-    """Return the coupling over that of air, and the mass of a cell, of a lossy fluid."""
+    """Return the coupling relative to air, and the mass of a cell, of a lossy fluid."""
     density, compressibility = _relative(fluid, air, stencil)
     kappa = stencil.kappa
     inner = kappa * cmath.sqrt(density * compressibility)

@@ -129,8 +129,8 @@ class TMatrixPropagator:
     ) -> torch.Tensor | tuple[torch.Tensor, float]:
         """Return the transfer matrix G; see `SimulatedPropagator.transfer_matrix`.
 
-        Differentiable by the points that are not served by the box. The error is that of the waves left out,
-        and, where T-matrices are simulated, the tolerance and that of the grid, from a second grid. For rows
+        Differentiable by the points that are not served by the box. The error counts the waves left out and,
+        where T-matrices are simulated, the tolerance and the error of the grid, from a second grid. For rows
         from the box, the box estimates it.
         """
         with_error = boolean("return_error", return_error)
@@ -166,7 +166,7 @@ class TMatrixPropagator:
             return torch.zeros(0, **REAL)
         free = free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber, self.scene.images)
         region = self.plan.region
-        if not self.plan.runs:  # exact but for the waves left out
+        if not self.plan.runs:  # exact up to the waves left out
             more = self.plan.at(self.spacing, _MORE_WAVES * self.tolerance)
             other, served = TMatrixPropagator(more, self._store)._by_waves(points)
             left_out = (matrix - other).norm(dim=1) / sizes(matrix, free)

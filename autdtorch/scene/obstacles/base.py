@@ -102,7 +102,7 @@ class Obstacle(ABC):
 
     @property
     def is_lossy(self) -> bool:
-        """Whether the obstacle absorbs sound."""
+        """True if the obstacle absorbs sound."""
         numbers = (self.density or 0.0, self.sound_speed or 0.0)
         soft = self.impedance is not None and self.impedance.real > 0
         return soft or self.absorption > 0 or any(isinstance(number, complex) for number in numbers)
@@ -250,7 +250,7 @@ def shared_box(
 
 
 def _impedance(name: str, value: object) -> complex:
-    """Return the impedance of a surface, a ratio to that of the medium."""
+    """Return the impedance of a surface, a ratio to the medium's."""
     impedance = passive_impedance(name, value)
     least, most = _IMPEDANCES
     if not least <= abs(impedance) <= most:
