@@ -217,7 +217,7 @@ def in_a_corner(*bodies, **changes):
 
 
 def test_reflectors_are_in_field_and_gradient():
-    """Panel and soft wall: the field equals that of `full`; bodies beside their images have one derivative."""
+    """Panel and soft wall: the field as of `full`; bodies beside their images have one derivative."""
     scene = in_a_corner(at.Sphere((0, 0, 10e-3), 3e-3, density=3.0, sound_speed=300.0))
     drive = at.drive_from_phases(torch.arange(4.0))
     speed = torch.tensor([300.0], dtype=torch.float64)
