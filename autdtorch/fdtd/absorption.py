@@ -12,7 +12,7 @@ from torch import Tensor
 
 from autdtorch.fdtd.assembly.heterogeneous import LossyCells
 from autdtorch.fdtd.region import Region
-from autdtorch.fdtd.stencil import flat_offsets, places_of
+from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.utils.array_types import Array, Index
 
@@ -57,7 +57,7 @@ def absorption(assembly: Assembly, region: Region, axes: Array | None = None) ->
     # on the grid the flow of a wave of unit pressure is less than in air by slope / 2 kappa
     watts = grid.spacing / (2 * 2 * np.pi * region.frequency * region.fluid.density.real)
     watts *= 2 * stencil.kappa / stencil.slope.real
-    places = np.array(grid.origin) + grid.spacing * places_of(index, grid.shape)
+    places = grid.centers_of(index)
     body = _nearest(torch.from_numpy(places @ (np.eye(3) if axes is None else axes)), region)
     # of a fluid the mass also absorbs as air does, which its losses leave out
     in_fluid = np.array([each.fluid is not None for each in region.bodies], bool)[body]

@@ -15,7 +15,7 @@ from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.placement import grid_offset
 from autdtorch.fdtd.region import Region, Shape, bounds
 from autdtorch.fdtd.stencil import places_of
-from autdtorch.utils.array_types import Array
+from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.process import cached_property
 from autdtorch.utils.validation import invalid, positive
 
@@ -100,6 +100,10 @@ class Grid:
     def to_cells(self, points: Tensor) -> Array:
         """Return positions (..., 3) [m] in cells; cell centres are whole numbers."""
         return np.asarray((points.numpy() - np.array(self.origin)) / self.spacing, np.float64)
+
+    def centers_of(self, index: Index) -> Array:
+        """Return the centres (n, 3) [m] of cells of flat `index` (n,)."""
+        return np.asarray(np.array(self.origin) + self.spacing * places_of(index, self.shape), np.float64)
 
     def inside(self, index: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which cells of flat `index` (...) are interior."""

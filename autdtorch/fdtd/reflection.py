@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from autdtorch.fdtd.region import Body, Region, Shape
-from autdtorch.fdtd.turning import Turned
+from autdtorch.fdtd.turning import Bounded, Turned
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.images import Image, Mirror, images_of
 from autdtorch.utils.process import cached_property
@@ -26,21 +26,11 @@ The Huygens surface is up to 4 cells from the bodies, and must not meet its own 
 
 
 @dataclass(frozen=True, eq=False)
-class Doubled:
+class Doubled(Bounded):
     """A shape that touches or crosses a mirror, cut at it and joined with its image."""
 
     shape: Shape
     mirror: Mirror
-
-    @property
-    def lower(self) -> Vector:
-        """Corner of the bounding box with the smallest coordinates (3,) [m]."""
-        return self._bounds[0]
-
-    @property
-    def upper(self) -> Vector:
-        """Corner of the bounding box with the largest coordinates (3,) [m]."""
-        return self._bounds[1]
 
     def signed_distance(self, points: Tensor, /) -> Tensor:
         """Return the distance (...) [m] of points (..., 3) to the surface, negative inside."""
@@ -61,15 +51,20 @@ class Doubled:
 
     @cached_property
     def _bounds(self) -> tuple[Vector, Vector]:
-        turned = Turned(self.shape, self.mirror.image.matrix.numpy(), self.mirror.image.offset.numpy())
-        lower = np.minimum(self.shape.lower, turned.lower)
-        upper = np.maximum(self.shape.upper, turned.upper)
+        image = _image(self.shape, self.mirror)
+        lower = np.minimum(self.shape.lower, image.lower)
+        upper = np.maximum(self.shape.upper, image.upper)
         normal, vertices = np.abs(np.array(self.mirror.normal)), self.surface()[0].numpy()
-        if (normal > 0.5).any() and np.count_nonzero(normal) == 1:  # the part behind is gone
+        if np.count_nonzero(normal) == 1:  # the part behind is gone
             axis = int(normal.argmax())
             lower[axis], upper[axis] = vertices[:, axis].min(), vertices[:, axis].max()
         (x, y, z), (u, v, w) = lower.tolist(), upper.tolist()
         return (x, y, z), (u, v, w)
+
+
+def _image(shape: Shape, mirror: Mirror) -> Turned:
+    image = mirror.image
+    return Turned(shape, image.matrix.numpy(), image.offset.numpy())
 
 
 def _cut(vertices: Tensor, triangles: Tensor, mirror: Mirror) -> Tensor:
@@ -146,8 +141,7 @@ def with_images(bodies: Sequence[Body], mirrors: Sequence[Mirror]) -> tuple[Body
 def _doubled(body: Body, mirror: Mirror) -> list[Body]:
     if float(mirror.height(body.shape.surface()[0]).min()) < LENGTH_TOLERANCE:
         return [replace(body, shape=Doubled(body.shape, mirror))]
-    image = mirror.image
-    return [body, replace(body, shape=Turned(body.shape, image.matrix.numpy(), image.offset.numpy()))]
+    return [body, replace(body, shape=_image(body.shape, mirror))]
 
 
 def whole_region(region: Region) -> Region:

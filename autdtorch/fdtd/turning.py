@@ -7,6 +7,7 @@ as one aligned with the axes of the scene.
 from __future__ import annotations
 
 import itertools
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -31,13 +32,8 @@ _ALL = 1 - 1e-6  # Aligned share of a surface from which all of it is aligned, a
 _SAGITTA = 1.5  # Growth of a bounding box, relative to the distance of triangles from a curved surface
 
 
-@dataclass(frozen=True, eq=False)
-class Turned:
-    """A shape in the coordinates of other axes, or its image in a mirror."""
-
-    shape: Shape
-    axes: Array  # the axes, one a row, in the coordinates of the shape (3, 3)
-    offset: Array = field(default_factory=lambda: np.zeros(3))  # place of the origin (3,) [m]
+class Bounded(ABC):
+    """A shape that computes both corners of its bounding box together."""
 
     @property
     def lower(self) -> Vector:
@@ -48,6 +44,20 @@ class Turned:
     def upper(self) -> Vector:
         """Corner of the bounding box with the largest coordinates (3,) [m]."""
         return self._bounds[1]
+
+    @property
+    @abstractmethod
+    def _bounds(self) -> tuple[Vector, Vector]:
+        """The lower and the upper corner."""
+
+
+@dataclass(frozen=True, eq=False)
+class Turned(Bounded):
+    """A shape in the coordinates of other axes, or its image in a mirror."""
+
+    shape: Shape
+    axes: Array  # the axes, one a row, in the coordinates of the shape (3, 3)
+    offset: Array = field(default_factory=lambda: np.zeros(3))  # place of the origin (3,) [m]
 
     def signed_distance(self, points: Tensor, /) -> Tensor:
         """Return the distance (...) [m] of points (..., 3) to the surface, negative inside."""
