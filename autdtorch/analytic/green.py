@@ -69,27 +69,14 @@ def free_space_matrix(
     unit drive. `images` are those of the space in reflectors, `Scene.images`.
     """
     positions, weights = array.nodes
-    if len(images) > 1:
-        parts = [
-            image.weight * _matrix_of_nodes(points, array, image.of(positions), weights, wavenumber)
-            for image in distinct(images, positions)
-        ]
-        return torch.stack(parts).sum(dim=0)
-    return _matrix_of_nodes(points, array, positions, weights, wavenumber)
-
-
-def _matrix_of_nodes(
-    points: ArrayLike,
-    array: TransducerArray,
-    positions: torch.Tensor,
-    weights: torch.Tensor,
-    wavenumber: complex,
-) -> torch.Tensor:
-    """Return the transfer matrix (P, M) of transducers with nodes (M, n, 3) [m]; see `free_space_matrix`."""
     points = differentiable_points("points", points)
     require_memory("points", tuple(points.shape), PAIR_BYTES * len(points) * len(array))
     # node by node, with memory for one matrix only
-    terms = (w * green(points, at, wavenumber) for at, w in zip(positions.unbind(1), weights, strict=True))
+    terms = (
+        image.weight * w * green(points, at, wavenumber)
+        for image in distinct(images, positions)
+        for at, w in zip(image.of(positions).unbind(1), weights, strict=True)
+    )
     none = torch.zeros((), **COMPLEX)
     return 4 * math.pi * strengths_of(array).to(points.device) * sum(terms, start=none)
 

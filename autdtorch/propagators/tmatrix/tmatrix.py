@@ -310,11 +310,12 @@ def _incoming_waves(body: TMatrix, array: TransducerArray, images: Sequence[Imag
     """Return the coefficients (N, M) [Pa] of the regular waves of unit drives around a body."""
     positions, weights = array.nodes
     _offsets(body, "array.positions", positions)
-    waves = [
+    waves = (
         image.weight * _incoming_from(body, image.of(positions), weights)
         for image in distinct(images, positions)
-    ]
-    return 4j * math.pi * body.wavenumber * strengths_of(array) * torch.stack(waves).sum(dim=0)
+    )
+    none = torch.zeros((), **COMPLEX)
+    return 4j * math.pi * body.wavenumber * strengths_of(array) * sum(waves, start=none)
 
 
 def _incoming_from(body: TMatrix, positions: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
@@ -336,12 +337,10 @@ def _outgoing_waves(body: TMatrix, points: torch.Tensor, images: Sequence[Image]
 
     A mirrored wave at a point is the wave at the mirrored point.
     """
-    total: torch.Tensor | float = 0.0
-    for image in images:
-        offsets = _offsets(body, "points", image.of(points))
-        total = total + image.weight * outgoing_waves(body.degree, body.wavenumber, offsets)
-    assert isinstance(total, torch.Tensor)
-    return total
+    offsets = (_offsets(body, "points", image.of(points)) for image in images)
+    waves = (outgoing_waves(body.degree, body.wavenumber, each) for each in offsets)
+    none = torch.zeros((), **COMPLEX)
+    return sum((image.weight * each for image, each in zip(images, waves, strict=True)), start=none)
 
 
 def _regular_waves(body: TMatrix, other: TMatrix, images: Sequence[Image]) -> torch.Tensor:
