@@ -2,9 +2,9 @@
 
 With maps T_i, incident waves d_i and the waves S_ij b_j that body j sends to body i, the outgoing waves are
 b_i = T_i (d_i + sum_j S_ij b_j) (Waterman and Truell 1961, doi:10.1063/1.1703737). Matrices are solved for;
-maps that cost a run are iterated. A pass of the iteration adds one scattering order. The sums follow
-x_(n+1) = T x_n + b like the phasors of a run, and are extrapolated in the same way; weakly coupled bodies
-need three or four passes. Later passes contribute little, and are simulated to looser tolerances.
+maps that cost a run are iterated. A pass of the iteration adds one scattering order, and the orders are
+combined by the least residual (`extrapolated`); weakly coupled bodies need three or four passes. Later passes
+contribute little, and are simulated to looser tolerances.
 """
 
 from __future__ import annotations
@@ -111,10 +111,11 @@ def iterated(
             residuals[index] = share * torch.tensor([each.residual for each in steady], **REAL)
         unsettled += residuals.amax(dim=0)
         orders.append(torch.cat(parts))
-        outgoing = [body.outgoing(part) for body, part in zip(bodies, parts, strict=True)]
-        if number > 1:
+        if number == 1:
+            silent = observe(torch.zeros_like(orders[0]))
+        else:
             phasors, left = extrapolated(orders)
-            values, silent = observe(phasors), observe(torch.zeros_like(phasors))
+            values = observe(phasors)
             missing = [
                 (part - nothing).norm(dim=0) / torch.maximum(value.norm(dim=0), floor)
                 for part, nothing, value, floor in zip(observe(left), silent, values, floors, strict=True)
@@ -125,7 +126,7 @@ def iterated(
             settled = bool((remaining <= tolerance / 2).all())
             if settled or number == MOST_PASSES:
                 break
-        sent = list(zip(bodies, outgoing, strict=True))
+        sent = [(body, body.outgoing(part)) for body, part in zip(bodies, parts, strict=True)]
         parts_of = ([body.incoming(other, waves) for other, waves in sent] for body in bodies)
         incoming = [torch.stack([part for part in each if part is not None]).sum(dim=0) for each in parts_of]
     logger.debug("%d boxes, %d passes of multiple scattering", len(bodies), number)
