@@ -20,7 +20,7 @@ from torch import Tensor
 from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.region import Shape
-from autdtorch.fdtd.stencil import flat_offsets, places_of
+from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.turning import turned_shape
 from autdtorch.utils.apertures import Apertures, Discs
@@ -36,7 +36,7 @@ _TOGETHER = 16  # Targets whose waves are computed at once
 _NEAREST = 0.5  # Distance [cells] from a source at which the singular incident field is cut off
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ScatteredField:
     """An assembled box with its incident and radiated fields."""
 
@@ -44,6 +44,7 @@ class ScatteredField:
     wavenumber: complex  # complex wavenumber in air [rad/m]
     axes: Array  # axes of the grid, one a row (3, 3)
     images: tuple[Image, ...] = NO_MIRRORS  # of what it radiates; the first is the space itself
+    mirrors: tuple[int, ...] = ()  # numbers of those whose images are on its grid
 
     @property
     def echoes(self) -> tuple[Image, ...]:
@@ -150,9 +151,7 @@ class ScatteredField:
 
     def positions(self, cells: Index) -> Tensor:
         """Return the centres (n, 3) [m] of cells."""
-        grid = self.assembly.grid
-        places = places_of(cells, grid.shape)
-        return torch.from_numpy((np.array(grid.origin) + grid.spacing * places) @ self.axes)
+        return torch.from_numpy(self.assembly.grid.centers_of(cells) @ self.axes)
 
     def _on_axes(self, points: Tensor) -> Tensor:
         """Return points (..., 3) [m] in the coordinates of the grid."""

@@ -12,9 +12,9 @@ import itertools
 import logging
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,16 +22,16 @@ from scipy.spatial import KDTree
 
 from autdtorch.fdtd.absorption import absorption
 from autdtorch.fdtd.coupling import Coupling, coupling_of
-from autdtorch.fdtd.grid import Grid, make_box
 from autdtorch.fdtd.grouping import one_box
 from autdtorch.fdtd.reflection import other_images, with_images
-from autdtorch.fdtd.region import Body, Region
+from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
 from autdtorch.fdtd.steady_state import MOST_JUDGED, SteadyState, run_to_steady_state
-from autdtorch.fdtd.stepping import Assembly, assemble_on
+from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_array, orbits_of_transducers
-from autdtorch.fdtd.turning import is_turned, turned
+from autdtorch.fdtd.turning import is_turned
 from autdtorch.propagators.absorbed_power import Radiators
+from autdtorch.propagators.assembled_box import assembled_box
 from autdtorch.propagators.multiple_scattering import Observe, iterated
 from autdtorch.propagators.simulation import (
     AbsorbingCells,
@@ -41,22 +41,18 @@ from autdtorch.propagators.simulation import (
     Stepped,
     mean_of_images,
 )
-from autdtorch.propagators.store import BODIES, MOST_BYTES, key_of
+from autdtorch.propagators.store import MOST_BYTES
 from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.scene.geometry import sphere_points
-from autdtorch.scene.obstacles import Obstacle
-from autdtorch.scene.obstacles.moving import circumscribed, is_movable, shifted
+from autdtorch.scene.obstacles.moving import circumscribed
 from autdtorch.scene.scene import require_clear, require_in_front
 from autdtorch.utils.apertures import Apertures
-from autdtorch.utils.array_types import COMPLEX, REAL, Array, Index
+from autdtorch.utils.array_types import COMPLEX, REAL, Index
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.images import Image, Mirror
 from autdtorch.utils.process import cached_property, one_library_thread, spread
 
 logger = logging.getLogger(__name__)
-
-_CELL_BYTES = 20
-"""Memory of an assembled cell [bytes]."""
 
 _ENTRY_BYTES = torch.complex128.itemsize
 
@@ -136,28 +132,35 @@ class BoxSimulation(Simulation):
         """The assembled boxes."""
         plan = self.plan
         plan.require_feasible()
-        boxes, grouping, region = [], plan.grouping, plan.region
+        boxes, grouping = [], plan.grouping
         for group, axes, near in zip(grouping.groups, grouping.axes, grouping.mirrors, strict=True):
-            bodies = [region.bodies[index] for index in group]
-            part = replace(region, bodies=with_images(bodies, [region.mirrors[number] for number in near]))
+            part = self._part(group, near)
             if is_turned(axes):
                 logger.debug("the grid around obstacles %s is turned along their faces", list(group))
             assembly = assembled_box(part, axes, plan.spacing, plan.dtype, plan.time_step)
-            images = other_images(region, near, plan.scene.images)
-            boxes.append(ScatteredField(assembly, plan.scene.complex_wavenumber, axes, images))
+            images = other_images(plan.region, near, plan.scene.images)
+            boxes.append(ScatteredField(assembly, plan.scene.complex_wavenumber, axes, images, near))
         return boxes
+
+    def _part(self, group: Sequence[int], near: Sequence[int]) -> Region:
+        """Return the region with a group of its bodies alone, and their images in mirrors near them."""
+        bodies = [self.plan.region.bodies[index] for index in group]
+        return replace(self.plan.region, bodies=with_images(bodies, self._mirrors(near)))
+
+    def _mirrors(self, numbers: Iterable[int]) -> list[Mirror]:
+        return [self.plan.region.mirrors[number] for number in numbers]
 
     def coupling(
         self, target: ScatteredField, source: ScatteredField, images: Sequence[Image]
     ) -> Coupling | None:
         """Return the coupling from a box to another or to itself; see `coupling_of`."""
-        key = self.boxes.index(target), self.boxes.index(source)
+        key = target, source
         if key not in self._couplings:
             self._couplings[key] = coupling_of(target, source, images)
         return self._couplings[key]
 
     @cached_property
-    def _couplings(self) -> dict[tuple[int, int], Coupling | None]:
+    def _couplings(self) -> dict[tuple[ScatteredField, ScatteredField], Coupling | None]:
         return {}
 
     @property
@@ -168,29 +171,23 @@ class BoxSimulation(Simulation):
     @property
     def held_mirrors(self) -> Sequence[Mirror]:
         """The mirrors next to bodies."""
-        near = {number for numbers in self.plan.grouping.mirrors for number in numbers}
-        return [self.plan.region.mirrors[number] for number in sorted(near)]
+        return self._mirrors(sorted({number for near in self.plan.grouping.mirrors for number in near}))
 
     @cached_property
     def absorptions(self) -> Sequence[AbsorbingCells]:
         """The cells of each box that absorb."""
-        region, result = self.plan.region, []
-        for box, group, near in zip(
-            self.boxes, self.plan.grouping.groups, self.plan.grouping.mirrors, strict=True
-        ):
-            bodies, mirrors = [region.bodies[index] for index in group], [region.mirrors[one] for one in near]
-            form = absorption(box.assembly, replace(region, bodies=with_images(bodies, mirrors)), box.axes)
-            result.append(AbsorbingCells.of(form, box.positions(form.cells), group, bodies, mirrors))
+        result = []
+        for box, group in zip(self.boxes, self.plan.grouping.groups, strict=True):
+            form = absorption(box.assembly, self._part(group, box.mirrors), box.axes)
+            places, mirrors = box.positions(form.cells), self._mirrors(box.mirrors)
+            result.append(AbsorbingCells.of(form, places, self.plan.region, group, mirrors))
         return result
 
     def radiators(self, drive: torch.Tensor) -> list[Radiators]:
         """Return the Huygens surfaces as monopoles, in runs of drives (R, M)."""
-        array, key = self.plan.scene.array, digest_of(self.plan.key, "drives", drive)
-        sources, strength = [apertures_of(array)] * len(drive), strengths_of(array) * drive
-        radiation = self._store.get(key, lambda: self._radiation(sources, strength))
-        simulation = self if list(radiation.boxes) == self.boxes else self._in_one_box
-        parts = zip(radiation.boxes, radiation.amplitudes, simulation.plan.grouping.mirrors, strict=True)
-        return [Radiators(box.surface[0], amplitude, near) for box, amplitude, near in parts]
+        radiation = self._radiation_of(drive)
+        parts = zip(radiation.boxes, radiation.amplitudes, strict=True)
+        return [Radiators(box.surface[0], amplitude, box.mirrors) for box, amplitude in parts]
 
     def near_obstacle(self, points: torch.Tensor) -> bool:
         """Return whether the interpolation kernel of any point (N, 3) has heterogeneous cells."""
@@ -225,11 +222,9 @@ class BoxSimulation(Simulation):
 
     def _fields(self, drive: torch.Tensor, points: torch.Tensor) -> PressureMap:
         if self._radiates(points):
-            array, key = self.plan.scene.array, digest_of(self.plan.key, "drives", drive)
-            sources, strength = [apertures_of(array)] * len(drive), strengths_of(array) * drive
-            radiation = self._store.get(key, lambda: self._radiation(sources, strength))
+            radiation = self._radiation_of(drive)
             if radiation.reaches(self._everywhere(points)):
-                return self._total(radiation, sources, strength, points)
+                return self._total(radiation, *self.sources_of(drive), points)
         return super()._fields(drive, points)
 
     def _radiates(self, points: torch.Tensor) -> bool:
@@ -237,9 +232,8 @@ class BoxSimulation(Simulation):
 
         For sources next to an obstacle, runs that begin at points are more accurate.
         """
-        return self._keeps_surfaces and not any(
-            box.inside(self._everywhere(points)).any() for box in self.boxes
-        )
+        places = self._everywhere(points)
+        return self._keeps_surfaces and not any(box.inside(places).any() for box in self.boxes)
 
     def _everywhere(self, points: torch.Tensor) -> torch.Tensor:
         """Return points (P, 3) and their images on grids."""
@@ -267,6 +261,11 @@ class BoxSimulation(Simulation):
             unit = part[torch.from_numpy(images[symmetry].T), torch.from_numpy(place)]
             amplitudes.append(strengths_of(array) * unit)
         return replace(radiation, amplitudes=tuple(amplitudes))
+
+    def _radiation_of(self, drive: torch.Tensor) -> Radiation:
+        """Return the radiation of drives (R, M), from the store or simulated."""
+        key = digest_of(self.plan.key, "drives", drive)
+        return self._store.get(key, lambda: self._radiation(*self.sources_of(drive)))
 
     def _radiation(self, sources: Sequence[Apertures], strength: torch.Tensor) -> Radiation:
         """Simulate the radiation of runs; see `_run`."""
@@ -419,48 +418,6 @@ class _Scatterer:
             return None
         coupling = self.simulation.coupling(here, box, images)
         return coupling.field(outgoing) if coupling else box.radiated(outgoing, here.driven, images)
-
-
-@dataclass(frozen=True)
-class _AssembledBox:
-    """An assembled box with its first cell at the origin."""
-
-    assembly: Assembly
-
-    @property
-    def nbytes(self) -> int:
-        """Memory [bytes], about."""
-        return _CELL_BYTES * math.prod(self.assembly.grid.shape)
-
-
-def assembled_box(
-    region: Region, axes: Array, spacing: float, dtype: torch.dtype, time_step: float | None
-) -> Assembly:
-    """Assemble the box of a region on a grid along `axes`, one a row (3, 3); see `stepping.assemble_on`.
-
-    It is assembled with its first cell at the origin: for a body that moves it is the same, to the last bit.
-    """
-    part = turned(region, axes)
-    grid = make_box(part, spacing)
-    if not all(isinstance(shape, Obstacle) and is_movable(shape) for shape in region.shapes):
-        return assemble_on(grid, part, dtype, time_step)
-    bodies = tuple(_shifted(body, grid, axes) for body in region.bodies)
-    here = replace(grid, origin=(0.0, 0.0, 0.0))
-
-    def assembled() -> _AssembledBox:
-        everywhere, nowhere = ((-math.inf,) * 3, (math.inf,) * 3), np.zeros((0, 3))
-        still = Region(region.fluid, region.attenuation, region.frequency, bodies, everywhere, nowhere)
-        return _AssembledBox(assemble_on(here, turned(still, axes), dtype, time_step))
-
-    medium = region.fluid, region.attenuation, region.frequency
-    key = key_of("box", bodies, axes, here, *medium, str(dtype), time_step)
-    return replace(BODIES.get(key, assembled).assembly, grid=grid)
-
-
-def _shifted(body: Body, grid: Grid, axes: Array) -> Body:
-    """Return a body as seen from the first cell of a grid along `axes`."""
-    offset = torch.from_numpy(-np.array(grid.origin) @ axes)
-    return replace(body, shape=shifted(cast(Obstacle, body.shape), offset))
 
 
 def _images(box: ScatteredField, symmetry: Symmetry) -> Index:

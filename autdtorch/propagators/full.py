@@ -12,7 +12,6 @@ import torch
 from autdtorch.fdtd.absorption import absorption
 from autdtorch.fdtd.reflection import whole_region
 from autdtorch.fdtd.steady_state import MOST_JUDGED, run_to_steady_state
-from autdtorch.fdtd.stencil import places_of
 from autdtorch.fdtd.stepping import Assembly, assemble
 from autdtorch.propagators.absorbed_power import Radiators
 from autdtorch.propagators.simulation import AbsorbingCells, Run, Simulation, Stepped
@@ -43,11 +42,8 @@ class DomainSimulation(Simulation):
         """The cells of the domain that absorb."""
         (assembly,), region = self.assemblies, self.plan.region
         form = absorption(assembly, whole_region(region))
-        places = torch.from_numpy(
-            np.array(assembly.grid.origin)
-            + assembly.grid.spacing * places_of(form.cells, assembly.grid.shape)
-        )
-        return [AbsorbingCells.of(form, places, range(len(region.bodies)), region.bodies, region.mirrors)]
+        places = torch.from_numpy(assembly.grid.centers_of(form.cells))
+        return [AbsorbingCells.of(form, places, region, range(len(region.bodies)), region.mirrors)]
 
     def radiators(self, drive: torch.Tensor) -> list[Radiators]:
         """Return nothing: reflectors of a domain absorb nothing."""

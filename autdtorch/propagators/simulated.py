@@ -247,12 +247,16 @@ class SimulatedPropagator:
         counts = len(self.scene.obstacles), len(self.scene.reflectors)
         power = [torch.zeros((len(flat), count), **REAL) for count in counts]
         if loud.any():
-            simulation = self.simulation
-            if self.plan.hides_losses:
-                simulation = simulation_of(self.plan.with_materials, self._store)
-            for whole, part in zip(power, simulation.absorbed_power(flat[loud]), strict=True):
+            for whole, part in zip(power, self._absorbing.absorbed_power(flat[loud]), strict=True):
                 whole[loud] = part
         return AbsorbedPower(*(part.reshape(*drive.shape[:-1], part.shape[1]) for part in power))
+
+    @cached_property
+    def _absorbing(self) -> Simulation:
+        """The simulation in which no body that absorbs is taken as rigid."""
+        if self.plan.hides_losses:
+            return simulation_of(self.plan.with_materials, self._store)
+        return self.simulation
 
     def _places(self, points: ArrayLike | None) -> torch.Tensor:
         """Return points (P, 3) after checking them, by default the control points."""

@@ -16,7 +16,7 @@ from autdtorch.fdtd.absorption import Absorption
 from autdtorch.fdtd.grouping import USUAL_PERIODS
 from autdtorch.fdtd.kernels.choice import make_kernel
 from autdtorch.fdtd.reflection import with_images
-from autdtorch.fdtd.region import Body
+from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import SILENCE, SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_points, orbits_of_transducers, symmetries
@@ -125,13 +125,12 @@ class AbsorbingCells(NamedTuple):
         cls,
         form: Absorption,
         places: torch.Tensor,
-        numbers: Iterable[int],
-        bodies: Sequence[Body],
+        region: Region,
+        group: Iterable[int],
         mirrors: Sequence[Mirror],
     ) -> Self:
-        """Return the cells of a grid of bodies, with `numbers`, and their images in mirrors."""
-        pairs = zip(numbers, bodies, strict=True)
-        owners = [number for number, body in pairs for _ in with_images([body], mirrors)]
+        """Return the cells of a grid of a group of a region's bodies and their images in mirrors."""
+        owners = [number for number in group for _ in with_images([region.bodies[number]], mirrors)]
         return cls(form, places, owners, 0.5 ** len(mirrors))
 
 
@@ -221,8 +220,7 @@ class Simulation(ABC):
         obstacles = torch.zeros((len(drive), len(scene.obstacles)), **REAL)
         places = torch.cat([each.places for each in self.absorptions])
         if len(places):
-            sources = [apertures_of(scene.array)] * len(drive), strengths_of(scene.array) * drive
-            receivers = Apertures.of_points(places)
+            sources, receivers = self.sources_of(drive), Apertures.of_points(places)
             pressure, _ = self._recorded(
                 len(drive), lambda stepped: self._simulate(*sources, receivers, stepped)
             )
@@ -253,6 +251,11 @@ class Simulation(ABC):
         scene, axes = self.plan.scene, self.plan.grouping.axes[0]
         every = symmetries(self.assemblies, axes, apertures_of(scene.array))
         return [each for each in every if each.keeps(self.plan.region.mirrors)]
+
+    def sources_of(self, drive: torch.Tensor) -> tuple[list[Apertures], torch.Tensor]:
+        """Return the sources of runs of drives (R, M) and their strengths (R, M) [Pa m]."""
+        array = self.plan.scene.array
+        return [apertures_of(array)] * len(drive), strengths_of(array) * drive
 
     def imaged(self, sources: Apertures, strength: torch.Tensor) -> tuple[Apertures, torch.Tensor]:
         """Return sources of strength (N,) [Pa m] with all their images in the scene's reflectors."""
@@ -341,9 +344,7 @@ class Simulation(ABC):
 
     def _fields(self, drive: torch.Tensor, points: torch.Tensor) -> PressureMap:
         """Simulate the pressure of drives at points; see `fields`."""
-        array = self.plan.scene.array
-        sources, strength = [apertures_of(array)] * len(drive), strengths_of(array) * drive
-        pressure, runs = self._run(sources, strength, Apertures.of_points(points))
+        pressure, runs = self._run(*self.sources_of(drive), Apertures.of_points(points))
         return PressureMap.of_runs(pressure.mT, runs, from_points=False)
 
     def _run(

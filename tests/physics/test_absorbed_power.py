@@ -120,6 +120,17 @@ def test_a_body_taken_as_rigid_still_absorbs():
     assert float(power.obstacles[0]) == pytest.approx(power_by_series(tissue, source), rel=0.1)
 
 
+def test_power_of_a_second_call_is_the_first():
+    """Runs of a body that is taken as rigid elsewhere, and the radiation to an absorbing plane, come again."""
+    tissue = at.Sphere(BALL.center, 3e-3, density=1000.0, sound_speed=1500.0, absorption=200.0)
+    scene = scene_of(monopole(), [tissue], [at.Reflector(*FLOOR, 0.5)])
+    propagator = at.make_propagator(scene, "box", 2e-3, tolerance=1e-2)
+    first, second = (propagator.absorbed_power(unit(1)) for _ in range(2))
+    assert torch.equal(first.obstacles, second.obstacles)
+    assert torch.equal(first.reflectors, second.reflectors)
+    assert float(first.reflectors[0]) > 0
+
+
 def test_box_and_domain_absorb_alike_and_what_is_rigid_absorbs_nothing():
     """Two grids of 1 mm: 2 %, the error of either for small bodies (0.5 % measured)."""
     rigid = at.Sphere((-14e-3, 0.0, 25e-3), 4e-3, rigid=True)
