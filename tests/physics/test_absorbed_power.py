@@ -121,7 +121,7 @@ def test_a_body_taken_as_rigid_still_absorbs():
 
 
 def test_power_of_a_second_call_is_the_first():
-    """Runs of a body that is taken as rigid elsewhere, and the radiation to an absorbing plane, come again."""
+    """Stored runs serve both: a body taken as rigid for the field, and the radiation to a plane."""
     tissue = at.Sphere(BALL.center, 3e-3, density=1000.0, sound_speed=1500.0, absorption=200.0)
     scene = scene_of(monopole(), [tissue], [at.Reflector(*FLOOR, 0.5)])
     propagator = at.make_propagator(scene, "box", 2e-3, tolerance=1e-2)
