@@ -23,23 +23,26 @@ OPTIONS = {"--cases": {"nargs": "+", "choices": CASES, "default": list(CASES), "
 
 def main(page: Page, cases: list[str]) -> None:
     """Measure, and write the block."""
-    header = ["gradient by", "run without", "times that", "largest resident set", "before"]
+    header = ["gradient by", "run without", "times that", "largest resident set"]
     page.write(table(header, printed(map(row, cases))))
 
 
 def row(case: str) -> list[str]:
     """Return the cells of a case."""
     cost = in_new_process(measure, case)
-    memory = f"{cost.most / 2**30:.2f} GiB", f"{cost.before / 2**30:.2f} GiB"
-    return [CASES[case], f"{cost.forward:.1f} s", f"{cost.gradient / cost.forward:.2f}", *memory]
+    return [
+        CASES[case],
+        f"{cost.forward:.1f} s",
+        f"{cost.gradient / cost.forward:.2f}",
+        f"{cost.most / 2**30:.2f} GiB",
+    ]
 
 
 class Cost(NamedTuple):
-    """Seconds without and with gradients; largest resident set before and after [byte]."""
+    """Seconds without and with gradients; largest resident set [byte]."""
 
     forward: float
     gradient: float
-    before: int
     most: int
 
 
@@ -68,12 +71,11 @@ def gradient(case: str, spacing: float, periods: int) -> Cost:
     def field() -> torch.Tensor:
         return at.differentiable_field(scene, drive, **materials, **settings)
 
-    before = peak_memory()
     _, forward = timed(field)
     for parameter in (drive, *materials.values()):
         parameter.requires_grad_()
     _, both = timed(lambda: field().abs().min().backward())
-    return Cost(forward, both, before, peak_memory())
+    return Cost(forward, both, peak_memory())
 
 
 def measure(case: str) -> Cost:

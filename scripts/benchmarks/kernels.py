@@ -117,9 +117,9 @@ def cell_rate(
 
 def assemblies() -> dict[str, Assembly]:
     """Assemble the scenes at 1 mm, on the whole domain and in the box."""
-    made = {"free space": assemble(region_of(paper_scene("homogeneous")), 1e-3)}
-    for name in ("three_cubes", "two_cubes"):
-        region, label = region_of(paper_scene(name)), name.replace("_", " ")
-        made[f"{label}, full"] = assemble(region, 1e-3)
-        made[f"{label}, box"] = assemble_on(make_box(region, 1e-3), region, torch.float32, None)
-    return made
+    air, cubes = (region_of(paper_scene(name)) for name in ("homogeneous", "three_cubes"))
+    return {
+        "free space": assemble(air, 1e-3),
+        "three cubes, full": assemble(cubes, 1e-3),
+        "three cubes, box": assemble_on(make_box(cubes, 1e-3), cubes, torch.float32, None),
+    }

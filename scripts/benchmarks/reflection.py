@@ -28,11 +28,11 @@ IMPEDANCES = (100.0, 20.0, 5.0, 1.5 + 1j)
 def main(page: Page) -> None:
     """Print all errors, and write the block."""
     lines = printed(rows())
-    errors = {(plane, ratio): f"{normal} ({best})" for plane, ratio, _, normal, best, _ in lines}
+    errors = {(plane, ratio): normal for plane, ratio, _, normal, *_ in lines}
     ratios = [f"{impedance:g}" for impedance in IMPEDANCES]
     page.write(
-        "Error of the transfer matrix of 16 x 16 transducers [%] with the factor of the normal, in brackets "
-        "with the best constant, by the impedance of the plane:",
+        "Error of the transfer matrix of 16 x 16 transducers [%] with the factor of the normal, by "
+        "the impedance of the plane:",
         table(["plane", *ratios], ([plane, *(errors[plane, ratio] for ratio in ratios)] for plane in PLANES)),
     )
 

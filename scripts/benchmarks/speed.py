@@ -23,7 +23,7 @@ from autdtorch.propagators import SimulatedPropagator
 
 DOCUMENT = "performance.md"
 
-SPACINGS = (1.0, 2 / 3, 0.5)  # [mm]
+SPACINGS = (1.0, 0.5)  # [mm]
 REPEATS = 3
 
 

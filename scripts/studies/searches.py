@@ -54,7 +54,6 @@ def measure(objective: at.Objective, trials: int) -> dict[str, Figures]:
         "GABS, order given": partial(at.gabs, order="given"),
         "GABS, by strength": partial(at.gabs, order="strength"),
         "GABS, 4 levels": partial(gabs, levels=4),
-        "GABS, 8 levels": partial(gabs, levels=8),
     }
     solutions = {name: search(objective) for name, search in searches.items()}
     figures = {name: (solution.score, solution.evaluations) for name, solution in solutions.items()}
