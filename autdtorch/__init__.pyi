@@ -27,6 +27,7 @@ from .objectives.metrics import FocusMetrics, focus_metrics
 from .objectives.objective import Objective, SimulatedObjective, weakest_focus
 from .objectives.perturbations import Drift, FailedTransducers, Noise, Quantised, true_pressure
 from .objectives.quiet import Contrast, QuietPoints
+from .objectives.readings import Readings
 from .plot.costs import plot_pareto, plot_scaling
 from .plot.explore import explore
 from .plot.pressure_maps import plot_plane, plot_planes
@@ -81,6 +82,7 @@ __all__ = [
     "Quantised",
     "QuietPoints",
     "RandomSearch",
+    "Readings",
     "Reflector",
     "ScaleWarning",
     "Scene",

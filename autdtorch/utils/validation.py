@@ -267,6 +267,17 @@ def real_tensor(name: str, value: object, unit: str = "") -> torch.Tensor:
     return _real(name, value, f"must be an array of real numbers{_in_unit(unit)}", unit)
 
 
+def gappy_tensor(name: str, value: object, unit: str = "") -> torch.Tensor:
+    """Return `value` as a float64 tensor of any shape, as `real_tensor` does, where NaN is a gap."""
+    accepted = f"must be an array of real numbers{_in_unit(unit)}, NaN for a gap"
+    tensor = _tensor(name, value, accepted)
+    if tensor.is_complex():
+        raise invalid(name, value, accepted)
+    tensor = tensor.to(torch.float64)
+    _require_finite(name, torch.where(tensor.isnan(), 0.0, tensor), unit)
+    return tensor
+
+
 def complex_tensor(
     name: str, value: object, accepted: str = "must be an array of complex numbers"
 ) -> torch.Tensor:

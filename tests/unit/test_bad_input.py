@@ -24,6 +24,11 @@ EXPECTED = {
     ("load_scene", "source", "a dict"),  # a scene without the keys that it needs
     ("view3d", "volume", "itself, with nan"),  # unknown values of a volume
     ("plot_poses", "bounds", "itself, with inf"),  # no bound is known
+    *(
+        (call, name, "itself, with nan")  # gaps
+        for call in ("Readings", "Readings.of_rows")
+        for name in ("pressure", "phase")
+    ),
     # whole metres, which move the obstacles out of the domain
     *(
         ("Scene.moved", "offset", f"a tensor {kind}")
