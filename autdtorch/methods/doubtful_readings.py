@@ -40,16 +40,24 @@ class Magnitudes:
     Attributes:
         value: (N, P) [Pa].
         limit: True for lower limits (N, P), bool.
+        phase: of the pressures (N, P) [rad], NaN where it was not read; None if nowhere.
     """
 
     value: torch.Tensor
     limit: torch.Tensor
+    phase: torch.Tensor | None = None
 
     @classmethod
-    def of(cls, observed: torch.Tensor, outliers: torch.Tensor, highest: torch.Tensor) -> Magnitudes:
+    def of(
+        cls,
+        observed: torch.Tensor,
+        outliers: torch.Tensor,
+        highest: torch.Tensor,
+        phase: torch.Tensor | None = None,
+    ) -> Magnitudes:
         """Return readings (N, P) [Pa] without `outliers` (N, P), of sensors that end at `highest` (P,)."""
         limit = outliers | (observed >= (1 - _EQUAL) * highest)
-        return cls(observed.masked_fill(outliers, 0), limit)
+        return cls(observed.masked_fill(outliers, 0), limit, phase)
 
     @property
     def outliers(self) -> torch.Tensor:

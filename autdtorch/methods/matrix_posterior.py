@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from autdtorch.methods.doubtful_readings import Magnitudes
+from autdtorch.methods.linearised_readings import LinearisedReadings
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.process import one_library_thread
 
@@ -28,15 +29,15 @@ _MEDIAN = 0.6745  # median magnitude of a standard normal deviate
 
 @dataclass(frozen=True, eq=False)
 class MatrixPrior:
-    """A Gaussian prior of the transfer matrix: G = e^(s + a_m + i b_m) (R + sum_k t_k V_k) + d_p e.
+    """A Gaussian prior of the transfer matrix: G = e^(s + i c + a_m + i b_m) (R + sum_k t_k V_k) + d_p e.
 
-    All foci share the factors a_m and b_m of transducer m, the scale s and the amounts t_k. The entries e of
-    row p and column m are circular, of variance 1.
+    All foci share the factors a_m and b_m of transducer m, the scale s, the common phase c and the amounts
+    t_k. The entries e of row p and column m are circular, of variance 1.
 
     Attributes:
         rows: R (P, M) [Pa].
         spread: d_p (P,) [Pa].
-        widths: standard deviations (2 M + 1 + K,) of a_m, b_m [rad], s and t_k; empty without factors.
+        widths: standard deviations (2 M + 2 + K,) of a_m, b_m [rad], s, c and t_k; empty without factors.
         changes: V (K, P, M) [Pa].
     """
 
@@ -83,7 +84,7 @@ class MatrixPosterior:
 
     Attributes:
         prior: of the matrix.
-        factors: a_m, b_m, s and t_k at the maximum, as `MatrixPrior.widths`.
+        factors: a_m, b_m, s, c and t_k at the maximum, as `MatrixPrior.widths`.
         entries: e_pm at the maximum (P, M).
         variance: of the magnitudes' noise, for each focus (P,) [Pa^2].
     """
@@ -111,7 +112,7 @@ class MatrixPosterior:
         The search for the maximum begins at this one. The noise follows MacKay's rule (1992): the misfit over
         the number of readings that no unknown explains, with a few pseudo-readings of the usual noise.
         """
-        now, line = self._maximum(_Linearised.at(self, drives, read), drives, read)
+        now, line = self._maximum(self.linearised(drives, read), drives, read)
         for _ in range(_NOISE_ROUNDS if infer_noise else 0):
             before, now = now.variance[0], now._with_noise(line)
             if not 1 / _NOISE_FACTOR < now.variance[0] / before < _NOISE_FACTOR:
@@ -119,15 +120,15 @@ class MatrixPosterior:
         return now
 
     def _maximum(
-        self, line: _Linearised, drives: torch.Tensor, read: Magnitudes
-    ) -> tuple[MatrixPosterior, _Linearised]:
+        self, line: LinearisedReadings, drives: torch.Tensor, read: Magnitudes
+    ) -> tuple[MatrixPosterior, LinearisedReadings]:
         """Return the maximum by damped Gauss-Newton steps, and its linearisation."""
         now = self
         for _ in range(_STEPS):
             target, misfit = now._solved(line), now._misfit(line)
             for halving in range(_HALVINGS):
                 there = now._towards(target, 0.5**halving)
-                new_line = _Linearised.at(there, drives, read)
+                new_line = there.linearised(drives, read)
                 better = there._misfit(new_line)
                 if better < misfit:
                     break
@@ -138,9 +139,9 @@ class MatrixPosterior:
                 break
         return now, line
 
-    def _with_noise(self, line: _Linearised) -> MatrixPosterior:
+    def _with_noise(self, line: LinearisedReadings) -> MatrixPosterior:
         left = line.left.square().sum() + _WEIGHT * self.prior.usual_variance
-        variance = left / (line.unexplained(self) + _WEIGHT)
+        variance = left / (line.unexplained + _WEIGHT)
         return replace(self, variance=variance.expand_as(self.variance))
 
     @one_library_thread()
@@ -149,14 +150,14 @@ class MatrixPosterior:
 
         A sample of the prior is corrected by the readings that it would give (Matheron's rule).
         """
-        line = _Linearised.at(self, drives, read)
-        factors = self.prior.widths * _normal(generator, *self.factors.shape)
+        line, widths = self.linearised(drives, read), self.prior.widths
+        factors = _normal(generator, *self.factors.shape)
         entries = _circular(generator, *self.entries.shape)
-        noise = self.variance.sqrt() * _normal(generator, *line.magnitudes.shape)
-        correction = line.explained(self, line.change(factors, entries) + noise)
+        noise = line.noise.sqrt() * _normal(generator, *line.left.shape)
+        correction = line.explained(line.change(factors, entries) + noise)
         drawn = replace(
             self,
-            factors=self.factors + factors - correction[0],
+            factors=self.factors + widths * (factors - correction[0]),
             entries=self.entries + entries - correction[1],
         )
         if len(self.factors):
@@ -167,25 +168,28 @@ class MatrixPosterior:
 
     def outliers(self, drives: torch.Tensor, read: Magnitudes, observed: torch.Tensor) -> torch.Tensor:
         """Return the readings (N, P), bool, of drives (N, M) that are far from this fit to `read`."""
-        line = _Linearised.at(self, drives, read)
-        left = torch.where(read.outliers, observed - line.magnitudes, line.left).abs()
-        doubtful: torch.Tensor = left > _HARMLESS * self.matrix.norm(dim=1)
-        if not doubtful.any():
-            return doubtful
-        share = line.unexplained_shares(self).masked_fill(~line.decided, 1)
+        line = self.linearised(drives, read)
+        across = line.left[len(drives) :]
+        left = torch.where(read.outliers, observed - line.magnitudes, line.left[: len(drives)])
+        left = torch.cat([left, across]).abs()
+        far = left > _HARMLESS * self.matrix.norm(dim=1)
+        if not far.any():
+            return torch.zeros_like(read.limit)
+        share = line.shares.masked_fill(~line.decided, 1)
         ratio = left / share.clamp_min(_LEAST_SHARE).sqrt()
         usual = ratio.masked_fill(~line.decided, torch.nan)
         # Of all readings, or of the point's: a row that the search missed explains none of its readings.
         deviation = torch.maximum(usual.nanmedian(), usual.nanmedian(dim=0).values.nan_to_num()) / _MEDIAN
-        return doubtful.logical_and(ratio > _OUTLIER * deviation)
+        doubtful: torch.Tensor = far & (ratio > _OUTLIER * deviation)
+        return doubtful.reshape(-1, *observed.shape).any(dim=0)
 
     def deviations(self, drives: torch.Tensor, read: Magnitudes) -> torch.Tensor:
         """Return how far the readings of each control point (P,) are from this fit, rms [Pa].
 
         It is over the number of readings that no unknown explains, at least 1.
         """
-        line = _Linearised.at(self, drives, read)
-        shares = (line.unexplained_shares(self) * line.decided).sum(dim=0)
+        line = self.linearised(drives, read)
+        shares = (line.shares * line.decided).sum(dim=0)
         return (line.left.square().sum(dim=0) / shares.clamp_min(1)).sqrt()
 
     def _scaled(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -194,14 +198,22 @@ class MatrixPosterior:
         if not len(self.factors):
             return rows, changes
         transducers = rows.shape[1]
-        gain, phase, scale, amounts = torch.split(self.factors, [transducers, transducers, 1, len(changes)])
-        factor = torch.polar((gain + scale).exp(), phase)
+        parts = [transducers, transducers, 1, 1, len(changes)]
+        gain, phase, scale, turn, amounts = torch.split(self.factors, parts)
+        factor = torch.polar((gain + scale).exp(), phase + turn)
         return factor * (rows + (amounts[:, None, None] * changes).sum(dim=0)), factor * changes
 
-    def _solved(self, line: _Linearised) -> MatrixPosterior:
-        left = line.left + line.change(self.factors, self.entries)
-        factors, entries = line.explained(self, left)
-        return replace(self, factors=factors, entries=entries)
+    def linearised(self, drives: torch.Tensor, read: Magnitudes) -> LinearisedReadings:
+        """Return readings (N, P) of drives (N, M), linearised around this matrix."""
+        rows, changes = self._scaled()
+        matrix = rows + self.prior.spread[:, None] * self.entries
+        widths, spread = self.prior.widths, self.prior.spread
+        return LinearisedReadings.at(matrix, rows, changes, widths, spread, drives, read, self.variance)
+
+    def _solved(self, line: LinearisedReadings) -> MatrixPosterior:
+        left = line.left + line.change(self.factors / self.prior.widths, self.entries)
+        factors, entries = line.explained(left)
+        return replace(self, factors=self.prior.widths * factors, entries=entries)
 
     def _towards(self, other: MatrixPosterior, share: float) -> MatrixPosterior:
         return replace(
@@ -210,101 +222,11 @@ class MatrixPosterior:
             entries=self.entries + share * (other.entries - self.entries),
         )
 
-    def _misfit(self, line: _Linearised) -> torch.Tensor:
+    def _misfit(self, line: LinearisedReadings) -> torch.Tensor:
         """Return twice the negative logarithm of the posterior, up to a constant."""
-        readings = (line.left.square() / self.variance).sum()
+        readings = (line.left.square() / line.noise).sum()
         factors = (self.factors / self.prior.widths).square().sum()
         return readings + factors + 2 * self.entries.abs().square().sum()
-
-
-@dataclass(frozen=True, eq=False)
-class _Linearised:
-    """Magnitudes (N, P), and their derivatives by factors (N, P, K) and entries (N, P, M).
-
-    Attributes:
-        left: differences (N, P) of readings to the magnitudes.
-        decided: readings that constrain the fit here (N, P), bool; differences and derivatives of the others
-            are 0.
-    """
-
-    magnitudes: torch.Tensor
-    left: torch.Tensor
-    decided: torch.Tensor
-    by_factors: torch.Tensor
-    by_entries: torch.Tensor
-
-    @classmethod
-    def at(cls, posterior: MatrixPosterior, drives: torch.Tensor, read: Magnitudes) -> _Linearised:
-        pressure = drives @ posterior.matrix.T
-        magnitudes = pressure.abs()
-        decided = read.decided(magnitudes)
-        turned = (pressure.sgn().conj() * decided)[..., None] * drives[:, None]
-        by_factors = pressure.real.new_empty(*pressure.shape, 0)
-        if len(posterior.factors):
-            rows, changes = posterior._scaled()
-            parts = turned * rows
-            by_amounts = torch.einsum("npm,kpm->npk", turned, changes).real
-            by_scale = parts.real.sum(dim=-1, keepdim=True)
-            by_factors = torch.cat([parts.real, -parts.imag, by_scale, by_amounts], dim=-1)
-        left = read.nearest(magnitudes) - magnitudes
-        return cls(magnitudes, left, decided, by_factors, turned * posterior.prior.spread[:, None])
-
-    def change(self, factors: torch.Tensor, entries: torch.Tensor) -> torch.Tensor:
-        """Return the change of the magnitudes (N, P) with factors and entries."""
-        return self.by_factors @ factors + (self.by_entries * entries).sum(dim=-1).real
-
-    def explained(self, posterior: MatrixPosterior, left: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the likeliest factors and entries that change the magnitudes by (N, P)."""
-        if not len(posterior.factors):
-            slope, factor = self._of_rows(posterior)
-            by_readings = slope.mT @ (left.T / posterior.variance[:, None])[..., None]
-            parts = torch.cholesky_solve(by_readings, factor)[..., 0]
-            return posterior.factors, torch.complex(*parts.chunk(2, dim=1))
-        column = torch.cholesky_solve(left.T.reshape(-1, 1), self._of_readings(posterior))
-        weights = column.reshape(left.T.shape).T
-        factors = posterior.prior.widths.square() * (weights[..., None] * self.by_factors).sum(dim=(0, 1))
-        return factors, 0.5 * (weights[..., None] * self.by_entries.conj()).sum(dim=0)
-
-    def unexplained(self, posterior: MatrixPosterior) -> torch.Tensor:
-        """Return the number of readings that no unknown explains."""
-        if not len(posterior.factors):
-            slope, factor = self._of_rows(posterior)
-            unknown = 2 * torch.cholesky_inverse(factor).diagonal(dim1=1, dim2=2).sum()
-            return self.decided.sum() - slope.shape[0] * slope.shape[2] + unknown
-        return (self.unexplained_shares(posterior) * self.decided).sum()
-
-    def unexplained_shares(self, posterior: MatrixPosterior) -> torch.Tensor:
-        """Return the share of each reading's variance (N, P) that no unknown explains."""
-        if not len(posterior.factors):
-            slope, factor = self._of_rows(posterior)
-            whitened = torch.linalg.solve_triangular(factor, slope.mT, upper=False)
-            shares: torch.Tensor = 1 - whitened.square().sum(dim=1).T / posterior.variance
-            return shares
-        inverse = torch.cholesky_inverse(self._of_readings(posterior))
-        return inverse.diagonal().reshape(self.magnitudes.T.shape).T * posterior.variance
-
-    def _of_rows(self, posterior: MatrixPosterior) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return derivatives (P, N, 2 M), and the Cholesky factor of the inverse covariance of the entries.
-
-        For many readings of each row, whose unknowns are separate.
-        """
-        by_focus = self.by_entries.transpose(0, 1)
-        slope = torch.cat([by_focus.real, -by_focus.imag], dim=-1)
-        inverse = slope.mT @ slope / posterior.variance[:, None, None]
-        inverse.diagonal(dim1=1, dim2=2).add_(2)  # parts of entries have the variance 1/2
-        return slope, torch.linalg.cholesky(inverse)
-
-    def _of_readings(self, posterior: MatrixPosterior) -> torch.Tensor:
-        """Return the Cholesky factor (P N, P N) of the readings' covariance, of which there are few."""
-        by_focus = self.by_entries.transpose(0, 1)
-        blocks = 0.5 * (by_focus @ by_focus.mH).real
-        blocks.diagonal(dim1=1, dim2=2).add_(posterior.variance[:, None])
-        shared = (self.by_factors * posterior.prior.widths).transpose(0, 1).flatten(0, 1)
-        covariance = (shared @ shared.T).reshape(2 * blocks.shape[:2])
-        for focus, block in enumerate(blocks):
-            covariance[focus, :, focus] += block
-        factor: torch.Tensor = torch.linalg.cholesky(covariance.reshape(len(shared), -1))
-        return factor
 
 
 def _normal(generator: torch.Generator, *shape: int) -> torch.Tensor:

@@ -20,6 +20,7 @@ _STARTS, _CLIMB_STEPS = 16, 300  # of the climbs to the best drive of a simulati
 _LEAST_WIDTH = 1e-6  # of gain, phase and rest
 _DARK = 1e-2  # least rms entry of a row, relative to the strongest row's: simulated shadows are deep
 
+_TURN = 1.8  # standard deviation of the phase between readings and simulation, which may be any [rad]
 _SCALE = 0.3
 """Standard deviation of the logarithm of the scale between readings and simulation, after a first scaling by
 the first reading."""
@@ -97,7 +98,13 @@ def matrix_prior(prior: Prior, problem: Problem) -> MatrixPrior:
     matrix = prior_mean(prior, problem)
     each = torch.ones(problem.transducers, **REAL)
     changes = matrix.new_empty(0, *matrix.shape) if prior.variants is None else prior.variants - matrix
-    widths = [prior.gain * each, prior.phase * each, _SCALE * each[:1], each.new_ones(len(changes))]
+    widths = [
+        prior.gain * each,
+        prior.phase * each,
+        _SCALE * each[:1],
+        _TURN * each[:1],
+        each.new_ones(len(changes)),
+    ]
     entries = matrix.abs().square().mean(dim=1).sqrt()
     if not entries.any():
         raise invalid("prior.transfer_matrix", 0, "must not be 0 throughout")

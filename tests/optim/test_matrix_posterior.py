@@ -8,7 +8,7 @@ import autdtorch as at
 from autdtorch.methods.doubtful_readings import Magnitudes
 from autdtorch.methods.gradient import random_drives
 from autdtorch.methods.matrix_fit import posteriors
-from autdtorch.methods.matrix_posterior import MatrixPosterior, MatrixPrior, _Linearised
+from autdtorch.methods.matrix_posterior import MatrixPosterior, MatrixPrior
 from autdtorch.objectives.perturbations import Noise
 
 FOCI = {"model": "foci", "kernel": "phasor", "noise": "inferred"}
@@ -32,7 +32,7 @@ def exact(magnitudes):
 @pytest.fixture
 def prior(random_matrix):
     rows = random_matrix(2, 4, 0)
-    widths = torch.tensor([0.1] * 4 + [0.5] * 4 + [1.0, 1.0], dtype=torch.float64)
+    widths = torch.tensor([0.1] * 4 + [0.5] * 4 + [1.0, 0.8, 1.0], dtype=torch.float64)
     changes = 0.1 * random_matrix(2, 4, 1)[None]
     return MatrixPrior(rows, torch.tensor([0.1, 0.2], dtype=torch.float64), widths, changes)
 
@@ -53,26 +53,27 @@ def test_derivatives_are_those_of_the_magnitudes(prior, with_factors):
     entries = here.entries.clone().requires_grad_(True)
     there = MatrixPosterior(prior, factors, entries, here.variance)
     magnitudes = (drives @ there.matrix.T).abs()
-    line = _Linearised.at(here, drives, exact(magnitudes.detach()))
+    line = here.linearised(drives, exact(magnitudes.detach()))
     for index in range(magnitudes.numel()):
         by = torch.autograd.grad(
             magnitudes.flatten()[index], (factors, entries), retain_graph=True, allow_unused=True
         )
         place = tuple(divmod(index, 2))
         if with_factors:
-            torch.testing.assert_close(line.by_factors[place], by[0])
+            torch.testing.assert_close(line.by_factors[place], by[0] * prior.widths)
         # PyTorch's gradient of a real function is the conjugate of the derivative by the entry.
         torch.testing.assert_close(line.by_entries[place], by[1][place[1]].conj())
 
 
 def slopes(posterior, drives):
     """Derivatives (N P, K) of magnitudes by factors, and by real and imaginary parts of all entries."""
-    line = _Linearised.at(posterior, drives, exact((drives @ posterior.matrix.T).abs()))
+    line = posterior.linearised(drives, exact((drives @ posterior.matrix.T).abs()))
     by_parts = torch.zeros(*line.magnitudes.shape, *posterior.entries.shape, 2, dtype=torch.float64)
     for focus in range(len(posterior.entries)):
         entry = line.by_entries[:, focus]
         by_parts[:, focus, focus] = torch.stack([entry.real, -entry.imag], dim=-1)
-    return torch.cat([line.by_factors, by_parts.flatten(2)], dim=-1).flatten(0, 1)
+    by_factors = line.by_factors / posterior.prior.widths
+    return torch.cat([by_factors, by_parts.flatten(2)], dim=-1).flatten(0, 1)
 
 
 def test_samples_have_the_covariance_that_readings_leave(prior):
