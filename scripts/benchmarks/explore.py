@@ -1,8 +1,8 @@
 """The live view: memory, and the time from a slider's move to the new field in a browser.
 
 A headless Chromium on the same machine moves a slider; the time ends with the frame of the new field. Then
-the obstacle is moved many times more, for the memory of the process. Takes about four minutes on 2 idle
-cores.
+the obstacle is moved many times more, for the memory of the process. The picture of the page is taken, too.
+Takes about four minutes on 2 idle cores.
 """
 
 import gc
@@ -65,6 +65,8 @@ def main(page: Page, scene: str, moves: int, more: int) -> None:
         tab = browser.new_page(viewport=_WINDOW)
         tab.goto(explorer.address)
         tab.wait_for_selector("section.picture[aria-busy=false]")
+        tab.get_by_text("Estimated error").wait_for()
+        tab.screenshot(path=page.folder / "explore.png")
         times(tab, place, 3)  # what is done once
         seconds = times(tab, place, moves)
         megabytes = memory(tab, place, more)

@@ -385,20 +385,13 @@ for name in ("left", "right"):
 
 
 def program(page, folder):
-    """Run the Python of a page, in this process if it can; a live view that it leaves is closed."""
+    """Run the Python of a page in this process; a live view that it leaves is closed."""
     code = PYTHON[page]
     if "view3d" in code or "explore" in code:
         from autdtorch.plot.view3d import rendering_problem
 
         if problem := rendering_problem():
             pytest.skip(problem)
-    if "playwright" in code and shutil.which("chromium") is None:
-        pytest.skip("no Chromium")
-    if "playwright" in code:  # whose loop another of Playwright in this process would refuse
-        (folder / "page.py").write_text(code, "utf-8")
-        done = run([sys.executable, "page.py"], folder)
-        assert done.returncode == 0, done.stderr
-        return
     if page == "docs/hardware.md":
         code = EMULATED + code
     with here(folder) as patch, matplotlib.rc_context({"backend": "Agg"}):

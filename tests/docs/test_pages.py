@@ -188,6 +188,6 @@ def test_the_citation_names_the_package_and_the_paper():
     assert (citation["authors"], citation["license"]) == (project["authors"], project["license"])
     assert citation["title"].startswith(project["name"])
     (paper,) = citation["references"]
-    faq = " ".join((DOCS / "faq.md").read_text("utf-8").split())
-    assert paper["title"] in faq
-    assert paper["doi"] in faq
+    readme = " ".join((ROOT / "README.md").read_text("utf-8").split())
+    assert paper["title"] in readme
+    assert paper["doi"] in readme
