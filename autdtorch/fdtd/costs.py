@@ -37,9 +37,8 @@ _RECORDED = 44
 """Memory [bytes] of a recorded number, and of what is made of it for the Fourier sums."""
 
 _CELL_STEPS, _COLUMN_STEPS, _LOSSY = 15.0, 150.0, 2.0
-"""Time of a step of a heterogeneous cell, and of one that a surface cuts in a boundary layer, and the factor
-on the former for bodies that absorb, whose cells have two rows. This and the
-following times are in steps of a cell of air."""
+"""Time of a step of a heterogeneous cell, and of one that a surface cuts in a boundary layer [steps of a cell
+of air, as in the following times]. Cells of bodies that absorb have two rows: the factor on the former."""
 
 _PAIR_STEPS, _ASSEMBLY_STEPS, _MESH_STEPS = 11.0, 60_000.0, 60_000.0
 """Time of one term of a sum over radiating cells, of the assembly of a heterogeneous cell, and of what a mesh

@@ -139,9 +139,9 @@ def iterated(
 def extrapolated(orders: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the sum of all scattering orders (k, R) of R runs from two or more, and what it leaves (k, R).
 
-    With x_(n+1) = K x_n, the sum is b = x_0 + K b. It is sought among the orders of all runs, as the one of
-    least residual x_0 + K v - v (the generalised minimal residual of Saad and Schultz 1986, with several
-    right-hand sides), and passed through K once more. Of many runs, each has its own orders alone.
+    With x_(n+1) = K x_n, the sum is b = x_0 + K b. The combination v of the orders of all runs with the least
+    residual x_0 + K v - v is passed through K once more (generalised minimal residuals, Saad and Schultz
+    1986). Of many runs, each is combined from its orders alone.
     """
     count, runs = orders[0].shape
     if runs > _TOGETHER:

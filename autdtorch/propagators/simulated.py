@@ -135,9 +135,9 @@ class SimulatedPropagator:
 
         Args:
             points: (P, 3) [m]; by default the scene's control points.
-            return_error: also return the estimated relative error (L2 of the whole matrix), from a second
-                grid, which takes a fifth of the time where it is coarser, and the distance to the steady
-                state. `point_errors` returns the error of each point.
+            return_error: also return the estimated relative error (L2 of the whole matrix): from a second
+                grid, and from the distance to the steady state. A coarser second grid takes a fifth of the
+                time. `point_errors` returns the error of each point.
 
         Returns:
             complex128 (P, M) [Pa], and the error if asked for.

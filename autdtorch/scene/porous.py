@@ -21,9 +21,8 @@ def porous(
 
         pad = at.Box((0, 0, 0.1), (0.05, 0.05, 0.01), **at.porous(200e3))
 
-    The formulas are those of Delany and Bazley (1970, Applied Acoustics 3, 105) for fibrous materials of a
-    porosity near 1, in the form of Miki (1990, J. Acoust. Soc. Jpn. (E) 11, 19), which is passive at all
-    frequencies.
+    For fibrous materials of a porosity near 1. Source: Delany and Bazley (1970), Applied Acoustics 3, 105, in
+    the form of Miki (1990), J. Acoust. Soc. Jpn. (E) 11, 19, which is passive at all frequencies.
 
     Args:
         flow_resistivity: static [Pa s/m^2], 1 to 100 times the frequency in Hz: 40e3 to 4e6 at 40 kHz.

@@ -48,8 +48,8 @@ def main(page: Page, families: list[str], first: int, scenes: int) -> int:
     caption = (
         f"Seeds {first} to {seeds[-1]} of each family at tolerances of {', '.join(map(percent, TOLERANCES))}"
         f" each: scenes judged of {len(seeds) * len(TOLERANCES)}, beyond their tolerance without a warning,"
-        " with a claim within a factor of three; median error and time of all. Required are at most 5 % without"
-        " a warning and 90 % within the factor."
+        " with a claim within a factor of three; median error and time of all. Required are at most 5 %"
+        " without a warning and 90 % within the factor."
     )
     header = ["family", "judged", "silent", "claim within 3", "error", "time"]
     if set(families) == set(FAMILIES):
