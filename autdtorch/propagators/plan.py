@@ -39,6 +39,9 @@ logger = logging.getLogger(__name__)
 _TAKEN_AS_RIGID = 0.25
 """Share of the error asked for up to which bodies are taken as rigid, where the spacing is chosen by it."""
 
+_SLACK = 1.05
+"""Room for the change of a body's difference from a rigid one, where a scene changes a little."""
+
 _NO_EFFECT = ("observation_plane", "name")
 """Scene fields that do not affect the pressure; left out of keys."""
 
@@ -71,6 +74,12 @@ class Plan:
         """Return a plan of the same method with another spacing [m], tolerance and time step [s]."""
         _, grouping = choose_grids(self.region, self.method, spacing, tolerance, self.runs)
         return replace(self, spacing=spacing, tolerance=tolerance, time_step=time_step, grouping=grouping)
+
+    def of(self, scene: Scene) -> Self:
+        """Return a plan of a changed scene with these settings, which takes the same bodies as rigid."""
+        rigid = _SLACK * max((body.rigid_error for body in self.region.bodies), default=0.0)
+        plan = replace(self, scene=scene, region=with_rigid(region_of(scene), rigid))
+        return plan.at(self.spacing, self.tolerance, self.time_step)
 
     @property
     def with_materials(self) -> Self:

@@ -7,12 +7,12 @@ equations are also those of ANSI S1.26 and of Bass et al., J. Acoust. Soc. Am. 9
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from autdtorch.utils.fluids import fluid
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.units import warn_user
-from autdtorch.utils.validation import not_negative, number_between
+from autdtorch.utils.validation import invalid, not_negative, number_between
 
 _TEMPERATURES = -20.0, 50.0  # deg C; range of ISO 9613-1
 _PRESSURES = 50e3, 200e3  # Pa; from half an atmosphere to the limit of ISO 9613-1
@@ -26,6 +26,7 @@ _REFERENCE_PRESSURE = 101325.0  # Pa
 _TRIPLE_POINT = 273.16  # K
 _GAS_CONSTANT = 8.314462618  # J/(mol K)
 _DRY_AIR, _WATER = 28.9647e-3, 18.01528e-3  # kg/mol
+_DIATOMIC = 1.4  # ratio of specific heats of dry air
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,35 @@ class Medium:
         # No argument of Medium: the frequency of an absorption set by hand, or replaced, is not known.
         object.__setattr__(medium, "absorption_frequency", float(frequency))
         return medium
+
+    @property
+    def is_air(self) -> bool:
+        """Whether density and sound speed are those of air in the range of `air`, taken as dry."""
+        least, most = (limit + _ZERO_CELSIUS for limit in _TEMPERATURES)
+        lowest, highest = _PRESSURES
+        pressure = self.density * self.sound_speed**2 / _DIATOMIC
+        return least <= self.temperature <= most and lowest <= pressure <= highest
+
+    @property
+    def temperature(self) -> float:
+        """Temperature [K] at which dry air has its sound speed."""
+        return self.sound_speed**2 * _DRY_AIR / (_DIATOMIC * _GAS_CONSTANT)
+
+    def warmed(self, kelvin: float) -> Medium:
+        """Return air after a rise of its temperature [K] at its pressure, by the law of ideal gases.
+
+        Vapour and absorption stay. At a constant relative humidity of 50 %, the sound speed would rise by 8 %
+        more.
+
+        Raises:
+            ValueError: the medium is no air, or would leave the range of temperatures of `air`.
+        """
+        if not self.is_air:
+            fluid = f"{self.density:.4g} kg/m^3, {self.sound_speed:.4g} m/s"
+            raise invalid("medium", fluid, "must be air: of others the change with temperature is not known")
+        least, most = (limit + _ZERO_CELSIUS - self.temperature for limit in _TEMPERATURES)
+        ratio = 1 + number_between("kelvin", kelvin, least, most, "K") / self.temperature
+        return replace(self, density=self.density / ratio, sound_speed=self.sound_speed * math.sqrt(ratio))
 
 
 def vapour_fraction(temperature: float, relative_humidity: float, pressure: float) -> float:

@@ -121,6 +121,11 @@ def require_arrangement(reflectors: Sequence[Reflector], wavenumber: complex) ->
             )  # fmt: skip
 
 
+def is_panel(plane: Reflector, array: TransducerArray) -> bool:
+    """Return whether an array stands in a plane, as in `Reflector.behind`."""
+    return bool((plane.mirror.height(array.positions).abs() <= _FLAT).all())
+
+
 def are_in_front(reflectors: Sequence[Reflector], points: torch.Tensor) -> torch.Tensor:
     """Return which points (..., 3) [m] are in front of all reflectors or in them, bool (...)."""
     front = torch.ones(points.shape[:-1], dtype=torch.bool, device=points.device)

@@ -23,7 +23,7 @@ from autdtorch.propagators.tmatrix.bodies import ObstacleGroup, are_outside, bod
 from autdtorch.propagators.tmatrix.body import Placed, Solver, placed
 from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster, scattered_waves, waves_at
 from autdtorch.scene.drive import validate_drive
-from autdtorch.scene.scene import require_clear, require_in_front
+from autdtorch.scene.scene import Scene, require_clear, require_in_front
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.images import Image
 from autdtorch.utils.process import cached_property, one_library_thread
@@ -75,6 +75,10 @@ class TMatrixPropagator:
         """Scene, settings and number of bodies."""
         settings = f"tmatrix, spacing {1e3 * self.spacing:.4g} mm, tolerance {self.tolerance:g}"
         return f"TMatrixPropagator(scene {self.scene.name!r}, {settings})"
+
+    def of(self, scene: Scene) -> TMatrixPropagator:
+        """Return the propagator of a changed scene, with these settings."""
+        return TMatrixPropagator(self.plan.of(scene), self._store)
 
     @property
     def runs(self) -> list[Run]:
