@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.special import j1
 
-from autdtorch.scene.arrays import TransducerArray, strengths_of
+from autdtorch.scene.arrays import TransducerArray, complex_strengths_of
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.images import NO_MIRRORS, Image, distinct
 from autdtorch.utils.process import require_memory
@@ -78,7 +78,7 @@ def free_space_matrix(
         for at, w in zip(image.of(positions).unbind(1), weights, strict=True)
     )
     none = torch.zeros((), **COMPLEX)
-    return 4 * math.pi * strengths_of(array).to(points.device) * sum(terms, start=none)
+    return 4 * math.pi * complex_strengths_of(array).to(points.device) * sum(terms, start=none)
 
 
 def piston_field(

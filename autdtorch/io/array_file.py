@@ -23,7 +23,8 @@ from autdtorch.utils.validation import ArrayLike, path_of, within
 PLACE_COLUMNS = {"x": "m", "y": "m", "z": "m"}
 NORMAL_COLUMNS = {"nx": "", "ny": "", "nz": ""}
 SIZE_COLUMNS = {"source_strength": "Pa m", "radius": "m"}
-_PARTS = ("positions", "normals", "source_strength", "radius")
+OFFSET = "phase_offset"  # [rad] of the transducers; phases in these files belong to drives
+_PARTS = ("positions", "normals", *SIZE_COLUMNS)
 _IGNORED = {"frame": "", "transducer": "", "phase": "rad", "amplitude": ""}
 _PITCHES = {"m": (3e-3, 0.1), "mm": (3.0, 100.0)}  # of arrays for airborne ultrasound, in each unit
 _UNIT_ROUNDING = 1e-3  # by which the length of a normal may differ from 1, in a file of few digits
@@ -40,11 +41,12 @@ def load_array(
     """Read an array from a file, and place it in the scene; by default, in the coordinates of the file.
 
     - `.csv`: columns `x [m]`, `y [m]`, `z [m]` (or `[mm]`, `[cm]`), and `nx`, `ny`, `nz` for the directions
-      of emission, by default +z; optionally `source_strength [Pa m]` and `radius [m]`. Names and units may be
-      in a comment. Without names, the columns are x, y, z or x, y, z, nx, ny, nz, of length 1. A unit that
-      is not stated is inferred from the distance of neighbours, with a `ScaleWarning`.
-    - `.npz`: arrays `positions` (M, 3) [m] and `normals` (M, 3) or (3,), optionally `source_strength` [Pa m]
-      and `radius` [m], numbers or (M,).
+      of emission, by default +z; optionally `source_strength [Pa m]`, `radius [m]` and `phase_offset [rad]`
+      (or `[deg]`), the phase of `TransducerArray`. Names and units may be in a comment. Without names, the
+      columns are x, y, z or x, y, z, nx, ny, nz, of length 1. A length's unit that is not stated is inferred
+      from the distance of neighbours, with a `ScaleWarning`.
+    - `.npz`: arrays `positions` (M, 3) [m] and `normals` (M, 3) or (3,), optionally `source_strength` [Pa m],
+      `radius` [m] and `phase_offset` [rad], numbers or (M,).
     - `.pat`: a board of OpenMPD, emitting along +z; `OpenMPDBoard.load` also reads its calibration.
     - `.xml.gz` or `.xml`: a simulation of Ultraino, its transducers in the order of their numbers, with their
       powers and half their apertures as strengths and radii. Ultraino's y axis, which points up, becomes z.
@@ -71,7 +73,7 @@ def load_array(
         file = TransducerArray(**{name: part for name, part in parts.items() if chosen.get(name) is None})
     sizes = {name: getattr(file, name) if value is None else value for name, value in chosen.items()}
     positions = in_plane(file.positions, center, normal, angle)
-    return TransducerArray(positions, file.normals @ device_axes(normal, angle), **sizes)
+    return TransducerArray(positions, file.normals @ device_axes(normal, angle), **sizes, phase=file.phase)
 
 
 def _from_pat(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -80,7 +82,7 @@ def _from_pat(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def _from_csv(path: str | os.PathLike[str]) -> dict[str, Any]:
-    known = PLACE_COLUMNS | NORMAL_COLUMNS | SIZE_COLUMNS | _IGNORED
+    known = PLACE_COLUMNS | NORMAL_COLUMNS | SIZE_COLUMNS | {OFFSET: "rad"} | _IGNORED
     table = table_of(read_rows(path), known, _names, _unit)
     wanted = PLACE_COLUMNS | (NORMAL_COLUMNS if NORMAL_COLUMNS.keys() & table.keys() else {})
     if missing := [name for name in wanted if name not in table]:
@@ -92,6 +94,7 @@ def _from_csv(path: str | os.PathLike[str]) -> dict[str, Any]:
         "positions": values[:, :3],
         "normals": values[:, 3:] if len(wanted) > 3 else (0.0, 0.0, 1.0),
         **sizes,
+        "phase": table[OFFSET][rows] if OFFSET in table else 0.0,
     }
 
 
@@ -115,6 +118,8 @@ def _names(values: Array) -> list[str]:
 
 def _unit(kind: str, table: Mapping[str, Array]) -> Guessed | None:
     """Return the unit of lengths or strengths that state none: that in which the pitch is a usual one."""
+    if OFFSET in table:
+        raise ValueError(f"column {OFFSET} has no unit; must be {OFFSET} [rad] or {OFFSET} [deg]")
     if kind != "m":
         return Guessed(kind, "") if kind == "Pa m" else None
     why = ""
@@ -136,7 +141,7 @@ def _from_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
     for name in ("positions", "normals"):
         if name not in arrays:
             raise ValueError(f"{path}: no array {name!r}; must have positions and normals")
-    return {name: arrays[name] for name in _PARTS if name in arrays}
+    return {name: arrays[name] for name in _PARTS if name in arrays} | {"phase": arrays.get(OFFSET, 0.0)}
 
 
 _READERS: dict[str, Callable[[str | os.PathLike[str]], dict[str, Any]]] = {

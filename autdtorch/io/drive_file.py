@@ -12,10 +12,10 @@ import numpy as np
 import torch
 
 from autdtorch.hardware.devices import DEVICES
-from autdtorch.io.array_file import NORMAL_COLUMNS, PLACE_COLUMNS, SIZE_COLUMNS
+from autdtorch.io.array_file import NORMAL_COLUMNS, OFFSET, PLACE_COLUMNS, SIZE_COLUMNS
 from autdtorch.io.csv_table import Guessed, Rows, read_rows, table_of, write_table
 from autdtorch.io.ultraino_file import SUFFIX, read_ultraino
-from autdtorch.scene.arrays import TransducerArray, radii_of, strengths_of
+from autdtorch.scene.arrays import TransducerArray, phase_offsets_of, radii_of, strengths_of
 from autdtorch.scene.drive import (
     amplitudes_of,
     drive_from_phases,
@@ -29,7 +29,7 @@ from autdtorch.utils.validation import ArrayLike, path_of, real_tensor, require_
 
 _FORMATS = (".csv", ".npz")
 _LEVEL_COLUMNS = {f"{name} {column}": "" for name, device in DEVICES.items() for column in device.columns}
-_PLAIN_COLUMNS = {"phase": "rad", "amplitude": ""}
+_PLAIN_COLUMNS = {OFFSET: "rad", "phase": "rad", "amplitude": ""}
 _NUMBERING = {"frame": "", "unit": "", "transducer": ""}
 _COLUMNS = _NUMBERING | PLACE_COLUMNS | NORMAL_COLUMNS | SIZE_COLUMNS | _PLAIN_COLUMNS | _LEVEL_COLUMNS
 _TURN = 2 * math.pi + 1e-6  # [rad], with room for rounding
@@ -41,8 +41,9 @@ def save_drive(
     """Write a drive, or the frames of a sequence, with full precision or as the levels of a device.
 
     Without `device`, `.csv` has the columns transducer, x, y, z [m], nx, ny, nz, source_strength [Pa m],
-    radius [m], phase [rad] and amplitude. `.npz` has the arrays drive (M,), positions, normals,
-    source_strength and radius. `load_array` reads the array from both.
+    radius [m], phase [rad] and amplitude, and phase_offset [rad] if the array has phases. `.npz` has the
+    arrays drive (M,), positions, normals, source_strength, radius and phase_offset. `load_array` reads the
+    array from both.
 
     With `device`, the drive is rounded to its phase levels. The array must have the order of the device, as
     `TransducerArray.autd3`, `.sonicsurface` and `.openmpd` have. `.csv` has the columns unit, transducer and,
@@ -173,8 +174,8 @@ def _names(values: Array) -> list[str]:
 
 def _unit(kind: str, table: Mapping[str, Array]) -> Guessed | None:
     """Return the unit of columns that state none: rad, if the phases can hardly be levels or degrees."""
-    if kind != "rad":
-        return None  # of positions, which are not used
+    if kind != "rad" or "phase" not in table:
+        return None  # of the array, which is not used
     phases = table["phase"]
     if (np.abs(phases) <= _TURN).all() and not (phases == phases.round()).all():
         return Guessed("rad", "phases; taken as rad, since all are within a turn")
@@ -217,12 +218,15 @@ def _plain(drive: torch.Tensor, array: TransducerArray) -> tuple[dict[str, Any],
     columns |= {name: normals[:, axis] for axis, name in enumerate(NORMAL_COLUMNS)}
     columns["source_strength [Pa m]"] = strengths_of(array).numpy()
     columns["radius [m]"] = radii_of(array).numpy()
+    if (offsets := phase_offsets_of(array)).any():
+        columns[f"{OFFSET} [rad]"] = offsets.numpy()
     columns = _numbered(columns, drive)
     flat = drive.flatten()
     amplitudes = amplitudes_of(flat).clamp(max=1.0)  # rounding may exceed 1, which is refused when read
     columns |= {"phase [rad]": phases_of(flat).numpy(), "amplitude": amplitudes.numpy()}
     arrays = {"drive": drive.numpy(), "positions": positions, "normals": normals}
-    return columns, arrays | {name: np.asarray(getattr(array, name)) for name in SIZE_COLUMNS}
+    arrays |= {name: np.asarray(getattr(array, name)) for name in SIZE_COLUMNS}
+    return columns, arrays | {OFFSET: np.asarray(array.phase)}
 
 
 def _levelled(drive: torch.Tensor, name: str) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -71,9 +71,10 @@ def load_scene(source: str | os.PathLike[str] | Mapping[str, Any], modules: Coll
     """Read a scene from a YAML file, or from a mapping of the same layout such as Hydra's `cfg.scene`.
 
     Control points and array are a section each, or a list of sections, whose points or transducers follow one
-    another. An obstacle has a `type`, or the `_target_` of a user's class, such as
-    `mymodule.MyObstacle`. Its complex numbers are written as in `impedance: 1.5+0.2j`. Its section `porous`,
-    `{flow_resistivity: 200e3}`, is the material that `porous` returns for the scene's frequency and medium.
+    another. An array of any type may have a `phase` [rad], which `TransducerArray.calibrated` adds.
+    An obstacle has a `type`, or the `_target_` of a user's class, such as `mymodule.MyObstacle`. Its complex
+    numbers are written as in `impedance: 1.5+0.2j`. Its section `porous`, `{flow_resistivity: 200e3}`, is the
+    material that `porous` returns for the scene's frequency and medium.
     A reflector has `point`, `normal` and `reflection`, the arguments of `Reflector`, or is `{type: panel}`,
     the panel that the array stands in (`Reflector.behind`).
     The section `pose`, with the keys `offset` and `rotation`, or `rotation_degrees`, moves all obstacles as
@@ -168,7 +169,9 @@ def _part(
         kind = section.pop("type", None)
         require_one_of(f"{where}: type", kind, _TYPES[key])
         builder = KINDS[kind].maker() if key == "obstacle" else _TYPES[key][kind]
-    return _build(where, section, builder)
+    phase = section.pop("phase", None) if key == "array" else None
+    part = _build(where, section, builder)
+    return part if phase is None else _build(where, {"phase": phase}, part.calibrated)
 
 
 def _reflectors(where: str, value: object, array: Any) -> list[Reflector]:
@@ -345,7 +348,10 @@ def scene_lines(scene: Scene, drive: torch.Tensor, name: str, beside: bool = Fal
     lines += ["import autdtorch as at", ""]
     arrays = ["array"] if len(boards) == 1 else [f"array_{number}" for number in range(len(boards))]
     for array, board in zip(arrays, boards, strict=True):
+        phase = board.pop("phase", None)
         lines.append(_call(array, FORMS[board.pop("type")], board))
+        if phase is not None:
+            lines.append(f"{array} = {array}.calibrated(phase={_value(phase, 25 + 2 * len(array))})")
     if len(boards) > 1:
         lines.append(f"array = {' + '.join(arrays)}")
     obstacles = [f"obstacle_{number}" for number in range(len(scene.obstacles))]

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal
 import torch
 
 from autdtorch.methods.base import Method, Problem, State, Step, first_of_best, setting, whole
+from autdtorch.scene.arrays import phase_offsets_of
 from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise, phases_of
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.validation import integers, invalid
@@ -172,4 +173,5 @@ def _focus_drives(problem: Problem) -> torch.Tensor:
     scene = problem.scene
     if scene is None:
         raise invalid("problem.scene", None, "must be a scene: the phases of the foci need its geometry")
-    return drive_from_phases(focus_phases(scene.array.positions, scene.control_points, scene.wavenumber))
+    phases = focus_phases(scene.array.positions, scene.control_points, scene.wavenumber)
+    return drive_from_phases(phases + phase_offsets_of(scene.array))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from autdtorch.scene.arrays import strengths_of
+from autdtorch.scene.arrays import complex_strengths_of
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.images import Mirror, images_of
@@ -40,7 +40,7 @@ class Radiators(NamedTuple):
 def radiators_of_array(scene: Scene, drive: torch.Tensor) -> Radiators:
     """Return the transducers of a scene as monopoles, for drives (R, M)."""
     positions, weights = scene.array.nodes
-    strength = (strengths_of(scene.array) * drive).mT
+    strength = (complex_strengths_of(scene.array) * drive).mT
     amplitude = strength[:, None] * weights[:, None].to(strength.dtype)
     return Radiators(positions.reshape(-1, 3), amplitude.reshape(-1, len(drive)))
 

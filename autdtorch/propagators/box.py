@@ -42,7 +42,7 @@ from autdtorch.propagators.simulation import (
     mean_of_images,
 )
 from autdtorch.propagators.store import MOST_BYTES
-from autdtorch.scene.arrays import apertures_of, strengths_of
+from autdtorch.scene.arrays import apertures_of, complex_strengths_of
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.obstacles.moving import circumscribed
 from autdtorch.scene.scene import require_clear, require_in_front
@@ -218,7 +218,8 @@ class BoxSimulation(Simulation):
             return self._matrix_of_orbits(points, orbits_of_transducers(points, self.symmetries))
         array = self.plan.scene.array
         alone = [apertures_of(array).chosen(slice(index, index + 1)) for index in range(len(array))]
-        return self._total(radiation, alone, strengths_of(array)[:, None].to(torch.complex128), points)
+        strength = complex_strengths_of(array)[:, None].to(torch.complex128)
+        return self._total(radiation, alone, strength, points)
 
     def _fields(self, drive: torch.Tensor, points: torch.Tensor) -> PressureMap:
         if self._radiates(points):
@@ -259,7 +260,7 @@ class BoxSimulation(Simulation):
         for box, part in zip(radiation.boxes, radiation.amplitudes, strict=True):
             images = np.stack([_images(box, each) for each in self.symmetries])
             unit = part[torch.from_numpy(images[symmetry].T), torch.from_numpy(place)]
-            amplitudes.append(strengths_of(array) * unit)
+            amplitudes.append(complex_strengths_of(array) * unit)
         return replace(radiation, amplitudes=tuple(amplitudes))
 
     def _radiation_of(self, drive: torch.Tensor) -> Radiation:

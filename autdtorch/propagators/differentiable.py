@@ -15,7 +15,7 @@ from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import block_of, fewest_periods
 from autdtorch.fdtd.stepping import drive_dft, drive_signal
 from autdtorch.propagators.scene_region import region_of, warn_of_ending_walls, warn_of_near_points
-from autdtorch.scene.arrays import apertures_of, strengths_of
+from autdtorch.scene.arrays import apertures_of, complex_strengths_of
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene, require_in_front, require_inside
 from autdtorch.utils.array_types import COMPLEX
@@ -114,7 +114,7 @@ def differentiable_field(
     signal = drive_signal(assembly.steps_per_period, 0, steps * math.ceil(periods / block)).to(precision)
     fields = [torch.zeros((0, len(targets)), **COMPLEX)]
     for row in drive.reshape(-1, drive.shape[-1]):
-        strength = weights * (strengths_of(scene.array) * row.cpu()).repeat(images)
+        strength = weights * (complex_strengths_of(scene.array) * row.cpu()).repeat(images)
         sources = cells.driven(assembly.sources(nodes.positions, strength, nodes.weights), assembly)
         record = recorded(stepper, assembly, sources, receivers, signal)
         fields.append(drive_dft(record[-steps:], block)[None])  # the last block

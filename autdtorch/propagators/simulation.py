@@ -28,7 +28,7 @@ from autdtorch.propagators.absorbed_power import (
 )
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.store import Store
-from autdtorch.scene.arrays import apertures_of, strengths_of
+from autdtorch.scene.arrays import apertures_of, complex_strengths_of
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL
@@ -255,7 +255,7 @@ class Simulation(ABC):
     def sources_of(self, drive: torch.Tensor) -> tuple[list[Apertures], torch.Tensor]:
         """Return the sources of runs of drives (R, M) and their strengths (R, M) [Pa m]."""
         array = self.plan.scene.array
-        return [apertures_of(array)] * len(drive), strengths_of(array) * drive
+        return [apertures_of(array)] * len(drive), complex_strengths_of(array) * drive
 
     def imaged(self, sources: Apertures, strength: torch.Tensor) -> tuple[Apertures, torch.Tensor]:
         """Return sources of strength (N,) [Pa m] with all their images in the scene's reflectors."""
@@ -339,7 +339,7 @@ class Simulation(ABC):
         alone = [sources.chosen(slice(index, index + 1)) for index in orbits.representatives]
         pressure, runs = self._run(alone, strength, receivers)
         rows = orbits.expand(pressure)
-        matrix = strengths_of(array) * (rows if orbits.from_points else rows.mT.contiguous())
+        matrix = complex_strengths_of(array) * (rows if orbits.from_points else rows.mT.contiguous())
         return PressureMap.of_runs(matrix, runs, orbits.from_points)
 
     def _fields(self, drive: torch.Tensor, points: torch.Tensor) -> PressureMap:

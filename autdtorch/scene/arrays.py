@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 
+from autdtorch.scene.drive import warn_of_degrees
 from autdtorch.scene.geometry import Coordinates, in_plane, plane_basis
 from autdtorch.scene.transducer_values import disc_radius, for_each, unit_normals
-from autdtorch.utils.apertures import Apertures
+from autdtorch.utils.apertures import Apertures, disc_rule
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.process import require_memory
@@ -20,6 +20,7 @@ from autdtorch.utils.spatial import require_distinct
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import (
     ArrayLike,
+    finite_number,
     points_tensor,
     positive,
     positive_integers,
@@ -49,8 +50,6 @@ _SQUARE_PLACES, _SQUARE_PITCH = 16, 10.5e-3
 
 _TRANSDUCER_BYTES = 500.0  # memory for each transducer [bytes], with the search for its neighbours
 
-_RINGS, _RING_NODES = 5, 16
-
 
 class Nodes(NamedTuple):
     """The monopoles of N sources or receivers, n each, in float64."""
@@ -64,6 +63,7 @@ class Recipe(NamedTuple):
 
     kind: str  # "positions", or the name of a method such as "autd3"
     arguments: dict[str, Any]
+    transducers: int
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -82,12 +82,15 @@ class TransducerArray:
         source_strength: on-axis pressure in the far field at full drive, times distance [Pa m], > 0: a number
             if equal for all, otherwise (M,), float64.
         radius: of the discs [m]; 0 for point sources: a number if equal for all, otherwise (M,), float64.
+        phase: of the sound relative to the drive's [rad], positive if late: p = S e^{i phase} q e^{ikr} / r.
+            A number if equal for all, otherwise (M,), float64.
     """
 
     positions: torch.Tensor
     normals: torch.Tensor
     source_strength: float | torch.Tensor
     radius: float | torch.Tensor
+    phase: float | torch.Tensor
 
     def __init__(
         self,
@@ -95,15 +98,19 @@ class TransducerArray:
         normals: ArrayLike,
         source_strength: ArrayLike = PAPER_SOURCE_STRENGTH,
         radius: ArrayLike | None = None,
+        phase: ArrayLike = 0.0,
     ) -> None:
         """Check and copy the input; the arguments are the attributes, see `TransducerArray`.
 
-        A single normal (3,), of any length, serves all, as does a single strength or radius. The radii of two
-        transducers are together at most their distance; None or 0 for points.
+        A single normal (3,), of any length, serves all, as does a single strength, radius or phase. The radii
+        of two transducers are together at most their distance; None or 0 for points.
 
         Raises:
             ValueError: not finite, wrong shape, zero normal, strength <= 0, two transducers at one position,
                 or discs that could overlap.
+
+        Warns:
+            ScaleWarning: the phases seem to be in degrees.
         """
         places = points_tensor("TransducerArray.positions", positions).cpu()
         require_distinct("TransducerArray.positions", places)
@@ -113,6 +120,9 @@ class TransducerArray:
         strength = for_each("TransducerArray.source_strength", source_strength, len(places), positive, "Pa m")
         object.__setattr__(self, "source_strength", strength)
         object.__setattr__(self, "radius", disc_radius(radius, places))
+        delay = for_each("TransducerArray.phase", phase, len(places), finite_number, "rad")
+        warn_of_degrees("TransducerArray.phase", torch.as_tensor(delay, **REAL))
+        object.__setattr__(self, "phase", delay)
 
     @classmethod
     @suggesting
@@ -229,9 +239,30 @@ class TransducerArray:
             torch.cat([self.normals, other.normals]),
             torch.cat([strengths_of(self), strengths_of(other)]),
             torch.cat([radii_of(self), radii_of(other)]),
+            torch.cat([phase_offsets_of(self), phase_offsets_of(other)]),
         )
-        object.__setattr__(joined, "_recipes", recipes_of(self) + recipes_of(other))
+        object.__setattr__(joined, "_recipes", _forms_of(self) + _forms_of(other))
         return joined
+
+    def calibrated(self, gain: ArrayLike = 1.0, phase: ArrayLike = 0.0) -> TransducerArray:
+        """Return the array with strengths multiplied by a gain, and with a phase added to its own.
+
+        Args:
+            gain: > 0, a number or (M,).
+            phase: [rad], positive if the sound is late, a number or (M,).
+
+        Raises:
+            ValueError: not finite, wrong shape, or a gain <= 0.
+        """
+        factor = torch.as_tensor(for_each("gain", gain, len(self), positive, ""), **REAL)
+        delay = torch.as_tensor(for_each("phase", phase, len(self), finite_number, "rad"), **REAL)
+        array = replace(
+            self,
+            source_strength=strengths_of(self) * factor,
+            phase=phase_offsets_of(self) + delay,
+        )
+        object.__setattr__(array, "_recipes", _forms_of(self))
+        return array
 
     @property
     def nodes(self) -> Nodes:
@@ -253,12 +284,12 @@ class TransducerArray:
         return len(self.positions)
 
     def __repr__(self) -> str:
-        """Return count, centre, radius and strength, with units."""
+        """Return count, centre, radius, strength and phases, with units."""
         x, y, z = (1e3 * self.positions.mean(dim=0)).tolist()
         size = f"radius {range_text(radii_of(self), 1e3)} mm, " if radii_of(self).any() else ""
         return (
             f"TransducerArray({counted(len(self), 'transducer')} around ({x:.4g}, {y:.4g}, {z:.4g}) mm, "
-            f"{size}source strength {range_text(strengths_of(self))} Pa m)"
+            f"{size}source strength {strengths_text(self)})"
         )
 
 
@@ -285,24 +316,43 @@ def flat_array(
     """Return the array of `places` (M, 2) [m] in a plane, with the recipe of a form and its arguments."""
     array = TransducerArray(in_plane(places, center, normal, angle), normal, source_strength, radius)
     pose = {"center": _numbers(center), "normal": _numbers(normal), "angle": float(angle)}
-    object.__setattr__(array, "_recipes", (Recipe(form, arguments | pose | _sizes(array)),))
+    object.__setattr__(array, "_recipes", (Recipe(form, arguments | pose, len(array)),))
     return array
 
 
 def recipes_of(array: TransducerArray) -> tuple[Recipe, ...]:
-    """Return the recipes of the arrays that were joined to an array, or the one of a single array."""
+    """Return the recipes of the arrays that were joined to an array, or the one of a single array.
+
+    Their arguments are those of the form and, where some phases are not 0, a `phase`.
+    """
+    recipes = _forms_of(array)
+    counts = [recipe.transducers for recipe in recipes]
+    values = strengths_of(array), radii_of(array), phase_offsets_of(array)
+    parts = [torch.split(each, counts) for each in values]
+    result = []
+    for recipe, strength, radius, phase in zip(recipes, *parts, strict=True):
+        arguments = {**recipe.arguments, "source_strength": _shared(strength), "radius": _shared(radius)}
+        if phase.any():
+            arguments["phase"] = _shared(phase)
+        result.append(recipe._replace(arguments=arguments))
+    return tuple(result)
+
+
+def _forms_of(array: TransducerArray) -> tuple[Recipe, ...]:
+    """Return recipes without strengths, radii and phases."""
     recipes: tuple[Recipe, ...] | None = vars(array).get("_recipes")
     if recipes is not None:
         return recipes
     normals = array.normals.tolist()
     alike = all(normal == normals[0] for normal in normals)
     places = {"positions": array.positions.tolist(), "normals": normals[0] if alike else normals}
-    return (Recipe("positions", places | _sizes(array)),)
+    return (Recipe("positions", places, len(array)),)
 
 
-def _sizes(array: TransducerArray) -> dict[str, Any]:
-    """Return strength and radius of an array as arguments."""
-    return {"source_strength": _numbers(array.source_strength), "radius": _numbers(array.radius)}
+def _shared(values: torch.Tensor) -> float | list[float]:
+    """Return the number that all values are, or else a list."""
+    numbers: list[float] = values.tolist()
+    return numbers[0] if len(set(numbers)) == 1 else numbers
 
 
 def _numbers(values: ArrayLike) -> Any:
@@ -315,6 +365,17 @@ def strengths_of(array: TransducerArray) -> torch.Tensor:
     return _expanded(array.source_strength, len(array))
 
 
+def complex_strengths_of(array: TransducerArray) -> torch.Tensor:
+    """Return S e^(i phase) of each transducer (M,) [Pa m]: complex128, or float64 if all phases are 0."""
+    strengths, phases = strengths_of(array), phase_offsets_of(array)
+    return torch.polar(strengths, phases) if phases.any() else strengths
+
+
+def phase_offsets_of(array: TransducerArray) -> torch.Tensor:
+    """Return the phase of each transducer's sound relative to its drive (M,) [rad]."""
+    return _expanded(array.phase, len(array))
+
+
 def radii_of(array: TransducerArray) -> torch.Tensor:
     """Return the radius of each transducer (M,) [m]."""
     return _expanded(array.radius, len(array))
@@ -323,6 +384,13 @@ def radii_of(array: TransducerArray) -> torch.Tensor:
 def _expanded(values: float | torch.Tensor, count: int) -> torch.Tensor:
     each = torch.as_tensor(values, **REAL)
     return each.as_subclass(torch.Tensor).expand(count)
+
+
+def strengths_text(array: TransducerArray) -> str:
+    """Return the strengths, and the phases if there are any, as text with units."""
+    phases = phase_offsets_of(array)
+    text = f"{range_text(strengths_of(array))} Pa m"
+    return f"{text}, phase {range_text(phases)} rad" if phases.any() else text
 
 
 def range_text(values: torch.Tensor, factor: float = 1.0) -> str:
@@ -336,7 +404,7 @@ def apertures_of(array: TransducerArray) -> Apertures:
     radii = radii_of(array)
     if not radii.any():
         return Apertures.of_points(array.positions)
-    disc, weights = _disc_rule()
+    disc, weights = disc_rule()
     normals, facing = torch.unique(array.normals, dim=0, return_inverse=True)  # most arrays have one
     axes = torch.stack([torch.stack(plane_basis(normal)) for normal in normals])[facing]
     positions = array.positions[:, None] + radii[:, None, None] * disc @ axes
@@ -363,13 +431,3 @@ def _autd3_places(count_x: int, count_y: int) -> torch.Tensor:
 def _centred(count: int) -> torch.Tensor:
     """Return `count` positions one apart, around 0."""
     return torch.arange(count, **REAL) - (count - 1) / 2
-
-
-def _disc_rule() -> tuple[torch.Tensor, torch.Tensor]:
-    """Return nodes (n, 2) and weights (n,) of a quadrature rule for the mean over the unit disc."""
-    abscissa, weights = np.polynomial.legendre.leggauss(_RINGS)
-    radius = np.sqrt((abscissa + 1) / 2)[:, None]
-    ring, step = np.indices((_RINGS, _RING_NODES))
-    angle = 2 * np.pi / _RING_NODES * (step + ring % 2 / 2)
-    disc = np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=-1).reshape(-1, 2)
-    return torch.from_numpy(disc), torch.from_numpy(np.repeat(weights / (2 * _RING_NODES), _RING_NODES))

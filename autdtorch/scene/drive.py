@@ -41,7 +41,7 @@ def drive_from_phases(phases: ArrayLike, amplitudes: ArrayLike | None = None) ->
         ScaleWarning: the phases seem to be in degrees, or levels of a device.
     """
     phi = real_tensor("phases", phases, "rad")
-    _warn_of_degrees(phi.detach())
+    warn_of_degrees("phases", phi.detach())
     if phi.ndim == 0:
         raise ValueError("phases: shape (); must be (..., M)")
     if amplitudes is None:
@@ -57,10 +57,10 @@ def drive_from_phases(phases: ArrayLike, amplitudes: ArrayLike | None = None) ->
     return torch.polar(a.expand(shape), -phi.expand(shape))
 
 
-def _warn_of_degrees(phases: torch.Tensor) -> None:
+def warn_of_degrees(name: str, phases: torch.Tensor) -> None:
     """Warn of whole numbers up to 90 or more, degrees or levels; phases in rad are seldom whole."""
     if phases.numel() > 1 and phases.abs().max() >= 90 and torch.equal(phases, phases.round()):
-        shown = f"phases: whole numbers from {phases.min():g} to {phases.max():g} rad"
+        shown = f"{name}: whole numbers from {phases.min():g} to {phases.max():g} rad"
         warn_user(
             f"{shown}; are these degrees, or levels of a device? Of degrees, take numpy.radians(phases)"
         )

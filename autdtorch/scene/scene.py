@@ -10,7 +10,7 @@ from operator import attrgetter
 
 import torch
 
-from autdtorch.scene.arrays import TransducerArray, radii_of, range_text, strengths_of
+from autdtorch.scene.arrays import TransducerArray, phase_offsets_of, radii_of, strengths_of, strengths_text
 from autdtorch.scene.geometry import Coordinates, Plane
 from autdtorch.scene.medium import Medium as Medium
 from autdtorch.scene.obstacles import Obstacle
@@ -188,6 +188,7 @@ class Scene:
             and torch.equal(array.normals, theirs.normals)
             and torch.equal(strengths_of(array), strengths_of(theirs))
             and torch.equal(radii_of(array), radii_of(theirs))
+            and torch.equal(phase_offsets_of(array), phase_offsets_of(theirs))
         )
 
     @property
@@ -238,10 +239,7 @@ class Scene:
         facts = [
             ("frequency", f"{self.frequency / 1e3:.4g} kHz, wavelength {1e3 * self.wavelength:.4g} mm"),
             ("medium", f"{fluid}, {medium.absorption:.3g} dB/m"),
-            (
-                "transducers",
-                f"{len(self.array)}, of source strength {range_text(strengths_of(self.array))} Pa m",
-            ),
+            ("transducers", f"{len(self.array)}, of source strength {strengths_text(self.array)}"),
             ("control points", str(len(self.control_points))),
             ("obstacles", ", ".join(obstacle_kinds(self.obstacles)) or "none"),
             ("reflectors", ", ".join(kinds_of(self.reflectors)) or "none"),

@@ -19,6 +19,7 @@ _LARGEST = 6.0  # k a of the largest discs: the first power that is left out is 
 # A disc is far at so many radii and where k a^2 / 2r is at most this: the orders that are left out are below
 # 3e-5 of the pressure on the axis
 _FAR_RADII, _FAR_PHASE = 10.0, 0.14
+_RINGS, _RING_NODES = 5, 16  # of the monopoles that stand for a disc
 
 
 class Apertures(NamedTuple):
@@ -99,3 +100,13 @@ class Discs(NamedTuple):
             laplacian[:-1] += 4 * power[1:] ** 2 * orders[-1][1:]
             orders.append((order * (order - 1) * orders[-1] + laplacian) / (2j * wavenumber * order))
         return np.stack((np.real(orders), np.imag(orders)), axis=1)
+
+
+def disc_rule() -> tuple[torch.Tensor, torch.Tensor]:
+    """Return nodes (n, 2) and weights (n,) of a quadrature rule for the mean over the unit disc."""
+    abscissa, weights = np.polynomial.legendre.leggauss(_RINGS)
+    radius = np.sqrt((abscissa + 1) / 2)[:, None]
+    ring, step = np.indices((_RINGS, _RING_NODES))
+    angle = 2 * np.pi / _RING_NODES * (step + ring % 2 / 2)
+    disc = np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=-1).reshape(-1, 2)
+    return torch.from_numpy(disc), torch.from_numpy(np.repeat(weights / (2 * _RING_NODES), _RING_NODES))

@@ -178,6 +178,13 @@ OUT_OF_RANGE: dict[Callable[..., Any] | str, list[tuple[dict[str, Any], str]]] =
         ({"positions": [[0, 0, 0], [0, 1, 0], [0, 0, 1e-10]]}, "positions: points 0 and 2 coincide at (0.0,"),
         ({"normals": [[1, 0, 0], [0, 0, 0]]}, "TransducerArray.normals[1]: (0.0, 0.0, 0.0); must"),
         ({"normals": [[1, 0, 0]] * 3}, "normals: shape (3, 3); must be (3,) or (2, 3)"),
+        ({"phase": [0.1, float("nan")]}, "TransducerArray.phase: (0.1, nan) rad; every entry must be finite"),
+        ({"phase": [0.1] * 3}, "TransducerArray.phase: shape (3,); must be a number or (2,) as positions"),
+    ],
+    "TransducerArray.calibrated": [
+        ({"gain": 0.0}, "gain: 0.0; must be finite and > 0"),
+        ({"gain": [1.0] * 3}, "gain: shape (3,); must be a number or (2,)"),
+        ({"phase": float("inf")}, "phase: inf rad; must be"),
     ],
     grid: [
         ({"source_strength": 0.0}, "TransducerArray.source_strength: 0.0 Pa m; must be finite and > 0"),

@@ -139,6 +139,7 @@ def test_everything_that_affects_a_matrix_affects_its_key(tmp_path):
         *(of(array=array(radius=1e-3)), of(array=array(plain.array.positions.flip(0)))),
         *(of(array=array(plain.array.positions, (1, 0, 0), each)) for each in UNEQUAL),
         *(of(array=array(radius=each)) for each in 1e-3 * UNEQUAL),
+        *(of(array=plain.array.calibrated(phase=each)) for each in (1e-12, -1.0, UNEQUAL[0])),
         *(key(method="full"), key(spacing=above(SPACING, 1)), key(tolerance=1e-3), key(dtype="float64")),
         *(key(kernel="reference"), key(max_periods=599), key(time_step=5e-6)),
         of(control_points=plain.control_points.flip(0)),  # they judge when a run has converged

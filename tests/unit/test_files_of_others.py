@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from autdtorch.io.array_file import load_array
 from autdtorch.io.drive_file import load_drive, save_drive
-from autdtorch.scene.arrays import TransducerArray, radii_of, strengths_of
+from autdtorch.scene.arrays import TransducerArray, phase_offsets_of, radii_of, strengths_of
 from autdtorch.scene.drive import drive_from_phases
 from autdtorch.scene.scene import ScaleWarning
 
@@ -97,6 +97,7 @@ def test_a_unit_that_is_not_stated_is_inferred_and_told(tmp_path, names, unit, f
         ("x [m],x [mm]\n", r"line 1: columns x, x; every name must occur once"),
         ("x [m],y [m]\n1,2\n", r"a.csv: no column z; must have x, y, z"),
         ("x [m],y [m],z [m]\n1,2,3\n1,2\n", r"line 3: 2 cells; must be 3 as in the header"),
+        ("x [m],y [m],z [m],phase_offset\n1,2,3,4\n", r"column phase_offset has no unit; .*\[rad\] or"),
         ("x [m],y [m],z [m]\n\n1,2,a\n", r"line 3, z: 'a'; must be a finite number"),
         ("x [m],y [m],z [m]\n", r"a.csv: no row under the header"),
         ("", r"a.csv: empty"),
@@ -109,15 +110,19 @@ def test_what_is_ambiguous_or_wrong_is_refused_with_its_line_and_what_to_write(t
 
 
 @given(
-    st.lists(st.tuples(st.floats(-1, 1), st.floats(1e-3, 10), st.floats(0, 4e-3)), min_size=1, max_size=6),
+    st.lists(
+        st.tuples(st.floats(-1, 1), st.floats(1e-3, 10), st.floats(0, 4e-3), st.sampled_from([0.0, 0.3, -4])),
+        min_size=1,
+        max_size=6,
+    ),
     st.sampled_from([".csv", ".NPZ"]),
     st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda n: math.hypot(*n) > 0.1),
 )
 @settings(max_examples=40, deadline=None)
 def test_an_array_comes_back_from_every_format(tmp_path_factory, rows, suffix, normal):
-    heights, strengths, radii = zip(*rows, strict=True)
+    heights, *values = zip(*rows, strict=True)
     places = [(0.01 * number, 0.0, height) for number, height in enumerate(heights)]
-    array = TransducerArray(places, normal, strengths, radii)
+    array = TransducerArray(places, normal, *values)
     drive = drive_from_phases(torch.linspace(0, 6, len(rows)).double(), 0.5)
     path = tmp_path_factory.mktemp("array") / f"drive{suffix}"
     save_drive(path, drive, array)
@@ -126,6 +131,7 @@ def test_an_array_comes_back_from_every_format(tmp_path_factory, rows, suffix, n
     torch.testing.assert_close(found.normals, array.normals, rtol=0, atol=1e-15)
     assert torch.equal(strengths_of(found), strengths_of(array))
     assert torch.equal(radii_of(found), radii_of(array))
+    assert torch.equal(phase_offsets_of(found), phase_offsets_of(array))
     torch.testing.assert_close(load_drive(path), drive, rtol=0, atol=1e-14)
     given = load_array(path, source_strength=2.0, radius=0)
     assert (given.source_strength, given.radius) == (2.0, 0.0)

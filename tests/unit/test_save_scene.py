@@ -68,7 +68,7 @@ ANGLE = st.floats(-4, 4)
 STRENGTHS = st.lists(st.floats(0.1, 9), min_size=4, max_size=4)
 RADII = st.lists(st.floats(0, 4e-3), min_size=4, max_size=4)
 # Functions that make an array around (x, 0, 0), so that several can be put side by side
-BOARDS = st.one_of(
+PLAIN_BOARDS = st.one_of(
     st.builds(
         lambda normal, angle, strength, radius: (
             lambda x: at.TransducerArray.grid((2, 2), 9e-3, (x, 0, 0), normal, strength, radius, angle)
@@ -90,6 +90,18 @@ BOARDS = st.one_of(
         st.sampled_from(["autd3", "sonicsurface", "openmpd"]), NORMAL, ANGLE,
     ),
 )  # fmt: skip
+
+
+def calibrated(board, phase, spread):
+    def make(x):
+        array = board(x)
+        ramp = torch.linspace(0, 1, len(array), dtype=torch.float64)
+        return array.calibrated(1 + 0.1 * spread * ramp, phase + spread * ramp)
+
+    return make
+
+
+BOARDS = PLAIN_BOARDS | st.builds(calibrated, PLAIN_BOARDS, st.floats(-3, 3), st.sampled_from([0.0, 0.7]))
 
 
 def kinds_in(path):

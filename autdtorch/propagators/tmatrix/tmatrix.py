@@ -23,7 +23,7 @@ from autdtorch.fdtd.kernels.choice import available_kernel
 from autdtorch.propagators.multiple_scattering import solved
 from autdtorch.propagators.store import store_in
 from autdtorch.propagators.tmatrix.body import Solver, placed
-from autdtorch.scene.arrays import TransducerArray, strengths_of
+from autdtorch.scene.arrays import TransducerArray, complex_strengths_of
 from autdtorch.scene.geometry import composed_rotation
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle
@@ -315,7 +315,7 @@ def _incoming_waves(body: TMatrix, array: TransducerArray, images: Sequence[Imag
         for image in distinct(images, positions)
     )
     none = torch.zeros((), **COMPLEX)
-    return 4j * math.pi * body.wavenumber * strengths_of(array) * sum(waves, start=none)
+    return 4j * math.pi * body.wavenumber * complex_strengths_of(array) * sum(waves, start=none)
 
 
 def _incoming_from(body: TMatrix, positions: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
