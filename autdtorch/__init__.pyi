@@ -5,11 +5,20 @@ from .io.array_file import load_array
 from .io.drive_file import load_drive, save_drive
 from .io.field_file import save_field
 from .io.scene_file import load_scene, save_scene
-from .methods.base import Method, Problem, State
+from .methods.base import Method, State
 from .methods.bayes.focus_problem import FocusProblem
 from .methods.bayes.gaussian_process import PhasorKernel
 from .methods.bayes_opt import BayesOpt
-from .methods.functions import bayes_opt, gabs, gradient_ascent, identify, lss, lssg, random_search
+from .methods.functions import (
+    bayes_opt,
+    bo_foci,
+    gabs,
+    gradient_ascent,
+    identify,
+    lss,
+    lssg,
+    random_search,
+)
 from .methods.gabs import GABS
 from .methods.gradient import GradientAscent
 from .methods.holography.holography import Holography, holography
@@ -17,6 +26,7 @@ from .methods.holography.sequence import drive_sequence
 from .methods.identify import Identify
 from .methods.lssg import LSS, LSSG
 from .methods.prior import Prior
+from .methods.problem import Problem
 from .methods.random_search import RandomSearch
 from .methods.run import run
 from .methods.solution import Solution
@@ -102,6 +112,7 @@ __all__ = [
     "analytic",
     "animate3d",
     "bayes_opt",
+    "bo_foci",
     "cell_centers",
     "circle_points",
     "collect_results",

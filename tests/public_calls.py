@@ -164,7 +164,7 @@ def scope_bus() -> EmulatedBus:
 
 #: By name of the parameter; others have the default value.
 ARGUMENTS: dict[str, Any] = {
-    **dict.fromkeys(("background", "boards", "captures", "input", "readings", "reads"), 1),
+    **dict.fromkeys(("background", "boards", "captures", "input", "reads"), 1),
     **dict.fromkeys(("frames", "starts"), 2),
     **dict.fromkeys(("count", "foci", "initial", "max_periods", "steps"), 3),
     **dict.fromkeys(("levels", "periods"), 4),
@@ -229,6 +229,7 @@ ARGUMENTS: dict[str, Any] = {
     "quantities": {"pressure [Pa]": {"scene": {"gabs": [1.0, 2.0]}}},
     "radius": 3e-3,
     "ratio": 0.1,
+    "readings": Made(lambda _: at.Readings(DRIVE[None], [[1.0, 2.0, torch.nan]])),
     "rotation": (0.0, 0.0, 0.1),
     "scale": 1e-3,
     "scene": SCENE,
@@ -291,6 +292,7 @@ OTHERS: dict[str, Any] = {
     "VoxelMask.load.path": Made(lambda folder: saved(folder, "mask.npy", np.ones((2, 2, 2), bool))),
     "animate3d.path": Made(lambda folder: folder / "wave.gif"),
     "cell_centers.scene": AIR_ALONE,
+    "check_transducers.readings": 1,
     "differentiable_field.density": [50.0],
     "differentiable_field.sound_speed": [340.0],
     "load_state.method": Made(lambda _: made("GABS")),

@@ -11,120 +11,22 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 
 from autdtorch.methods.doubtful_readings import log_doubts, lone_score
+from autdtorch.methods.further_readings import LOUDEST, answered, fitting, joined
+from autdtorch.methods.problem import Problem, starts_of
 from autdtorch.methods.seeds import Trials, trial_seeds
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal, goal_of, scores_of
-from autdtorch.objectives.objective import (
-    GoalFunction,
-    Objective,
-    require_objective,
-    validate_drives,
-    validate_matrix,
-)
-from autdtorch.objectives.perturbations import quantised, simulated_matrix
-from autdtorch.scene.scene import Scene
+from autdtorch.objectives.goals import scores_of
+from autdtorch.objectives.objective import GoalFunction
+from autdtorch.objectives.readings import Readings
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.process import require_memory
-from autdtorch.utils.validation import (
-    complex_tensor,
-    integer_at_least,
-    invalid,
-    real_tensor,
-    require_callable,
-    require_kind,
-    require_one_of,
-    within,
-)
+from autdtorch.utils.validation import integer_at_least, invalid, real_tensor, require_kind, require_one_of
 
-_LOUDEST = 1e9  # Largest pressure [Pa] that is no error of a program; air has 1e5 Pa
+_OBSERVED = "pressure of the objective"
 
 NEAR_TIE = 1e-5
 """Relative difference below which scores count as equal. Symmetric scenes have many equal scores, and the
 rounding of the simulation, which differs between machines, must not decide between them."""
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """The problem that a method solves: transducers, foci, the goal, and further knowledge.
-
-    A method that sees magnitudes only needs no more than the two numbers.
-
-    Attributes:
-        transducers: number M of entries of a drive.
-        foci: number P of control points.
-        goal: such as `WeakestFocus`, or a function of pressures (..., P) [Pa] that gives the scores (...) to
-            maximise.
-        scene: geometry, for methods that start from free-space phases (`LSS`, `LSSG`).
-        transfer_matrix: simulated G (P, M) [Pa], for `GradientAscent` and as a `Prior` of what is measured.
-        quantise: function of drives (..., M) that gives the drives which the device plays.
-        start: drive (M,) that was good before, such as at the last pose of an obstacle, or one for each trial
-            (T, M); `BayesOpt`, `GABS` and `GradientAscent` begin there.
-    """
-
-    transducers: int
-    foci: int
-    goal: GoalFunction = WEAKEST_FOCUS
-    scene: Scene | None = None
-    transfer_matrix: torch.Tensor | None = None
-    quantise: Callable[[torch.Tensor], torch.Tensor] = field(default=lambda drive: drive)
-    start: torch.Tensor | None = None
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        for name in ("transducers", "foci"):
-            object.__setattr__(self, name, integer_at_least(name, getattr(self, name), 1))
-        require_callable("goal", self.goal)
-        object.__setattr__(self, "goal", goal_of(self.goal))
-        if isinstance(self.goal, Goal):
-            self.goal.check(self.foci)
-        require_callable("quantise", self.quantise)
-        if self.scene is not None:
-            require_kind("scene", self.scene, Scene)
-        if self.transfer_matrix is not None:
-            matrix = validate_matrix("transfer_matrix", self.transfer_matrix, self.foci, self.transducers)
-            object.__setattr__(self, "transfer_matrix", matrix)
-        if self.start is not None:
-            start = complex_tensor("start", self.start)
-            if start.ndim not in (1, 2) or start.shape[-1] != self.transducers:
-                accepted = f"must be ({self.transducers},) or (T, {self.transducers})"
-                raise ValueError(f"start: shape {tuple(start.shape)}; {accepted}")
-            with within("start"):
-                start = validate_drives(start, self.transducers).clone()
-            object.__setattr__(self, "start", start)
-
-    @classmethod
-    def of(
-        cls, objective: Objective, goal: GoalFunction = WEAKEST_FOCUS, start: torch.Tensor | None = None
-    ) -> Problem:
-        """Return the problem that an objective poses, with the transfer matrix that it has inside, if any.
-
-        Args:
-            objective: simulated or measured.
-            goal: function of pressures (..., P) [Pa] that gives the scores (...) to maximise.
-            start: drive (M,) or (T, M) to start from, if any.
-        """
-        require_objective(objective)
-        scene, matrix = objective.scene, simulated_matrix(objective)
-        counts = len(scene.array), len(scene.control_points)
-        return cls(*counts, goal, scene, matrix, lambda drive: quantised(objective, drive), start)
-
-
-def starts_of(problem: Problem, trials: int) -> torch.Tensor | None:
-    """Return the drive (T, M) that each of some trials begins at, if any."""
-    start = problem.start
-    if start is None or start.ndim == 1:
-        return None if start is None else start.expand(trials, -1)
-    if len(start) != trials:
-        raise ValueError(f"start: {len(start)} drives; must be one for each of {trials} trials")
-    return start
-
-
-def known_matrix(problem: Problem) -> torch.Tensor:
-    """Return the transfer matrix (P, M) [Pa] of a problem, which must have one."""
-    if problem.transfer_matrix is None:
-        accepted = 'must have a transfer matrix, as SimulatedObjective has in mode "transfer"'
-        raise invalid("objective", None, accepted)
-    return problem.transfer_matrix
 
 
 class Step(NamedTuple):
@@ -153,6 +55,8 @@ class State:
         drives: B drives for each of them to observe next (L, B, M), complex128.
         search: tensors by name, from which the method goes on.
         best: the best drive of each trial so far, with its history.
+        pressure: magnitudes (L, B, P) [Pa] of `drives`, NaN where they were not observed yet.
+        readings: of drives that the method did not ask for, besides those of the problem.
     """
 
     method: Method
@@ -162,6 +66,13 @@ class State:
     drives: torch.Tensor
     search: Mapping[str, torch.Tensor]
     best: Solution
+    pressure: torch.Tensor
+    readings: Readings | None = None
+
+    @property
+    def waiting(self) -> torch.Tensor:
+        """The asked drives that were not observed yet (L, B), bool."""
+        return self.pressure[..., 0].isnan()
 
     @property
     def done(self) -> bool:
@@ -264,18 +175,23 @@ class Method(ABC):
         largest = max(whole, key=whole.__getitem__)
         require_memory(largest, whole[largest], 8 * trials * self.numbers_kept(problem))
 
-    def start(self, problem: Problem, seed: int = 0, trials: Trials = 1) -> State:
+    def start(
+        self, problem: Problem, seed: int = 0, trials: Trials = 1, readings: Readings | None = None
+    ) -> State:
         """Begin T trials.
 
         Args:
             problem: of all trials.
             seed: of the random choices, >= 0. Trial t has the same seed for every number of trials.
             trials: number of trials T, or their numbers.
+            readings: earlier ones, in place of the problem's; see `Problem`.
 
         Returns:
             A state whose drives wait to be observed.
         """
         require_kind("problem", problem, Problem)
+        if readings is not None:
+            problem = replace(problem, readings=readings)
         seeds = trial_seeds(seed, trials)
         if not self.random and len(seeds) > 1:
             raise invalid("trials", trials, f"must be 1: {self.label} has no random choices")
@@ -290,50 +206,91 @@ class Method(ABC):
             torch.zeros(count, dtype=torch.int64, device="cpu"),
             torch.empty(count, 0, **REAL),
         )
-        places = torch.arange(count, device="cpu")
-        return State(self, problem, tuple(seeds), places, step.drives, step.search, empty)
+        best = _with_readings(empty, problem.readings, problem.goal)
+        places, pressure = torch.arange(count, device="cpu"), _unread(step.drives, problem)
+        state = State(self, problem, tuple(seeds), places, step.drives, step.search, best, pressure)
+        if problem.readings is not None:
+            log_doubts(self.label, self._doubts(state))
+        return state
 
     def ask(self, state: State) -> torch.Tensor:
         """Return the drives (B, M), complex128, to observe next; none when the method is done."""
         self._require_state(state)
-        return state.drives.flatten(0, 1).clone()
+        return state.drives[state.waiting]
 
-    def tell(self, state: State, pressure: torch.Tensor) -> State:
-        """Return the state after the drives of `ask` were observed.
+    def tell(self, state: State, pressure: torch.Tensor, drives: torch.Tensor | None = None) -> State:
+        """Return the state after drives were observed: those of `ask`, or others.
+
+        The method goes on when all drives of `ask` are observed, in one call or in several. A drive answers
+        one of `ask` if it equals it, or if it is what a device played for it: as many drives as were asked,
+        in their order, each off by no more than rounding to 6 phases. Drives that answer none are further
+        readings. They are no evaluations: `Identify` and `BayesOpt` use them from the next step on, and for
+        all methods the best of them counts.
 
         Args:
             state: whose drives were observed.
-            pressure: magnitudes at the control points (B, P) [Pa].
+            pressure: magnitudes at the control points (B, P) [Pa]; of a further reading, NaN is a gap.
+            drives: (B, M) that were played; None for all drives of `ask`.
 
         Raises:
-            ValueError: a state that is done or of another method, pressures of another shape or that cannot
-                be magnitudes, or scores that are not finite.
+            ValueError: a state of another method, or one that is done without `drives`; pressures of another
+                shape or that cannot be magnitudes; or scores that are not finite.
         """
         self._require_state(state)
+        if drives is not None:
+            return self._told(state, Readings(drives, pressure))
         if state.done:
             raise ValueError("state: it is done, and no drive was asked for; take best(state)")
-        batch = state.drives.shape[:2]
-        name = "pressure of the objective"
-        pressure = real_tensor(name, pressure, "Pa").detach().cpu()
-        if pressure.shape != (shape := (batch.numel(), state.problem.foci)):
-            raise ValueError(f"{name}: shape {tuple(pressure.shape)}; must be {shape}")
-        if len(wrong := ((pressure < 0) | (pressure > _LOUDEST)).nonzero()):
+        pressure = real_tensor(_OBSERVED, pressure, "Pa").detach().cpu()
+        if pressure.shape != (shape := (int(state.waiting.sum()), state.problem.foci)):
+            raise ValueError(f"{_OBSERVED}: shape {tuple(pressure.shape)}; must be {shape}")
+        if len(wrong := ((pressure < 0) | (pressure > LOUDEST)).nonzero()):
             place, value = wrong[0].tolist(), float(pressure[tuple(wrong[0])])
-            accepted = f"must be a magnitude from 0 to {_LOUDEST:g}, not a level in dB or a signed sample"
-            raise invalid(f"{name}{place}", value, accepted, "Pa")
-        pressure = pressure.reshape(*batch, -1)
+            accepted = f"must be a magnitude from 0 to {LOUDEST:g}, not a level in dB or a signed sample"
+            raise invalid(f"{_OBSERVED}{place}", value, accepted, "Pa")
+        complete = state.pressure.clone()
+        complete[state.waiting] = pressure
+        return self._advanced(replace(state, pressure=complete))
+
+    def _told(self, state: State, readings: Readings) -> State:
+        """Return the state after readings of any drives."""
+        problem = state.problem
+        readings = fitting(readings, None, problem.transducers, problem.foci, where="")
+        places = answered(state.drives[state.waiting], readings.drives)
+        waiting = state.waiting.nonzero().tolist()
+        drives, pressure = state.drives.clone(), state.pressure.clone()
+        for row, place in enumerate(places):
+            if place is not None:
+                if readings.pressure[row].isnan().any():
+                    accepted = "must have no gap, as the drive was asked for; leave it out to be asked again"
+                    raise invalid(f"pressure[{row}]", readings.pressure[row].tolist(), accepted, "Pa")
+                index = tuple(waiting[place])
+                drives[index], pressure[index] = readings.drives[row], readings.pressure[row]
+        if others := [row for row, place in enumerate(places) if place is None]:
+            more = readings[others]
+            best = _with_readings(state.best, more, problem.goal)
+            state = replace(state, best=best, readings=joined(state.readings, more))
+        if len(others) == len(places):
+            return state
+        state = replace(state, drives=drives, pressure=pressure)
+        return state if state.waiting.any() else self._advanced(state)
+
+    def _advanced(self, state: State) -> State:
+        """Return the state after all its drives were observed."""
+        pressure = state.pressure
         score = scores_of(state.problem.goal, pressure)
         state = replace(state, best=_improved(state, pressure, score))
         step = self.advance(state, pressure, score)
         trials = state.trials if step.goes_on is None else state.trials[step.goes_on]
-        state = replace(state, trials=trials, drives=step.drives, search=step.search)
+        unread = _unread(step.drives, state.problem)
+        state = replace(state, trials=trials, drives=step.drives, search=step.search, pressure=unread)
         log_doubts(self.label, self._doubts(state))
         return state
 
     def best(self, state: State) -> Solution:
         """Return the best drive of each trial so far; `ValueError` before the first evaluation."""
         self._require_state(state)
-        if not state.best.history.shape[1]:
+        if state.best.score.isneginf().any():
             raise ValueError("state: nothing was observed yet; tell what the drives of ask give first")
         history = state.best.history.cummax(dim=1).values.minimum(state.best.score[:, None])
         missing = max(0, self.most_evaluations(state.problem) - history.shape[1]) if state.done else 0
@@ -348,6 +305,28 @@ class Method(ABC):
         require_kind("state", state, State)
         if state.method != self:
             raise invalid("state", f"of {state.method}", f"must be of {self}")
+
+
+def _unread(drives: torch.Tensor, problem: Problem) -> torch.Tensor:
+    """Return pressures (L, B, P) of drives (L, B, M) that were not observed yet."""
+    return torch.full((*drives.shape[:2], problem.foci), torch.nan, **REAL)
+
+
+def _with_readings(best: Solution, readings: Readings | None, goal: GoalFunction) -> Solution:
+    """Return the best drives after readings without gaps of drives that were not asked for."""
+    complete = None if readings is None else ~readings.pressure.isnan().any(dim=1)
+    if readings is None or complete is None or not complete.any():
+        return best
+    drives, pressure = readings.drives[complete], readings.pressure[complete]
+    score = scores_of(goal, pressure)
+    index = first_of_best(score[None])
+    better = score[index] - NEAR_TIE * score[index].abs() > best.score
+    return replace(
+        best,
+        drive=torch.where(better[:, None], drives[index], best.drive),
+        pressure=torch.where(better[:, None], pressure[index], best.pressure),
+        score=torch.where(better, score[index], best.score),
+    )
 
 
 def _improved(state: State, pressure: torch.Tensor, score: torch.Tensor) -> Solution:

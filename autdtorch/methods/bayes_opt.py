@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, State, Step, choice, setting, starts_of, whole
+from autdtorch.methods.base import Method, State, Step, choice, setting, whole
 from autdtorch.methods.gradient import climbed
 from autdtorch.methods.matrix_fit import posteriors, tensors_of
 from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, prior_mean, prior_of
+from autdtorch.methods.problem import Problem, starts_of
 from autdtorch.methods.seeds import generators_of, restored, states_of, uniform
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import scores_of
 from autdtorch.objectives.objective import GoalFunction
-from autdtorch.scene.drive import drive_from_phases, phases_of
+from autdtorch.objectives.readings import Readings
+from autdtorch.scene.drive import AMPLITUDE_TOLERANCE, drive_from_phases, phases_of
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import integer_at_least, invalid, number_between, require_one_of
@@ -33,6 +35,7 @@ take the kinks of the minimum over the foci for noise, and the search would end 
 
 _SAMPLE_STEPS = 60  # of the climb on a sample of the matrix, from the best drive
 _REFIT_GROWTH = 1.2  # growth of the number of observations after which the hyperparameters are fitted again
+_PLAYED = 1e-9  # difference of drives from which on a device has played others than were asked for
 _PAPERS_FIXED = 6  # Transducer whose phase is fixed in the paper, its 7th
 
 
@@ -67,6 +70,10 @@ class BayesOpt(Method):
     The trials of a block are in the batch shape of one model: another block rounds otherwise, and the search
     amplifies that, so that numbers repeat for equal blocks only. Where the problem has a drive to start from,
     it is the first to be observed.
+
+    Earlier readings of the problem take the place of initial drives, as many as there are, and a search with
+    a prior begins with them. Drives told that were not asked for join later. Those with amplitudes below 1 or
+    with gaps are not used, which the log says.
 
     Attributes:
         evaluations: number of evaluations of a trial, > `initial`; >= 2 with a prior.
@@ -129,47 +136,66 @@ class BayesOpt(Method):
         """Return the numbers of the processes: a few matrices of all pairs of evaluations."""
         outputs = self._outputs(problem)
         coupled = outputs if self.prior is not None else 1  # a fit from a prior couples the foci
-        return 4.0 * outputs * coupled * self.evaluations**2
+        earlier = 0 if problem.readings is None else len(problem.readings)
+        return 4.0 * outputs * coupled * (self.evaluations + earlier) ** 2
 
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
-        """Observe the initial points."""
-        generators = generators_of(seeds)
-        dimensions = problem.transducers - 1
-        if self.prior is not None:
+        """Observe the initial points that earlier readings do not stand for, or what these show."""
+        generators, dimensions = generators_of(seeds), problem.transducers - 1
+        points = torch.empty(len(seeds), 0, dimensions, **REAL)
+        values = torch.empty(len(seeds), 0, self._outputs(problem), **REAL)
+        search = {"points": points, "values": values}
+        count = self.initial
+        if (earlier := _usable(problem.readings)) is not None:
+            search = self._with(search, problem, earlier)
+            count = 0 if self.prior is not None else max(0, count - len(earlier))
+        if self.prior is not None and earlier is None:
             points = self._points(best_simulated_drives(self.prior, problem, generators))[:, None]
-        elif self.initial_points == "sobol":
-            points = torch.stack([_sobol(self.initial, dimensions, seed) for seed in seeds])
-        else:
-            points = torch.stack([uniform(draws, self.initial, dimensions) for draws in generators])
+        elif count and self.initial_points == "sobol":
+            points = torch.stack([_sobol(count, dimensions, seed) for seed in seeds])
+        elif count:
+            points = torch.stack([uniform(draws, count, dimensions) for draws in generators])
         if (starts := starts_of(problem, len(seeds))) is not None:
-            points[:, 0] = self._points(starts)
-        search = {
-            "points": points,
-            "values": torch.empty(len(seeds), 0, self._outputs(problem), **REAL),
-            "generators": states_of(generators),
-        }
+            points = torch.cat([self._points(starts)[:, None], points[:, 1:]], dim=1)
+        search["generators"] = states_of(generators)
+        if not points.shape[1]:
+            return self._next(problem, search, self.evaluations)
+        search["points"] = torch.cat([search["points"], points], dim=1)
         return Step(self._drives(points), search)
+
+    def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
+        """Observe the points of the largest expected improvement."""
+        search, problem = dict(state.search), state.problem
+        count, done = search["values"].shape[1], state.best.history.shape[1]
+        points, asked = search["points"][:, :count], search["points"][:, count:]
+        if (self._drives(asked) - state.drives).abs().max() > _PLAYED:
+            asked = self._points(state.drives)
+        search["points"] = torch.cat([points, asked], dim=1)
+        values = score[..., None] if self.model == "weakest" else pressure
+        search["values"] = torch.cat([search["values"], values], dim=1)
+        if (further := _usable(state.readings)) is not None:
+            earlier = _usable(problem.readings)
+            joined = search["values"].shape[1] - done - (0 if earlier is None else len(earlier))
+            if joined < len(further):
+                search = self._with(search, problem, further[joined:])
+        left = self.evaluations - done
+        if self.model == "weakest" and left == 0:
+            return Step(state.drives[:, :0], search)
+        return self._next(problem, search, left)
 
     @one_library_thread()
     @_defaults_of_processes()
-    def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
-        """Observe the points of the largest expected improvement."""
-        values = score[..., None] if self.model == "weakest" else pressure
-        # Tensors of inference mode are read-only.
-        search = {name: tensor.clone() for name, tensor in state.search.items()}
-        search["values"] = torch.cat([search["values"], values.clone()], dim=1)
-        count = search["values"].shape[1]
-        if self.model == "weakest" and count == self.evaluations:
-            return Step(state.drives[:, :0], search)
-        generators = restored(search["generators"])
-        points = search["points"]
+    def _next(self, problem: Problem, search: Mapping[str, torch.Tensor], left: int) -> Step:
+        """Observe the points of the largest expected improvement, with so many evaluations left."""
+        search = {name: tensor.clone() for name, tensor in search.items()}  # of inference mode: read-only
+        generators, points = restored(search["generators"]), search["points"]
         if self.model == "foci":  # processes of the points that were played
-            points = self._points(state.problem.quantise(self._drives(points)))
-        fit, rows = self._fitted(state.problem, search, points, generators)
-        acquisition = self._acquisition(state.problem.goal, search["values"], points, fit, rows)
-        if count == self.evaluations:
-            return Step(state.drives[:, :0], {**search, "answer": acquisition.best})
-        point = acquisition.next_points(generators, last=count == self.evaluations - 1)[:, None]
+            points = self._points(problem.quantise(self._drives(points)))
+        fit, rows = self._fitted(problem, search, points, generators, left)
+        acquisition = self._acquisition(problem.goal, search["values"], points, fit, rows)
+        if left == 0:
+            return Step(self._drives(points[:, :0]), {**search, "answer": acquisition.best})
+        point = acquisition.next_points(generators, last=left == 1)[:, None]
         search |= {"points": torch.cat([search["points"], point], dim=1), "generators": states_of(generators)}
         return Step(self._drives(point), search)
 
@@ -183,6 +209,31 @@ class BayesOpt(Method):
         pressure = state.search["values"][chosen]
         score = scores_of(state.problem.goal, pressure)
         return replace(solution, drive=drive, pressure=pressure, score=score)
+
+    def _doubts(self, state: State) -> Sequence[Iterable[str]]:
+        """Describe a lone highest score, and readings that are not used: at the beginning and at the end."""
+        doubts = [[*texts] for texts in super()._doubts(state)]
+        told = [readings for readings in (state.problem.readings, state.readings) if readings is not None]
+        unused = sum(len(readings) - len(_usable(readings) or ()) for readings in told)
+        if unused and (state.done or not state.evaluations):
+            every = sum(map(len, told))
+            text = f"{unused} of {every} readings are not used: they have gaps or amplitudes below 1"
+            doubts = [[text, *texts] for texts in doubts or [[]]]
+        return doubts
+
+    def _with(
+        self, search: Mapping[str, torch.Tensor], problem: Problem, readings: Readings
+    ) -> dict[str, torch.Tensor]:
+        """Return the search with usable readings that are no evaluations."""
+        values = readings.pressure
+        if self.model == "weakest":
+            values = scores_of(problem.goal, values)[:, None]
+        more = {"points": self._points(readings.drives), "values": values}
+        joined = {
+            name: torch.cat([search[name], tensor.expand(len(search[name]), *tensor.shape)], dim=1)
+            for name, tensor in more.items()
+        }
+        return {**search, **joined}
 
     def _outputs(self, problem: Problem) -> int:
         return 1 if self.model == "weakest" else problem.foci
@@ -212,13 +263,14 @@ class BayesOpt(Method):
         search: dict[str, torch.Tensor],
         points: torch.Tensor,
         generators: Sequence[torch.Generator],
+        left: int,
     ) -> tuple[Fit, Rows | None]:
         """Return hyperparameters and rows; `search` gets the tensors that the next fit begins with."""
         from autdtorch.methods.bayes.gaussian_process import Fit, fitted
 
         count = search["values"].shape[1]
         if self.model == "foci" and (self.prior is not None or count >= 3 * problem.transducers - 1):
-            return self._with_rows(problem, search, generators)
+            return self._with_rows(problem, search, generators, left)
         # The hyperparameters are fitted again where the observations grew by a fifth.
         if "fitted" not in search or count >= _REFIT_GROWTH * int(search["fitted"]):
             search |= fitted(self.kernel, points, search["values"], self.noise)._asdict()
@@ -226,7 +278,11 @@ class BayesOpt(Method):
         return Fit(search["length_scale"], search["noise"]), None
 
     def _with_rows(
-        self, problem: Problem, search: dict[str, torch.Tensor], generators: Sequence[torch.Generator]
+        self,
+        problem: Problem,
+        search: dict[str, torch.Tensor],
+        generators: Sequence[torch.Generator],
+        left: int,
     ) -> tuple[Fit, Rows]:
         """Return the noise, and rows of the matrix that is fitted to all readings, or of a sample of it."""
         from autdtorch.methods.bayes.gaussian_process import Fit, Rows, mean_intensity
@@ -243,7 +299,7 @@ class BayesOpt(Method):
         sampled = torch.stack([fit.posterior.sample(drives, fit.read, draws) for fit, drives, draws in each])
         spread = (sampled - mean).abs().square().mean(dim=-1)
         # The search explores by samples; the answer, and the last drive, follow the mean.
-        rows = mean if observed.shape[1] >= self.evaluations - 1 else sampled
+        rows = mean if left <= 1 else sampled
         share = (2 * search["variance"] / power).clamp_max(0.5)
         fit = Fit(torch.ones_like(share), share / (1 - share))
         seen = scores_of(problem.goal, (drives @ rows.mT).abs()).argmax(dim=1)
@@ -260,6 +316,15 @@ class BayesOpt(Method):
         if self.model == "weakest":
             return ScoreAcquisition(processes, points, values, self.acquisition == "log_ei")
         return FocusAcquisition(processes, points, goal, None if rows is None else rows.best)
+
+
+def _usable(readings: Readings | None) -> Readings | None:
+    """Return the readings of drives at full amplitude without gaps, if there are any."""
+    if readings is None:
+        return None
+    full = (readings.drives.abs() > 1 - AMPLITUDE_TOLERANCE).all(dim=1)
+    usable = full & ~readings.pressure.isnan().any(dim=1)
+    return readings[usable] if usable.any() else None
 
 
 def require_transducer(fixed_transducer: int, transducers: int) -> None:

@@ -90,7 +90,7 @@ class Magnitudes:
 
 def gross_outliers(observed: torch.Tensor) -> torch.Tensor:
     """Return the readings (N, P), bool, that are far above or far below the others of random phases."""
-    middle = observed.median(dim=0).values
+    middle = observed.nanmedian(dim=0).values
     return ((observed > _GROSS * middle) | (observed < _NOTHING * middle)) & (middle > 0)
 
 
@@ -98,14 +98,14 @@ def range_ends(drives: torch.Tensor, observed: torch.Tensor) -> torch.Tensor:
     """Return the possible end of each sensor's range (P,) [Pa], infinite where no reading (N, P) shows it.
 
     There, several different drives (N, M) have the same highest reading, but not all of them. It is the end
-    of the range if the sensor `reads_finely`; coarse steps make equal readings, too.
+    of the range if the sensor `reads_finely`; coarse steps make equal readings, too. NaN is a gap.
     """
     unit = drives / drives.norm(dim=1, keepdim=True).clamp_min(1e-300)
     ends = torch.full_like(observed[0], torch.inf)
     for point, column in enumerate(observed.T):
-        highest = column.max()
+        highest = column.nan_to_num().max()
         at_end = unit[column >= (1 - _EQUAL) * highest]
-        if _SATURATED <= len(at_end) < len(column):
+        if _SATURATED <= len(at_end) < (~column.isnan()).sum():
             alike = ((at_end @ at_end.mH).abs() > _ALIKE).sum(dim=1)
             if (1 / alike).sum() >= _SATURATED:
                 ends[point] = highest
@@ -172,6 +172,7 @@ def _silent(observed: torch.Tensor, fitted: torch.Tensor, unknowns: int) -> torc
 
 
 def reading_doubts(
+    names: Sequence[str],
     observed: torch.Tensor,
     read: Magnitudes,
     fitted: torch.Tensor,
@@ -181,18 +182,19 @@ def reading_doubts(
     """Describe outliers, a last reading far from the fit, and a large residual of the fit.
 
     Args:
-        observed: magnitudes (N, P) [Pa], outliers as they were read.
+        names: of the N drives.
+        observed: magnitudes (N, P) [Pa], outliers as they were read; NaN at gaps, which are no outliers.
         read: as they were used.
         fitted: magnitudes (N, P) [Pa] by the fitted matrix, which does not know the last readings.
         deviation: of the noise that was fitted (P,) [Pa].
         prior: whether a prior is behind the fit, which may be wrong instead.
     """
     away = (read.nearest(fitted) - fitted)[-1].abs()
-    outliers = read.outliers
+    outliers = read.outliers & ~observed.isnan()
     outliers[-1] |= (away > _SURPRISE * deviation) & (away > _LEAST_SURPRISE * fitted[-1])
     places = outliers.nonzero().tolist()
     shown = [
-        f"evaluation {row} at control point {point} (read {float(observed[row, point]):.3g} Pa, "
+        f"{names[row]} at control point {point} (read {float(observed[row, point]):.3g} Pa, "
         f"fitted {float(fitted[row, point]):.3g} Pa)"
         for row, point in places[:_SHOWN]
     ]

@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
 import torch
 
-from autdtorch.methods.base import Method, Problem
+from autdtorch.methods.base import Method
 from autdtorch.methods.bayes_opt import BayesOpt
+from autdtorch.methods.catalogue import VARIANTS
 from autdtorch.methods.gabs import GABS
 from autdtorch.methods.gradient import GradientAscent
 from autdtorch.methods.identify import Identify
 from autdtorch.methods.lssg import LSS, LSSG
+from autdtorch.methods.problem import Problem
 from autdtorch.methods.random_search import RandomSearch
 from autdtorch.methods.run import run
 from autdtorch.methods.seeds import Trials
@@ -34,23 +37,29 @@ _EITHER, _BY_NAME = inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.K
 
 def _function(
     name: str,
-    kind: type[Method],
+    method: Method,
     positional: str = "",
     execute: Callable[..., Solution] = run,
     details: str = "",
+    continues: bool = False,
 ) -> Callable[..., Any]:
-    """Return the function of a class of methods.
+    """Return the function that runs a method with other settings.
 
     Args:
         name: of the function.
-        kind: class of the method.
+        method: has the defaults.
         positional: parameters after the objective that are also taken by position, in this order; all others
             by name only. By default settings, trials, seed and goal.
         execute: runs the method.
         details: second part of the docstring.
+        continues: whether the function takes readings, which the method goes on from.
     """
-    settings = inspect.signature(kind).parameters
-    common = {key: _OF_RUN[key] for key in (("trials", "seed") if kind.random else ()) + ("goal",)}
+    settings = {
+        key: parameter.replace(default=getattr(method, key))
+        for key, parameter in inspect.signature(type(method)).parameters.items()
+    }
+    of_run = [*(("trials", "seed") if method.random else ()), "goal", *(("readings",) if continues else ())]
+    common = {key: _OF_RUN[key] for key in of_run}
     parameters = {**settings, **common}
     order = positional.split() or list(parameters)
     rest = [key for key in parameters if key not in order]
@@ -68,12 +77,13 @@ def _function(
         if unknown := keywords.keys() - signature.parameters.keys():  # `bind` would name missing ones first
             raise TypeError(f"{name}() got an unexpected keyword argument '{min(unknown)}'")
         values = signature.bind(*arguments, **keywords).arguments
-        method = kind(**{key: values.pop(key) for key in settings if key in values})
-        return execute(method, **values)
+        changed = replace(method, **{key: values.pop(key) for key in settings if key in values})
+        return execute(changed, **values)
 
     call.__name__ = call.__qualname__ = name
     call.__signature__ = signature  # type: ignore[attr-defined]
-    call.__doc__ = f"Run `{kind.__name__}` with these settings; see `{kind.__name__}` and `run`.{details}"
+    kind = type(method).__name__
+    call.__doc__ = f"Run `{kind}` with these settings; see `{kind}` and `run`.{details}"
     return renamed_keywords(score="goal")(call)
 
 
@@ -95,15 +105,17 @@ def _on_matrix(
     return method.best(method.tell(state, (method.ask(state) @ matrix.mT).abs()))
 
 
-lss = _function("lss", LSS)
-lssg = _function("lssg", LSSG)
-gabs = _function("gabs", GABS)
-bayes_opt = _function("bayes_opt", BayesOpt, "evaluations initial trials seed fixed_transducer goal")
-identify = _function("identify", Identify, "evaluations trials seed")
-random_search = _function("random_search", RandomSearch)
+lss = _function("lss", LSS())
+lssg = _function("lssg", LSSG())
+gabs = _function("gabs", GABS())
+_OF_BAYES_OPT = "evaluations initial trials seed fixed_transducer goal"
+bayes_opt = _function("bayes_opt", BayesOpt(), _OF_BAYES_OPT, continues=True)
+bo_foci = _function("bo_foci", VARIANTS["bo_foci"], _OF_BAYES_OPT, continues=True)
+identify = _function("identify", Identify(), "evaluations trials seed", continues=True)
+random_search = _function("random_search", RandomSearch())
 gradient_ascent = _function(
     "gradient_ascent",
-    GradientAscent,
+    GradientAscent(),
     execute=_on_matrix,
     details="\n\nIn place of the objective, it takes the transfer matrix G (P, M) [Pa] alone, too.",
 )

@@ -5,6 +5,7 @@ from autdtorch.methods.prior import Prior
 from autdtorch.methods.seeds import Trials
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.objective import GoalFunction, Objective
+from autdtorch.objectives.readings import Readings
 from autdtorch.utils.validation import ArrayLike
 
 def lss(objective: Objective, goal: GoalFunction = ...) -> Solution: ...
@@ -40,6 +41,24 @@ def bayes_opt(
     initial_points: Literal["sobol", "random"] = "sobol",
     noise: float | Literal["inferred"] = 1e-4,
     prior: Prior | None = None,
+    readings: Readings | None = None,
+) -> Solution: ...
+def bo_foci(
+    objective: Objective,
+    evaluations: int = 64,
+    initial: int = 4,
+    trials: Trials = 1,
+    seed: int = 0,
+    fixed_transducer: int | None = None,
+    goal: GoalFunction = ...,
+    *,
+    model: Literal["weakest", "foci"] = "foci",
+    kernel: Literal["phases", "circle", "phasor"] = "phasor",
+    acquisition: Literal["ei", "log_ei"] = "ei",
+    initial_points: Literal["sobol", "random"] = "sobol",
+    noise: float | Literal["inferred"] = "inferred",
+    prior: Prior | None = None,
+    readings: Readings | None = None,
 ) -> Solution: ...
 def identify(
     objective: Objective,
@@ -49,6 +68,7 @@ def identify(
     *,
     prior: Prior | None = None,
     goal: GoalFunction = ...,
+    readings: Readings | None = None,
 ) -> Solution: ...
 def random_search(
     objective: Objective,

@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 
 import torch
 
-from autdtorch.methods.base import NEAR_TIE, Method, Problem, State, Step, starts_of, whole
+from autdtorch.methods.base import NEAR_TIE, Method, State, Step, whole
 from autdtorch.methods.lssg import (
     Search,
     ascend,
@@ -19,6 +19,7 @@ from autdtorch.methods.lssg import (
     order_setting,
     require_all,
 )
+from autdtorch.methods.problem import Problem, starts_of
 from autdtorch.methods.seeds import generators_of
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.validation import invalid

@@ -12,7 +12,8 @@ from typing import ClassVar
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, Step, known_matrix, starts_of, whole
+from autdtorch.methods.base import Method, Step, whole
+from autdtorch.methods.problem import Problem, known_matrix, starts_of
 from autdtorch.methods.seeds import generators_of, uniform
 from autdtorch.objectives.goals import scores_of, slope_of
 from autdtorch.objectives.objective import GoalFunction

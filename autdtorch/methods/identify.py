@@ -12,15 +12,18 @@ from typing import ClassVar
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, State, Step, setting, whole
+from autdtorch.methods.base import Method, State, Step, setting, whole
 from autdtorch.methods.doubtful_readings import Magnitudes, reading_doubts, sensor_doubts
+from autdtorch.methods.further_readings import independent_readings
 from autdtorch.methods.gradient import climb, climbed, random_drives
 from autdtorch.methods.matrix_fit import Fit, posteriors, tensors_of
 from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, prior_mean, prior_of
+from autdtorch.methods.problem import Problem
 from autdtorch.methods.seeds import generators_of, restored, states_of
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import scores_of
 from autdtorch.objectives.objective import GoalFunction
+from autdtorch.objectives.readings import Readings
 from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import invalid
 
@@ -43,6 +46,9 @@ class Identify(Method):
     of the matrix, from its posterior (Thompson 1933). The last one is the best drive of the likeliest matrix.
     It is the solution, since the highest of many noisy readings is a lucky one; unless it reads far worse
     than another drive whose readings the matrix explains.
+
+    Earlier readings of the problem, and drives told that were not asked for, are fitted together with the
+    others. They stand for random drives as far as they show something else of the matrix.
 
     Readings far from the fit of the others are left out, and readings at the end of a sensor's range are
     taken as lower limits. Both are logged, like a sensor that does not respond to the drives.
@@ -67,6 +73,7 @@ class Identify(Method):
             return
         transducers = problem.transducers
         least = min(3 * transducers - 1, math.ceil(_LEAST_READINGS * transducers) + 1)
+        least = max(2, least - _independent(problem))
         if self.most_evaluations(problem) < least:
             accepted = f"must be an integer >= {least}, to identify {problem.transducers} transducers"
             raise invalid("evaluations", self.evaluations, accepted)
@@ -79,39 +86,59 @@ class Identify(Method):
 
     def numbers_kept(self, problem: Problem) -> float:
         """Add the numbers of the fit: derivatives, and with a prior all pairs of readings."""
-        readings = float(self.most_evaluations(problem) * problem.foci)
+        earlier = 0 if problem.readings is None else len(problem.readings)
+        readings = float((self.most_evaluations(problem) + earlier) * problem.foci)
         pairs = 3 * readings**2 if self.prior is not None else 0.0
         return super().numbers_kept(problem) + 6 * readings * problem.transducers + pairs
 
+    @one_library_thread()
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
-        """Observe random phases, or the best drive of the prior."""
+        """Observe random phases, or the best drive of the prior, or of what earlier readings show."""
         generators = generators_of(seeds)
-        if self.prior is None:
-            count = self._random_drives(problem)
-            drives = torch.stack([random_drives(count, problem.transducers, draws) for draws in generators])
+        search = {} if problem.readings is None else _added({}, problem.readings, len(seeds))
+        random = self._random_drives(problem)
+        search["random"] = torch.full((len(seeds),), random, dtype=torch.int64, device="cpu")
+        if random:
+            drives = torch.stack([random_drives(random, problem.transducers, draws) for draws in generators])
+        elif problem.readings is not None:
+            return self._next(problem, search, generators, self.most_evaluations(problem) - 1)
         else:
+            assert self.prior is not None
             drives = best_simulated_drives(self.prior, problem, generators)[:, None]
-        return Step(problem.quantise(drives), {"generators": states_of(generators)})
+        return Step(problem.quantise(drives), {**search, "generators": states_of(generators)})
 
     @one_library_thread()
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
         """Fit the matrix, and observe the best drives of samples of it, or of the fit at the end."""
-        search, problem = dict(state.search), state.problem
-        drives, observed = state.drives, pressure
-        if "drives" in search:
-            drives = torch.cat([search["drives"], drives], dim=1)
-            observed = torch.cat([search["observed"], observed], dim=1)
-        left = self.most_evaluations(problem) - drives.shape[1] - 1
+        done = state.best.history.shape[1]
+        numbers = torch.arange(done - pressure.shape[1], done, device="cpu").expand(pressure.shape[:2])
+        search = _with(state.search, state.drives, pressure, numbers)
+        left = self.most_evaluations(state.problem) - done - 1
         if left < 0:
-            search |= {"drives": drives, "observed": observed}
-            return Step(state.drives[:, :0], {**search, "answer": _answer(problem.goal, search)})
-        generators = restored(search["generators"])
+            return Step(state.drives[:, :0], {**search, "answer": _answer(state.problem.goal, search)})
+        if state.readings is not None:
+            # Number -1 - k is the k-th of the problem's readings and the further ones.
+            joined = int((search["numbers"][0] < 0).sum())
+            earlier = 0 if state.problem.readings is None else len(state.problem.readings)
+            if joined < earlier + len(state.readings):
+                search = _added(search, state.readings[joined - earlier :], len(pressure), joined)
+        return self._next(state.problem, search, restored(search["generators"]), left)
+
+    def _next(
+        self,
+        problem: Problem,
+        search: Mapping[str, torch.Tensor],
+        generators: Sequence[torch.Generator],
+        left: int,
+    ) -> Step:
+        """Fit the matrix to all readings, and observe the best drives of samples of it, or of the fit."""
+        drives, observed = search["drives"], search["observed"]
         prior = None if self.prior is None else matrix_prior(self.prior, problem)
         fits = posteriors(prior, search, drives, observed, generators)
         copies = [played.clone() for played in drives]  # products must not round by the place in memory
         trials = list(zip(fits, copies, generators, strict=True))
         best = torch.stack([_highest(problem.goal, *trial) for trial in trials])
-        search |= {"drives": drives, "observed": observed, **tensors_of(fits)}
+        search = {**search, **tensors_of(fits)}
         if left == 0:
             last = problem.quantise(best)[:, None]
             return Step(last, {**search, "fitted": _magnitudes(fits, torch.cat([drives, last], dim=1))})
@@ -126,7 +153,10 @@ class Identify(Method):
         solution, search, goal = super().best(state), state.search, state.problem.goal
         if "outliers" not in search:
             return solution
-        answer = search["answer"] if state.done else _best_believed(_believed_scores(goal, search))
+        believed = _believed_scores(goal, search)
+        if not state.done and believed.isnan().all(dim=1).any():
+            return solution
+        answer = search["answer"] if state.done else _best_believed(believed)
         chosen = torch.arange(len(answer), device="cpu"), answer
         pressure = search["observed"][chosen]
         score = scores_of(goal, pressure)
@@ -134,8 +164,8 @@ class Identify(Method):
 
     def _doubts(self, state: State) -> Sequence[Iterable[str]]:
         """Describe doubtful sensors after the random drives, in time to mend them, and all at the end."""
-        random = self.prior is None and state.best.history.shape[1] == self._random_drives(state.problem)
-        looked = random or state.done
+        random = state.best.history.shape[1] == int(state.search["random"][0])
+        looked = "fitted" in state.search and (random or state.done)
         return [self._doubts_of(state, trial) for trial in range(len(state.seeds))] if looked else []
 
     def _doubts_of(self, state: State, trial: int) -> Iterator[str]:
@@ -147,16 +177,55 @@ class Identify(Method):
         read = Magnitudes.of(observed, outliers, search["ends"])
         yield from sensor_doubts(drives[:count], read.first(count), fitted[:count])
         if state.done:
+            names = [_name(number) for number in search["numbers"].tolist()]
             yield from reading_doubts(
-                observed, read, fitted, search["variance"].sqrt(), prior=self.prior is not None
+                names, observed, read, fitted, search["variance"].sqrt(), prior=self.prior is not None
             )
             if int(search["answer"]) < count:
-                yield f"the last drive is far worse than the solution, evaluation {int(search['answer'])}"
+                yield f"the last drive is far worse than the solution, {names[int(search['answer'])]}"
 
     def _random_drives(self, problem: Problem) -> int:
-        """Return the number of random drives of a trial without a prior."""
-        most = self.most_evaluations(problem)
-        return min(max(3 * problem.transducers - 2, most // 2), most - 1)
+        """Return the number of random drives of a trial, none with a prior or with enough readings."""
+        if self.prior is not None:
+            return 0
+        most, earlier = self.most_evaluations(problem), problem.readings
+        needed = 3 * problem.transducers - 2 - _independent(problem)
+        half = most // 2 - (0 if earlier is None else len(earlier))
+        return max(0, min(max(needed, half), most - 1))
+
+
+def _independent(problem: Problem) -> int:
+    """Return how many random drives the earlier readings of a problem stand for, at the point with fewest."""
+    if problem.readings is None:
+        return 0
+    drives, read = problem.readings.drives, ~problem.readings.pressure.isnan()
+    return min(independent_readings(drives[column]) for column in read.T)
+
+
+def _with(
+    search: Mapping[str, torch.Tensor], drives: torch.Tensor, observed: torch.Tensor, numbers: torch.Tensor
+) -> dict[str, torch.Tensor]:
+    """Return the search with further drives (T, N, M), what they gave (T, N, P), and their numbers (T, N).
+
+    Evaluations count from 0; other readings have the numbers -1, -2, and so on.
+    """
+    more = {"drives": drives, "observed": observed, "numbers": numbers}
+    if "drives" in search:
+        more = {name: torch.cat([search[name], tensor], dim=1) for name, tensor in more.items()}
+    return {**search, **more}
+
+
+def _added(
+    search: Mapping[str, torch.Tensor], readings: Readings, trials: int, before: int = 0
+) -> dict[str, torch.Tensor]:
+    """Return the search of some trials with readings that are no evaluations, after some `before` them."""
+    numbers = -1 - torch.arange(before, before + len(readings), device="cpu")
+    parts = readings.drives, readings.pressure, numbers
+    return _with(search, *(part.expand(trials, *part.shape) for part in parts))
+
+
+def _name(number: int) -> str:
+    return f"evaluation {number}" if number >= 0 else f"earlier reading {-1 - number}"
 
 
 def _highest(goal: GoalFunction, fit: Fit, drives: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
@@ -187,8 +256,8 @@ def _magnitudes(fits: Sequence[Fit], drives: torch.Tensor) -> torch.Tensor:
 
 def _believed_scores(goal: GoalFunction, search: Mapping[str, torch.Tensor]) -> torch.Tensor:
     """Return the scores (T, N) of the evaluations that were fitted, NaN where a reading is an outlier."""
-    outliers = search["outliers"]
-    score = scores_of(goal, search["observed"][:, : outliers.shape[1]])
+    outliers = search["outliers"]  # gaps among them
+    score = scores_of(goal, search["observed"][:, : outliers.shape[1]].nan_to_num())
     return score.masked_fill(outliers.any(dim=-1), torch.nan)
 
 

@@ -10,7 +10,8 @@ from typing import Any, ClassVar, Literal
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, State, Step, first_of_best, setting, whole
+from autdtorch.methods.base import Method, State, Step, first_of_best, setting, whole
+from autdtorch.methods.problem import Problem
 from autdtorch.scene.arrays import phase_offsets_of
 from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise, phases_of
 from autdtorch.utils.array_types import COMPLEX, REAL

@@ -55,7 +55,7 @@ def posteriors(
         prior: of the matrix; None if nothing is known, for at least 3 M - 2 readings.
         search: tensors of `tensors_of` after fewer readings, if there were any.
         drives: (T, N, M).
-        observed: magnitudes (T, N, P).
+        observed: magnitudes (T, N, P); NaN is a gap, which is taken like an outlier.
         generators: of the trials, for the first search without a prior.
         variance: of the magnitudes' noise (T, P) [Pa^2]; None to infer it.
     """
@@ -114,18 +114,19 @@ class _Trial:
 
     def _screened(self, ends: torch.Tensor, matrix: torch.Tensor | None) -> Fit:
         """Return the fit that shows no further outlier; the first begins at a matrix (P, M), if any."""
-        outliers = torch.zeros_like(self.observed, dtype=torch.bool)
+        outliers = gaps = self.observed.isnan()
         if self.before:
-            outliers[: len(self.before["outliers"])] = self.before["outliers"]
+            known = self.before["outliers"]
+            outliers = torch.cat([known, gaps[len(known) :]])
         elif self.prior is None:
-            outliers = gross_outliers(self.observed)
+            outliers = gaps | gross_outliers(self.observed)
         for _ in range(_SCREENINGS):
             read = Magnitudes.of(self.observed, outliers, ends)
             start = self._start(read, matrix)
             if self.variance is not None:
                 start = replace(start, variance=self.variance)
             fit = start.fitted(self.drives, read, infer_noise=self.variance is None)
-            shown, matrix = fit.outliers(self.drives, read, self.observed), fit.matrix
+            shown, matrix = fit.outliers(self.drives, read, self.observed) | gaps, fit.matrix
             if torch.equal(shown, outliers):
                 break
             outliers = shown

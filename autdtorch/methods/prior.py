@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, fields
 
 import torch
 
-from autdtorch.methods.base import Problem
 from autdtorch.methods.gradient import climb, random_drives
 from autdtorch.methods.matrix_posterior import MatrixPrior
+from autdtorch.methods.problem import Problem
 from autdtorch.objectives.objective import validate_matrix
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import complex_tensor, invalid, number_between, require_known, within

@@ -9,7 +9,8 @@ from typing import ClassVar
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, State, Step, whole
+from autdtorch.methods.base import Method, State, Step, whole
+from autdtorch.methods.problem import Problem
 from autdtorch.methods.seeds import generators_of, restored, states_of, uniform
 
 _AT_ONCE = 64  # evaluations of a trial in one step, which bounds the memory of a step

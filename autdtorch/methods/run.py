@@ -8,13 +8,15 @@ from typing import cast, overload
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, State
+from autdtorch.methods.base import Method, State
 from autdtorch.methods.catalogue import METHODS
+from autdtorch.methods.problem import Problem
 from autdtorch.methods.seeds import Trials, trial_seeds
 from autdtorch.methods.solution import Solution
 from autdtorch.methods.state_file import load_state, save_state
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import GoalFunction, Objective, require_objective
+from autdtorch.objectives.readings import Readings
 from autdtorch.utils.hints import did_you_mean, renamed_keywords
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.validation import invalid, path_of, require_callable, within
@@ -31,6 +33,7 @@ def run(
     stop: Callable[[State], bool] | None = None,
     state_file: str | Path | None = None,
     start: torch.Tensor | None = None,
+    readings: Readings | None = None,
 ) -> Solution: ...
 @overload
 def run(
@@ -54,6 +57,7 @@ def run(
     stop: Callable[[State], bool] | None = None,
     state_file: str | Path | None = None,
     start: torch.Tensor | None = None,
+    readings: Readings | None = None,
 ) -> Solution | list[Solution]:
     """Run a method on an objective: ask, observe and tell until the method is done.
 
@@ -72,6 +76,8 @@ def run(
         state_file: file that keeps the state after every step. If it exists, the run goes on from it. Only
             of one objective.
         start: drive (M,) that was good before, or one for each trial (T, M); see `Problem`.
+        readings: earlier ones of the array and the control points, which `Identify` and `BayesOpt` go on
+            from; see `Problem`. Only of one objective.
 
     Returns:
         The drive that each trial chose; of a list, a list of these.
@@ -87,10 +93,12 @@ def run(
         require_callable("stop", stop)
     path = None if state_file is None else path_of("state_file", state_file)
     if not isinstance(objective, list | tuple):
-        problem = Problem.of(cast(Objective, objective), goal, start)
+        problem = Problem.of(cast(Objective, objective), goal, start, readings)
         return _run(method, cast(Objective, objective), problem, trials, seed, stop, path)
     if path is not None:
         raise invalid("state_file", str(path), "must be None for a sequence of objectives")
+    if readings is not None:
+        raise invalid("readings", readings, "must be None for a sequence of objectives")
     if not objective:
         raise invalid("objective", objective, "must have at least one")
     for number, pose in enumerate(objective):

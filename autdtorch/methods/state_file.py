@@ -18,16 +18,19 @@ from typing import Any
 import numpy as np
 import torch
 
-from autdtorch.methods.base import Method, Problem, State
+from autdtorch.methods.base import Method, State
+from autdtorch.methods.problem import Problem
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import Goal
+from autdtorch.objectives.readings import Readings
 from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import read_arrays, replace_file
 from autdtorch.utils.validation import invalid, path_of, require_kind, within
 
-_BEST, _SEARCH, _HEADER = "best.", "search.", "header"
-_VERSION = 3  # of the format; a new one where `State`, or the `search` of a method, changes
+_BEST, _SEARCH, _READINGS, _HEADER = "best.", "search.", "readings.", "header"
+_OF_READINGS = ("drives", "pressure", "phase")
+_VERSION = 4  # of the format; a new one where `State`, or the `search` of a method, changes
 _SHOWN = 16  # digits of a digest
 _COLUMNS = tuple(field.name for field in dataclasses.fields(Solution))
 
@@ -46,7 +49,10 @@ def save_state(path: str | os.PathLike[str], method: Method, state: State) -> No
     require_kind("method", method, Method)
     require_kind("state", state, State)
     seeds = torch.tensor(state.seeds, dtype=torch.int64, device="cpu")
-    tensors = {"seeds": seeds, "trials": state.trials, "drives": state.drives}
+    tensors = {"seeds": seeds, "trials": state.trials, "drives": state.drives, "pressure": state.pressure}
+    if (readings := state.readings) is not None:
+        parts = {name: getattr(readings, name) for name in _OF_READINGS}
+        tensors |= {f"{_READINGS}{name}": part for name, part in parts.items() if part is not None}
     tensors |= {f"{_BEST}{name}": getattr(state.best, name) for name in _COLUMNS}
     tensors |= {f"{_SEARCH}{name}": tensor for name, tensor in state.search.items()}
     arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in tensors.items()}
@@ -64,9 +70,10 @@ def load_state(path: str | os.PathLike[str], method: Method, problem: Problem) -
     Args:
         path: of the file.
         method: of the same settings as when the state was saved.
-        problem: the same as when the state was saved: numbers of transducers and foci, goal, start, scene and
-            transfer matrix. Of a goal that is a function, code and values are compared, but not what it finds
-            by global names; of an object of a user's class, unless it is a dataclass, the name alone.
+        problem: the same as when the state was saved: numbers of transducers and foci, goal, start, readings,
+            scene and transfer matrix. Of a goal that is a function, code and values are compared, but not
+            what it finds by global names; of an object of a user's class, unless it is a dataclass, the name
+            alone.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -84,7 +91,10 @@ def load_state(path: str | os.PathLike[str], method: Method, problem: Problem) -
         name.removeprefix(_SEARCH): tensor for name, tensor in tensors.items() if name.startswith(_SEARCH)
     }
     seeds = tuple(map(int, arrays["seeds"]))
-    return State(method, problem, seeds, tensors["trials"], tensors["drives"], search, best)
+    parts = {name: tensors[key] for name in _OF_READINGS if (key := f"{_READINGS}{name}") in tensors}
+    readings = Readings(**parts) if parts else None
+    trials, drives, pressure = (tensors[name] for name in ("trials", "drives", "pressure"))
+    return State(method, problem, seeds, trials, drives, search, best, pressure, readings)
 
 
 def _require_as_saved(
@@ -124,6 +134,7 @@ def _origin_of(method: Method, problem: Problem) -> dict[str, Any]:
         "foci": problem.foci,
         "goal": _goal(problem.goal),
         "start": problem.start,
+        "readings": problem.readings,
         "scene": None if problem.scene is None else _digest(problem.scene),
         "transfer_matrix": problem.transfer_matrix,
     }

@@ -16,7 +16,8 @@ from typing import Any, TypeAlias
 import torch
 
 from autdtorch.io.goal_section import goal_section, require_score
-from autdtorch.methods.base import Method, Problem
+from autdtorch.methods.base import Method
+from autdtorch.methods.problem import Problem
 from autdtorch.methods.run import run
 from autdtorch.methods.seeds import TRIAL_BYTES, Trials
 from autdtorch.methods.solution import Solution

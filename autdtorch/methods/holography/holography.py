@@ -12,8 +12,9 @@ from typing import ClassVar, cast, get_args
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, Step, choice, known_matrix, setting, whole
+from autdtorch.methods.base import Method, Step, choice, setting, whole
 from autdtorch.methods.holography.algorithms import SOLVERS, TINY, Algorithm, descent, within_largest
+from autdtorch.methods.problem import Problem, known_matrix
 from autdtorch.objectives.goals import Goal
 from autdtorch.objectives.objective import GoalFunction, Objective
 from autdtorch.utils.array_types import REAL

@@ -16,8 +16,9 @@ from typing import TypeAlias
 import numpy as np
 import torch
 
-from autdtorch.methods.base import Method, Problem, State
+from autdtorch.methods.base import Method, State
 from autdtorch.methods.gradient import GradientAscent
+from autdtorch.methods.problem import Problem
 from autdtorch.methods.run import observed
 from autdtorch.objectives.bound import focus_bound
 from autdtorch.objectives.objective import SimulatedObjective
