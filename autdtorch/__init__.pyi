@@ -4,6 +4,7 @@ from .hardware.devices.openmpd import OpenMPDBoard
 from .io.array_file import load_array
 from .io.drive_file import load_drive, save_drive
 from .io.field_file import save_field
+from .io.readings_file import load_readings, save_readings
 from .io.scene_file import load_scene, save_scene
 from .methods.base import Method, State
 from .methods.bayes.focus_problem import FocusProblem
@@ -132,6 +133,7 @@ __all__ = [
     "identify",
     "load_array",
     "load_drive",
+    "load_readings",
     "load_results",
     "load_scene",
     "load_state",
@@ -152,6 +154,7 @@ __all__ = [
     "run",
     "save_drive",
     "save_field",
+    "save_readings",
     "save_scene",
     "save_state",
     "sphere_points",

@@ -87,6 +87,14 @@ def drive_file(folder: Path) -> Path:
     return written(folder, "drive.csv", "phase [rad],amplitude\n0,1\n1,0.5\n")
 
 
+def readings_file(folder: Path) -> Path:
+    return written(folder, "readings.csv", "phase 0 [deg],phase 1 [deg],p [Pa rms]\n10,20,3\n30,40.5,5\n")
+
+
+def readings() -> at.Readings:
+    return at.Readings(torch.stack([DRIVE, DRIVE]), [1.0, 2.0])
+
+
 def mesh_file(folder: Path) -> Path:
     return written(folder, "corner.obj", CORNER)
 
@@ -300,6 +308,13 @@ OTHERS: dict[str, Any] = {
     "run.method": Made(lambda _: made("GABS")),
     "save_state.method": Made(lambda _: made("GABS")),
     "save_state.state": Made(lambda _: state("GABS")),
+    "load_readings.source": Made(readings_file),
+    "load_readings.columns": None,
+    "load_readings.phases": "deg",
+    "load_readings.pressure": "rms",
+    "load_readings.phase": None,
+    "load_readings.points": [[0.0, 0.0, 0.1]],
+    "save_readings.readings": Made(lambda _: readings()),
     "load_array.path": Made(array_file),
     "load_drive.path": Made(drive_file),
     "explore.port": 0,

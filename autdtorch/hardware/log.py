@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import math
 import os
 from collections.abc import Iterator, Mapping
@@ -20,6 +21,8 @@ from autdtorch.scene.drive import validate_single_drive
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import JsonLines, held, line_of, row_of
 from autdtorch.utils.validation import integer_at_least, not_negative, real_tensor, require_kind
+
+logger = logging.getLogger(__name__)
 
 _ORIGIN, _NUMBER = "origin", "evaluation"
 
@@ -189,6 +192,36 @@ class EvaluationLog:
             self._lines.append(row)
         except ValueError as error:
             raise LogError(str(error)) from error
+
+
+def read_log(path: Path) -> tuple[dict[str, Any], list[Evaluation]]:
+    """Return the origin of a log and its evaluations in the order of time, without changing the file.
+
+    The last line may have broken off, and is left out with a warning in the log of this program.
+
+    Raises:
+        LogError: a damaged line, or no log.
+    """
+    head, *lines = path.read_bytes().split(b"\n")
+    try:
+        origin = dict(row_of(head)[_ORIGIN])
+    except (ValueError, KeyError, TypeError) as error:
+        accepted = "must be the log of a hardware trial, written by this version"
+        raise LogError(f"{path}, line 1: cannot be read ({error}); {accepted}") from error
+    key, evaluations = digest_of(origin), []
+    for number, line in enumerate(lines, 2):
+        try:
+            row = row_of(line, key) if line else {}
+        except ValueError as error:
+            if number > len(lines):
+                logger.warning("%s, line %d: broke off, and is left out", path, number)
+                break
+            raise LogError(f"{path}, line {number}: {error}; must be as the trial wrote it") from error
+        if _NUMBER in row:
+            drive = torch.view_as_complex(real_tensor("drive", row["drive"]))
+            pressure = real_tensor("pressure", row["pressure"], "Pa")
+            evaluations.append(Evaluation(row["time"], drive, pressure, row["seconds_on"]))
+    return origin, evaluations
 
 
 @contextlib.contextmanager

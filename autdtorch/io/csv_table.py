@@ -102,17 +102,21 @@ class Rows(NamedTuple):
         """
         lines = self.lines[first:]
         count = len(names or lines[0][1])
+        self.require_regular(lines, count, "in the header" if names else "in the first row")
+        return np.array([self._finite(line, cells, names) for line, cells in lines]).reshape(-1, count)
+
+    def require_regular(self, lines: list[tuple[int, list[str]]], count: int, like: str) -> None:
+        """Check that lines have `count` cells each, and decimals that begin alike."""
         for line, cells in lines:
             if len(cells) != count:
-                as_what = "in the header" if names else "in the first row"
-                raise ValueError(
-                    f"{self.path}, line {line}: {len(cells)} cells; must be {count} as {as_what}"
-                )
-        if len({mark for _, cells in lines for cell in cells for mark in ".," if mark in cell}) > 1:
+                raise ValueError(f"{self.path}, line {line}: {len(cells)} cells; must be {count} as {like}")
+        cells_of_all = [cell for _, cells in lines for cell in cells if "." in cell or "," in cell]
+        decimals = [cell for cell in cells_of_all if self.number(cell) is not None or {".", ","} <= {*cell}]
+        marks = {mark for cell in decimals for mark in ".," if mark in cell}
+        if len(marks) > 1:
             raise ValueError(
                 f"{self.path}: decimals begin with . and with a comma; must be alike in all cells"
             )
-        return np.array([self._finite(line, cells, names) for line, cells in lines]).reshape(-1, count)
 
     def _finite(self, line: int, cells: list[str], names: list[str] | None) -> list[float]:
         row = [self.number(cell) for cell in cells]
@@ -123,8 +127,11 @@ class Rows(NamedTuple):
         return [number for number in row if number is not None]
 
 
-def read_rows(path: str | os.PathLike[str]) -> Rows:
-    """Return the cells of a CSV file, separated by commas, semicolons, tabs or blanks; at least one line."""
+def read_rows(path: str | os.PathLike[str], gaps: bool = False) -> Rows:
+    """Return the cells of a CSV file, separated by commas, semicolons, tabs or blanks; at least one line.
+
+    An empty cell at the end of a line is left out, unless there may be `gaps` and other lines are longer.
+    """
     content = Path(path).read_bytes()
     try:
         text = content.decode("utf-8-sig")
@@ -138,7 +145,8 @@ def read_rows(path: str | os.PathLike[str]) -> Rows:
         raise ValueError(f"{path}: empty; must begin with the names of the columns, or with numbers")
     separator = _separator(lines[0][1])
     cells = [(number, _cells(f"{path}, line {number}", line, separator)) for number, line in lines]
-    return Rows(str(path), cells, comments, separator)
+    width = max(len(_shortened(row)) for _, row in cells) if gaps else 1
+    return Rows(str(path), [(number, _shortened(row, width)) for number, row in cells], comments, separator)
 
 
 def table_of(
@@ -158,7 +166,7 @@ def table_of(
 
     The errors of both functions, and the warnings of the first, get the path in front.
     """
-    rows = _without_index(rows)
+    rows = without_index(rows)
     first, header = (1, _header(rows, columns)) if rows.has_header else (0, _from_comments(rows, columns))
     if first == len(rows.lines):
         raise ValueError(f"{rows.path}: no row under the header; must have at least one")
@@ -193,9 +201,12 @@ def _unit(rows: Rows, kind: str, table: Mapping[str, Array], guess: Guess) -> st
         return unit
 
 
-def write_table(path: str | os.PathLike[str], columns: Mapping[str, AnyArray]) -> None:
-    """Write columns (R,) by header, floats with full precision."""
+def write_table(
+    path: str | os.PathLike[str], columns: Mapping[str, AnyArray], comments: Sequence[str] = ()
+) -> None:
+    """Write columns (R,) by header, floats with full precision, under lines of comments."""
     with replacing(Path(path)) as partial, partial.open("w", encoding="utf-8", newline="") as file:
+        file.writelines(f"# {comment}\n" for comment in comments)
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))
@@ -214,17 +225,22 @@ def _separator(line: str) -> str:
 
 
 def _cells(where: str, line: str, separator: str) -> list[str]:
-    """Return the cells of a line without blanks around them; an empty one at the end is left out."""
+    """Return the cells of a line without blanks around them."""
     if not separator:
-        return re.split(r"(?<!\s)\s+(?![\[(\s])", line.strip())  # a unit belongs to its name
+        return re.split(r"(?<!\s)\s+(?![\[(\s]|[^\[(]*[\])])", line.strip())  # a unit belongs to its name
     try:
         cells = [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
     except csv.Error as error:
         raise ValueError(f"{where}: {error}; must be CSV in UTF-8") from error
-    return cells[:-1] if len(cells) > 1 and not cells[-1] else cells
+    return cells
 
 
-def _without_index(rows: Rows) -> Rows:
+def _shortened(cells: list[str], width: int = 1) -> list[str]:
+    """Return cells without an empty one at the end, if they are more than `width`."""
+    return cells[:-1] if len(cells) > width and not cells[-1] else cells
+
+
+def without_index(rows: Rows) -> Rows:
     """Return rows without a first column that has no name and counts from 0, as pandas writes it."""
     (line, header), *others = rows.lines
     if header[0] or [cells[0] for _, cells in others] != [str(number) for number in range(len(others))]:
@@ -252,7 +268,7 @@ def _from_comments(rows: Rows, columns: Mapping[str, str]) -> list[Column] | Non
     """Return the columns that the last such comment names, None if none does."""
     for comment in reversed(rows.comments):
         for separator in {rows.separator: None, ",": None}:
-            cells = _cells(rows.path, comment, separator)
+            cells = _shortened(_cells(rows.path, comment, separator))
             if len(cells) == len(rows.lines[0][1]):
                 try:
                     header = [_column("", cell, columns) for cell in cells]

@@ -122,7 +122,7 @@ class Readings:
 
     def __getitem__(self, rows: Any) -> Readings:
         """Return the readings of drives, by a slice, a mask, indices or one index."""
-        chosen = torch.arange(len(self))[rows].reshape(-1)
+        chosen = torch.arange(len(self), dtype=torch.int64, device="cpu")[rows].reshape(-1)
         phase = None if self.phase is None else self.phase[chosen]
         return Readings(self.drives[chosen], self.pressure[chosen], self.points, phase)
 
