@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeAlias
 
 import torch
 
-from autdtorch.scene.arrays import TransducerArray, radii_of, strengths_of
+from autdtorch.scene.arrays import TransducerArray, radii_of
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle, Sphere
@@ -168,7 +168,7 @@ def changed_array(array: TransducerArray, amounts: Amounts) -> TransducerArray:
         return array
     turn, center = rotation_matrix(angles), array.positions.mean(dim=0)
     places = center + shift + (array.positions - center) @ turn.mT
-    return TransducerArray(places, array.normals @ turn.mT, strengths_of(array), radii_of(array) + growth)
+    return replace(array, positions=places, normals=array.normals @ turn.mT, radius=radii_of(array) + growth)
 
 
 def changed_obstacles(obstacles: tuple[Obstacle, ...], amounts: Amounts) -> tuple[Obstacle, ...]:

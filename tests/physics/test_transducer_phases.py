@@ -13,6 +13,7 @@ from autdtorch.analytic.green import free_space_matrix
 from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.propagators import differentiable_field, make_propagator
 from autdtorch.scene.arrays import complex_strengths_of, phase_offsets_of, strengths_of
+from autdtorch.scene.changes import changed_array
 
 WAVENUMBER = 2 * math.pi * 40e3 / 340.0
 PHASES = torch.tensor([0.0, 0.4, -1.7, 4.0], dtype=torch.float64)
@@ -105,3 +106,9 @@ def test_arrays_differ_by_their_phases_and_are_joined_with_them():
     assert "phase -1.7 to 4 rad" in repr(TURNED)
     assert "phase -1.7 to 4 rad" in scene_of(TURNED)._repr_html_()
     assert "phase" not in repr(PLAIN)
+
+
+def test_a_moved_array_and_one_of_other_discs_have_the_phases_too():
+    moved = changed_array(TURNED.calibrated(GAINS), {"array.x": 1e-3, "radius": 2e-3})
+    assert torch.equal(phase_offsets_of(moved), PHASES)
+    assert torch.equal(strengths_of(moved), strengths_of(PLAIN) * GAINS)
