@@ -10,6 +10,8 @@ from .methods.base import Method, State
 from .methods.bayes.focus_problem import FocusProblem
 from .methods.bayes.gaussian_process import PhasorKernel
 from .methods.bayes_opt import BayesOpt
+from .methods.calibration.calibrate import calibrate
+from .methods.calibration.calibration import Calibration
 from .methods.functions import (
     bayes_opt,
     bo_foci,
@@ -66,6 +68,7 @@ __all__ = [
     "PAPER_SOURCE_STRENGTH",
     "BayesOpt",
     "Box",
+    "Calibration",
     "Contrast",
     "Cylinder",
     "Drift",
@@ -114,6 +117,7 @@ __all__ = [
     "animate3d",
     "bayes_opt",
     "bo_foci",
+    "calibrate",
     "cell_centers",
     "circle_points",
     "collect_results",

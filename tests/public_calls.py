@@ -313,7 +313,6 @@ OTHERS: dict[str, Any] = {
     "load_readings.phases": "deg",
     "load_readings.pressure": "rms",
     "load_readings.phase": None,
-    "load_readings.lengths": None,
     "load_readings.points": [[0.0, 0.0, 0.1]],
     "save_readings.readings": Made(lambda _: readings()),
     "load_array.path": Made(array_file),

@@ -29,7 +29,6 @@ SKIP = "skip"
 """SKIP: columns that the call counts, but that are not read."""
 
 _TITLE = re.compile(r"(.*?)\s*[\[(](.*)[\])]\s*(.*)", re.DOTALL)
-_NUMBER = re.compile(r"[\[(](\d+)[\])]")
 _WORD = re.compile(r"[^\W\d_]+|\d+")
 
 # Words of names, in lower case
@@ -70,7 +69,7 @@ def checked_names(columns: object) -> Named | None:
     accepted = f"must be numbers of columns or their titles by quantity, as {_COUNTS} or {_NAMES}"
     if not isinstance(columns, Mapping) or not columns:
         raise invalid("columns", columns, accepted)
-    require_known("columns", columns, (*QUANTITIES, SKIP))
+    require_known("columns", columns, (*QUANTITIES, SKIP), "quantity")
     titled = [isinstance(names, str | list | tuple) for names in columns.values()]
     if any(titled) != all(titled):
         raise invalid("columns", columns, accepted)
@@ -168,9 +167,9 @@ def _column(index: int, title: str, what: str | None = None) -> Column | None:
     """Return the column that a title names, None if it names none; the call may know what it holds.
 
     Titles are such as `phase 3 [deg]`, `autd3 phase 3`, `arg q 3 [rad]`, `amplitude_3`, `p3_rms (kPa)`,
-    `SPL 1`, `mic[2] phase [deg]` and `x [mm]`.
+    `SPL 1`, `mic 2 phase [deg]` and `x [mm]`.
     """
-    match = _TITLE.fullmatch(_NUMBER.sub(r" \1 ", title).strip())
+    match = _TITLE.fullmatch(title.strip())
     name, stated = (f"{match[1]} {match[3]}", match[2]) if match else (title, "")
     device = next((known for known in DEVICES if name.casefold().startswith(f"{known} ")), "")
     words = _WORD.findall(peak_to_peak_as_word(name[len(device) :]))

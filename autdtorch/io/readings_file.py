@@ -16,7 +16,7 @@ from autdtorch.hardware.log import read_log
 from autdtorch.io.csv_table import write_table
 from autdtorch.io.readings_columns import Named, checked_names
 from autdtorch.io.readings_table import Table, Units, csv_table, frame_table, plain_number, readings_of
-from autdtorch.io.readings_units import angle_unit, length_unit, phase_unit, pressure_unit
+from autdtorch.io.readings_units import angle_unit, phase_unit, pressure_unit
 from autdtorch.objectives.readings import Readings
 from autdtorch.scene.drive import amplitudes_of, phases_of
 from autdtorch.utils.array_types import AnyArray
@@ -44,7 +44,6 @@ def load_readings(
     phases: str | int | None = None,
     pressure: str | None = None,
     phase: str | None = None,
-    lengths: str | None = None,
     drives: ArrayLike | None = None,
     points: ArrayLike | None = None,
 ) -> Readings:
@@ -74,7 +73,6 @@ def load_readings(
         pressure: unit and kind of the pressures, such as "Pa rms", "kPa peak" or "mPa peak-to-peak", or what
             the titles lack of it; "dB" is re 20 uPa, of the RMS pressure.
         phase: unit of the phases of the pressure: "rad" or "deg".
-        lengths: unit of x, y and z: "m", "cm" or "mm".
         drives: of the rows (R, M), or of all rows (M,), where the file has only pressures, as of a scan.
         points: (P, 3) [m] of the columns of pressures; by default those of the file, or the control points.
 
@@ -90,7 +88,6 @@ def load_readings(
         None if phases is None else phase_unit("phases", phases),
         None if pressure is None else pressure_unit("pressure", pressure),
         None if phase is None else angle_unit("phase", phase),
-        None if lengths is None else length_unit("lengths", lengths),
     )
     named = checked_names(columns)
     rows = None if drives is None else _drives(drives)

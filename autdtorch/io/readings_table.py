@@ -27,12 +27,11 @@ _POINT = re.compile(r"point (\d+) \[m\]: (\S+) (\S+) (\S+)")  # a comment of `sa
 
 
 class Units(NamedTuple):
-    """Units that the call states: of phases, pressures, their phases and places; None if it does not."""
+    """Units that the call states: of phases, of pressures and of their phases; None if it does not."""
 
     phases: Unit | None = None
     pressure: Unit | None = None
     phase: Unit | None = None
-    lengths: Unit | None = None
 
 
 @dataclass(frozen=True)
@@ -59,36 +58,26 @@ class Table:
         """Return the numbers (R, C) of columns in a unit; those of pressures may have gaps, as NaN."""
         gaps = columns[0].what.startswith("pressure")
         least, most, whole = range_of(columns[0].what, unit)
-        accepted = _accepted(least, most, whole, gaps)
-        values = np.array(
-            [[self._number(row, column, accepted) for column in columns] for row in range(len(self.rows))]
-        )
-        fits = (
-            (values >= least)
-            & (values <= most * (1 + (not whole) * AMPLITUDE_TOLERANCE))
-            & np.isfinite(values)
-        )
-        if whole:
-            fits &= values == values.round()
-        for row, index in np.argwhere(~fits & ~(np.isnan(values) & gaps))[:1]:
-            raise invalid(self._where(row, columns[index]), self.rows[row][columns[index].index], accepted)
+        values = np.empty((len(self.rows), len(columns)))
+        for row, cells in enumerate(self.rows):
+            for place, column in enumerate(columns):
+                cell = cells[column.index]
+                number = math.nan if is_gap(cell) else self.number(cell)
+                if number is None or not (_fits(number, least, most, whole) or (gaps and math.isnan(number))):
+                    where = f"{self.place}, {self.lines[row]}, column {column.title!r}"
+                    raise invalid(where, cell, _accepted(least, most, whole, gaps))
+                values[row, place] = number
         return values
 
-    def _number(self, row: int, column: Column, accepted: str) -> float:
-        """Return the number in a cell, NaN at a gap."""
-        cell = self.rows[row][column.index]
-        number = self.number(cell)
-        if number is None and not is_gap(cell):
-            raise invalid(self._where(row, column), cell, accepted)
-        return math.nan if number is None else number
 
-    def _where(self, row: int, column: Column) -> str:
-        """Return the place of a cell for messages."""
-        return f"{self.place}, {self.lines[row]}, column {column.title!r}"
+def _fits(number: float, least: float, most: float, whole: bool) -> bool:
+    """Check that a number is finite and in a range, with room for rounding unless it must be whole."""
+    room = 0 if whole else AMPLITUDE_TOLERANCE
+    return math.isfinite(number) and least <= number <= most * (1 + room) and not (whole and number % 1)
 
 
 def _accepted(least: float, most: float, whole: bool, gaps: bool) -> str:
-    """Describe the numbers of a range, with room for rounding unless they must be whole."""
+    """Describe the numbers that `_fits` accepts."""
     text = f"must be a {'whole' if whole else 'finite'} number"
     if math.isfinite(least):
         text += f" >= {least:g}" if math.isinf(most) else f" from {least:g} to {most:g}"
@@ -176,7 +165,7 @@ def readings_of(
         have = ", ".join(column.title for column in coordinates + columns["pressure"])
         accepted = "must be x, y, z and a single pressure, where rows have points"
         raise ValueError(f"{table.place}: columns {have}; {accepted}")
-    places = np.concatenate([_metres(table, column, units.lengths) for column in coordinates], axis=1)
+    places = np.concatenate([_metres(table, column) for column in coordinates], axis=1)
     return Readings.of_rows(rows, places, pressure[:, 0], None if phase is None else phase[:, 0])
 
 
@@ -224,12 +213,11 @@ def _drives(table: Table, columns: Columns, said: Unit | None, drives: torch.Ten
         return drives_of(values, shares, unit, of_amplitudes)
 
 
-def _metres(table: Table, column: Column, said: Unit | None) -> Array:
+def _metres(table: Table, column: Column) -> Array:
     """Return coordinates (R, 1) [m]."""
-    unit = _unit(table, "lengths", [column], said)
-    values = table.read([column], unit)
+    values = table.read([column], column.unit)
     with within(table.place):
-        return in_metres(values, unit)
+        return in_metres(values, column.unit)
 
 
 def _unit(table: Table, keyword: str, columns: list[Column], said: Unit | None) -> Unit:

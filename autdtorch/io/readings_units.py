@@ -125,9 +125,9 @@ def angle_unit(name: str, text: object) -> Unit:
     return Unit(unit)
 
 
-def length_unit(name: str, text: object) -> Unit:
+def length_unit(name: str, text: str) -> Unit:
     """Return the unit of a length that a text states."""
-    if not isinstance(text, str) or text not in _LENGTHS:
+    if text not in _LENGTHS:
         raise invalid(name, text, f"must be {', '.join(_LENGTHS)}")
     return Unit(text)
 
@@ -178,9 +178,7 @@ def peak_amplitudes(values: Array, unit: Unit, in_header: bool) -> Array:
 def in_metres(values: Array, unit: Unit) -> Array:
     """Return lengths in m."""
     if unit.unit is None:
-        raise ValueError(
-            "no unit of x, y, z; must be stated, in titles as 'x [mm]', or in the call as lengths='mm'"
-        )
+        raise ValueError("no unit of x, y, z; must be stated in their titles, as in 'x [mm]'")
     return values * _LENGTHS[unit.unit]
 
 

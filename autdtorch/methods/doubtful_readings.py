@@ -150,14 +150,20 @@ def sensor_doubts(drives: torch.Tensor, read: Magnitudes, fitted: torch.Tensor) 
         fitted: magnitudes (N, P) [Pa] by the fitted matrix.
     """
     silent = _silent(read.nearest(fitted), fitted, 2 * drives.shape[1] - 1)
-    at_end = read.limit & ~read.outliers
-    for point, column in enumerate(read.value.T):
+    for point in range(len(silent)):
         if silent[point]:
-            reads = f"control point {point} reads up to {float(column.max()):.3g} Pa"
+            reads = f"control point {point} reads up to {float(read.value[:, point].max()):.3g} Pa"
             yield f"{reads}, hardly depending on the drive: has its sensor failed, or is it always saturated?"
-        elif at_end[:, point].any():
-            count, end = int(at_end[:, point].sum()), float(column[at_end[:, point]].min())
-            yield f"control point {point} reads {end:.3g} Pa {count} times, and no more: its sensor saturates"
+        else:
+            yield from saturation_doubts(read, point)
+
+
+def saturation_doubts(read: Magnitudes, point: int) -> Iterator[str]:
+    """Describe the end of the range of a point's sensor, where readings reach it."""
+    at_end = read.value[(read.limit & ~read.outliers)[:, point], point]
+    if len(at_end):
+        reads = f"control point {point} reads {float(at_end.min()):.3g} Pa {len(at_end)} times"
+        yield f"{reads}, and no more: its sensor saturates"
 
 
 def _silent(observed: torch.Tensor, fitted: torch.Tensor, unknowns: int) -> torch.Tensor:

@@ -112,34 +112,27 @@ class Covariance:
     """
 
     def __init__(self, line: LinearisedReadings) -> None:
-        """Factorise the covariance of linearised readings."""
+        """Factorise the blocks B of linearised readings, which the covariance has without factors."""
         entries = line.by_entries.transpose(0, 1)
         self._noise = line.noise.mT  # (P, R)
         self._shared = line.by_factors.transpose(0, 1)  # (P, R, K)
         points, readings, factors = self._shared.shape
-        slopes = torch.cat([entries.real, entries.imag], dim=-1) * 0.5**0.5  # (P, R, 2 M)
-        self._is_dense = factors > 0 and points * readings <= factors
-        self._slopes = None if self._is_dense or readings <= slopes.shape[-1] else slopes
-        if self._slopes is not None:
-            scaled = slopes / self._noise[..., None]
-            inner = slopes.mT @ scaled
+        self._slopes = _parts(entries)  # (P, R, 2 M)
+        self._is_long = readings > self._slopes.shape[-1]
+        self._is_dense = 0 < points * readings <= factors  # else the factors are the fewer
+        if self._is_long:
+            self._scaled = self._slopes / self._noise[..., None]
+            inner = self._slopes.mT @ self._scaled
             inner.diagonal(dim1=1, dim2=2).add_(1)
-            self._factor, self._scaled = torch.linalg.cholesky(inner), scaled
+            self._factor = torch.linalg.cholesky(inner)
         else:
-            blocks = slopes @ slopes.mT
-            blocks.diagonal(dim1=1, dim2=2).add_(self._noise)
-            self._factor = torch.linalg.cholesky(_dense(blocks, self._shared) if self._is_dense else blocks)
-        if factors and not self._is_dense:
-            self._by_block = self._blocks_solved(self._shared)
-            inner = torch.einsum("prk,prl->kl", self._shared, self._by_block)
-            inner.diagonal().add_(1)
-            self._inner = torch.linalg.cholesky(inner)
+            self._factor = torch.linalg.cholesky(self._blocks)
 
     def solved(self, right: torch.Tensor) -> torch.Tensor:
         """Return C^-1 X of columns X (R, P, C)."""
         columns = right.transpose(0, 1)
         if self._is_dense:
-            flat = torch.cholesky_solve(columns.flatten(0, 1), self._factor)
+            flat = torch.cholesky_solve(columns.flatten(0, 1), self._dense)
             return flat.reshape(columns.shape).transpose(0, 1)
         by_block = self._blocks_solved(columns)
         if self._shared.shape[-1]:
@@ -151,34 +144,85 @@ class Covariance:
     def inverse_diagonal(self) -> torch.Tensor:
         """The diagonal of C^-1, as (R, P)."""
         if self._is_dense:
-            diagonal = torch.cholesky_inverse(self._factor).diagonal().reshape(self._noise.shape)
-        elif self._slopes is None:
-            diagonal = torch.cholesky_inverse(self._factor).diagonal(dim1=1, dim2=2)
-        else:
+            return torch.cholesky_inverse(self._dense).diagonal().reshape(self._noise.shape).mT
+        if self._is_long:
             diagonal = 1 / self._noise - _squares(self._factor, self._scaled)
-        if self._shared.shape[-1] and not self._is_dense:
+        else:
+            diagonal = torch.cholesky_inverse(self._factor).diagonal(dim1=1, dim2=2)
+        if self._shared.shape[-1]:
             diagonal = diagonal - _squares(self._inner, self._by_block)
         return diagonal.mT
 
+    @cached_property
+    def of_factors(self) -> torch.Tensor:
+        """The covariance (K, K) of the factors, in their widths, that the readings leave."""
+        inverse: torch.Tensor = torch.cholesky_inverse(self._inner)
+        return inverse
+
+    def deviations_of(self, others: LinearisedReadings, same_points: bool) -> torch.Tensor:
+        """Return the standard deviations (R', P') of other readings that these leave, without noise.
+
+        The entries of others are known from these readings at the same points, in the same order.
+        """
+        slopes = _parts(others.by_entries.transpose(0, 1))
+        shared, variance = others.by_factors.transpose(0, 1), slopes.square().sum(dim=-1)
+        if same_points:
+            alike = self._slopes @ slopes.mT  # (P, R, R')
+            known = self._blocks_solved(alike)
+            variance = variance - (alike * known).sum(dim=1)
+            shared = shared - known.mT @ self._shared
+        variance = variance + ((shared @ self.of_factors) * shared).sum(dim=-1)
+        deviations: torch.Tensor = variance.clamp_min(0).sqrt().mT
+        return deviations
+
+    @property
+    def _blocks(self) -> torch.Tensor:
+        """B (P, R, R)."""
+        blocks = self._slopes @ self._slopes.mT
+        blocks.diagonal(dim1=1, dim2=2).add_(self._noise)
+        return blocks
+
+    @cached_property
+    def _dense(self) -> torch.Tensor:
+        """The Cholesky factor of C (P R, P R)."""
+        flat, blocks = self._shared.flatten(0, 1), self._blocks
+        covariance = (flat @ flat.T).reshape(2 * blocks.shape[:2])
+        for point, block in enumerate(blocks):
+            covariance[point, :, point] += block
+        factor: torch.Tensor = torch.linalg.cholesky(covariance.reshape(len(flat), -1))
+        return factor
+
+    @cached_property
+    def _by_block(self) -> torch.Tensor:
+        """B^-1 times the derivatives by factors (P, R, K)."""
+        return self._blocks_solved(self._shared)
+
+    @cached_property
+    def _inner(self) -> torch.Tensor:
+        """The Cholesky factor of the factors' inverse covariance (K, K) after the readings."""
+        inner = torch.einsum("prk,prl->kl", self._shared, self._by_block)
+        inner.diagonal().add_(1)
+        factor: torch.Tensor = torch.linalg.cholesky(inner)
+        return factor
+
     def _blocks_solved(self, columns: torch.Tensor) -> torch.Tensor:
-        """Return B^-1 X of columns X (P, R, C), B the part of C without factors."""
-        if self._slopes is None:
-            return torch.cholesky_solve(columns, self._factor)
-        scaled = columns / self._noise[..., None]
-        by_entries = torch.cholesky_solve(self._slopes.mT @ scaled, self._factor)
-        return torch.sub(scaled, self._scaled @ by_entries)
+        """Return B^-1 X of columns X (P, R, C)."""
+        solved: torch.Tensor
+        if self._is_long:
+            scaled = columns / self._noise[..., None]
+            solved = scaled - self._scaled @ torch.cholesky_solve(self._slopes.mT @ scaled, self._factor)
+        else:
+            solved = torch.cholesky_solve(columns, self._factor)
+        return solved
+
+
+def _parts(by_entries: torch.Tensor) -> torch.Tensor:
+    """Return derivatives (..., M) by entries as (..., 2 M) by real parts of variance 1."""
+    parts: torch.Tensor = torch.cat([by_entries.real, by_entries.imag], dim=-1) * 0.5**0.5
+    return parts
 
 
 def _squares(factor: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
     """Return x A^-1 x of rows x (..., R, K), as (..., R), by a Cholesky factor of A (..., K, K)."""
     whitened: torch.Tensor = torch.linalg.solve_triangular(factor, rows.mT, upper=False)
     return whitened.square().sum(dim=-2)
-
-
-def _dense(blocks: torch.Tensor, shared: torch.Tensor) -> torch.Tensor:
-    """Return the covariance (P R, P R) of blocks (P, R, R) and shared factors (P, R, K)."""
-    flat = shared.flatten(0, 1)
-    covariance = (flat @ flat.T).reshape(2 * blocks.shape[:2])
-    for point, block in enumerate(blocks):
-        covariance[point, :, point] += block
-    return covariance.reshape(len(flat), -1)

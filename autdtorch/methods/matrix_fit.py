@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
@@ -67,7 +67,7 @@ def posteriors(
         before = {name: search[name][trial].clone() for name in names}
         scaled = None if prior is None else prior.in_units_of(played, seen)
         noise = None if variance is None else variance[trial]
-        fits.append(_Trial(scaled, before, played, seen, generator, noise).fit())
+        fits.append(Trial(scaled, before, played, seen, generator, noise).fit())
     return fits
 
 
@@ -83,15 +83,20 @@ def tensors_of(fits: Sequence[Fit]) -> dict[str, torch.Tensor]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Trial:
-    """The data of a trial's fit; see `posteriors`."""
+class Trial:
+    """The data of a trial's fit; see `posteriors`.
+
+    The generator is for the first search without a prior. The phases of the pressures (N, P) [rad] are
+    fitted, too, where they are read.
+    """
 
     prior: MatrixPrior | None
     before: Mapping[str, torch.Tensor]
     drives: torch.Tensor
     observed: torch.Tensor
-    generator: torch.Generator
-    variance: torch.Tensor | None
+    generator: torch.Generator = field(default_factory=torch.Generator)
+    variance: torch.Tensor | None = None
+    phase: torch.Tensor | None = None
 
     def fit(self) -> Fit:
         """Return the fit without outliers, where readings at the end of a sensor's range are limits.
@@ -121,7 +126,7 @@ class _Trial:
         elif self.prior is None:
             outliers = gaps | gross_outliers(self.observed)
         for _ in range(_SCREENINGS):
-            read = Magnitudes.of(self.observed, outliers, ends)
+            read = Magnitudes.of(self.observed, outliers, ends, self.phase)
             start = self._start(read, matrix)
             if self.variance is not None:
                 start = replace(start, variance=self.variance)

@@ -57,16 +57,30 @@ class MatrixPrior:
 
         The median decides where the first reading is far from it: an outlier.
         """
+        usual = self.unit_of(drives, observed)
+        factor = float(observed[0].norm() / (drives[0] @ self.rows.T).norm())
+        return self.times(factor if usual / _FAR < factor < usual * _FAR else usual)
+
+    def unit_of(self, drives: torch.Tensor, observed: torch.Tensor) -> float:
+        """Return the median ratio of magnitudes (N, P) to those by drives (N, M); 1 where all are 0."""
         expected = (drives @ self.rows.T).abs()
         ratio = (observed / expected)[(observed > 0) & (expected > 0)]
-        if not len(ratio):
-            return self
-        usual = ratio.median()
-        factor = observed[0].norm() / expected[0].norm()
-        if not usual / _FAR < factor < usual * _FAR:
-            factor = usual
-        parts = {name: factor * getattr(self, name) for name in ("rows", "spread", "changes")}
-        return replace(self, **parts)
+        return float(ratio.median()) if len(ratio) else 1.0
+
+    def times(self, unit: float) -> MatrixPrior:
+        """Return the prior of another unit."""
+        return replace(self, **{name: unit * getattr(self, name) for name in ("rows", "spread", "changes")})
+
+    def errors(self, drives: torch.Tensor) -> torch.Tensor:
+        """Return the standard deviations (N, P) [Pa] of the pressures of drives (N, M), without scale."""
+        transducers, power = self.rows.shape[1], drives.abs().square()
+        parts = [transducers, transducers, 2, len(self.changes)]
+        gain, phase, _, amounts = torch.split(self.widths, parts)
+        of_factors = (power * (gain.square() + phase.square())) @ self.rows.abs().square().T
+        by_amounts = torch.einsum("nm,kpm->knp", drives, self.changes).abs() * amounts[:, None, None]
+        of_entries = power.sum(dim=1, keepdim=True) * self.spread.square()
+        variance = of_factors + by_amounts.square().sum(dim=0) + of_entries + self.usual_variance
+        return variance.sqrt()
 
     @classmethod
     def unknown(cls, read: Magnitudes, transducers: int) -> MatrixPrior:
@@ -221,6 +235,10 @@ class MatrixPosterior:
             factors=torch.lerp(self.factors, other.factors, share),
             entries=self.entries + share * (other.entries - self.entries),
         )
+
+    def misfit(self, drives: torch.Tensor, read: Magnitudes) -> torch.Tensor:
+        """Return twice the negative logarithm of the posterior by readings (N, P), up to a constant."""
+        return self._misfit(self.linearised(drives, read))
 
     def _misfit(self, line: LinearisedReadings) -> torch.Tensor:
         """Return twice the negative logarithm of the posterior, up to a constant."""

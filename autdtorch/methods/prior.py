@@ -13,7 +13,14 @@ from autdtorch.methods.matrix_posterior import MatrixPrior
 from autdtorch.methods.problem import Problem
 from autdtorch.objectives.objective import validate_matrix
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.validation import complex_tensor, invalid, number_between, require_known, within
+from autdtorch.utils.validation import (
+    complex_tensor,
+    invalid,
+    number_between,
+    positive,
+    require_known,
+    within,
+)
 
 _STARTS, _CLIMB_STEPS = 16, 300  # of the climbs to the best drive of a simulation
 
@@ -37,7 +44,9 @@ class Prior:
         transfer_matrix: G (P, M) [Pa] of the simulation; None for the one that the objective has: a
             `SimulatedObjective`, also within perturbations, or a `HardwareObjective` made with one.
         variants: transfer matrices (K, P, M) [Pa] of the scene as it may also be, each simulated with one
-            change of the size that is to be expected: an obstacle 2 mm aside, the air 5 K warmer.
+            change of the size that is to be expected: an obstacle 2 mm aside, the air 5 K warmer. For
+            `calibrate` also names of changes with their standard deviations, such as ``{"obstacles.x": 2e-3,
+            "temperature": 5.0}``; see `SceneChanges`.
         gain: standard deviation of the logarithm of a transducer's gain, 1e-6 to 3.
         phase: of a transducer's phase [rad], 1e-6 to 2 pi.
         rest: of an entry, in rms entries of its row, 1e-6 to 10.
@@ -47,7 +56,7 @@ class Prior:
     """
 
     transfer_matrix: torch.Tensor | None = field(default=None, repr=False)
-    variants: torch.Tensor | None = field(default=None, repr=False)
+    variants: torch.Tensor | Mapping[str, float] | None = field(default=None, repr=False)
     gain: float = 0.1
     phase: float = 0.5
     rest: float = 0.15
@@ -59,7 +68,10 @@ class Prior:
             if matrix.ndim != 2:
                 raise ValueError(f"transfer_matrix: shape {tuple(matrix.shape)}; must be (P, M)")
             object.__setattr__(self, "transfer_matrix", matrix)
-        if self.variants is not None:
+        if isinstance(self.variants, Mapping):
+            widths = {name: positive(f"variants[{name!r}]", width) for name, width in self.variants.items()}
+            object.__setattr__(self, "variants", widths)
+        elif self.variants is not None:
             variants = complex_tensor("variants", self.variants).detach().cpu()
             if variants.ndim != 3:
                 raise ValueError(f"variants: shape {tuple(variants.shape)}; must be (K, P, M)")
@@ -87,7 +99,7 @@ def prior_mean(prior: Prior, problem: Problem) -> torch.Tensor:
         raise invalid("prior.transfer_matrix", None, "must be given where the objective has none")
     shape = problem.foci, problem.transducers
     matrix = validate_matrix("prior.transfer_matrix", matrix, *shape)
-    if prior.variants is not None and (prior.variants.shape[1:] != shape):
+    if isinstance(prior.variants, torch.Tensor) and prior.variants.shape[1:] != shape:
         accepted = f"must be (K, {shape[0]}, {shape[1]})"
         raise ValueError(f"prior.variants: shape {tuple(prior.variants.shape)}; {accepted}")
     return matrix
@@ -96,20 +108,39 @@ def prior_mean(prior: Prior, problem: Problem) -> torch.Tensor:
 def matrix_prior(prior: Prior, problem: Problem) -> MatrixPrior:
     """Return the Gaussian prior of the transfer matrix of a problem."""
     matrix = prior_mean(prior, problem)
-    each = torch.ones(problem.transducers, **REAL)
+    if isinstance(prior.variants, Mapping):
+        accepted = "must be transfer matrices (K, P, M) here; calibrate takes names, and gives a prior"
+        raise invalid("prior.variants", [*prior.variants], accepted)
     changes = matrix.new_empty(0, *matrix.shape) if prior.variants is None else prior.variants - matrix
-    widths = [
-        prior.gain * each,
-        prior.phase * each,
-        _SCALE * each[:1],
-        _TURN * each[:1],
-        each.new_ones(len(changes)),
-    ]
+    return gaussian_prior(prior, matrix, changes, torch.ones(len(changes), **REAL))
+
+
+def gaussian_prior(
+    prior: Prior,
+    matrix: torch.Tensor,
+    changes: torch.Tensor,
+    widths: torch.Tensor,
+    amounts: torch.Tensor | None = None,
+) -> MatrixPrior:
+    """Return the Gaussian prior around a simulated matrix (P, M) [Pa].
+
+    Args:
+        prior: trust in the simulation.
+        matrix: simulated with some amounts of changes.
+        changes: derivatives (K, P, M) of the matrix there.
+        widths: standard deviations of the amounts (K,).
+        amounts: those of the matrix (K,); None for 0.
+    """
+    each = torch.ones(matrix.shape[1], **REAL)
     entries = matrix.abs().square().mean(dim=1).sqrt()
     if not entries.any():
         raise invalid("prior.transfer_matrix", 0, "must not be 0 throughout")
     spread = prior.rest * entries.clamp_min(_DARK * float(entries.max()))
-    return MatrixPrior(matrix, spread, torch.cat(widths), changes)
+    rows = matrix if amounts is None else matrix - (amounts[:, None, None] * changes).sum(dim=0)
+    of_all = each.new_tensor([_SCALE, _TURN])
+    return MatrixPrior(
+        rows, spread, torch.cat([prior.gain * each, prior.phase * each, of_all, widths]), changes
+    )
 
 
 def best_simulated_drives(

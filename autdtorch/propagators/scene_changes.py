@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from autdtorch.propagators.free_space import FreeSpacePropagator
-from autdtorch.propagators.simulated import SimulatedPropagator
+from autdtorch.propagators.simulated import Propagator, SimulatedPropagator
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.changes import Amounts, changed_points, changed_scene, lever, require_change, unit_of
 from autdtorch.scene.scene import Scene
@@ -34,7 +34,7 @@ class SceneChanges:
 
     def __init__(
         self,
-        propagator: FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator,
+        propagator: Propagator,
         names: Sequence[str],
         points: ArrayLike | None = None,
     ) -> None:

@@ -1,0 +1,1 @@
+"""Calibration: a simulation is fitted to readings, and says how sure it is."""

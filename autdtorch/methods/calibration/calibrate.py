@@ -1,0 +1,186 @@
+"""Calibration of a simulation by readings, with its score at readings held back."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import replace
+
+import torch
+
+from autdtorch.methods.calibration.calibration import Calibration, HeldBack
+from autdtorch.methods.calibration.fit import CalibrationFit, fitted
+from autdtorch.methods.calibration.simulation import Simulation
+from autdtorch.methods.doubtful_readings import saturation_doubts
+from autdtorch.methods.prior import Prior, prior_of
+from autdtorch.objectives.readings import Readings
+from autdtorch.propagators import Propagator
+from autdtorch.utils.array_types import REAL
+from autdtorch.utils.process import one_library_thread
+from autdtorch.utils.validation import ArrayLike, integer_at_least, invalid, require_kind
+
+logger = logging.getLogger(__name__)
+
+_INTERVAL = 1.96  # standard deviations of a 95 % interval
+_LEAST_DRIVES = 2  # for each fold, to hold back drives; else readings are held back one by one
+_SHIFTS = (-3, -2, -1, 1, 2, 3)  # rows by which readings and drives may be shifted
+_COMPARED = 24  # least number of drives to look for a shift or a failed sensor
+_FOLLOWS = 0.3  # least rank correlation with the drives of a sensor that follows them
+
+
+@one_library_thread()
+def calibrate(
+    propagator_or_matrix: Propagator | ArrayLike,
+    readings: Readings,
+    prior: Prior | None = None,
+    *,
+    folds: int = 5,
+    seed: int = 0,
+) -> Calibration:
+    """Fit a simulation to readings: gains and phases of transducers, a scale, changes of the scene.
+
+    The model is p = c G(t) diag(g e^{i b}) q, with errors of single entries of the matrix besides, all with
+    the widths of the prior. Readings of the magnitude constrain it, and phases where they were read, up to a
+    common one. The likeliest values are sought by Gauss-Newton steps, and deviations are those of the
+    posterior linearised there (Laplace's approximation). Readings that stay beyond six deviations are left
+    out and named.
+
+    Args:
+        propagator_or_matrix: of the scene, or its transfer matrix G (P, M) [Pa].
+        readings: drives and pressures; at the scene's control points if they have no points.
+        prior: how far to trust the simulation; ``variants={"obstacles.x": 2e-3}`` names changes of the scene.
+        folds: parts of the readings that are held back in turn for `Calibration.held_back`; 0 to leave it
+            out. Each costs a fit.
+        seed: of the parts.
+
+    Raises:
+        ValueError: readings of another array or other points, variants that do not fit, readings shifted
+            against their drives, or fewer readings than folds.
+    """
+    require_kind("readings", readings, Readings)
+    prior = prior_of("prior", prior) or Prior()
+    folds = integer_at_least("folds", folds, 0)
+    if readings.count == 0:
+        raise invalid("readings", readings, "must have at least one reading")
+    if folds == 1 or folds > readings.count:
+        raise invalid("folds", folds, f"must be 0, or 2 to {readings.count}, the number of readings")
+    simulation = Simulation.of(propagator_or_matrix, readings, prior)
+    start = simulation.changes.matrix(torch.zeros_like(simulation.widths)).to("cpu", torch.complex128)
+    expected = (readings.drives @ start.T).abs()
+    _require_in_step(expected, readings.pressure)
+    fit, failed = _fit_without_failed(simulation, readings, prior, expected)
+    used = _without(readings, failed.expand_as(readings.pressure))
+    doubts = [
+        f"point {point} does not follow the drives, and is left out: has its sensor failed?"
+        for point in failed.nonzero()[:, 0].tolist()
+    ]
+    for point in range(len(failed)):
+        doubts += saturation_doubts(fit.read, point)
+    for doubt in doubts:
+        logger.warning("calibration: %s", doubt)
+    calibration = Calibration(simulation, used, prior, fit, None, tuple(doubts))
+    for row, column in calibration.outliers:
+        logger.warning(
+            "calibration: the reading of drive %d at point %d, %.4g Pa, is far from the fit, and left out",
+            row,
+            column,
+            float(readings.pressure[row, column]),
+        )
+    if not folds:
+        return calibration
+    return replace(calibration, held_back=_held_back(calibration, start, folds, seed))
+
+
+def _held_back(calibration: Calibration, start: torch.Tensor, folds: int, seed: int) -> HeldBack:
+    """Return errors at readings held back in turn, from fits around the amounts of all readings."""
+    readings, errors, others, scaled = calibration.readings, [], [], []
+    known = ~readings.pressure.isnan() & ~calibration.fit.read.outliers
+    clean = _without(readings, ~known)
+    here = calibration.simulation.linear_at(calibration.fit.amounts)
+    for away in _parts(known, folds, seed):
+        rest = _without(clean, away)
+        fit = fitted(here, rest, calibration.settings)
+        part = replace(calibration, simulation=here, readings=rest, fit=fit)
+        prediction, taken = part.predict(readings.drives), away & known
+        observed = readings.pressure[taken]
+        errors.append(prediction.pressure[taken] - observed)
+        scaled.append(errors[-1] / prediction.of_reading[taken])
+        simulated, seen = (readings.drives @ start.T).abs(), known & ~away
+        gain = (simulated[seen] * readings.pressure[seen]).sum() / simulated[seen].square().sum()
+        others.append(gain * simulated[taken] - observed)
+    rms = readings.pressure[known].square().mean().sqrt()
+    error, before = (float(torch.cat(parts).square().mean().sqrt() / rms) for parts in (errors, others))
+    inside = torch.cat(scaled).abs() < _INTERVAL
+    return HeldBack(error, before, float(inside.double().mean()), len(inside))
+
+
+def _parts(known: torch.Tensor, folds: int, seed: int) -> Iterator[torch.Tensor]:
+    """Yield masks (N, P) of readings to hold back: of whole drives, or of readings where drives are few."""
+    generator = torch.Generator().manual_seed(seed)
+    if len(known) >= _LEAST_DRIVES * folds:
+        order = torch.randperm(len(known), generator=generator, device="cpu")
+        for part in order.chunk(folds):
+            away = torch.zeros_like(known)
+            away[part] = True
+            yield away
+        return
+    places = known.nonzero()
+    for part in torch.randperm(len(places), generator=generator, device="cpu").chunk(folds):
+        away = torch.zeros_like(known)
+        away[tuple(places[part].T)] = True
+        yield away
+
+
+def _without(readings: Readings, gaps: torch.Tensor) -> Readings:
+    """Return readings with gaps (N, P) where they are not used."""
+    return replace(readings, pressure=readings.pressure.masked_fill(gaps, torch.nan))
+
+
+def _require_in_step(expected: torch.Tensor, observed: torch.Tensor) -> None:
+    """Refuse readings (N, P) that fit the drives of other rows far better than their own."""
+    if len(observed) < _COMPARED:
+        return
+    level = _correlation(expected, observed)
+    for shift in _SHIFTS:
+        one, other = (
+            (expected[shift:], observed[:-shift]) if shift > 0 else (expected[:shift], observed[-shift:])
+        )
+        if (shifted := _correlation(one, other)) > max(_FOLLOWS, level + 4 / observed.numel() ** 0.5):
+            where = "before" if shift > 0 else "after"
+            follow = f"they follow the drives {abs(shift)} rows {'later' if shift > 0 else 'earlier'}"
+            raise ValueError(
+                f"readings.pressure: shifted against the drives: {follow} (correlation {shifted:.2f}, "
+                f"{level:.2f} as given); remove {abs(shift)} rows of the one {where} the other"
+            )
+
+
+def _fit_without_failed(
+    simulation: Simulation, readings: Readings, prior: Prior, expected: torch.Tensor
+) -> tuple[CalibrationFit, torch.Tensor]:
+    """Return the fit, and the points (P,), bool, that neither simulation nor other readings explain."""
+    observed = readings.pressure
+    suspects = _failed(expected, observed)
+    if not suspects.any() or suspects.all():
+        return fitted(simulation, readings, prior), torch.zeros_like(suspects)
+    fit = fitted(simulation, _without(readings, suspects.expand_as(observed)), prior)
+    failed = suspects & _failed((readings.drives @ fit.posterior.matrix.T).abs(), observed)
+    if not torch.equal(failed, suspects):
+        fit = fitted(simulation, _without(readings, failed.expand_as(observed)), prior)
+    return fit, failed
+
+
+def _failed(expected: torch.Tensor, observed: torch.Tensor) -> torch.Tensor:
+    """Return the points (P,), bool, whose readings (N, P) do not follow the expected ones."""
+    columns = [_correlation(a[:, None], b[:, None]) for a, b in zip(expected.T, observed.T, strict=True)]
+    return torch.tensor(columns, **REAL) < (_FOLLOWS if len(observed) >= _COMPARED else -1.0)
+
+
+def _correlation(expected: torch.Tensor, observed: torch.Tensor) -> float:
+    """Return the mean over points of the rank correlation of magnitudes (N, P), without gaps."""
+    levels = []
+    for one, other in zip(expected.T, observed.T, strict=True):
+        known = ~other.isnan()
+        ranks = torch.stack([each[known].argsort().argsort().double() for each in (one, other)])
+        if ranks.shape[1] > 2:
+            levels.append(torch.corrcoef(ranks)[0, 1].nan_to_num())
+    return float(torch.stack(levels).mean()) if levels else 0.0

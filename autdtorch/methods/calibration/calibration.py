@@ -1,0 +1,258 @@
+"""The result of a calibration: what the readings say of array and scene, how surely, and predictions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+
+from autdtorch.methods.calibration.fit import CalibrationFit, around_amounts
+from autdtorch.methods.calibration.simulation import Simulation
+from autdtorch.methods.doubtful_readings import Magnitudes
+from autdtorch.methods.prior import Prior
+from autdtorch.objectives.objective import validate_drives
+from autdtorch.objectives.readings import Readings
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.array_types import COMPLEX
+from autdtorch.utils.process import cached_property, one_library_thread
+from autdtorch.utils.text import html_facts
+from autdtorch.utils.validation import ArrayLike, complex_tensor, points_tensor
+
+_SHOWN = 0.5  # share of a transducer's prior variance that readings explain, above which they determine it
+_ALIKE = 0.9999  # cosine of two transducers' derivatives above which readings show them only together
+
+
+class Amount(NamedTuple):
+    """The fitted amount of a change, in SI units, and its standard deviation."""
+
+    value: float
+    deviation: float
+
+
+class Prediction(NamedTuple):
+    """Predicted magnitudes (N, P) [Pa].
+
+    Attributes:
+        pressure: the likeliest magnitudes.
+        deviation: their standard deviations.
+        of_reading: standard deviations of readings, with the noise.
+    """
+
+    pressure: torch.Tensor
+    deviation: torch.Tensor
+    of_reading: torch.Tensor
+
+
+class HeldBack(NamedTuple):
+    """Errors at readings that were held back from the fit, in turn.
+
+    Attributes:
+        error: rms error of the calibrated predictions over the rms reading.
+        before: that of the simulation with one free gain.
+        coverage: share of the readings within the stated 95 % intervals.
+        readings: number of readings.
+    """
+
+    error: float
+    before: float
+    coverage: float
+    readings: int
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibration:
+    """A simulation that was fitted to readings; `calibrate` makes it.
+
+    Attributes:
+        simulation: before the fit.
+        readings: that were fitted.
+        prior: trust in the simulation.
+        fit: the posterior around the likeliest matrix.
+        held_back: errors at readings that were held back; None without.
+        doubts: sentences about sensors and readings that do not fit.
+    """
+
+    simulation: Simulation
+    readings: Readings
+    settings: Prior
+    fit: CalibrationFit
+    held_back: HeldBack | None
+    doubts: tuple[str, ...]
+
+    @property
+    def transfer_matrix(self) -> torch.Tensor:
+        """The calibrated transfer matrix (P, M) [Pa] at the points of the readings."""
+        return self.fit.posterior.matrix
+
+    @property
+    def gain(self) -> torch.Tensor:
+        """Gain of each transducer (M,) by the simulation's, besides the scale."""
+        return self._factors[0].exp()
+
+    @property
+    def gain_deviation(self) -> torch.Tensor:
+        """Standard deviations of the gains (M,), relative."""
+        return self._deviations[0]
+
+    @property
+    def phase(self) -> torch.Tensor:
+        """Phase of each transducer (M,) beside the simulation's [rad]: p = G e^(i phase) q."""
+        return self._factors[1]
+
+    @property
+    def phase_deviation(self) -> torch.Tensor:
+        """Standard deviations of the phases (M,) [rad]."""
+        return self._deviations[1]
+
+    @property
+    def scale(self) -> Amount:
+        """Scale of all readings by the simulation, and its standard deviation."""
+        value = self.fit.unit * float(self._factors[2].exp())
+        return Amount(value, value * float(self._deviations[2]))
+
+    @property
+    def amounts(self) -> Mapping[str, Amount]:
+        """Amounts of the changes of the scene, by name."""
+        rows = zip(self._factors[4].tolist(), self._deviations[4].tolist(), strict=True)
+        return {name: Amount(*row) for name, row in zip(self.simulation.changes.names, rows, strict=True)}
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the readings' noise [Pa]."""
+        return float(self.fit.posterior.variance.mean().sqrt())
+
+    @property
+    def outliers(self) -> list[tuple[int, int]]:
+        """Drive and point of each reading that was left out, counted from 0."""
+        rejected = self.fit.read.outliers & ~self.readings.pressure.isnan()
+        return [(row, column) for row, column in rejected.nonzero().tolist()]
+
+    @cached_property
+    def determined(self) -> float:
+        """Number of directions of gains and phases (of 2 M) that the readings determine."""
+        transducers = 2 * len(self.gain)
+        left = self.fit.line.covariance.of_factors[:transducers, :transducers]
+        return float(transducers - torch.linalg.eigvalsh(left).clamp(0, 1).sum())
+
+    @cached_property
+    def together(self) -> list[list[int]]:
+        """Groups of transducers that the readings show only together, such as rings of symmetric drives."""
+        by_gain = self.fit.line.by_factors.flatten(0, 1)[:, : len(self.gain)]
+        unit = by_gain / by_gain.norm(dim=0).clamp_min(torch.finfo(by_gain.dtype).tiny)
+        alike, seen, groups = unit.mT @ unit > _ALIKE, set[int](), []
+        for transducer, row in enumerate(alike):
+            members = [each for each in row.nonzero()[:, 0].tolist() if each not in seen]
+            seen |= {*members, transducer}
+            if len(members) > 1:
+                groups.append(members)
+        return groups
+
+    @property
+    def scene(self) -> Scene | None:
+        """The scene with the fitted changes, gains, phases and scale; None where a matrix was calibrated."""
+        scene = self.simulation.changed_scene(self._factors[4])
+        if scene is None:
+            return None
+        array = scene.array.calibrated(self.scale.value * self.gain, self.phase)
+        return replace(scene, array=array)
+
+    @property
+    def prior(self) -> Prior:
+        """The prior of a method that reads on at the same points: the matrix, and what is left unsure."""
+        steps = self._deviations[4][:, None, None] * self.fit.posterior.prior.changes
+        matrix = self.transfer_matrix
+        return Prior(
+            matrix,
+            matrix + steps if len(steps) else None,
+            gain=float(self.gain_deviation.square().mean().sqrt()),
+            phase=float(self.phase_deviation.square().mean().sqrt()),
+            rest=self.settings.rest,
+        )
+
+    @one_library_thread()
+    def predict(self, drives: ArrayLike, points: ArrayLike | None = None) -> Prediction:
+        """Predict magnitudes of drives (..., M), flattened to (N, M), at points.
+
+        Args:
+            drives: (..., M), |q| <= 1.
+            points: (P, 3) [m]; None for those of the readings, whose rows of the matrix are known best.
+
+        Raises:
+            ValueError: drives of another shape, or points where a matrix alone was calibrated.
+        """
+        played = validate_drives(complex_tensor("drives", drives), self.readings.drives.shape[1])
+        played = played.reshape(-1, played.shape[-1]).to(**COMPLEX)
+        posterior = self.fit.posterior
+        if points is not None:
+            changes = self.simulation.elsewhere(points_tensor("points", points))
+            around = around_amounts(changes, self.simulation.widths, self.settings, self.fit.amounts)
+            around = around.times(self.fit.unit)
+            entries = around.rows.new_zeros(around.rows.shape)
+            variance = posterior.variance.mean().expand_as(around.spread)
+            posterior = replace(posterior, prior=around, entries=entries, variance=variance)
+        magnitudes = (played @ posterior.matrix.T).abs()
+        others = posterior.linearised(
+            played, Magnitudes(magnitudes, torch.zeros_like(magnitudes, dtype=torch.bool))
+        )
+        deviation = self.fit.line.covariance.deviations_of(others, same_points=points is None)
+        return Prediction(magnitudes, deviation, (deviation.square() + posterior.variance).sqrt())
+
+    @property
+    def _factors(self) -> tuple[torch.Tensor, ...]:
+        return self._split(self.fit.posterior.factors)
+
+    @property
+    def _deviations(self) -> tuple[torch.Tensor, ...]:
+        return self._split(self.fit.deviations)
+
+    def _split(self, factors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return gains, phases, scale, common phase and amounts of factors."""
+        transducers = self.readings.drives.shape[1]
+        sizes = [transducers, transducers, 1, 1, len(factors) - 2 * transducers - 2]
+        return torch.split(factors, sizes)
+
+    def summary(self) -> str:
+        """Return the facts as lines of text."""
+        width = max(len(name) for name, _ in self._facts())
+        return "\n".join(f"{name:{width}}  {value}" for name, value in self._facts())
+
+    def __repr__(self) -> str:
+        """Return the facts in a line."""
+        return f"Calibration({', '.join(f'{name} {value}' for name, value in self._facts())})"
+
+    def _repr_html_(self) -> str:
+        """Return the facts as a table, for Jupyter."""
+        return html_facts("Calibration", self._facts())
+
+    def _facts(self) -> list[tuple[str, str]]:
+        facts = [("readings", f"{self.readings.count} of {len(self.readings)} drives")]
+        if (held := self.held_back) is not None:
+            error = f"{held.error:.1%} after, {held.before:.1%} before with one gain"
+            facts += [
+                ("error at readings held back", error),
+                ("held by 95 % intervals", f"{held.coverage:.0%} of {held.readings}"),
+            ]
+        spread = (self.gain.log() - self.gain.log().mean()).square().mean().sqrt()
+        facts += [
+            ("scale", f"{self.scale.value:.4g} +- {self.scale.deviation:.2g}"),
+            ("gains", f"spread {float(spread):.1%}, each +- {float(self.gain_deviation.mean()):.1%}"),
+            (
+                "phases",
+                f"spread {float(self.phase.square().mean().sqrt()):.3f} rad, each +- "
+                f"{float(self.phase_deviation.mean()):.3f} rad",
+            ),
+            ("noise", f"{self.noise:.3g} Pa"),
+            ("determined", f"{self.determined:.0f} of {2 * len(self.gain)} directions of gains and phases"),
+        ]
+        facts += [
+            (name, f"{value:.4g} +- {deviation:.2g}") for name, (value, deviation) in self.amounts.items()
+        ]
+        if self.together:
+            facts.append(("seen only together", f"{len(self.together)} groups of transducers"))
+        if self.outliers:
+            places = ", ".join(f"drive {row} point {column}" for row, column in self.outliers[:5])
+            more = f" and {len(self.outliers) - 5} more" if len(self.outliers) > 5 else ""
+            facts.append(("left out", places + more))
+        return facts + [("doubt", doubt) for doubt in self.doubts]

@@ -1,0 +1,146 @@
+"""The fit of a simulation to readings: gains, phases, scale, and amounts of changes by linearising again."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+
+import torch
+
+from autdtorch.methods.calibration.simulation import Changes, Simulation
+from autdtorch.methods.doubtful_readings import Magnitudes
+from autdtorch.methods.linearised_readings import LinearisedReadings
+from autdtorch.methods.matrix_fit import Trial
+from autdtorch.methods.matrix_posterior import MatrixPosterior, MatrixPrior
+from autdtorch.methods.prior import Prior, gaussian_prior
+from autdtorch.objectives.readings import Readings
+from autdtorch.utils.process import cached_property
+
+logger = logging.getLogger(__name__)
+
+_ROUNDS = 12  # linearisations by the amounts of changes
+_ENOUGH = 0.1  # change of the amounts, in their standard deviations, at which they have converged
+_HALVINGS = 3  # of a step of the amounts that fits worse, or that the scene cannot take
+_TEMPERED = (1000.0, 300.0, 100.0, 30.0, 10.0, 3.0)
+"""Factors of the assumed noise in the first fits: the maximum is followed from one that noise makes wide, and
+fewer fits end in a local one (64 drives of 249 transducers: twice the negative logarithm is 232 for 261)."""
+
+_FAR = 6.0  # standard deviations of the prior beyond which a reading is an outlier at first
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationFit:
+    """The posterior of a calibration, and the readings as they were taken.
+
+    Attributes:
+        posterior: of the transfer matrix, linearised by the amounts around the last ones but one.
+        read: magnitudes (N, P) and phases; outliers and gaps say nothing.
+        drives: (N, M).
+        unit: scale of the readings by the simulation before the fit.
+    """
+
+    posterior: MatrixPosterior
+    read: Magnitudes
+    drives: torch.Tensor
+    unit: float
+
+    @property
+    def amounts(self) -> torch.Tensor:
+        """The fitted amounts of the changes (K,)."""
+        return self.posterior.factors[2 * self.drives.shape[1] + 2 :]
+
+    @cached_property
+    def line(self) -> LinearisedReadings:
+        """The readings, linearised at the maximum."""
+        return self.posterior.linearised(self.drives, self.read)
+
+    @cached_property
+    def deviations(self) -> torch.Tensor:
+        """The standard deviations of the factors, as those of `MatrixPrior.widths`."""
+        return self.posterior.prior.widths * self.line.covariance.of_factors.diagonal().clamp_min(0).sqrt()
+
+    @property
+    def before(self) -> dict[str, torch.Tensor]:
+        """Tensors from which another fit goes on."""
+        posterior = self.posterior
+        return {
+            "factors": posterior.factors,
+            "entries": posterior.entries,
+            "variance": posterior.variance,
+            "spread": posterior.prior.spread,
+            "outliers": self.read.outliers,
+        }
+
+
+def fitted(simulation: Simulation, readings: Readings, prior: Prior) -> CalibrationFit:
+    """Fit a simulation to readings.
+
+    The matrix is linearised by the amounts of changes, fitted, and linearised again at the fitted amounts
+    until they no longer change (Gauss-Newton). A step that fits worse than the one before is halved.
+    """
+    amounts = torch.zeros_like(simulation.widths)
+    around = around_amounts(simulation.changes, simulation.widths, prior, amounts)
+    unit = around.unit_of(readings.drives, readings.pressure)
+    fit = _first(around.times(unit), readings, unit)
+    for _ in range(_ROUNDS):
+        before, prior_here = fit, around.times(unit)
+        trial = Trial(prior_here, fit.before, readings.drives, readings.pressure, phase=readings.phase).fit()
+        fit = replace(fit, posterior=trial.posterior, read=trial.read)
+        step = fit.amounts - amounts
+        if not len(amounts) or (step.abs() < _ENOUGH * fit.deviations[-len(amounts) :]).all():
+            break
+        fit, around, amounts = _moved(simulation, prior, before, fit, amounts)
+        logger.debug("calibration: amounts %s", amounts.tolist())
+    return fit
+
+
+def around_amounts(
+    changes: Changes, widths: torch.Tensor, prior: Prior, amounts: torch.Tensor
+) -> MatrixPrior:
+    """Return the prior of a matrix by changes of widths (K,), linearised around amounts (K,)."""
+    matrix = changes.matrix(amounts).to("cpu", torch.complex128)
+    derivatives = changes.derivatives(amounts).to("cpu", torch.complex128)
+    return gaussian_prior(prior, matrix, derivatives, widths, amounts)
+
+
+def _first(prior: MatrixPrior, readings: Readings, unit: float) -> CalibrationFit:
+    """Return the maximum of the prior, with the common phase of the readings and without outliers far off."""
+    drives, observed = readings.drives, readings.pressure
+    expected = drives @ prior.rows.T
+    start = MatrixPosterior.start(prior)
+    if readings.phase is not None:
+        parts = torch.polar(observed, readings.phase) * expected.conj()
+        start.factors[2 * drives.shape[1] + 1] = parts[parts.abs().isfinite()].sum().angle()
+    far = (observed - expected.abs()).abs() > _FAR * prior.errors(drives)
+    outliers = far | observed.isnan()
+    read = Magnitudes.of(observed, outliers, torch.full_like(observed[0], torch.inf), readings.phase)
+    usual = start.variance
+    for factor in _TEMPERED:
+        start = replace(start, variance=factor * usual).fitted(drives, read, infer_noise=False)
+    return CalibrationFit(start, read, drives, unit)
+
+
+def _moved(
+    simulation: Simulation,
+    prior: Prior,
+    before: CalibrationFit,
+    fit: CalibrationFit,
+    start: torch.Tensor,
+) -> tuple[CalibrationFit, MatrixPrior, torch.Tensor]:
+    """Return a fit with its amounts, or nearer to those at the start, where it fits better than before."""
+    factors = len(fit.posterior.factors) - len(start)
+    worst = replace(before.posterior, variance=fit.posterior.variance).misfit(fit.drives, fit.read)
+    for halving in range(_HALVINGS + 1):
+        amounts = start + 0.5**halving * (fit.amounts - start)
+        try:
+            around = around_amounts(simulation.changes, simulation.widths, prior, amounts)
+        except ValueError as error:
+            if halving == _HALVINGS:
+                raise
+            logger.info("calibration: amounts %s are no scene: %s", amounts.tolist(), error)
+            continue
+        moved = torch.cat([fit.posterior.factors[:factors], amounts])
+        there = replace(fit.posterior, prior=around.times(fit.unit), factors=moved)
+        if there.misfit(fit.drives, fit.read) < worst:
+            break
+    return replace(fit, posterior=there), around, amounts

@@ -1,0 +1,139 @@
+"""A simulation as calibration sees it: the transfer matrix by amounts of named changes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import torch
+
+from autdtorch.methods.prior import Prior
+from autdtorch.objectives.readings import Readings
+from autdtorch.propagators import Propagator
+from autdtorch.propagators.scene_changes import SceneChanges
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.array_types import REAL
+from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid
+
+
+@dataclass(frozen=True, eq=False)
+class LinearChanges:
+    """A matrix (P, M) [Pa], and its changes (K, P, M) by amounts of 1, with their names."""
+
+    start: torch.Tensor
+    steps: torch.Tensor
+    names: tuple[str, ...] = ()
+
+    def matrix(self, amounts: torch.Tensor) -> torch.Tensor:
+        """Return the matrix (P, M) [Pa]."""
+        return self.start + (amounts[:, None, None] * self.steps).sum(dim=0)
+
+    def derivatives(self, amounts: torch.Tensor) -> torch.Tensor:
+        """Return the derivatives (K, P, M) of the matrix by the amounts."""
+        return self.steps
+
+
+Changes: TypeAlias = SceneChanges | LinearChanges
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """The simulation that a calibration starts from.
+
+    Attributes:
+        propagator: of the scene; None where a transfer matrix alone is known.
+        changes: the transfer matrix at the points of the readings.
+        widths: standard deviations of the amounts (K,).
+        points: of the readings (P, 3) [m], None for the control points of the scene, or of the matrix.
+    """
+
+    propagator: Propagator | None
+    changes: Changes
+    widths: torch.Tensor
+    points: torch.Tensor | None
+
+    @classmethod
+    def of(cls, model: Propagator | ArrayLike, readings: Readings, prior: Prior) -> Simulation:
+        """Check a propagator, or a transfer matrix (P, M) [Pa], against the readings and the prior."""
+        if prior.transfer_matrix is not None:
+            accepted = "must be None: calibrate takes the matrix as its first argument"
+            raise invalid("prior.transfer_matrix", "given", accepted)
+        propagator = model if isinstance(model, Propagator) else None
+        points, variants = readings.points, prior.variants
+        if propagator is None:
+            if points is not None:
+                accepted = (
+                    "must be None with a transfer matrix, whose rows are the points; or give a propagator"
+                )
+                raise invalid("readings.points", points, accepted)
+            matrix = complex_tensor("propagator_or_matrix", model).detach().cpu()
+            changes: Changes = _linear(matrix, prior)
+        elif isinstance(variants, Mapping):
+            changes = SceneChanges(propagator, tuple(variants), points)
+        else:
+            matrix = propagator.transfer_matrix(points).detach().to("cpu", torch.complex128)
+            changes = _linear(matrix, prior)
+        widths = variants.values() if isinstance(variants, Mapping) else [1.0] * len(changes.names)
+        simulation = cls(propagator, changes, torch.tensor([*widths], **REAL), points)
+        simulation._require_fit(readings)
+        return simulation
+
+    @property
+    def scene(self) -> Scene | None:
+        """The scene of the propagator."""
+        return None if self.propagator is None else self.propagator.scene
+
+    def linear_at(self, amounts: torch.Tensor) -> Simulation:
+        """Return the simulation linearised around amounts (K,)."""
+        steps = self.changes.derivatives(amounts).to("cpu", torch.complex128)
+        start = self.changes.matrix(amounts).to("cpu", torch.complex128)
+        start = start - (amounts[:, None, None] * steps).sum(dim=0)
+        return replace(self, changes=LinearChanges(start, steps, self.changes.names))
+
+    def changed_scene(self, amounts: torch.Tensor) -> Scene | None:
+        """Return the scene with amounts (K,) of the changes; None where there is a matrix alone."""
+        return self.changes.scene(amounts) if isinstance(self.changes, SceneChanges) else self.scene
+
+    def elsewhere(self, points: torch.Tensor) -> Changes:
+        """Return the matrix by amounts at other points (P, 3) [m]."""
+        if self.propagator is None:
+            raise invalid("points", points, "must be None: the calibration knows a matrix, and no propagator")
+        if isinstance(self.changes, SceneChanges):
+            return SceneChanges(self.propagator, self.changes.names, points)
+        if len(self.changes.names):
+            accepted = (
+                "must be None: variants that are matrices are known at their points alone; name changes"
+            )
+            raise invalid("points", points, accepted)
+        matrix = self.propagator.transfer_matrix(points).detach().to("cpu", torch.complex128)
+        return LinearChanges(matrix, matrix.new_empty(0, *matrix.shape))
+
+    def _require_fit(self, readings: Readings) -> None:
+        shape = (readings.pressure.shape[1], readings.drives.shape[1])
+        if self.scene is not None:
+            points = len(self.scene.control_points) if self.points is None else len(self.points)
+            expected = (points, len(self.scene.array))
+        else:
+            assert isinstance(self.changes, LinearChanges)
+            points, transducers = self.changes.start.shape
+            expected = (points, transducers)
+        if shape != expected:
+            has = f"{shape[0]} points and {shape[1]} transducers"
+            raise invalid("readings", has, f"must be {expected[0]} points and {expected[1]} transducers")
+
+
+def _linear(matrix: torch.Tensor, prior: Prior) -> LinearChanges:
+    if matrix.ndim != 2:
+        raise ValueError(f"propagator_or_matrix: shape {tuple(matrix.shape)}; must be (P, M)")
+    variants = prior.variants
+    if isinstance(variants, Mapping):
+        accepted = "must be transfer matrices (K, P, M) where a matrix is calibrated; names need a propagator"
+        raise invalid("prior.variants", [*variants], accepted)
+    if variants is None:
+        return LinearChanges(matrix, matrix.new_empty(0, *matrix.shape))
+    if variants.shape[1:] != matrix.shape:
+        accepted = f"must be (K, {matrix.shape[0]}, {matrix.shape[1]})"
+        raise ValueError(f"prior.variants: shape {tuple(variants.shape)}; {accepted}")
+    names = tuple(f"variants[{number}]" for number in range(len(variants)))
+    return LinearChanges(matrix, variants - matrix, names)

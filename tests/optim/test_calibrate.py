@@ -1,0 +1,206 @@
+"""Calibration of a simulation by readings of a simulated bench that differs from it."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import autdtorch as at
+from autdtorch.propagators.scene_changes import SceneChanges
+
+GAIN, PHASE, NOISE = 0.1, 0.5, 0.03  # of the bench; noise relative to the rms pressure
+
+
+def array(shape=(4, 4)):
+    return at.TransducerArray.grid(shape, 10e-3, (0.0, 0.0, 0.0), source_strength=2.0, radius=4.5e-3)
+
+
+def scene(points=3, shape=(4, 4), **fields):
+    places = [[80e-3, 12e-3 * (number - 1), 3e-3 * number] for number in range(points)]
+    return at.Scene(array(shape), at.Medium(1.2, 340.0), 40e3, control_points=places, **fields)
+
+
+class Bench:
+    """Transducers with gains and phases that differ, and a noisy microphone."""
+
+    def __init__(self, matrix, seed, gain=GAIN, phase=PHASE, noise=NOISE, unit=1.0):
+        self.draws = torch.Generator().manual_seed(seed)
+        log_gain, angle = torch.randn(2, matrix.shape[1], dtype=torch.float64, generator=self.draws)
+        self.log_gain, self.phase = gain * log_gain, phase * angle
+        self.matrix = unit * matrix * torch.polar(self.log_gain.exp(), self.phase)
+        self.noise = noise * float(self.matrix.abs().square().sum(dim=1).mean().sqrt())
+
+    def drives(self, count):
+        phases = (
+            2 * math.pi * torch.rand(count, self.matrix.shape[1], dtype=torch.float64, generator=self.draws)
+        )
+        return torch.polar(torch.ones_like(phases), phases)
+
+    def pressure(self, drives):
+        pressure = drives @ self.matrix.T
+        return pressure + self.noise * torch.randn(
+            pressure.shape, dtype=torch.complex128, generator=self.draws
+        )
+
+    def readings(self, count, phase=False, **fields):
+        drives = self.drives(count)
+        pressure = self.pressure(drives)
+        return at.Readings(drives, pressure.abs(), phase=pressure.angle() if phase else None, **fields)
+
+
+def error(calibration, matrix):
+    """Relative error of the calibrated matrix (P, M), up to a phase of each row."""
+    turn = (calibration.transfer_matrix.conj() * matrix).sum(dim=1, keepdim=True).sgn()
+    return float((calibration.transfer_matrix * turn - matrix).norm() / matrix.norm())
+
+
+@pytest.fixture(scope="module")
+def matrix():
+    return at.make_propagator(scene()).transfer_matrix()
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 400.0])
+def test_gains_and_phases_are_those_of_the_bench(matrix, unit):
+    bench = Bench(matrix, 1, unit=unit)
+    calibration = at.calibrate(matrix, bench.readings(120), at.Prior(rest=0.01))
+    # 360 readings of 34 unknowns with 3 % noise: 0.03 / sqrt(360 / 34) = 1 % of the matrix
+    assert error(calibration, bench.matrix) < 0.03
+    off = (calibration.gain.log() - bench.log_gain) / calibration.gain_deviation
+    # The scale takes the mean of the gains in part; of 16 deviates one in 20 is beyond 2.
+    assert (off - off.mean()).abs().max() < 4
+    assert calibration.scale.value == pytest.approx(unit, rel=4 * calibration.scale.deviation / unit + 0.01)
+    held = calibration.held_back
+    assert held.error < 0.5 * held.before
+    assert 0.85 < held.coverage <= 1  # of 360, 95 % +- 1.1 % are expected
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.integers(0, 10**6), st.booleans(), st.sampled_from([1, 3]))
+def test_calibration_predicts_readings_it_has_not_seen(seed, phase, points):
+    matrix = at.make_propagator(scene(points)).transfer_matrix()
+    bench = Bench(matrix, seed)
+    calibration = at.calibrate(matrix, bench.readings(150, phase), at.Prior(rest=0.01), folds=0)
+    drives = bench.drives(200)
+    prediction, truth = calibration.predict(drives), (drives @ bench.matrix.T).abs()
+    inside = (prediction.pressure - truth).abs() < 3 * prediction.deviation + 0.5 * bench.noise
+    assert inside.double().mean() > 0.95
+    # Noise of 3 % on 150 readings or more, of at most 34 unknowns
+    assert (prediction.pressure - truth).norm() < 0.05 * truth.norm()
+
+
+def test_phases_determine_more_than_magnitudes(matrix):
+    bench = Bench(matrix, 3)
+    readings = bench.readings(12, phase=True)
+    turned = dataclasses.replace(readings, phase=readings.phase + 2.5)  # the phase of the trigger is unknown
+    plain = at.calibrate(matrix, dataclasses.replace(readings, phase=None), at.Prior(rest=0.01), folds=0)
+    with_phase = at.calibrate(matrix, turned, at.Prior(rest=0.01), folds=0)
+    assert error(with_phase, bench.matrix) < 0.6 * error(plain, bench.matrix)
+    assert with_phase.phase_deviation.mean() < plain.phase_deviation.mean()
+
+
+def test_outliers_are_named_and_left_out(matrix):
+    bench = Bench(matrix, 4)
+    readings = bench.readings(60)
+    broken = [(3, 0), (17, 2), (40, 1)]
+    pressure = readings.pressure.clone()
+    for place in broken:
+        pressure[place] *= 100
+    calibration = at.calibrate(matrix, dataclasses.replace(readings, pressure=pressure), folds=0)
+    assert set(broken) <= set(calibration.outliers)
+    assert len(calibration.outliers) <= 5
+    clean = at.calibrate(matrix, readings, folds=0)
+    assert error(calibration, bench.matrix) < 1.3 * error(clean, bench.matrix) + 0.01
+
+
+def test_gaps_are_no_readings(matrix):
+    bench = Bench(matrix, 5)
+    readings = bench.readings(60)
+    pressure = readings.pressure.clone()
+    pressure[::3, 1] = torch.nan
+    calibration = at.calibrate(matrix, dataclasses.replace(readings, pressure=pressure), at.Prior(rest=0.01))
+    assert error(calibration, bench.matrix) < 0.08
+    assert not calibration.outliers
+    assert calibration.held_back.readings == 160
+
+
+@pytest.mark.parametrize("shift", [-2, -1, 1, 3])
+def test_shifted_rows_are_refused(matrix, shift):
+    readings = Bench(matrix, 6, phase=0.2).readings(60)
+    with pytest.raises(ValueError, match=rf"follow the drives {abs(shift)} rows"):
+        at.calibrate(matrix, dataclasses.replace(readings, pressure=readings.pressure.roll(shift, 0)))
+
+
+def test_a_failed_microphone_is_named_and_left_out(matrix, caplog):
+    bench = Bench(matrix, 7)
+    readings = bench.readings(60)
+    pressure = readings.pressure.clone()
+    pressure[:, 1] = 0.3 + 0.01 * torch.rand(60, dtype=torch.float64, generator=bench.draws)
+    calibration = at.calibrate(matrix, dataclasses.replace(readings, pressure=pressure), folds=0)
+    assert "point 1 does not follow the drives" in calibration.doubts[0]
+    others = [0, 2]
+    turn = (calibration.transfer_matrix.conj() * bench.matrix)[others].sum(dim=1, keepdim=True).sgn()
+    off = calibration.transfer_matrix[others] * turn - bench.matrix[others]
+    assert off.norm() < 0.15 * bench.matrix[others].norm()
+
+
+def test_symmetric_drives_show_sums_of_their_transducers_only(matrix):
+    bench = Bench(matrix[1:2], 8, phase=0.1)
+    drives = bench.drives(80)
+    drives[:, 8:] = drives[:, :8].flip(1)  # the point lies in the plane of symmetry
+    middle = torch.tensor([[80e-3, 0.0, 0.0]], dtype=torch.float64)
+    symmetric = at.make_propagator(dataclasses.replace(scene(), control_points=middle)).transfer_matrix()
+    readings = at.Readings(drives, (drives @ symmetric.T).abs())
+    calibration = at.calibrate(symmetric, readings, folds=0)
+    assert sorted(map(len, calibration.together)) == [2] * 8
+    assert calibration.determined < 17
+
+
+@pytest.mark.parametrize(
+    "names", [{"points.x": 1e-3, "points.z": 1e-3}, {"temperature": 3.0, "array.y": 1e-3}]
+)
+def test_named_changes_are_found(names):
+    simulated = at.make_propagator(scene())
+    amounts = {name: 1.3 * width for name, width in names.items()}
+    true = SceneChanges(simulated, [*names]).matrix([*amounts.values()])
+    bench = Bench(true, 9, gain=0.02, phase=0.05)
+    prior = at.Prior(variants=names, gain=0.02, phase=0.05, rest=0.01)
+    calibration = at.calibrate(simulated, bench.readings(150), prior, folds=0)
+    for name, (value, deviation) in calibration.amounts.items():
+        assert deviation < names[name]
+        assert abs(value - amounts[name]) < 4 * deviation
+
+
+def test_a_scan_of_a_plane_is_one_drive_at_many_points():
+    y, z = torch.meshgrid(*2 * [torch.linspace(-20e-3, 20e-3, 12, dtype=torch.float64)], indexing="ij")
+    points = torch.stack([torch.full_like(y, 60e-3), y, z], dim=-1).reshape(-1, 3)
+    simulated = at.make_propagator(scene(1))
+    bench = Bench(simulated.transfer_matrix(points), 10)
+    drive = bench.drives(1)
+    readings = at.Readings(drive, bench.pressure(drive).abs(), points)
+    calibration = at.calibrate(simulated, readings, at.Prior(rest=0.01))
+    assert calibration.held_back.error < 0.5 * calibration.held_back.before
+    elsewhere = calibration.predict(drive, points[:4] + 1e-3)
+    assert elsewhere.pressure.shape == (1, 4)
+    assert (elsewhere.deviation < elsewhere.pressure.mean()).all()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"folds": 1}, "folds: 1; must be 0, or 2 to"),
+        ({"prior": at.Prior(torch.ones(3, 16, dtype=torch.complex128))}, "prior.transfer_matrix"),
+        ({"prior": at.Prior(variants={"points.x": 1e-3})}, "prior.variants: .*names need a propagator"),
+        ({"readings": "readings.csv"}, "readings: 'readings.csv'"),
+        (
+            {"readings": at.Readings(torch.ones(3, 5).to(torch.complex128), torch.ones(3, 3))},
+            "16 transducers",
+        ),
+    ],
+)
+def test_wrong_arguments_are_refused(matrix, settings, message):
+    arguments = {"readings": Bench(matrix, 0).readings(5), **settings}
+    with pytest.raises(ValueError, match=message):
+        at.calibrate(matrix, **arguments)
