@@ -18,21 +18,33 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 
 from autdtorch import hardware
-from autdtorch.cli.settings import folder_of, is_given, load_method, scene_of, section_of, solver_of
+from autdtorch.cli.settings import (
+    folder_of,
+    given_file,
+    is_given,
+    load_method,
+    scene_of,
+    section_of,
+    solver_of,
+)
 from autdtorch.hardware.sensors.by_hand import typed
 from autdtorch.hardware.sensors.sensor import SensorConfig, Setup
 from autdtorch.io.drive_file import save_drive
 from autdtorch.io.goal_section import goal_section, load_goal, score_label
+from autdtorch.io.readings_file import load_readings
+from autdtorch.methods.problem import Problem
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.objectives.perturbations import simulated_matrix
+from autdtorch.objectives.readings import Readings
 from autdtorch.propagators import make_propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.study.report.hardware_report import write_hardware_report
 from autdtorch.study.run_study import check_goal, name_of, solve
+from autdtorch.utils.digest import digest_of
 from autdtorch.utils.progress import Progress, show_progress
-from autdtorch.utils.validation import boolean, indices, invalid, require_known, require_one_of
+from autdtorch.utils.validation import boolean, indices, invalid, require_known, require_one_of, within
 
 logger = logging.getLogger(__name__)
 
@@ -184,15 +196,15 @@ _Measured: TypeAlias = tuple[Solution, torch.Tensor, hardware.Preflight, hardwar
 _LOG_FILE = "trial.jsonl"
 
 
-def hardware_trial(settings: dict[str, Any], modules: list[Any], output: Any) -> None:
-    """Run a method on a device, or on its emulator.
+def hardware_trial(settings: dict[str, Any], modules: list[Any], output: Any, readings: object) -> None:
+    """Run a method on a device, or on its emulator, from earlier readings in a file, if any.
 
     Every error carries a note on whether the outputs are off.
     """
     trial = None
     try:
         with hardware.ended_by_signals():
-            trial = _Trial(settings, modules, output)
+            trial = _Trial(settings, modules, output, readings)
             trial.run()
     except (Exception, KeyboardInterrupt) as error:
         if (left_on := _left_on(error)) is not None:
@@ -216,7 +228,7 @@ def _left_on(error: BaseException | None) -> BaseException | None:
 class _Trial:
     """A trial that was simulated; `run` plays it. `begun`: whether the device was opened."""
 
-    def __init__(self, settings: dict[str, Any], modules: list[Any], output: Any) -> None:
+    def __init__(self, settings: dict[str, Any], modules: list[Any], output: Any, readings: object) -> None:
         """Check the settings, and run the method in the simulation."""
         if "scenes" in settings:
             raise ValueError("hardware: given beside an experiment; must be one scene and one method")
@@ -243,7 +255,23 @@ class _Trial:
         bench.emulate(simulated)
         self._simulated = hardware.Played(simulated, bench.device, bench.transducers, bench.limits.amplitude)
         self._settings["largest amplitude"] = round(self._simulated.largest, 4)
-        self._expected = solve(self._method, self._simulated, [0], seed, self._goal)
+        simulated_readings = self._with_readings(readings)
+        self._expected = solve(
+            self._method, self._simulated, [0], seed, self._goal, readings=simulated_readings
+        )
+
+    def _with_readings(self, value: object) -> Readings | None:
+        """Read the earlier readings of a file, if any, and return the simulated ones of these drives."""
+        self._readings = None
+        if (file := given_file("readings", value)) is None:
+            return None
+        with within("readings"):
+            self._readings = load_readings(file)
+        self._settings["readings"] = digest_of(self._readings)[:16]
+        earlier = Problem.of(self._simulated, readings=self._readings).readings
+        assert earlier is not None
+        magnitudes = self._simulated(earlier.drives).masked_fill(earlier.pressure.isnan(), torch.nan)
+        return Readings(earlier.drives, magnitudes)
 
     def run(self) -> None:
         """Play and measure; leave log, drive and report, unless the run is dry."""
@@ -291,7 +319,7 @@ class _Trial:
             progress.begin("checking the transducers, one by one")
             preflight = self._preflight(limited, sensor, readings, progress)
             progress.begin(f"running {name_of(self._method)} on {bench.device.name}")
-            solution = solve(self._method, objective, [0], self._seed, self._goal)
+            solution = solve(self._method, objective, [0], self._seed, self._goal, readings=self._readings)
             progress.begin("the drive of the method, once more")
             limited.play(solution.drive[0])
             again = torch.stack([limited.reading(sensor, points) for _ in range(readings)])

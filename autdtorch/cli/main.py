@@ -137,11 +137,11 @@ def explore_scene(settings: dict[str, Any], modules: list[Any]) -> None:
     Raises:
         ValueError: a setting of `explore` that is unknown or out of range, or one that has no effect here.
     """
-    from autdtorch.cli.settings import is_given, scene_of, section_of, solver_of
+    from autdtorch.cli.settings import given_file, scene_of, section_of, solver_of
     from autdtorch.io.drive_file import load_drive
     from autdtorch.plot.explore import explore
     from autdtorch.utils.process import signals_restored
-    from autdtorch.utils.validation import invalid, path_of, require_known, within
+    from autdtorch.utils.validation import require_known, within
 
     for override in HydraConfig.get().overrides.task:
         if not _EXPLORE_SETTINGS.match(override):
@@ -150,11 +150,9 @@ def explore_scene(settings: dict[str, Any], modules: list[Any]) -> None:
     section = section_of(settings, "explore")
     require_known("explore", section, _EXPLORE_KEYS)
     drive = None
-    if (file := section.get("drive")) is not None:
-        if not is_given("explore.drive"):
-            raise invalid("explore.drive", file, "must be given on the command line")
+    if (file := given_file("explore.drive", section.get("drive"))) is not None:
         with within("explore.drive"):
-            drive = load_drive(path_of("drive", file))
+            drive = load_drive(file)
     scene = scene_of("scene", section_of(settings, "scene"), modules)
     spacing, port, browser = solver_of(settings)["spacing"], section["port"], section["browser"]
     with signals_restored():
@@ -196,10 +194,12 @@ def _job(config: DictConfig, sweep: Path | None) -> None:
 
     settings, modules, output = settings_of(config)
     settings.pop("explore", None)
-    drive = settings.pop("drive", None)
+    drive, readings = settings.pop("drive", None), settings.pop("readings", None)
     if settings.get("hardware") is None:
         from autdtorch.cli.study_command import study
 
+        if readings is not None:
+            raise ValueError(f"readings: {readings!r}; must be null: only a hardware trial uses them")
         settings.pop("hardware", None)
         study(settings, modules, output, sweep, drive)
         return
@@ -209,7 +209,7 @@ def _job(config: DictConfig, sweep: Path | None) -> None:
         raise ValueError(f"drive: {drive!r}; must be null: a hardware trial writes its drive as drive.npz")
     if sweep is not None:
         raise ValueError("hardware: a sweep; must be one trial at a time")
-    hardware_trial(settings, modules, output)
+    hardware_trial(settings, modules, output, readings)
 
 
 def _job_folder(overrides: str) -> str:

@@ -19,7 +19,7 @@ from autdtorch.methods.catalogue import METHODS
 from autdtorch.propagators import make_propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.study.run_study import StudyMethod
-from autdtorch.utils.validation import require_known
+from autdtorch.utils.validation import invalid, path_of, require_known
 
 _SETTINGS = (
     "scene",
@@ -34,6 +34,7 @@ _SETTINGS = (
     "plane_spacing",
     "poses",
     "drive",
+    "readings",
     "explore",
 )
 _PLACES = ("modules", "output")  # settings that change no result
@@ -129,6 +130,15 @@ def folder_of(key: str, value: object) -> Path:
         accepted = f"must be below the working directory, or given on the command line, as {key}=FOLDER"
         raise ValueError(f"{key}: {value!r}; {accepted}")
     return folder
+
+
+def given_file(key: str, value: object) -> Path | None:
+    """Return the path of a file to read, or None; it must be given on the command line."""
+    if value is None:
+        return None
+    if not is_given(key):
+        raise invalid(key, value, "must be given on the command line")
+    return path_of(key, value)
 
 
 def is_given(key: str) -> bool:

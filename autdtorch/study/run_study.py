@@ -25,6 +25,7 @@ from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.objectives.metrics import focus_metrics
 from autdtorch.objectives.objective import Objective, SimulatedObjective
 from autdtorch.objectives.quiet import QuietPoints
+from autdtorch.objectives.readings import Readings
 from autdtorch.propagators import Propagator, SimulatedPropagator, TMatrixPropagator, make_propagator
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.tmatrix.propagator import placed_bodies
@@ -250,11 +251,15 @@ def solve(
     seed: int,
     goal: Goal,
     start: torch.Tensor | None = None,
+    readings: Readings | None = None,
 ) -> Solution:
-    """Run trials of a method on an objective, from drives (T, M) where it begins at any."""
+    """Run trials of a method on an objective, from drives (T, M) and readings where it begins at any."""
     if isinstance(method, Method):
-        return run(method, objective, trials, seed, goal=goal, start=start)
+        return run(method, objective, trials, seed, goal=goal, start=start, readings=readings)
     taken = inspect.signature(method).parameters
+    if readings is not None:
+        accepted = "must be None: only a Method goes on from them, no function"
+        raise invalid("readings", readings, accepted)
     arguments = {"trials": trials, "seed": seed, goal_keyword(method) or "goal": goal}
     return method(objective, **{key: value for key, value in arguments.items() if key in taken})
 

@@ -134,6 +134,25 @@ def test_a_trial_maximises_its_goal(trial, tmp_path, words, goal):
     assert (status, "of another trial, whose goal is" in log) == (2, True)
 
 
+def test_a_trial_goes_on_from_the_readings_of_another(trial, tmp_path):
+    words = (*EMULATED, "method=identify")
+    few = (*words, "method.evaluations=3", "readings=out")
+    assert trial(*words, "method.evaluations=26")[0] == 0
+    assert trial(*few, folder="output=next")[0] == 0
+    lines = (tmp_path / "next" / "trial.jsonl").read_text().splitlines()
+    assert len(lines) == 1 + 3 + 1  # settings, evaluations and end
+    first, then = (
+        json.loads((tmp_path / f / "trial.jsonl").read_text().splitlines()[-2]) for f in ("out", "next")
+    )
+    assert min(then["pressure"]) > 0.99 * min(first["pressure"])  # without noise: the optimum, to the levels
+    assert trial(*few, folder="output=next")[0] == 0
+    assert len((tmp_path / "next" / "trial.jsonl").read_text().splitlines()) == len(lines) + 1
+    status, _, log = trial(*words, "method.evaluations=3", folder="output=alone")
+    assert (status, "evaluations: 3; must be an integer >= 22" in log) == (2, True)
+    status, _, log = trial("method=gabs", "readings=out")
+    assert (status, "must be null: only a hardware trial" in log) == (2, True)
+
+
 OPENMPD = ("hardware=openmpd", "hardware.limits.amplitude=1", "hardware.transducers='0-8'")
 
 
