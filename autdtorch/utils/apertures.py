@@ -40,6 +40,14 @@ class Apertures(NamedTuple):
         normals, radii = (None if part is None else part[index] for part in (self.normals, self.radii))
         return self._replace(positions=self.positions[index], normals=normals, radii=radii)
 
+    def alike(self) -> list[torch.Tensor]:
+        """Return the indices (n,) of the discs of each direction and radius; points are all alike."""
+        if self.normals is None or self.radii is None:
+            return [torch.arange(len(self.positions), dtype=torch.int64, device="cpu")]
+        kinds = torch.cat([self.normals, self.radii[:, None]], dim=1)
+        _, kind = torch.unique(kinds, dim=0, return_inverse=True)
+        return [torch.nonzero(kind == number)[:, 0] for number in range(int(kind.max()) + 1)]
+
     def with_images(self, images: Sequence[Image]) -> tuple[Self, torch.Tensor]:
         """Return all images of the apertures, one image after the other, and their weights (G N,)."""
         parts = distinct(images, self.positions)

@@ -2,6 +2,7 @@
 
 import cmath
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from scipy.special import sph_harm_y
 from small_scenes import assert_slopes, relative_error
 
 import autdtorch as at
+from autdtorch.analytic.disc_waves import mean_waves, powers_needed
 from autdtorch.analytic.sphere import fluid_sphere, impedance_sphere, rigid_sphere
 from autdtorch.analytic.spherical_waves import (
     degrees,
@@ -24,6 +26,7 @@ from autdtorch.analytic.spherical_waves import (
     sphere_coefficients,
 )
 from autdtorch.propagators import make_propagator
+from autdtorch.scene.geometry import rotation_matrix
 
 AIR = at.Medium(density=1.2, sound_speed=340.0)
 FREQUENCY = 40e3
@@ -58,6 +61,26 @@ def test_harmonics_are_those_of_scipy():
             (degree, -m),
             (-1) ** m,
         )
+
+
+@pytest.mark.parametrize("wavenumber", [WAVENUMBER, complex(WAVENUMBER, 3.0)])
+@pytest.mark.parametrize("normal", [(1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.3, -0.5, 0.8)])
+def test_means_of_waves_over_discs_are_those_over_their_nodes(wavenumber, normal):
+    discs = at.TransducerArray.grid((2, 3), 10e-3, (0.0, 0.0, 0.0), normal, radius=4.5e-3)
+    axes, center = rotation_matrix((0.3, -0.2, 0.5)), torch.tensor(CENTER).double()
+    places, weights = discs.nodes
+    waves = outgoing_waves(12, wavenumber, (places - center) @ axes, conjugate=True)
+    expected = torch.einsum("mnk,n->mk", waves, weights.to(torch.complex128))
+    offsets = discs.positions - center
+    powers = powers_needed(12, wavenumber, float(offsets.norm(dim=1).min()) - 4.5e-3, 4.5e-3)
+    means = mean_waves(12, wavenumber, offsets, discs.normals[0], 4.5e-3, axes, powers)
+    errors = (means - expected).norm(dim=0) / expected.norm(dim=0)
+    assert errors.max() < 1e-7  # of the nodes, for waves of high degrees at this distance
+
+
+def test_a_series_for_a_disc_next_to_the_centre_takes_too_many_powers():
+    assert powers_needed(12, WAVENUMBER, 80e-3, 4.5e-3) <= 12
+    assert powers_needed(12, WAVENUMBER, 2e-3, 4.5e-3) is None
 
 
 @pytest.mark.parametrize("wavenumber", [WAVENUMBER, complex(WAVENUMBER, 3.0)])
@@ -148,11 +171,13 @@ def test_a_cube_turned_by_a_right_angle_is_itself(cube):
         assert relative_error(found, cube.transfer_matrix(ARRAY, POINTS)) < 5e-3
 
 
-def test_gradients_by_the_pose_are_those_of_finite_differences(cube):
+@pytest.mark.parametrize("radius", [0.0, 4.5e-3])
+def test_gradients_by_the_pose_are_those_of_finite_differences(cube, radius):
+    array = replace(ARRAY, radius=radius)
     drive = torch.polar(torch.ones(6).double(), torch.arange(6).double())
 
     def weakest(pose: torch.Tensor) -> torch.Tensor:
-        matrix = cube.moved(pose[:3], pose[3:]).transfer_matrix(ARRAY, POINTS)
+        matrix = cube.moved(pose[:3], pose[3:]).transfer_matrix(array, POINTS)
         return (matrix @ drive).abs().amin()
 
     pose = torch.tensor([1e-3, 0.5e-3, -1e-3, 0.2, 0.1, -0.3], dtype=torch.float64)

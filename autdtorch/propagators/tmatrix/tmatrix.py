@@ -17,18 +17,20 @@ from typing import Literal
 import numpy as np
 import torch
 
+from autdtorch.analytic.disc_waves import mean_waves, powers_needed
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.analytic.spherical_waves import degrees, harmonics, mirrored, outgoing_waves, regular_radial
 from autdtorch.fdtd.kernels.choice import available_kernel
 from autdtorch.propagators.multiple_scattering import solved
 from autdtorch.propagators.store import store_in
 from autdtorch.propagators.tmatrix.body import Solver, placed
-from autdtorch.scene.arrays import TransducerArray, complex_strengths_of
+from autdtorch.scene.arrays import TransducerArray, apertures_of, complex_strengths_of
 from autdtorch.scene.geometry import composed_rotation
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.reflectors import Reflector, require_arrangement
 from autdtorch.scene.scene import require_in_front
+from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.files import read_arrays, write_arrays
 from autdtorch.utils.hints import renamed_keywords
@@ -55,6 +57,9 @@ _AT_ONCE = 200_000
 
 _SHELLS = (0.55, 0.7, 0.85, 0.99)
 """Radii of shells, relative to the circumscribed sphere: j_l is small on one of them at most."""
+
+_ALIKE = 4
+"""Discs of one radius and direction from which on their means are `mean_waves`, and not those over nodes."""
 
 _ENTRY_BYTES = 48.0
 """Memory of a pair of waves in the system of equations [bytes]."""
@@ -308,28 +313,35 @@ def scattered_waves(
 
 def _incoming_waves(body: TMatrix, array: TransducerArray, images: Sequence[Image]) -> torch.Tensor:
     """Return the coefficients (N, M) [Pa] of the regular waves of unit drives around a body."""
-    positions, weights = array.nodes
-    _offsets(body, "array.positions", positions)
-    waves = (
-        image.weight * _incoming_from(body, image.of(positions), weights)
-        for image in distinct(images, positions)
-    )
-    none = torch.zeros((), **COMPLEX)
-    return 4j * math.pi * body.wavenumber * complex_strengths_of(array) * sum(waves, start=none)
+    transducers = apertures_of(array)
+    _offsets(body, "array.positions", transducers.positions)
+    waves = torch.zeros((len(array), len(body.matrix)), **COMPLEX)
+    for index in transducers.alike():
+        some = transducers.chosen(index)
+        for image in distinct(images, some.positions):
+            waves = waves.index_add(0, index, image.weight * _incoming_from(body, some, image))
+    return 4j * math.pi * body.wavenumber * complex_strengths_of(array) * waves.mT
 
 
-def _incoming_from(body: TMatrix, positions: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
-    """Return the regular waves (N, M) around a body, of transducers with nodes (M, n, 3) [m]."""
-    offsets = _offsets(body, "array.positions", positions)
+def _incoming_from(body: TMatrix, sources: Apertures, image: Image) -> torch.Tensor:
+    """Return the regular waves (M, N) around a body, of images of points or of discs of one kind."""
+    if sources.normals is not None and sources.radii is not None and len(sources.positions) >= _ALIKE:
+        normal, radius = image.matrix @ sources.normals[0], float(sources.radii[0])
+        offsets = image.of(sources.positions.mean(dim=1)) - body.center
+        nearest = float(offsets.detach().norm(dim=1).min()) - radius
+        powers = powers_needed(body.degree, body.wavenumber, nearest, radius)
+        if powers is not None:
+            return mean_waves(body.degree, body.wavenumber, offsets, normal, radius, body.axes, powers)
+    offsets = _offsets(body, "array.positions", image.of(sources.positions))
     means = [
         torch.einsum(
-            "mnk,n->km",
+            "mnk,n->mk",
             outgoing_waves(body.degree, body.wavenumber, some, conjugate=True),
-            weights.to(torch.complex128),
+            sources.weights.to(torch.complex128),
         )
         for some in parts_of(offsets, len(body.matrix))
     ]
-    return torch.cat(means, dim=1)
+    return torch.cat(means)
 
 
 def _outgoing_waves(body: TMatrix, points: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:
