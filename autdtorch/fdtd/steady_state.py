@@ -25,6 +25,8 @@ from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_basis, drive_s
 from autdtorch.utils.array_types import COMPLEX, Index
 
 Phasors = NDArray[np.complex128]
+Echo = Callable[[Tensor], Sources]
+"""The sources of a run whose cells have phasors (k,): a linear map, and a constant."""
 MOST_JUDGED = 64
 """Receivers of a kind whose pressure decides when a run has converged."""
 
@@ -66,19 +68,23 @@ def run_to_steady_state(
     observe: Callable[[Tensor], Sequence[Tensor]],
     stepped: Callable[[int], None],
     floors: Sequence[float] = (0.0,),
+    echo: Echo | None = None,
 ) -> SteadyState:
     """Step until the relative residual is within `tolerance`, or `max_periods` have passed.
 
     `observe` maps the phasors of `cells` (k,) to the quantities that must all converge, once sound has
     arrived everywhere. The residual of each is relative to its norm, or to its entry of `floors` if that is
-    more. `stepped` is called with the number of periods after each block.
+    more. `stepped` is called with the number of periods after each block. With an `echo`, the sources follow
+    the phasors: see `windows_of_run`.
     """
     earliest, block = fewest_periods(assembly.grid.arrival), block_of(assembly.steps_per_period)[1]
+    if echo:
+        earliest += block  # the first answer to an echo is a block late
     sequence = Extrapolation(phasors_kept(len(cells)))
     values: deque[Sequence[Tensor]] = deque(maxlen=_JUDGED)
     first_judged = min(earliest, max_periods) - (_JUDGED - 1) * block
     ramp = math.ceil(RAMP_PERIODS * assembly.steps_per_period)
-    for count, windows in windows_of_run(assembly, kernel, sources, cells):
+    for count, windows in windows_of_run(assembly, kernel, sources, cells, echo):
         stepped(block)
         for start, phasor in windows:
             if start >= ramp:
@@ -151,12 +157,18 @@ class Extrapolation:
 
 
 def windows_of_run(
-    assembly: Assembly, kernel: Kernel, sources: Sources, cells: Index
+    assembly: Assembly, kernel: Kernel, sources: Sources, cells: Index, echo: Echo | None = None
 ) -> Iterator[tuple[int, list[tuple[int, Phasors]]]]:
-    """Step from silence; yield after each block the periods so far, and start and phasors of its windows."""
+    """Step from silence; yield after each block the periods so far, and start and phasors of its windows.
+
+    With an `echo`, `sources` fade over the next block into those that it returns for the phasors of a block:
+    what the cells radiate comes back while they are stepped, and blocks still follow x_(n+1) = A x_n + b.
+    """
     steps_per_period = assembly.steps_per_period
     steps, periods = block_of(steps_per_period)
-    shift = max(1, steps // _PARTS)
+    shift = steps if echo else max(1, steps // _PARTS)
+    rising = _smooth((torch.arange(steps, device="cpu") + 0.5) / steps)[:, None].to(assembly.dtype)
+    before = sources
     ones = torch.ones((len(cells), 1), dtype=assembly.dtype, device="cpu")
     receivers = Receivers(torch.from_numpy(cells[:, None]), ones)
     state, basis = assembly.silence(sources), drive_basis(steps, periods)
@@ -165,7 +177,11 @@ def windows_of_run(
     for block in itertools.count():
         first = block * steps
         signal = drive_signal(steps_per_period, first, steps).to(assembly.dtype)
-        state, recorded = kernel.advance(state, assembly.coefficients, sources, receivers, signal)
+        driven = sources
+        if echo:
+            signal = torch.cat([(1 - rising) * signal, rising * signal], dim=1)
+            driven = Sources(sources.index, torch.cat([before.force, sources.force], dim=1))
+        state, recorded = kernel.advance(state, assembly.coefficients, driven, receivers, signal)
         sums = {time: value for time, value in sums.items() if time > first - steps}
         inside = (time for time in range(first + 1, first + steps) if _is_needed(time, steps, shift))
         for begin, end in itertools.pairwise((first, *inside, first + steps)):
@@ -175,9 +191,15 @@ def windows_of_run(
         starts = range(-(-(first + 1) // shift) * shift - steps, first + 1, shift)
         windows = []
         for start in starts:
-            before = sums[start] if start > 0 else silence
-            windows.append((start, (sums[start + steps] - before).numpy()))
+            until = sums[start] if start > 0 else silence
+            windows.append((start, (sums[start + steps] - until).numpy()))
         yield (block + 1) * periods, windows
+        if echo:
+            before, sources = sources, echo(torch.from_numpy(windows[-1][1]))
+
+
+def _smooth(share: Tensor) -> Tensor:
+    return share * share * (3 - 2 * share)
 
 
 def _is_needed(time: int, steps: int, shift: int) -> bool:

@@ -23,6 +23,7 @@ from scipy.spatial import KDTree
 from autdtorch.fdtd.absorption import absorption
 from autdtorch.fdtd.coupling import Coupling, coupling_of
 from autdtorch.fdtd.grouping import one_box
+from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.reflection import other_images, with_images
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
@@ -341,8 +342,11 @@ class BoxSimulation(Simulation):
             pressure = audible * (incident[:, runs] + sum(reading.field(part) for reading, part in parts))
             return [pressure[group] for group in groups]
 
-        bodies = [_Scatterer(self, transform, stepped) for transform in transforms]
-        if len(bodies) == 1 and not self.boxes[0].echoes:
+        bodies = [
+            _Scatterer(self, transform, stepped, self.coupling(box, box, box.echoes) if box.echoes else None)
+            for box, transform in zip(self.boxes, transforms, strict=True)
+        ]
+        if len(bodies) == 1 and not bodies[0].comes_back_later:
 
             @torch.no_grad()  # holds in one thread only
             def alone(run: int) -> tuple[SteadyState, float]:
@@ -376,11 +380,20 @@ class BoxSimulation(Simulation):
 
 @dataclass(frozen=True, eq=False)
 class _Scatterer:
-    """The obstacles of a box, whose answers to incident fields are simulated."""
+    """The obstacles of a box, whose answers to incident fields are simulated.
+
+    What mirrors send back drives the run itself, if there is an `echo`; else it is a further incident field.
+    """
 
     simulation: BoxSimulation
     transform: NearToFar
     stepped: Stepped
+    echo: Coupling | None
+
+    @property
+    def comes_back_later(self) -> bool:
+        """Whether mirrors send back an incident field of a further run."""
+        return bool(self.transform.box.echoes) and self.echo is None
 
     def answer(
         self, field: torch.Tensor, tolerance: float, observe: Observe, floors: Sequence[float] = (0.0,)
@@ -390,7 +403,13 @@ class _Scatterer:
         forces = box.sources(field)
         if not forces.force.any():  # obstacles of air, or drives that cancel
             return SteadyState(torch.zeros(len(cells), **COMPLEX), 0, 0.0, True)
-        settings = tolerance, plan.max_periods, observe, self.stepped, floors
+        echo = self.echo
+
+        def echoed(phasors: torch.Tensor) -> Sources:
+            assert echo
+            return box.sources(field + echo.field(self.outgoing(phasors[:, None]))[:, 0])
+
+        settings = tolerance, plan.max_periods, observe, self.stepped, floors, echoed if echo else None
         return run_to_steady_state(box.assembly, self.simulation._kernel, forces, cells, *settings)
 
     def answers(self, incoming: torch.Tensor, tolerances: Sequence[float]) -> list[SteadyState]:
@@ -414,9 +433,9 @@ class _Scatterer:
     def incoming(self, other: _Scatterer, outgoing: torch.Tensor) -> torch.Tensor | None:
         """Return the field (n, R) that a Huygens surface radiates to this box, its own by mirrors only."""
         box, here = other.transform.box, self.transform.box
-        images = box.echoes if other is self else box.images
-        if not images:
+        if other is self and not self.comes_back_later:
             return None
+        images = box.echoes if other is self else box.images
         coupling = self.simulation.coupling(here, box, images)
         return coupling.field(outgoing) if coupling else box.radiated(outgoing, here.driven, images)
 
