@@ -33,7 +33,6 @@ logger = logging.getLogger(__name__)
 
 MOST_PASSES = 12  # Most passes of the iteration between boxes; beyond, one box is cheaper
 _MOST_OBSTACLES = 64  # Most obstacles that are grouped; more share one box
-_ECHOES = 3  # Passes of a usual iteration between obstacles and mirrors
 # Periods of a usual run among obstacles, relative to the fewest; 1.0 to 3.5 depending on the resonances
 USUAL_PERIODS = 1.7
 # Time of a step of a cell in a boundary layer, of a run in a box beside its steps, and of a term of a sum
@@ -237,8 +236,6 @@ def _grids(region: Region, spacing: float, boxes: Sequence[_Outline], passes: in
     grids = tuple(grid_cost(region, box.extent, spacing) for box in boxes)
     groups, axes = tuple(box.group for box in boxes), tuple(box.axes for box in boxes)
     mirrors = tuple(box.mirrors for box in boxes)
-    if any(len(near) < len(region.mirrors) for near in mirrors):
-        passes = max(passes, _ECHOES)
     return Grouping(groups, axes, grids, passes, all(box.aligned for box in boxes), mirrors)
 
 

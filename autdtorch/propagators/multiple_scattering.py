@@ -56,9 +56,9 @@ class Scatterer(Protocol):
         ...
 
     def incoming(self, other: Self, outgoing: torch.Tensor) -> torch.Tensor | None:
-        """Return the waves (n, R) that come in from outgoing ones (m, R); None from a body to itself.
+        """Return the waves (n, R) that come in from outgoing ones (m, R); None if none do.
 
-        With reflectors, waves of a body come back to it.
+        From a body to itself, they are those that reflectors send back and that its runs do not include.
         """
         ...
 

@@ -6,6 +6,7 @@ to 0.4 % of the transfer matrix before a rigid plane, and 0.2 to 0.5 % before a 
 smaller; with an impedance up to 1.0 %.
 """
 
+import dataclasses
 import math
 from itertools import combinations
 
@@ -19,6 +20,7 @@ from small_scenes import relative_error
 
 import autdtorch as at
 from autdtorch.propagators import make_propagator
+from autdtorch.propagators.box import BoxSimulation
 
 AIR = at.Medium(1.2, 343.0)
 K = 2 * math.pi * 40e3 / 343.0
@@ -63,6 +65,24 @@ def test_sphere_before_a_plane_by_box(body, gap, normal, reflection):
     matrix = make_propagator(scene, "box", 1e-3, tolerance=1e-3).transfer_matrix()
     limit = (1e-2 if body == "impedance" else 5e-3) * (1 if reflection == 1 else 1.2)
     assert relative_error(matrix, exact) < limit
+
+
+def test_what_a_panel_sends_back_drives_the_run_itself(monkeypatch):
+    """It gives what passes of multiple scattering give, each within 3e-4 of its steady state."""
+    array = at.TransducerArray.grid((3, 3), 10e-3, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    plate = at.Box((0.0, 0.0, 30e-3), (16e-3, 12e-3, 2e-3), rigid=True, rotation=(0.3, 0.2, 0.0))
+    scene = at.Scene(array, AIR, 40e3, [[5e-3, 0.0, 60e-3], [-8e-3, 3e-3, 55e-3]], [plate])
+    panel = dataclasses.replace(scene, reflectors=[at.Reflector.behind(array)])
+
+    def solved(scene):
+        propagator = make_propagator(scene, "box", 1.5e-3, 3e-4, cache=False)
+        return propagator.transfer_matrix(), max(run.periods for run in propagator.runs)
+
+    (_, alone), (matrix, periods) = solved(scene), solved(panel)
+    monkeypatch.setattr(BoxSimulation, "coupling", lambda *boxes: None)
+    by_passes, of_passes = solved(panel)
+    assert relative_error(matrix, by_passes) < 6e-4
+    assert alone < periods <= 2 * alone < of_passes
 
 
 @pytest.mark.parametrize("reflection", [0.5, 0.3 + 0.4j])
