@@ -43,7 +43,7 @@ from autdtorch.propagators.simulation import (
     mean_of_images,
 )
 from autdtorch.propagators.store import MOST_BYTES
-from autdtorch.scene.arrays import apertures_of, complex_strengths_of
+from autdtorch.scene.arrays import apertures_of
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.obstacles.moving import circumscribed
 from autdtorch.scene.scene import require_clear, require_in_front
@@ -219,8 +219,7 @@ class BoxSimulation(Simulation):
             return self._matrix_of_orbits(points, orbits_of_transducers(points, self.symmetries))
         array = self.plan.scene.array
         alone = [apertures_of(array).chosen(slice(index, index + 1)) for index in range(len(array))]
-        strength = complex_strengths_of(array)[:, None].to(torch.complex128)
-        return self._total(radiation, alone, strength, points)
+        return self._total(radiation, alone, torch.ones((len(array), 1), **COMPLEX), points)
 
     def _fields(self, drive: torch.Tensor, points: torch.Tensor) -> PressureMap:
         if self._radiates(points):
@@ -248,7 +247,7 @@ class BoxSimulation(Simulation):
         return size <= MOST_BYTES and not self.near_obstacle(array.nodes.positions.reshape(-1, 3))
 
     def _radiation_of_transducers(self) -> Radiation:
-        """Simulate the radiation of unit drives of all transducers.
+        """Simulate the radiation of all transducers, each of unit strength.
 
         Under a symmetry that maps a transducer to its representative, cells of the surface map to cells.
         """
@@ -260,14 +259,14 @@ class BoxSimulation(Simulation):
         amplitudes = []
         for box, part in zip(radiation.boxes, radiation.amplitudes, strict=True):
             images = np.stack([_images(box, each) for each in self.symmetries])
-            unit = part[torch.from_numpy(images[symmetry].T), torch.from_numpy(place)]
-            amplitudes.append(complex_strengths_of(array) * unit)
+            amplitudes.append(part[torch.from_numpy(images[symmetry].T), torch.from_numpy(place)])
         return replace(radiation, amplitudes=tuple(amplitudes))
 
     def _radiation_of(self, drive: torch.Tensor) -> Radiation:
         """Return the radiation of drives (R, M), from the store or simulated."""
-        key = digest_of(self.plan.key, "drives", drive)
-        return self._store.get(key, lambda: self._radiation(*self.sources_of(drive)))
+        sources, strength = self.sources_of(drive)
+        key = digest_of(self.plan.key, "drives", strength)
+        return self._store.get(key, lambda: self._radiation(sources, strength))
 
     def _radiation(self, sources: Sequence[Apertures], strength: torch.Tensor) -> Radiation:
         """Simulate the radiation of runs; see `_run`."""

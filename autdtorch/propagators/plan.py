@@ -21,7 +21,7 @@ from autdtorch.fdtd.region import Region
 from autdtorch.propagators.scene_region import region_of, with_rigid
 from autdtorch.propagators.store import key_of
 from autdtorch.propagators.tmatrix.bodies import waves_to_simulate
-from autdtorch.scene.arrays import apertures_of
+from autdtorch.scene.arrays import apertures_of, radii_of
 from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.process import cached_property, require_memory
@@ -100,12 +100,14 @@ class Plan:
 
     @cached_property
     def key(self) -> str:
-        """A digest of everything that affects the plan's results."""
+        """A digest of everything that affects the pressure of transducers of unit strength."""
         scene = {entry.name: getattr(self.scene, entry.name) for entry in fields(self.scene)}
         settings = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         settings |= {"scene": None, "region": None, "runs": None, "dtype": str(self.dtype)}
         rigid = [body.fluid is None for body in self.region.bodies]
         affecting = {name: part for name, part in scene.items() if name not in _NO_EFFECT}
+        array = self.scene.array
+        affecting["array"] = array.positions, array.normals, radii_of(array)
         return key_of(settings, rigid, affecting)
 
     @property

@@ -158,7 +158,7 @@ class SimulatedPropagator:
         self._notices.of_cavities(places, result.matrix)
         if points is None:
             self._notices.of_faint_points(result.matrix, self._free(places))
-        matrix = result.matrix.clone()
+        matrix = result.matrix
         return (matrix, self._error(results, places)) if with_error else matrix
 
     @one_library_thread()

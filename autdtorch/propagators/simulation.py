@@ -189,13 +189,14 @@ class Simulation(ABC):
         return points
 
     def transfer_matrix(self, points: torch.Tensor) -> PressureMap:
-        """Return the transfer matrix of points (P, 3), from the store or simulated; not to be changed."""
+        """Return the transfer matrix of points (P, 3), by that of unit strengths, stored or simulated."""
         key = digest_of(self.plan.key, points)
-        return self._store.get(key, lambda: self._loaded(key, points) or self._saved(key, points))
+        unit = self._store.get(key, lambda: self._loaded(key, points) or self._saved(key, points))
+        return replace(unit, matrix=complex_strengths_of(self.plan.scene.array) * unit.matrix)
 
     def fields(self, drive: torch.Tensor, points: torch.Tensor) -> PressureMap:
         """Return the pressure (P, R) of drives (R, M), none of them silent, at points (P, 3)."""
-        key = digest_of(self.plan.key, points, drive)
+        key = digest_of(self.plan.key, points, self.sources_of(drive)[1])
         return self._store.get(key, lambda: self._audible_fields(drive, points))
 
     @property
@@ -292,7 +293,7 @@ class Simulation(ABC):
         return enclosed
 
     def _loaded(self, key: str, points: torch.Tensor) -> PressureMap | None:
-        """Return the transfer matrix of points that an earlier process saved, if it is there."""
+        """Return the transfer matrix of unit strengths that an earlier process saved, if it is there."""
         saved = self._store.load(key, (len(points), len(self.plan.scene.array)), 2)
         if saved is None:
             return None
@@ -302,14 +303,14 @@ class Simulation(ABC):
         return PressureMap(torch.from_numpy(matrix), residual, int(periods))
 
     def _saved(self, key: str, points: torch.Tensor) -> PressureMap:
-        """Simulate the transfer matrix of points, and save it if all runs converged."""
+        """Simulate the transfer matrix of unit strengths, and save it if all runs converged."""
         result = self._audible(points)
         if all(run.reached for run in result.runs):
             self._store.save(key, result.matrix.numpy(), result.residual, result.periods)
         return result
 
     def _audible(self, points: torch.Tensor) -> PressureMap:
-        """Simulate the transfer matrix of points; no run begins at one that no sound reaches."""
+        """Simulate the transfer matrix of unit strengths; no run begins at a point that no sound reaches."""
         audible = ~self.silent(points[:, None])
         matrix = torch.zeros((len(points), len(self.plan.scene.array)), **COMPLEX)
         if not audible.any():
@@ -325,11 +326,11 @@ class Simulation(ABC):
         return self._fields(drive, points)
 
     def _matrix(self, points: torch.Tensor) -> PressureMap:
-        """Simulate the transfer matrix of points (P, 3), none of them silent."""
+        """Simulate the transfer matrix of unit strengths at points (P, 3), none of them silent."""
         return self._matrix_of_orbits(points, self.orbits(points))
 
     def _matrix_of_orbits(self, points: torch.Tensor, orbits: Orbits) -> PressureMap:
-        """Simulate the transfer matrix of points by a run for each of the orbits' representatives."""
+        """Simulate the transfer matrix of unit strengths by a run for each of the orbits' representatives."""
         array = self.plan.scene.array
         targets, transducers = Apertures.of_points(points), apertures_of(array)
         sources, receivers = (targets, transducers) if orbits.from_points else (transducers, targets)
@@ -339,7 +340,7 @@ class Simulation(ABC):
         alone = [sources.chosen(slice(index, index + 1)) for index in orbits.representatives]
         pressure, runs = self._run(alone, strength, receivers)
         rows = orbits.expand(pressure)
-        matrix = complex_strengths_of(array) * (rows if orbits.from_points else rows.mT.contiguous())
+        matrix = rows if orbits.from_points else rows.mT.contiguous()
         return PressureMap.of_runs(matrix, runs, orbits.from_points)
 
     def _fields(self, drive: torch.Tensor, points: torch.Tensor) -> PressureMap:

@@ -56,6 +56,18 @@ def test_a_simulated_field_has_the_phases_too(method):
     assert relative_error(turned.field(DRIVE, POINTS), plain.field(DRIVE * TURN, POINTS)) < 1e-12
 
 
+@pytest.mark.parametrize("method", ["full", "box"])
+def test_a_calibrated_array_takes_no_runs_of_its_own(method):
+    """Control points, and points beside, whose pressure a box takes from what it radiates."""
+    settings = {"dtype": "float64", "spacing": 1.3e-3}
+    before = make_propagator(scene_of(PLAIN, (BALL,)), method, **settings)
+    after = before.of(scene_of(PLAIN.calibrated(GAINS, PHASES), (BALL,)))
+    for points in (POINTS, torch.cat([POINTS + 1e-3, POINTS - 1e-3])):
+        expected = before.transfer_matrix(points) * GAINS * TURN
+        assert relative_error(after.transfer_matrix(points), expected) < ROUNDING
+    assert len(after.runs) == 0
+
+
 def test_gradients_of_the_differentiable_field_have_them():
     """Through time steps: rounding of some hundred."""
     step = {"spacing": 1.3e-3, "periods": 4, "dtype": "float64"}
