@@ -8,24 +8,28 @@ import torch
 
 from autdtorch.propagators.free_space import FreeSpacePropagator
 from autdtorch.propagators.simulated import Propagator, SimulatedPropagator
+from autdtorch.propagators.tmatrix.moved_bodies import MovedBodies
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.changes import Amounts, changed_points, changed_scene, lever, require_change, unit_of
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.process import cached_property
+from autdtorch.utils.process import cached_property, one_library_thread
 from autdtorch.utils.validation import ArrayLike, invalid, points_tensor, real_tensor
 
-_STEP_OF_SUMS, _STEP_ON_GRIDS = 1e-4, 0.016
-"""Steps of central differences [wavelengths], which they shift something by: their error is their phase
-squared over 6, 7e-8 and 0.2 %. Runs on grids end at a distance from the steady state, which needs the larger
-one."""
+_STEP_OF_SUMS = 1e-7
+"""Step of forward differences of exact sums [wavelengths]: their error is half its phase, 3e-7."""
+
+_STEP_ON_GRIDS = 0.016
+"""Step of central differences of simulations [wavelengths]: their error is its phase squared over 6, 0.2 %.
+Runs end at a distance from the steady state, which needs a large step."""
 
 
 class SceneChanges:
     """The transfer matrix of a scene as a function of the amounts of named changes.
 
     Names and units of amounts are those of `autdtorch.scene.changes.KINDS`; the scene itself has amounts of
-    0. A matrix is that of the changed scene, not an extrapolation.
+    0. A matrix is that of the changed scene, not an extrapolation. T-matrices are moved, not simulated again;
+    at other temperatures they are interpolated between simulations 6 K apart.
 
     Attributes:
         names: of the changes.
@@ -60,6 +64,9 @@ class SceneChanges:
         if len(set(self.names)) < len(self.names):
             raise invalid("names", self.names, "must be there once each")
         self.units = tuple(map(unit_of, self.names))
+        self._last: tuple[Amounts, FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator] | None = (
+            None
+        )
 
     def scene(self, amounts: ArrayLike) -> Scene:
         """Return the scene changed by amounts (K,).
@@ -71,44 +78,88 @@ class SceneChanges:
 
     def points(self, amounts: ArrayLike) -> torch.Tensor:
         """Return the points of observation (P, 3) [m] after changes by amounts (K,)."""
-        points = self._base.control_points if self._points is None else self._points
-        return changed_points(points, self._by_name(amounts))
+        return self._points_by(self._by_name(amounts))
 
+    @one_library_thread()
     def matrix(self, amounts: ArrayLike) -> torch.Tensor:
         """Return the transfer matrix (P, M) [Pa] of the scene changed by amounts (K,)."""
         return self._matrix(self._by_name(amounts))
 
+    @one_library_thread()
     def derivatives(self, amounts: ArrayLike) -> torch.Tensor:
-        """Return the derivatives (K, P, M) of the transfer matrix by the amounts (K,), at these."""
+        """Return the derivatives (K, P, M) of the transfer matrix by the amounts (K,), at these.
+
+        They are differences of matrices: two more for each change or, where no body is simulated again, one.
+        """
         named = self._by_name(amounts)
-        points = len(self.points(amounts))
-        slopes = torch.zeros((len(named), points, len(self._base.array)), **COMPLEX)
+        if self._is_by_waves(named):
+            return self._forward_differences(named)
+        slopes = torch.zeros((len(named), len(self.points(amounts)), len(self._base.array)), **COMPLEX)
         for number, (name, amount) in enumerate(named.items()):
-            step = self._steps[name]
+            step = _STEP_ON_GRIDS * self._base.wavelength / lever(name, self._base)
             upper, lower = (self._matrix(named | {name: amount + each}) for each in (step, -step))
             slopes[number] = (upper - lower) / (2 * step)
         return slopes
 
+    def _is_by_waves(self, amounts: Amounts) -> bool:
+        """Return whether sums over sources and waves of the same bodies serve all points."""
+        if isinstance(self._propagator, FreeSpacePropagator):
+            return True
+        if self._bodies is None or not self._bodies.stay(amounts):
+            return False
+        propagator = self._propagator_of(amounts)
+        assert isinstance(propagator, TMatrixPropagator)
+        return bool(propagator.by_waves(self._points_by(amounts))[1].all())
+
+    def _forward_differences(self, amounts: Amounts) -> torch.Tensor:
+        start = self._sums(amounts)
+        slopes = torch.zeros((len(amounts), *start.shape), **COMPLEX)
+        for number, (name, amount) in enumerate(amounts.items()):
+            step = _STEP_OF_SUMS * self._base.wavelength / lever(name, self._base)
+            if name == "radius" or name.endswith(".distance"):
+                step = -step  # discs may touch, and points may lie in a plane
+            slopes[number] = (self._sums({**amounts, name: amount + step}) - start) / step
+        return slopes
+
+    def _sums(self, amounts: Amounts) -> torch.Tensor:
+        """Return the matrix of free space, or of moved bodies."""
+        points = self._base.control_points if self._points is None else self._points
+        return self._matrix(amounts) if self._bodies is None else self._bodies.matrix(points, amounts)
+
     def _matrix(self, amounts: Amounts) -> torch.Tensor:
         points = None if self._points is None else changed_points(self._points, amounts)
-        return self._propagator_of(self._scene(amounts)).transfer_matrix(points)
+        return self._propagator_of(amounts).transfer_matrix(points)
+
+    def _points_by(self, amounts: Amounts) -> torch.Tensor:
+        return changed_points(self._base.control_points if self._points is None else self._points, amounts)
 
     def _scene(self, amounts: Amounts) -> Scene:
         if self._points is not None:
             amounts = {name: each for name, each in amounts.items() if not name.startswith("points")}
         return changed_scene(self._base, amounts)
 
-    def _propagator_of(self, scene: Scene) -> FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator:
-        """Return the propagator of a changed scene."""
+    def _propagator_of(
+        self, amounts: Amounts
+    ) -> FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator:
+        """Return the propagator of the changed scene; the last one is at hand."""
         before = self._propagator
-        return FreeSpacePropagator(scene) if isinstance(before, FreeSpacePropagator) else before.of(scene)
+        if self._last is not None and self._last[0] == amounts:
+            return self._last[1]
+        scene = self._scene(amounts)
+        after: FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator
+        if isinstance(before, FreeSpacePropagator):
+            after = FreeSpacePropagator(scene)
+        elif isinstance(before, TMatrixPropagator) and self._bodies and self._bodies.stay(amounts):
+            after = before.of(scene, self._bodies.cluster(amounts))
+        else:
+            after = before.of(scene)
+        self._last = dict(amounts), after
+        return after
 
     @cached_property
-    def _steps(self) -> dict[str, float]:
-        """Steps of differences, by name."""
-        simulates = not isinstance(self._propagator, FreeSpacePropagator | TMatrixPropagator)
-        step = (_STEP_ON_GRIDS if simulates else _STEP_OF_SUMS) * self._base.wavelength
-        return {name: step / lever(name, self._base) for name in self.names}
+    def _bodies(self) -> MovedBodies | None:
+        """The bodies of T-matrices, if there are any."""
+        return MovedBodies(self._propagator) if isinstance(self._propagator, TMatrixPropagator) else None
 
     def _by_name(self, amounts: ArrayLike) -> dict[str, float]:
         values = real_tensor("amounts", amounts).detach().cpu()

@@ -147,22 +147,22 @@ def changed_scene(scene: Scene, amounts: Amounts) -> Scene:
             medium=medium,
             control_points=points,
             obstacles=changed_obstacles(_in_medium(scene, medium), amounts),
-            reflectors=_changed_reflectors(scene, amounts),
+            reflectors=changed_reflectors(scene, amounts),
             domain=_domain_with(scene, array, points),
         )
 
 
 def changed_points(points: torch.Tensor, amounts: Amounts) -> torch.Tensor:
     """Return points of observation (P, 3) [m] after changes by amounts."""
-    places = points + _move_of("points", amounts)[0]
+    places = points + move_of("points", amounts)[0]
     for part in {name.partition(".")[0] for name in amounts if name.startswith("points[")}:
-        places[_index_of(part)] += _move_of(part, amounts)[0]
+        places[_index_of(part)] += move_of(part, amounts)[0]
     return places
 
 
 def changed_array(array: TransducerArray, amounts: Amounts) -> TransducerArray:
     """Return an array after changes by amounts."""
-    shift, angles = _move_of("array", amounts)
+    shift, angles = move_of("array", amounts)
     growth = amounts.get("radius", 0.0)
     if not growth and not shift.any() and not any(angles):
         return array
@@ -183,8 +183,9 @@ def changed_medium(medium: Medium, amounts: Amounts) -> Medium:
     return medium.warmed(kelvin) if kelvin else medium
 
 
-def _changed_reflectors(scene: Scene, amounts: Amounts) -> tuple[Reflector, ...]:
-    shift, angles = _move_of("array", amounts)
+def changed_reflectors(scene: Scene, amounts: Amounts) -> tuple[Reflector, ...]:
+    """Return the reflectors of a scene after changes by amounts."""
+    shift, angles = move_of("array", amounts)
     turn, center = rotation_matrix(angles), scene.array.positions.mean(dim=0)
     reflectors = []
     for index, plane in enumerate(scene.reflectors):
@@ -196,7 +197,7 @@ def _changed_reflectors(scene: Scene, amounts: Amounts) -> tuple[Reflector, ...]
     return tuple(reflectors)
 
 
-def _move_of(part: str, amounts: Amounts) -> tuple[torch.Tensor, Vector]:
+def move_of(part: str, amounts: Amounts) -> tuple[torch.Tensor, Vector]:
     """Return shift (3,) [m] and turn, angles (3,) [rad] about the fixed axes, of a part."""
     shift = torch.tensor([amounts.get(f"{part}.{axis}", 0.0) for axis in _AXES], **REAL)
     x, y, z = (amounts.get(f"{part}.turn_{axis}", 0.0) for axis in _AXES)
@@ -204,7 +205,7 @@ def _move_of(part: str, amounts: Amounts) -> tuple[torch.Tensor, Vector]:
 
 
 def _moved(obstacles: tuple[Obstacle, ...], part: str, amounts: Amounts) -> tuple[Obstacle, ...]:
-    shift, angles = _move_of(part, amounts)
+    shift, angles = move_of(part, amounts)
     return moved(obstacles, shift, angles) if shift.any() or any(angles) else obstacles
 
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from small_scenes import AIR, relative_error, small_scene
 from autdtorch.propagators import TMatrixPropagator, make_propagator
 from autdtorch.propagators.scene_changes import SceneChanges
 from autdtorch.propagators.tmatrix.tmatrix import TMatrixCluster
+from autdtorch.propagators.tmatrix.waves import BodyWaves
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.changes import KINDS
 from autdtorch.scene.geometry import rotation_matrix
@@ -98,13 +100,35 @@ def test_derivatives_of_places_are_those_of_automatic_differentiation():
     expected = torch.complex(*(torch.cat([of_shifts, of_places[1:2]]) for of_shifts, of_places in parts))
     names = [f"{part}.{axis}" for part in ("obstacles[0]", "obstacles[1]", "points[1]") for axis in "xyz"]
     slope = SceneChanges(propagator, names).derivatives([0.0] * 9)
-    assert (
-        relative_error(slope[:, 1, 2], expected.reshape(-1)) < 1e-6
-    )  # a step of 6e-4 rad, squared, and rounding
+    # half a step of 6e-7 rad, and rounding
+    assert relative_error(slope[:, 1, 2], expected.reshape(-1)) < 1e-6
     assert not slope[6:, 0].any()
 
 
-def test_derivatives_on_grids_are_those_of_t_matrices(): ...
+SIMULATED = replace(DISCS, obstacles=(TILTED,))
+
+
+def test_derivatives_on_grids_are_those_of_t_matrices():
+    names, levers = ["obstacles.x", "obstacles[0].turn_z"], [1.0, 3.5e-3]
+    changes = [changes_of(SIMULATED, *names, method=method) for method in ("box", "tmatrix")]
+    size = changes[1].matrix([0.0, 0.0]).norm()
+    by_box, by_waves = (each.derivatives([0.0, 0.0]) for each in changes)
+    for one, other, lever in zip(by_box, by_waves, levers, strict=True):
+        # two digits of the matrix were asked for, which a radian of phase may use up
+        assert (one - other).norm() < 0.02 * size * SIMULATED.wavenumber * lever
+
+
+def test_simulated_bodies_move_and_warm_without_further_simulations():
+    changes = changes_of(SIMULATED, "obstacles.x", "obstacles[0].turn_y", "temperature", method="tmatrix")
+    changes.matrix([0.0, 0.0, 1.0])  # the temperatures around
+    amounts = [-0.5e-3, 0.2, 2.5]
+    with mock.patch.object(BodyWaves, "matrix", side_effect=AssertionError):
+        matrix = changes.matrix(amounts)
+        changes.derivatives(amounts)
+    exact = make_propagator(changes.scene(amounts), "tmatrix", **COARSE).transfer_matrix()
+    # of T between simulations 6 K apart: the phase across the body, 0.02 rad in 2.5 K, cubed, and runs
+    assert relative_error(matrix, exact) < 1e-3
+    assert relative_error(changes.matrix([0.0, 0.0, 0.0]), exact) > 0.05  # there is something to follow
 
 
 @pytest.mark.parametrize("name", ["array.turn_y", "temperature", "radius", "reflectors[0].distance"])

@@ -61,14 +61,16 @@ class TMatrixPropagator:
         plan: Plan,
         store: Store | None = None,
         make_box: Callable[[], SimulatedPropagator] | None = None,
+        bodies: TMatrixCluster | None = None,
     ) -> None:
         """Use `make_propagator`, which checks its arguments. Nothing is computed here.
 
         `make_box` makes the propagator of points near a body; by default it has the plan's spacing.
+        `bodies` are those of the scene, where they are known.
         """
         self.scene, self.method, self.spacing = plan.scene, plan.method, plan.spacing
         self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
-        self.plan, self._store = plan, store or Store()
+        self.plan, self._store, self._bodies = plan, store or Store(), bodies
         self._make_box = make_box or functools.partial(SimulatedPropagator, plan.on_grids, self._store)
 
     def __repr__(self) -> str:
@@ -76,9 +78,9 @@ class TMatrixPropagator:
         settings = f"tmatrix, spacing {1e3 * self.spacing:.4g} mm, tolerance {self.tolerance:g}"
         return f"TMatrixPropagator(scene {self.scene.name!r}, {settings})"
 
-    def of(self, scene: Scene) -> TMatrixPropagator:
-        """Return the propagator of a changed scene, with these settings."""
-        return TMatrixPropagator(self.plan.of(scene), self._store)
+    def of(self, scene: Scene, bodies: TMatrixCluster | None = None) -> TMatrixPropagator:
+        """Return the propagator of a changed scene with these settings; its bodies need not be simulated."""
+        return TMatrixPropagator(self.plan.of(scene), self._store, bodies=bodies)
 
     @property
     def runs(self) -> list[Run]:
@@ -98,6 +100,8 @@ class TMatrixPropagator:
     @cached_property
     def bodies(self) -> TMatrixCluster:
         """The bodies of the scene."""
+        if self._bodies is not None:
+            return self._bodies
         with torch.inference_mode(False):  # later calls may need gradients
             return TMatrixCluster(
                 (TMatrix(*body.matrix(self._store)) for body in placed_bodies(self.plan)),
@@ -139,7 +143,7 @@ class TMatrixPropagator:
         """
         with_error = boolean("return_error", return_error)
         places = self._checked(points)
-        matrix, served = self._by_waves(places)
+        matrix, served = self.by_waves(places)
         near, box_error = places[~served].detach(), 0.0
         if len(near) and with_error:
             rows, box_error = self._box.transfer_matrix(near, return_error=True)
@@ -157,7 +161,7 @@ class TMatrixPropagator:
     def point_errors(self, points: ArrayLike | None = None) -> torch.Tensor:
         """Return the estimated relative error of each point's row of the transfer matrix, float64 (P,)."""
         places = self._checked(points).detach()
-        matrix, served = self._by_waves(places)
+        matrix, served = self.by_waves(places)
         errors = torch.zeros(len(places), **REAL)
         errors[served] = self._wave_errors(places[served], matrix[served])
         if not served.all():
@@ -172,7 +176,7 @@ class TMatrixPropagator:
         region = self.plan.region
         if not self.plan.runs:  # exact up to the waves left out
             more = self.plan.at(self.spacing, _MORE_WAVES * self.tolerance)
-            other, served = TMatrixPropagator(more, self._store)._by_waves(points)
+            other, served = TMatrixPropagator(more, self._store).by_waves(points)
             left_out = (matrix - other).norm(dim=1) / sizes(matrix, free)
             errors = torch.full((len(points),), self.tolerance, **REAL)
             return torch.where(served, left_out + _ROUNDING, errors)
@@ -192,7 +196,7 @@ class TMatrixPropagator:
         places = self._checked(places)
         parts, masks = [], []
         for part in torch.split(places, _AT_ONCE):
-            matrix, served = self._by_waves(part)
+            matrix, served = self.by_waves(part)
             parts.append(drive @ matrix.mT)
             masks.append(served)
         field, served = torch.cat(parts, dim=-1), torch.cat(masks)
@@ -218,7 +222,7 @@ class TMatrixPropagator:
         require_in_front(self.scene.reflectors, "points", places.detach())
         return places.cpu()
 
-    def _by_waves(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def by_waves(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return G (P, M) at points (P, 3), and which rows (P,) the waves serve; others are 0."""
         served = self.serves(points)
         matrix = torch.zeros((len(points), len(self.scene.array)), **COMPLEX)
