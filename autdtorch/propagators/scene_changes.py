@@ -29,7 +29,7 @@ class SceneChanges:
 
     Names and units of amounts are those of `autdtorch.scene.changes.KINDS`; the scene itself has amounts of
     0. A matrix is that of the changed scene, not an extrapolation. T-matrices are moved, not simulated again;
-    at other temperatures they are interpolated between simulations 6 K apart.
+    at other temperatures they are interpolated between simulations 12 K apart.
 
     Attributes:
         names: of the changes.

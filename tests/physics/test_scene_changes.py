@@ -126,7 +126,7 @@ def test_simulated_bodies_move_and_warm_without_further_simulations():
         matrix = changes.matrix(amounts)
         changes.derivatives(amounts)
     exact = make_propagator(changes.scene(amounts), "tmatrix", **COARSE).transfer_matrix()
-    # of T between simulations 6 K apart: the phase across the body, 0.02 rad in 2.5 K, cubed, and runs
+    # of T between simulations 12 K apart: the phase across the body, 0.02 rad in 2.5 K, cubed, and runs
     assert relative_error(matrix, exact) < 1e-3
     assert relative_error(changes.matrix([0.0, 0.0, 0.0]), exact) > 0.05  # there is something to follow
 

@@ -24,9 +24,9 @@ from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.moving import circumscribed
 from autdtorch.utils.array_types import COMPLEX
 
-_BETWEEN = 6.0
+_BETWEEN = 12.0
 """Kelvins between the temperatures at which T-matrices are simulated; others are interpolated by the nearest
-three."""
+three. For the paper's cubes, 6 K apart err by 7e-6, and the error grows with the cube."""
 
 _ASIDE = 1e-6
 """Share of it by which the temperatures taken change before half of it, so that a small step from there takes
