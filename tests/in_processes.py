@@ -1,6 +1,6 @@
 """Simulate and search in this process, then in others of each kind; print what differs. A program.
 
-With an empty `NUMBA_CACHE_DIR`, this process compiles the kernels; spawned ones load them from there.
+With an empty `NUMBA_CACHE_DIR`, this process compiles the kernels; loky's new ones load them from there.
 """
 
 import logging
@@ -39,14 +39,14 @@ def numbers_of_loaded_kernels(seed: int) -> list[float]:
 
 
 def in_processes(kind: str) -> list[list[float]]:
-    """`numbers` of seeds 0 and 1, in two processes; spawned ones share nothing, so that one is enough."""
+    """`numbers` of seeds 0 and 1, in two processes; new ones share nothing, so that one is enough."""
     if kind == "dataloader":
         loader = DataLoader([0, 1], batch_size=None, num_workers=2, collate_fn=numbers_of_loaded_kernels)
         return list(loader)
     if kind == "loky":
         with get_reusable_executor(1) as workers:
             return list(workers.map(numbers_of_loaded_kernels, (0, 1)))
-    with multiprocessing.get_context(kind).Pool(2 if kind == "fork" else 1) as pool:
+    with multiprocessing.get_context(kind).Pool(2) as pool:
         return pool.map_async(numbers_of_loaded_kernels, (0, 1), chunksize=1).get(timeout=100)
 
 

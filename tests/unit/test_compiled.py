@@ -114,12 +114,16 @@ def threads(count: int) -> Iterator[None]:
         yield
 
 
-#: Pairs of settings, as each run takes seconds.
+#: Several settings at once, as each run takes seconds.
 STATES = {
-    "float16, three threads": lambda: (setting("default_dtype", torch.float16), threads(3)),
-    "float64, one thread": lambda: (setting("default_dtype", torch.float64), threads(1)),
-    "meta device, no gradients": lambda: (torch.device("meta"), torch.no_grad()),
-    "inference mode, coarse products": lambda: (
+    "float16, three threads, no gradients": lambda: (
+        setting("default_dtype", torch.float16),
+        threads(3),
+        torch.no_grad(),
+    ),
+    "meta device, one thread, inference mode, coarse products": lambda: (
+        torch.device("meta"),
+        threads(1),
         torch.inference_mode(),
         setting("float32_matmul_precision", "medium"),
     ),

@@ -183,7 +183,7 @@ def test_a_lock_that_a_user_gave_tqdm_stays(monkeypatch: pytest.MonkeyPatch) -> 
 PROGRAM = Path(__file__).parents[1] / "in_processes.py"
 
 
-KINDS = ["fork", "dataloader", "spawn", "loky"]
+KINDS = ["fork", "dataloader", "loky"]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks, which is safe with threads on Linux alone")
