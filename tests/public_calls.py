@@ -51,7 +51,16 @@ NOT_CALLED_BY_USERS = {
 
 #: Methods that the driver calls, and that authors of methods implement.
 INSIDE_METHODS = {"advance", "begin", "check", "most_at_once", "most_evaluations", "numbers_kept"}
-INSIDE_METHODS |= {"checked", "forward", "levels", "recorded", "require_fit", "slope"}
+INSIDE_METHODS |= {
+    "by_waves",
+    "checked",
+    "for_scene",
+    "forward",
+    "levels",
+    "recorded",
+    "require_fit",
+    "slope",
+}
 INSIDE_METHODS |= {"at", "farthest", "near", "section", "wanted", "write_file"}
 
 
@@ -186,6 +195,7 @@ ARGUMENTS: dict[str, Any] = {
     **dict.fromkeys(("observation_plane", "plane"), PLANE),
     **dict.fromkeys(("G", "transfer_matrix"), MATRIX),
     "fixed_transducer": 0,
+    "kelvin": 1.0,
     "amplitudes": [1.0, 0.5, 1.0, 1.0],
     "angle": 0.3,
     "array": SCENE.array,
@@ -354,6 +364,7 @@ OTHERS: dict[str, Any] = {
 INSTANCES = {
     "SimulatedPropagator": Made(lambda _: at.make_propagator(SCENE, "box", 2e-3, 0.5, max_periods=6)),
     "TMatrixPropagator": Made(lambda _: at.make_propagator(BALL, "tmatrix")),
+    "Medium": Made(lambda _: AIR),
     "TMatrix": Made(lambda _: operator()),
     "TMatrixCluster": Made(lambda _: at.TMatrixCluster([operator()])),
     "OpenMPDBoard": Made(lambda folder: at.OpenMPDBoard.load(board_file(folder))),

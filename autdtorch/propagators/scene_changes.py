@@ -150,9 +150,9 @@ class SceneChanges:
         if isinstance(before, FreeSpacePropagator):
             after = FreeSpacePropagator(scene)
         elif isinstance(before, TMatrixPropagator) and self._bodies and self._bodies.stay(amounts):
-            after = before.of(scene, self._bodies.cluster(amounts))
+            after = before.for_scene(scene, self._bodies.cluster(amounts))
         else:
-            after = before.of(scene)
+            after = before.for_scene(scene)
         self._last = dict(amounts), after
         return after
 

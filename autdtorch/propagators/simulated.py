@@ -83,7 +83,7 @@ class SimulatedPropagator:
         settings = f"{self.method}, spacing {1e3 * self.spacing:.4g} mm, steady to {self.tolerance:g}"
         return f"SimulatedPropagator(scene {self.scene.name!r}, {settings}, {counted(len(self.runs), 'run')})"
 
-    def of(self, scene: Scene) -> SimulatedPropagator:
+    def for_scene(self, scene: Scene) -> SimulatedPropagator:
         """Return the propagator of a changed scene, with these settings."""
         return SimulatedPropagator(self.plan.of(scene), self._store)
 

@@ -93,7 +93,7 @@ class MovedBodies:
         """Return the T of all bodies in air that is warmer [K], of as many waves as at the start."""
         if kelvin not in self._matrices:
             start = self._propagator.bodies.bodies
-            warmer = self._propagator.of(changed_scene(self._scene, {"temperature": kelvin}))
+            warmer = self._propagator.for_scene(changed_scene(self._scene, {"temperature": kelvin}))
             bodies = warmer.bodies.bodies if kelvin else start
             pairs = zip(bodies, start, strict=True)
             self._matrices[kelvin] = [_of_size(body.matrix, len(before.matrix)) for body, before in pairs]

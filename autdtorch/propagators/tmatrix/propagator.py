@@ -78,7 +78,7 @@ class TMatrixPropagator:
         settings = f"tmatrix, spacing {1e3 * self.spacing:.4g} mm, tolerance {self.tolerance:g}"
         return f"TMatrixPropagator(scene {self.scene.name!r}, {settings})"
 
-    def of(self, scene: Scene, bodies: TMatrixCluster | None = None) -> TMatrixPropagator:
+    def for_scene(self, scene: Scene, bodies: TMatrixCluster | None = None) -> TMatrixPropagator:
         """Return the propagator of a changed scene with these settings; its bodies need not be simulated."""
         return TMatrixPropagator(self.plan.of(scene), self._store, bodies=bodies)
 
