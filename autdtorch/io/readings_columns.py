@@ -46,7 +46,7 @@ _COUNTS = "columns={'phase': 16, 'pressure': 4}"
 
 @dataclass(frozen=True)
 class Column:
-    """A column: its index and title, what of `QUANTITIES` it holds, its number, and its unit as stated."""
+    """A column: index and title, its quantity of `QUANTITIES`, its number, and its stated unit."""
 
     index: int
     title: str

@@ -94,7 +94,7 @@ def answered(asked: torch.Tensor, drives: torch.Tensor) -> list[int | None]:
     free = torch.ones(len(asked), dtype=torch.bool, device="cpu")
     places: list[int | None] = []
     for drive, away in zip(drives, distance, strict=True):
-        exact = (asked == drive).all(dim=1)  # asked drives that differ by rounding are told apart
+        exact = (asked == drive).all(dim=1)  # distinguishes asked drives that differ by rounding
         candidates = free & (exact if (free & exact).any() else away <= _EQUAL)
         nearest = away.masked_fill(~candidates, torch.inf).argmin() if candidates.any() else None
         places.append(None if nearest is None else int(nearest))

@@ -391,7 +391,7 @@ class _Scatterer:
 
     @property
     def comes_back_later(self) -> bool:
-        """Whether mirrors send back an incident field of a further run."""
+        """True if mirrors send back an incident field of a further run."""
         return bool(self.transform.box.echoes) and self.echo is None
 
     def answer(

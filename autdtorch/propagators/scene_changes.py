@@ -28,7 +28,7 @@ class SceneChanges:
     """The transfer matrix of a scene as a function of the amounts of named changes.
 
     Names and units of amounts are those of `autdtorch.scene.changes.KINDS`; the scene itself has amounts of
-    0. A matrix is that of the changed scene, not an extrapolation. T-matrices are moved, not simulated again;
+    0. Each matrix is computed for the changed scene. T-matrices are moved, not simulated again;
     at other temperatures they are interpolated between simulations 12 K apart.
 
     Attributes:

@@ -189,7 +189,7 @@ class Simulation(ABC):
         return points
 
     def transfer_matrix(self, points: torch.Tensor) -> PressureMap:
-        """Return the transfer matrix of points (P, 3), by that of unit strengths, stored or simulated."""
+        """Return the transfer matrix of points (P, 3): strengths times the matrix of unit strengths."""
         key = digest_of(self.plan.key, points)
         unit = self._store.get(key, lambda: self._loaded(key, points) or self._saved(key, points))
         return replace(unit, matrix=complex_strengths_of(self.plan.scene.array) * unit.matrix)

@@ -101,7 +101,7 @@ class Medium:
 
     @property
     def is_air(self) -> bool:
-        """Whether density and sound speed are those of air in the range of `air`, taken as dry."""
+        """True if dry air in the range of `air` has this density and sound speed."""
         least, most = (limit + _ZERO_CELSIUS for limit in _TEMPERATURES)
         lowest, highest = _PRESSURES
         pressure = self.density * self.sound_speed**2 / _DIATOMIC

@@ -50,7 +50,7 @@ class HeldBack(NamedTuple):
 
     Attributes:
         error: rms error of the calibrated predictions over the rms reading.
-        before: that of the simulation with one free gain.
+        before: rms error of the simulation with one free gain, likewise.
         coverage: share of the readings within the stated 95 % intervals.
         readings: number of readings.
     """
