@@ -101,6 +101,11 @@ class SceneChanges:
             slopes[number] = (upper - lower) / (2 * step)
         return slopes
 
+    @property
+    def simulates(self) -> bool:
+        """True if each matrix takes simulations on grids; sums over waves or sources take none."""
+        return isinstance(self._propagator, SimulatedPropagator)
+
     def _is_by_waves(self, amounts: Amounts) -> bool:
         """Return whether sums over sources and waves of the same bodies serve all points."""
         if isinstance(self._propagator, FreeSpacePropagator):

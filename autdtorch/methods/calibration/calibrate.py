@@ -10,7 +10,7 @@ import torch
 
 from autdtorch.methods.calibration.calibration import Calibration, HeldBack
 from autdtorch.methods.calibration.fit import CalibrationFit, fitted
-from autdtorch.methods.calibration.simulation import Simulation
+from autdtorch.methods.calibration.simulation import LinearChanges, Simulation
 from autdtorch.methods.doubtful_readings import saturation_doubts
 from autdtorch.methods.prior import Prior, prior_of
 from autdtorch.objectives.readings import Readings
@@ -96,7 +96,9 @@ def _held_back(calibration: Calibration, start: torch.Tensor, folds: int, seed: 
     readings, errors, others, scaled = calibration.readings, [], [], []
     known = ~readings.pressure.isnan() & ~calibration.fit.read.outliers
     clean = _without(readings, ~known)
-    here = calibration.simulation.linear_at(calibration.fit.amounts)
+    simulation = calibration.simulation
+    linear = LinearChanges(*calibration.fit.changes, simulation.changes.names)
+    here = replace(simulation, changes=linear)
     for away in _parts(known, folds, seed):
         rest = _without(clean, away)
         fit = fitted(here, rest, calibration.settings)

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import torch
 
-from autdtorch.methods.calibration.fit import CalibrationFit, around_amounts
-from autdtorch.methods.calibration.simulation import Simulation
+from autdtorch.methods.calibration.fit import CalibrationFit, prior_around
+from autdtorch.methods.calibration.simulation import Simulation, Tangent
 from autdtorch.methods.doubtful_readings import Magnitudes
 from autdtorch.methods.prior import Prior
 from autdtorch.objectives.objective import validate_drives
@@ -187,8 +187,8 @@ class Calibration:
         posterior = self.fit.posterior
         if points is not None:
             changes = self.simulation.elsewhere(points_tensor("points", points))
-            around = around_amounts(changes, self.simulation.widths, self.settings, self.fit.amounts)
-            around = around.times(self.fit.unit)
+            tangent = Tangent.at(changes, self.fit.amounts)
+            around = prior_around(tangent, self.simulation.widths, self.settings).times(self.fit.unit)
             entries = around.rows.new_zeros(around.rows.shape)
             variance = posterior.variance.mean().expand_as(around.spread)
             posterior = replace(posterior, prior=around, entries=entries, variance=variance)

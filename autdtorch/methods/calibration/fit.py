@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from autdtorch.methods.calibration.simulation import Changes, Simulation
+from autdtorch.methods.calibration.simulation import Simulation, Tangent
 from autdtorch.methods.doubtful_readings import Magnitudes
 from autdtorch.methods.linearised_readings import LinearisedReadings
 from autdtorch.methods.matrix_fit import Trial
@@ -49,6 +49,12 @@ class CalibrationFit:
         """The fitted amounts of the changes (K,)."""
         return self.posterior.factors[2 * self.drives.shape[1] + 2 :]
 
+    @property
+    def changes(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The simulated matrix (P, M) at amounts of 0, and its derivatives (K, P, M), by the last tangent."""
+        prior = self.posterior.prior
+        return prior.rows / self.unit, prior.changes / self.unit
+
     @cached_property
     def line(self) -> LinearisedReadings:
         """The readings, linearised at the maximum."""
@@ -79,28 +85,26 @@ def fitted(simulation: Simulation, readings: Readings, prior: Prior) -> Calibrat
     until they no longer change (Gauss-Newton). A step that fits worse than the one before is halved.
     """
     amounts = torch.zeros_like(simulation.widths)
-    around = around_amounts(simulation.changes, simulation.widths, prior, amounts)
+    tangent = Tangent.at(simulation.changes, amounts)
+    around = prior_around(tangent, simulation.widths, prior)
     unit = around.unit_of(readings.drives, readings.pressure)
     fit = _first(around.times(unit), readings, unit)
     for _ in range(_ROUNDS):
-        before, prior_here = fit, around.times(unit)
-        trial = Trial(prior_here, fit.before, readings.drives, readings.pressure, phase=readings.phase).fit()
+        before, around = fit, prior_around(tangent, simulation.widths, prior).times(unit)
+        trial = Trial(around, fit.before, readings.drives, readings.pressure, phase=readings.phase).fit()
         fit = replace(fit, posterior=trial.posterior, read=trial.read)
         step = fit.amounts - amounts
         if not len(amounts) or (step.abs() < _ENOUGH * fit.deviations[-len(amounts) :]).all():
             break
-        fit, around, amounts = _moved(simulation, prior, before, fit, amounts)
+        fit, tangent = _moved(simulation, prior, before, fit, tangent)
+        amounts = tangent.amounts
         logger.debug("calibration: amounts %s", amounts.tolist())
     return fit
 
 
-def around_amounts(
-    changes: Changes, widths: torch.Tensor, prior: Prior, amounts: torch.Tensor
-) -> MatrixPrior:
-    """Return the prior of a matrix by changes of widths (K,), linearised around amounts (K,)."""
-    matrix = changes.matrix(amounts).to("cpu", torch.complex128)
-    derivatives = changes.derivatives(amounts).to("cpu", torch.complex128)
-    return gaussian_prior(prior, matrix, derivatives, widths, amounts)
+def prior_around(tangent: Tangent, widths: torch.Tensor, prior: Prior) -> MatrixPrior:
+    """Return the prior of a matrix by changes of widths (K,), as linear as its tangent."""
+    return gaussian_prior(prior, tangent.matrix, tangent.derivatives, widths, tangent.amounts)
 
 
 def _first(prior: MatrixPrior, readings: Readings, unit: float) -> CalibrationFit:
@@ -125,22 +129,25 @@ def _moved(
     prior: Prior,
     before: CalibrationFit,
     fit: CalibrationFit,
-    start: torch.Tensor,
-) -> tuple[CalibrationFit, MatrixPrior, torch.Tensor]:
-    """Return a fit with its amounts, or nearer to those at the start, where it fits better than before."""
+    tangent: Tangent,
+) -> tuple[CalibrationFit, Tangent]:
+    """Return a fit with its amounts, or nearer to those of the tangent, where it fits better than before."""
+    start = tangent.amounts
     factors = len(fit.posterior.factors) - len(start)
     worst = replace(before.posterior, variance=fit.posterior.variance).misfit(fit.drives, fit.read)
     for halving in range(_HALVINGS + 1):
         amounts = start + 0.5**halving * (fit.amounts - start)
         try:
-            around = around_amounts(simulation.changes, simulation.widths, prior, amounts)
+            after = tangent.moved(simulation.changes, amounts, simulation.widths)
         except ValueError as error:
             if halving == _HALVINGS:
                 raise
             logger.info("calibration: amounts %s are no scene: %s", amounts.tolist(), error)
             continue
         moved = torch.cat([fit.posterior.factors[:factors], amounts])
-        there = replace(fit.posterior, prior=around.times(fit.unit), factors=moved)
+        there = replace(
+            fit.posterior, prior=prior_around(after, simulation.widths, prior).times(fit.unit), factors=moved
+        )
         if there.misfit(fit.drives, fit.read) < worst:
             break
-    return replace(fit, posterior=there), around, amounts
+    return replace(fit, posterior=there), after

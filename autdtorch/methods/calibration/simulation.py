@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import TypeAlias
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import torch
 
@@ -24,6 +24,7 @@ class LinearChanges:
     start: torch.Tensor
     steps: torch.Tensor
     names: tuple[str, ...] = ()
+    simulates: ClassVar[bool] = False
 
     def matrix(self, amounts: torch.Tensor) -> torch.Tensor:
         """Return the matrix (P, M) [Pa]."""
@@ -35,6 +36,35 @@ class LinearChanges:
 
 
 Changes: TypeAlias = SceneChanges | LinearChanges
+
+
+class Tangent(NamedTuple):
+    """A matrix (P, M) [Pa] at amounts (K,) of changes, and its derivatives (K, P, M) there."""
+
+    amounts: torch.Tensor
+    matrix: torch.Tensor
+    derivatives: torch.Tensor
+
+    @classmethod
+    def at(cls, changes: Changes, amounts: torch.Tensor) -> Tangent:
+        """Return matrix and derivatives at amounts (K,)."""
+        matrix, derivatives = changes.matrix(amounts), changes.derivatives(amounts)
+        return cls(amounts, matrix.to("cpu", torch.complex128), derivatives.to("cpu", torch.complex128))
+
+    def moved(self, changes: Changes, amounts: torch.Tensor, widths: torch.Tensor) -> Tangent:
+        """Return the tangent at other amounts (K,), with Broyden's update where matrices are simulated.
+
+        The update, by the new matrix, takes one matrix instead of one or two for each change. Amounts count
+        in their `widths` (K,).
+        """
+        if not changes.simulates:
+            return self.at(changes, amounts)
+        matrix, step = changes.matrix(amounts).to("cpu", torch.complex128), amounts - self.amounts
+        left = matrix - self.matrix - (step[:, None, None] * self.derivatives).sum(dim=0)
+        shares = (
+            step / widths.square() / (step / widths).square().sum().clamp_min(torch.finfo(step.dtype).tiny)
+        )
+        return Tangent(amounts, matrix, self.derivatives + shares[:, None, None] * left)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +113,6 @@ class Simulation:
     def scene(self) -> Scene | None:
         """The scene of the propagator."""
         return None if self.propagator is None else self.propagator.scene
-
-    def linear_at(self, amounts: torch.Tensor) -> Simulation:
-        """Return the simulation linearised around amounts (K,)."""
-        steps = self.changes.derivatives(amounts).to("cpu", torch.complex128)
-        start = self.changes.matrix(amounts).to("cpu", torch.complex128)
-        start = start - (amounts[:, None, None] * steps).sum(dim=0)
-        return replace(self, changes=LinearChanges(start, steps, self.changes.names))
 
     def changed_scene(self, amounts: torch.Tensor) -> Scene | None:
         """Return the scene with amounts (K,) of the changes; None where there is a matrix alone."""
