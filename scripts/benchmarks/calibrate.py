@@ -7,7 +7,6 @@ the obstacle's pose and the temperature, and its readings have noise. Takes abou
 import dataclasses
 import math
 import time
-from collections.abc import Iterator
 
 import torch
 from shared.document import Page, table
@@ -25,9 +24,10 @@ OUTLIER = 100.0  # factor of a false reading
 
 OPTIONS = {
     "--scenes": {"default": "two_cubes,phone", "help": "scenes, by commas"},
+    "--drives": {"default": "random,trial", "help": "drives that were read: of random phases, or of a trial"},
     "--seeds": {"type": int, "default": 20, "help": "benches"},
-    "--readings": {"type": int, "default": 64, "help": "drives of random phases that were read"},
-    "--outliers": {"type": float, "default": 0.0, "help": "share of readings a hundred times too large"},
+    "--readings": {"type": int, "default": 64, "help": "drives that were read"},
+    "--outliers": {"default": "0,0.02", "help": "shares of readings a hundred times too large"},
 }
 
 _POSE = (
@@ -45,13 +45,18 @@ _PRIOR = {
 }
 
 
-def main(page: Page, scenes: str, seeds: int, readings: int, outliers: float) -> None:
+def main(page: Page, scenes: str, drives: str, seeds: int, readings: int, outliers: str) -> None:
     """Measure and write the block."""
     header = [
-        "scene", "drives", "outliers", "share of the optimum", "before", "gains within 2 deviations",
+        "scene, drives read", "outliers", "share of the optimum", "before", "gains within 2 deviations",
         "place off", "stated", "time",
     ]  # fmt: skip
-    rows = [row for name in scenes.split(",") for row in _rows(name, seeds, readings, outliers)]
+    rows = [
+        _row(propagator, kind, seeds, readings, float(share))
+        for propagator in map(_propagator, scenes.split(","))
+        for kind in drives.split(",")
+        for share in outliers.split(",")
+    ]
     page.add(table(header, rows))
 
 
@@ -69,58 +74,96 @@ def scene_of(name: str) -> at.Scene:
     )
 
 
-def _rows(name: str, seeds: int, readings: int, outliers: float) -> Iterator[list[str]]:
-    propagator = at.make_propagator(scene_of(name), method="tmatrix" if name == "two_cubes" else "auto")
+def _propagator(name: str) -> at.propagators.Propagator:
+    return at.make_propagator(scene_of(name), method="tmatrix" if name == "two_cubes" else "auto")
+
+
+def _row(
+    propagator: at.propagators.Propagator, kind: str, seeds: int, count: int, outliers: float
+) -> list[str]:
     results = []
     for seed in range(seeds):
-        results.append(_calibrated(propagator, seed, readings, outliers))
-        print(name, seed, [round(value, 4) for value in results[-1]], flush=True)
+        results.append(_calibrated(propagator, kind, seed, count, outliers))
+        print(
+            propagator.scene.name,
+            kind,
+            outliers,
+            seed,
+            [round(value, 4) for value in results[-1]],
+            flush=True,
+        )
     share, before, within, off, stated, seconds = torch.tensor(results).quantile(0.5, dim=0).tolist()
-    yield [
-        name, str(readings), f"{outliers:.0%}", f"{share:.3f}", f"{before:.3f}", f"{within:.0%}",
-        f"{1e3 * off:.2f} mm", f"{1e3 * stated:.2f} mm", f"{seconds:.0f} s",
+    return [
+        f"{propagator.scene.name}, {count} {kind}", f"{outliers:.0%}", f"{share:.3f}", f"{before:.3f}",
+        f"{within:.0%}", f"{1e3 * off:.2f} mm", f"{1e3 * stated:.2f} mm", f"{seconds:.0f} s",
     ]  # fmt: skip
 
 
+class Bench:
+    """An array, an obstacle and air that differ from the simulation, and a noisy microphone."""
+
+    def __init__(self, propagator: at.propagators.Propagator, seed: int) -> None:
+        """Draw the deviations, and simulate the scene as it is."""
+        self.draws = torch.Generator().manual_seed(seed)
+        changes = SceneChanges(propagator, [*_PRIOR])
+        shift, turn = self._normal(2, 3)
+        parts = [SHIFT * shift / shift.norm(), TURN * turn / turn.norm(), WARMER * self._normal(1)]
+        self.amounts = torch.cat(parts)
+        self.simulated = changes.matrix(torch.zeros_like(self.amounts))
+        count = self.simulated.shape[1]
+        self.log_gain, phase = GAIN * self._normal(count), PHASE * self._normal(count)
+        self.matrix = changes.matrix(self.amounts) * torch.polar(self.log_gain.exp(), phase)
+        self._noise = 10 ** (-NOISE / 20) * float(self.matrix.abs().square().sum(dim=1).mean().sqrt())
+
+    def __call__(self, drives: torch.Tensor) -> torch.Tensor:
+        """Read magnitudes of drives (N, M)."""
+        pressure = drives @ self.matrix.T
+        noise = torch.complex(self._normal(*pressure.shape), self._normal(*pressure.shape))
+        return (pressure + 0.5**0.5 * self._noise * noise).abs()
+
+    def readings(self, kind: str, count: int, outliers: float, seed: int) -> at.Readings:
+        """Return readings of random drives, or of those that `identify` asked for in a trial."""
+        if kind == "random":
+            shape = (count, self.matrix.shape[1])
+            phases = 2 * math.pi * torch.rand(shape, dtype=torch.float64, generator=self.draws)
+            drives = at.drive_from_phases(phases)
+            pressure = self(drives)
+        else:
+            method = at.Identify(count, at.Prior(self.simulated))
+            points, transducers = self.matrix.shape
+            state = method.start(at.Problem(transducers, points), seed)
+            parts = []
+            while not state.done:
+                asked = method.ask(state)
+                parts.append((asked, self(asked)))
+                state = method.tell(state, parts[-1][1])
+            drives, pressure = (torch.cat(part) for part in zip(*parts, strict=True))
+        false = torch.rand(pressure.shape, generator=self.draws) < outliers
+        return at.Readings(drives, torch.where(false, OUTLIER * pressure, pressure))
+
+    def weakest(self, drive: torch.Tensor) -> float:
+        """Return the weakest focus [Pa] of a drive (1, M), without noise."""
+        return float((drive @ self.matrix.T).abs().amin())
+
+    def _normal(self, *shape: int) -> torch.Tensor:
+        return torch.randn(*shape, dtype=torch.float64, generator=self.draws)
+
+
 def _calibrated(
-    propagator: at.propagators.Propagator, seed: int, count: int, outliers: float
+    propagator: at.propagators.Propagator, kind: str, seed: int, count: int, outliers: float
 ) -> tuple[float, float, float, float, float, float]:
     """Return shares of the optimum after and before, share of gains, the pose's error and deviation, time."""
-    draws = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, dtype=torch.float64, generator=draws)
-
-    changes = SceneChanges(propagator, [*_PRIOR])
-    shift, turn = normal(2, 3)
-    amounts = torch.cat([SHIFT * shift / shift.norm(), TURN * turn / turn.norm(), WARMER * normal(1)])
-    simulated = changes.matrix(torch.zeros_like(amounts))
-    log_gain, phase = GAIN * normal(simulated.shape[1]), PHASE * normal(simulated.shape[1])
-    matrix = changes.matrix(amounts) * torch.polar(log_gain.exp(), phase)
-    phases = 2 * math.pi * torch.rand(count, len(phase), dtype=torch.float64, generator=draws)
-    drives = at.drive_from_phases(phases)
-    pressure = drives @ matrix.T
-    noise = 10 ** (-NOISE / 20) * float(pressure.abs().square().mean().sqrt())
-    pressure = (
-        pressure + noise * torch.complex(normal(*pressure.shape), normal(*pressure.shape)) / 2**0.5
-    ).abs()
-    false = torch.rand(pressure.shape, generator=draws) < outliers
-    readings = at.Readings(drives, torch.where(false, OUTLIER * pressure, pressure))
+    bench = Bench(propagator, seed)
+    readings = bench.readings(kind, count, outliers, seed)
+    prior = at.Prior(variants=_PRIOR, gain=GAIN, phase=PHASE, rest=0.02)
     begin = time.perf_counter()
-    model = at.calibrate(
-        propagator, readings, at.Prior(variants=_PRIOR, gain=GAIN, phase=PHASE, rest=0.02), folds=0
-    )
+    model = at.calibrate(propagator, readings, prior, folds=0)
     drive = at.gradient_ascent(model.transfer_matrix).drive
     seconds = time.perf_counter() - begin
-
-    def weakest(drive: torch.Tensor) -> float:
-        return float((drive @ matrix.T).abs().amin())
-
-    best = weakest(at.gradient_ascent(matrix).drive)
-    deviates = (model.gain.log() - log_gain) / model.gain_deviation
+    best = bench.weakest(at.gradient_ascent(bench.matrix).drive)
+    before = bench.weakest(at.gradient_ascent(bench.simulated).drive)
+    within = float(((model.gain.log() - bench.log_gain) / model.gain_deviation).abs().lt(2).double().mean())
     place = [model.amounts[name] for name in _POSE[:3]]
-    off = math.dist([value for value, _ in place], amounts[:3].tolist())
+    off = math.dist([value for value, _ in place], bench.amounts[:3].tolist())
     stated = math.hypot(*(deviation for _, deviation in place))
-    before = weakest(at.gradient_ascent(simulated).drive)
-    within = float((deviates.abs() < 2).double().mean())
-    return weakest(drive) / best, before / best, within, off, stated, seconds
+    return bench.weakest(drive) / best, before / best, within, off, stated, seconds

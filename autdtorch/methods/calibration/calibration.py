@@ -68,7 +68,7 @@ class Calibration:
     Attributes:
         simulation: before the fit.
         readings: that were fitted.
-        prior: trust in the simulation.
+        settings: prior of the fit.
         fit: the posterior around the likeliest matrix.
         held_back: errors at readings that were held back; None without.
         doubts: sentences about sensors and readings that do not fit.
