@@ -17,7 +17,7 @@ import torch
 
 from autdtorch.scene.arrays import TransducerArray, radii_of
 from autdtorch.scene.geometry import rotation_matrix
-from autdtorch.scene.medium import Medium
+from autdtorch.scene.medium import ZERO_CELSIUS, Medium
 from autdtorch.scene.obstacles import Obstacle, Sphere
 from autdtorch.scene.obstacles.moving import circumscribed, is_movable, moved
 from autdtorch.scene.reflectors import Reflector, is_panel
@@ -93,7 +93,7 @@ def lever(name: str, scene: Scene) -> float:
     part, _, kind = name.rpartition(".")
     if name == "temperature":
         apart = torch.cdist(scene.control_points, scene.array.positions).max()
-        return float(apart) / (2 * scene.medium.temperature)
+        return float(apart) / (2 * (scene.medium.temperature + ZERO_CELSIUS))
     if not kind.startswith("turn_"):
         return 1.0
     if part == "array":

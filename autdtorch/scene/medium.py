@@ -20,7 +20,7 @@ _FREQUENCIES_BY_PRESSURE = 4e-4, 10.0  # Hz/Pa; range of ISO 9613-1
 
 _USUAL_SPEEDS = 20.0, 15e3  # m/s; bubbly water is slowest, and diamond faster than any fluid
 
-_ZERO_CELSIUS = 273.15  # K
+ZERO_CELSIUS = 273.15  # K
 _REFERENCE_TEMPERATURE = 293.15  # K
 _REFERENCE_PRESSURE = 101325.0  # Pa
 _TRIPLE_POINT = 273.16  # K
@@ -102,15 +102,15 @@ class Medium:
     @property
     def is_air(self) -> bool:
         """True if dry air in the range of `air` has this density and sound speed."""
-        least, most = (limit + _ZERO_CELSIUS for limit in _TEMPERATURES)
+        least, most = _TEMPERATURES
         lowest, highest = _PRESSURES
         pressure = self.density * self.sound_speed**2 / _DIATOMIC
         return least <= self.temperature <= most and lowest <= pressure <= highest
 
     @property
     def temperature(self) -> float:
-        """Temperature [K] at which dry air has its sound speed."""
-        return self.sound_speed**2 * _DRY_AIR / (_DIATOMIC * _GAS_CONSTANT)
+        """Temperature [deg C] at which dry air has its sound speed."""
+        return self.sound_speed**2 * _DRY_AIR / (_DIATOMIC * _GAS_CONSTANT) - ZERO_CELSIUS
 
     def warmed(self, kelvin: float) -> Medium:
         """Return air after a rise of its temperature [K] at its pressure, by the law of ideal gases.
@@ -124,8 +124,9 @@ class Medium:
         if not self.is_air:
             fluid = f"{self.density:.4g} kg/m^3, {self.sound_speed:.4g} m/s"
             raise invalid("medium", fluid, "must be air: of others the change with temperature is not known")
-        least, most = (limit + _ZERO_CELSIUS - self.temperature for limit in _TEMPERATURES)
-        ratio = 1 + number_between("kelvin", kelvin, least, most, "K") / self.temperature
+        least, most = (limit - self.temperature for limit in _TEMPERATURES)
+        rise = number_between("kelvin", kelvin, least, most, "K")
+        ratio = 1 + rise / (self.temperature + ZERO_CELSIUS)
         return replace(self, density=self.density / ratio, sound_speed=self.sound_speed * math.sqrt(ratio))
 
 
@@ -134,7 +135,7 @@ def vapour_fraction(temperature: float, relative_humidity: float, pressure: floa
     celsius = number_between("temperature", temperature, *_TEMPERATURES, "deg C")
     humidity = number_between("relative_humidity", relative_humidity, 0.0, 100.0, "%")
     pressure = number_between("pressure", pressure, *_PRESSURES, "Pa")
-    exponent = 4.6151 - 6.8346 * (_TRIPLE_POINT / (celsius + _ZERO_CELSIUS)) ** 1.261
+    exponent = 4.6151 - 6.8346 * (_TRIPLE_POINT / (celsius + ZERO_CELSIUS)) ** 1.261
     return humidity / 100 * math.pow(10, exponent) * _REFERENCE_PRESSURE / pressure
 
 
@@ -149,7 +150,7 @@ def _density_and_sound_speed(
     accurate to 0.03 %.
     """
     x = vapour_fraction(temperature, relative_humidity, pressure)
-    thermal = _GAS_CONSTANT * (temperature + _ZERO_CELSIUS) / ((1 - x) * _DRY_AIR + x * _WATER)
+    thermal = _GAS_CONSTANT * (temperature + ZERO_CELSIUS) / ((1 - x) * _DRY_AIR + x * _WATER)
     return pressure / thermal, math.sqrt((7 + x) / (5 + x) * thermal)
 
 
@@ -164,7 +165,7 @@ def _absorption_of_air(
     percent = 100 * vapour_fraction(temperature, relative_humidity, pressure)
     least, most = (limit * pressure for limit in _FREQUENCIES_BY_PRESSURE)
     frequency = number_between("frequency", frequency, least, most, "Hz")
-    kelvin = temperature + _ZERO_CELSIUS
+    kelvin = temperature + ZERO_CELSIUS
     warmth, atmospheres = kelvin / _REFERENCE_TEMPERATURE, pressure / _REFERENCE_PRESSURE
     oxygen = atmospheres * (24 + 4.04e4 * percent * (0.02 + percent) / (0.391 + percent))
     slowing = math.exp(-4.170 * (math.pow(warmth, -1 / 3) - 1))
