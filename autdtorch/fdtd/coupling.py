@@ -8,10 +8,9 @@ some rows and columns.
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,11 +29,12 @@ _ERROR = 1e-5
 _FREEDOM = 10.0
 """Degrees of freedom between two parts: more make large matrices, fewer make many."""
 
-_MOST_RANK = 120
-"""Rank of a pair of parts from which all waves are summed instead; usual are 30 to 60."""
+_MOST_RANK, _MOST_SIDES = 120, 4
+"""Rank of a pair of parts from which all waves are summed instead; usual are 30 to 60. Images may surround a
+box: then it is several times as large."""
 
 _NEAREST = 0.5
-"""Distance [wavelengths] of a surface up to which all waves are summed."""
+"""Distance [wavelengths] of a surface or an image of it up to which all waves are summed."""
 
 _SEVERAL = 3
 """Successive terms that must be small: a single one may be so by chance."""
@@ -54,9 +54,10 @@ class Coupling(NamedTuple):
 
     places: int  # number of the points
     pairs: Sequence[Pair]
+    rest: Sequence[Image]  # images of the surface too near for that, whose waves are to be added
 
     def field(self, amplitude: Tensor) -> Tensor:
-        """Return the fields (n, R) of amplitudes (m, R) [Pa m]."""
+        """Return the fields (n, R) of amplitudes (m, R) [Pa m], without those of the `rest`."""
         values, total = amplitude.numpy(), torch.zeros((self.places, amplitude.shape[1]), **COMPLEX)
         fields = total.numpy()
         for pair in self.pairs:
@@ -64,63 +65,69 @@ class Coupling(NamedTuple):
         return total
 
 
-def coupling_of(target: ScatteredField, source: ScatteredField, images: Sequence[Image]) -> Coupling | None:
-    """Return the coupling from images of a box's Huygens surface to another box; None where one is near."""
-    points, surface = target.driven.numpy(), source.surface[0]
-    seen = [image.of(surface).numpy() for image in images]
-    k = source.wavenumber
+def coupling_of(target: ScatteredField, source: ScatteredField, images: Sequence[Image]) -> Coupling:
+    """Return the coupling from images of a box's Huygens surface to another box."""
+    points, surface, k = target.driven, source.surface[0], source.wavenumber
     wavelength = 2 * math.pi / abs(k)
-    nearest = min(_nearest(points, places, wavelength) for places in seen)
-    if nearest < _NEAREST * wavelength:
-        return None
+    here, there = _balls(points.numpy(), wavelength), _balls(surface.numpy(), wavelength)
+    gaps = [_gap(here, (image.of(there[0]), there[1])) for image in images]
+    apart = [gap >= _NEAREST * wavelength for gap in gaps]
+    if not any(apart):
+        return Coupling(len(points), (), images)
+    nearest = min(itertools.compress(gaps, apart))
+    far = list(itertools.compress(images, apart))
+    rest = [image for image, clear in zip(images, apart, strict=True) if not clear]
     edge = math.sqrt(math.sqrt(_FREEDOM) * wavelength * nearest)
-    pairs = itertools.product(_parts(points, edge), _parts(surface.numpy(), edge))
+    pairs = itertools.product(_parts(points.numpy(), edge), _parts(surface.numpy(), edge))
+    weights = torch.tensor([image.weight for image in far], **COMPLEX)
+    most = _MOST_RANK * min(len(far), _MOST_SIDES)
 
     def approximated(pair: tuple[Index, Index]) -> Pair | None:
-        here, there = pair
-        ends = points[here].T.copy()
-        starts = [(image.weight, places[there].T.copy()) for image, places in zip(images, seen, strict=True)]
+        ends, starts = points[pair[0]], surface[pair[1]]
 
-        def row(number: int) -> AnyArray:
-            return _sum(weight * _waves(places - ends[:, number, None], k) for weight, places in starts)
+        def row(number: int) -> AnyArray:  # distances to an image are those from the place that it is of
+            places = [(ends[number] - image.offset) @ image.matrix for image in far]
+            return _waves(starts, torch.stack(places), weights, k)
 
         def column(number: int) -> AnyArray:
-            return _sum(weight * _waves(ends - places[:, number, None], k) for weight, places in starts)
+            return _waves(ends, torch.stack([image.of(starts[number]) for image in far]), weights, k)
 
-        factors = cross_approximation(row, column, (len(here), len(there)))
-        return None if factors is None else Pair(here, there, *factors)
+        factors = cross_approximation(row, column, (len(ends), len(starts)), most)
+        return None if factors is None else Pair(*pair, *factors)
 
     parts = spread(approximated, list(pairs), thread_count())
     whole = [part for part in parts if part is not None]
-    return Coupling(len(points), whole) if len(whole) == len(parts) else None
+    if len(whole) < len(parts):
+        return Coupling(len(points), (), images)
+    return Coupling(len(points), whole, rest)
 
 
-def _sum(terms: Iterable[AnyArray]) -> AnyArray:
-    return functools.reduce(np.add, terms)
+def _waves(points: Tensor, sources: Tensor, amplitude: Tensor, wavenumber: complex) -> AnyArray:
+    """Return the field (n,) at points (n, 3) of sources (m, 3) with amplitudes (m,)."""
+    if len(sources) > 1:
+        from autdtorch.fdtd.kernels.cpu_waves import superposition  # loads numba
 
-
-def _waves(offsets: Array, wavenumber: complex) -> AnyArray:
-    """Return e^{ikr} / r (n,) at offsets (3, n) [m]."""
-    x, y, z = offsets
+        return superposition(points, sources, amplitude[:, None], wavenumber)[:, 0].numpy()
+    x, y, z = (points - sources).mT.numpy()
     distance = np.sqrt(x * x + y * y + z * z)
     size, turn = np.exp(-wavenumber.imag * distance) / distance, wavenumber.real * distance
     waves = np.empty(len(distance), complex)
     waves.real, waves.imag = size * np.cos(turn), size * np.sin(turn)
-    return waves
+    return np.asarray(amplitude.item() * waves)
 
 
-def _nearest(points: Array, places: Array, edge: float) -> float:
-    """Return a distance [m] that points (n, 3) and places (m, 3) keep, from their cubes of an edge."""
-    ends = []
-    for each in (points, places):
-        parts = [each[index] for index in _parts(each, edge)]
-        center = np.array([part.mean(axis=0) for part in parts])
-        radius = [
-            np.linalg.norm(part - middle, axis=1).max() for part, middle in zip(parts, center, strict=True)
-        ]
-        ends.append((center, np.array(radius)))
-    (here, small), (there, wide) = ends
-    return float((cdist(here, there) - small[:, None] - wide).min())
+def _balls(places: Array, edge: float) -> tuple[Tensor, Array]:
+    """Return centres (c, 3) and radii (c,) [m] of balls around places (n, 3), a ball for each cube."""
+    parts = [places[index] for index in _parts(places, edge)]
+    center = np.array([part.mean(axis=0) for part in parts])
+    radius = [np.linalg.norm(part - middle, axis=1).max() for part, middle in zip(parts, center, strict=True)]
+    return torch.from_numpy(center), np.array(radius)
+
+
+def _gap(these: tuple[Tensor, Array], those: tuple[Tensor, Array]) -> float:
+    """Return the smallest distance [m] between two sets of balls."""
+    (here, small), (there, wide) = these, those
+    return float((cdist(here.numpy(), there.numpy()) - small[:, None] - wide).min())
 
 
 def _parts(places: Array, edge: float) -> list[Index]:
@@ -132,14 +139,14 @@ def _parts(places: Array, edge: float) -> list[Index]:
 
 
 def cross_approximation(
-    row: Callable[[int], AnyArray], column: Callable[[int], AnyArray], shape: tuple[int, int]
+    row: Callable[[int], AnyArray], column: Callable[[int], AnyArray], shape: tuple[int, int], most: int
 ) -> tuple[AnyArray, AnyArray] | None:
     """Return factors (n, rank) and (rank, m) of a matrix of `shape` from its rows and columns.
 
     Each term removes a row and a column of what is left; the next row goes through the largest entry of the
-    column. The result is None if the rank is larger than `_MOST_RANK`.
+    column. The result is None if the rank is larger than `most`.
     """
-    most = min(_MOST_RANK, *shape)
+    most = min(most, *shape)
     lefts, rights = np.zeros((most, shape[0]), complex), np.zeros((most, shape[1]), complex)
     unused, pivot, square, small = np.ones(shape[0], bool), 0, 0.0, 0
     for rank in range(most):

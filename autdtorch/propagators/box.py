@@ -151,9 +151,7 @@ class BoxSimulation(Simulation):
     def _mirrors(self, numbers: Iterable[int]) -> list[Mirror]:
         return [self.plan.region.mirrors[number] for number in numbers]
 
-    def coupling(
-        self, target: ScatteredField, source: ScatteredField, images: Sequence[Image]
-    ) -> Coupling | None:
+    def coupling(self, target: ScatteredField, source: ScatteredField, images: Sequence[Image]) -> Coupling:
         """Return the coupling from a box to another or to itself; see `coupling_of`."""
         key = target, source
         if key not in self._couplings:
@@ -161,7 +159,7 @@ class BoxSimulation(Simulation):
         return self._couplings[key]
 
     @cached_property
-    def _couplings(self) -> dict[tuple[ScatteredField, ScatteredField], Coupling | None]:
+    def _couplings(self) -> dict[tuple[ScatteredField, ScatteredField], Coupling]:
         return {}
 
     @property
@@ -381,7 +379,8 @@ class BoxSimulation(Simulation):
 class _Scatterer:
     """The obstacles of a box, whose answers to incident fields are simulated.
 
-    What mirrors send back drives the run itself, if there is an `echo`; else it is a further incident field.
+    The `echo` is what mirrors send back, None without mirrors. It drives the run itself, or where some waves
+    are summed one by one, it is a further incident field.
     """
 
     simulation: BoxSimulation
@@ -392,7 +391,7 @@ class _Scatterer:
     @property
     def comes_back_later(self) -> bool:
         """True if mirrors send back an incident field of a further run."""
-        return bool(self.transform.box.echoes) and self.echo is None
+        return self.echo is not None and bool(self.echo.rest)
 
     def answer(
         self, field: torch.Tensor, tolerance: float, observe: Observe, floors: Sequence[float] = (0.0,)
@@ -402,7 +401,7 @@ class _Scatterer:
         forces = box.sources(field)
         if not forces.force.any():  # obstacles of air, or drives that cancel
             return SteadyState(torch.zeros(len(cells), **COMPLEX), 0, 0.0, True)
-        echo = self.echo
+        echo = None if self.comes_back_later else self.echo
 
         def echoed(phasors: torch.Tensor) -> Sources:
             assert echo
@@ -434,9 +433,11 @@ class _Scatterer:
         box, here = other.transform.box, self.transform.box
         if other is self and not self.comes_back_later:
             return None
-        images = box.echoes if other is self else box.images
-        coupling = self.simulation.coupling(here, box, images)
-        return coupling.field(outgoing) if coupling else box.radiated(outgoing, here.driven, images)
+        coupling = self.simulation.coupling(here, box, box.echoes if other is self else box.images)
+        if not coupling.pairs:
+            return box.radiated(outgoing, here.driven, coupling.rest)
+        field = coupling.field(outgoing)
+        return field + box.radiated(outgoing, here.driven, coupling.rest) if coupling.rest else field
 
 
 def _images(box: ScatteredField, symmetry: Symmetry) -> Index:

@@ -21,14 +21,15 @@ _FEWEST, _MOST = 10, 400
 
 _CYCLES = 14.0
 """Turns of the phase of successive images over the series of two parallel planes. With 14, what is left out
-is below 2e-5 of the field of 50 drawn scenes, as the tail fades out smoothly; with 10 up to 1.5e-4, with 5
+is below 1e-4 of the field of 200 drawn scenes, as the tail fades out smoothly; with 10 up to 1.5e-4, with 5
 up to 1e-3 (`docs/decisions/room.md`)."""
 
 _NEGLIGIBLE = 1e-6
 """Weight of an image, relative to the first, that ends the series of two planes that absorb."""
 
-_REACH = 3.0
-"""Distance of the last image of two parallel planes, relative to the size of the scene."""
+_REACH = 1.5
+"""Distance up to which the images of two parallel planes have their full weights, relative to that of those
+that send the steepest wave guided between the planes across the scene."""
 
 _PLATEAU = 0.3
 """Share of the images of two parallel planes before the tail begins to fade out."""
@@ -124,9 +125,24 @@ def series_phase(first: Mirror, second: Mirror, wavenumber: complex) -> float:
 
     At zero the space between them resonates across, and its field grows without limit.
     """
-    turns = (wavenumber.real * 2 * _gap(first, second)) / (2 * math.pi)
-    turns += float(np.angle(first.reflection * second.reflection)) / (2 * math.pi)
+    turns = _turns(first, second, wavenumber)
     return abs(turns - round(turns))
+
+
+def _turns(first: Mirror, second: Mirror, wavenumber: complex) -> float:
+    """Return the phase [turns] of a round trip between two facing planes."""
+    turns = (wavenumber.real * 2 * _gap(first, second)) / (2 * math.pi)
+    return turns + float(np.angle(first.reflection * second.reflection)) / (2 * math.pi)
+
+
+def _steepest(first: Mirror, second: Mirror, wavenumber: complex) -> float:
+    """Return the slope of the steepest wave guided between two facing planes: its rise for each run.
+
+    Around the images in its direction, whose phases agree, the series gives its amplitude.
+    """
+    turns = _turns(first, second, wavenumber)
+    cosine = 1 - (turns - math.floor(turns)) / (wavenumber.real * _gap(first, second) / math.pi)
+    return cosine / math.sqrt(max(1 - cosine**2, 1 / _MOST**2))
 
 
 def _gap(first: Mirror, second: Mirror) -> float:
@@ -145,7 +161,7 @@ def _between(
     gap = _gap(first, second)
     decay = _decay(first, second, wavenumber)
     trips = _CYCLES / max(series_phase(first, second, wavenumber), _CYCLES / _MOST)
-    trips = max(trips, _REACH * size / gap)
+    trips = max(trips, _REACH * size * _steepest(first, second, wavenumber) / (2 * gap * _PLATEAU))
     if decay < 1:
         trips = min(trips, math.log(_NEGLIGIBLE) / math.log(max(decay, _NEGLIGIBLE)))
     count = min(max(math.ceil(trips), _FEWEST), _MOST)
