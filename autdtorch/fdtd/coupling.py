@@ -36,6 +36,9 @@ box: then it is several times as large."""
 _NEAREST = 0.5
 """Distance [wavelengths] of a surface or an image of it up to which all waves are summed."""
 
+_RATIO = 4.0
+"""Ratio of the distances of images whose waves are summed in one matrix."""
+
 _SEVERAL = 3
 """Successive terms that must be small: a single one may be so by chance."""
 
@@ -66,40 +69,57 @@ class Coupling(NamedTuple):
 
 
 def coupling_of(target: ScatteredField, source: ScatteredField, images: Sequence[Image]) -> Coupling:
-    """Return the coupling from images of a box's Huygens surface to another box."""
+    """Return the coupling from images of a box's Huygens surface to another box.
+
+    Images at similar distances are one matrix: the farther, the fewer degrees of freedom it has.
+    """
     points, surface, k = target.driven, source.surface[0], source.wavenumber
     wavelength = 2 * math.pi / abs(k)
     here, there = _balls(points.numpy(), wavelength), _balls(surface.numpy(), wavelength)
-    gaps = [_gap(here, (image.of(there[0]), there[1])) for image in images]
-    apart = [gap >= _NEAREST * wavelength for gap in gaps]
-    if not any(apart):
-        return Coupling(len(points), (), images)
-    nearest = min(itertools.compress(gaps, apart))
-    far = list(itertools.compress(images, apart))
-    rest = [image for image, clear in zip(images, apart, strict=True) if not clear]
-    edge = math.sqrt(math.sqrt(_FREEDOM) * wavelength * nearest)
-    pairs = itertools.product(_parts(points.numpy(), edge), _parts(surface.numpy(), edge))
-    weights = torch.tensor([image.weight for image in far], **COMPLEX)
-    most = _MOST_RANK * min(len(far), _MOST_SIDES)
+    pairs: list[Pair] = []
+    rest: list[Image] = []
+    levels: dict[int, list[tuple[float, Image]]] = {}
+    for image in images:
+        gap = _gap(here, (image.of(there[0]), there[1]))
+        if gap < _NEAREST * wavelength:
+            rest.append(image)
+        else:
+            levels.setdefault(int(math.log(gap / wavelength / _NEAREST, _RATIO)), []).append((gap, image))
+    for level in levels.values():
+        nearest, alike = min(gap for gap, _ in level), [image for _, image in level]
+        edge = math.sqrt(math.sqrt(_FREEDOM) * wavelength * nearest)
+        approximated = _pairs(points, surface, alike, edge, k)
+        pairs += approximated or ()
+        rest += () if approximated else alike
+    return Coupling(len(points), pairs, rest)
+
+
+def _pairs(
+    points: Tensor, surface: Tensor, images: Sequence[Image], edge: float, wavenumber: complex
+) -> list[Pair] | None:
+    """Return the waves from images of a surface to points, by parts of an edge; None if of too high rank."""
+    weights = torch.tensor([image.weight for image in images], **COMPLEX)
+    matrices = torch.stack([image.matrix for image in images])
+    offsets = torch.stack([image.offset for image in images])
+    most = _MOST_RANK * min(len(images), _MOST_SIDES)
 
     def approximated(pair: tuple[Index, Index]) -> Pair | None:
         ends, starts = points[pair[0]], surface[pair[1]]
 
         def row(number: int) -> AnyArray:  # distances to an image are those from the place that it is of
-            places = [(ends[number] - image.offset) @ image.matrix for image in far]
-            return _waves(starts, torch.stack(places), weights, k)
+            places = ((ends[number] - offsets)[:, None] @ matrices)[:, 0]
+            return _waves(starts, places, weights, wavenumber)
 
         def column(number: int) -> AnyArray:
-            return _waves(ends, torch.stack([image.of(starts[number]) for image in far]), weights, k)
+            return _waves(ends, matrices @ starts[number] + offsets, weights, wavenumber)
 
         factors = cross_approximation(row, column, (len(ends), len(starts)), most)
         return None if factors is None else Pair(*pair, *factors)
 
-    parts = spread(approximated, list(pairs), thread_count())
-    whole = [part for part in parts if part is not None]
-    if len(whole) < len(parts):
-        return Coupling(len(points), (), images)
-    return Coupling(len(points), whole, rest)
+    parts = itertools.product(_parts(points.numpy(), edge), _parts(surface.numpy(), edge))
+    pairs = spread(approximated, list(parts), thread_count())
+    whole = [pair for pair in pairs if pair is not None]
+    return whole if len(whole) == len(pairs) else None
 
 
 def _waves(points: Tensor, sources: Tensor, amplitude: Tensor, wavenumber: complex) -> AnyArray:
