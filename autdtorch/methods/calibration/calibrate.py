@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import torch
 
-from autdtorch.methods.calibration.calibration import Calibration, HeldBack
+from autdtorch.methods.calibration.calibration import Calibration, HeldBack, gain_to, relative_error
 from autdtorch.methods.calibration.fit import CalibrationFit, fitted
 from autdtorch.methods.calibration.simulation import LinearChanges, Simulation
 from autdtorch.methods.doubtful_readings import saturation_doubts
@@ -78,7 +78,7 @@ def calibrate(
         doubts += saturation_doubts(fit.read, point)
     for doubt in doubts:
         logger.warning("calibration: %s", doubt)
-    calibration = Calibration(simulation, used, prior, fit, None, tuple(doubts))
+    calibration = Calibration(simulation, start, used, prior, fit, None, tuple(doubts))
     for row, column in calibration.outliers:
         logger.warning(
             "calibration: the reading of drive %d at point %d, %.4g Pa, is far from the fit, and left out",
@@ -88,32 +88,29 @@ def calibrate(
         )
     if not folds:
         return calibration
-    return replace(calibration, held_back=_held_back(calibration, start, folds, seed))
+    return replace(calibration, held_back=_held_back(calibration, folds, seed))
 
 
-def _held_back(calibration: Calibration, start: torch.Tensor, folds: int, seed: int) -> HeldBack:
+def _held_back(calibration: Calibration, folds: int, seed: int) -> HeldBack:
     """Return errors at readings held back in turn, from fits around the amounts of all readings."""
-    readings, errors, others, scaled = calibration.readings, [], [], []
-    known = ~readings.pressure.isnan() & ~calibration.fit.read.outliers
+    readings = calibration.readings
+    observed, known = readings.pressure, ~readings.pressure.isnan() & ~calibration.fit.read.outliers
     clean = _without(readings, ~known)
     simulation = calibration.simulation
     linear = LinearChanges(*calibration.fit.changes, simulation.changes.names)
     here = replace(simulation, changes=linear)
+    simulated = (readings.drives @ calibration.simulated.T).abs()
+    predicted, scaled, deviation = (torch.full_like(observed, torch.nan) for _ in range(3))
     for away in _parts(known, folds, seed):
-        rest = _without(clean, away)
+        rest, taken, seen = _without(clean, away), away & known, known & ~away
         fit = fitted(here, rest, calibration.settings)
         part = replace(calibration, simulation=here, readings=rest, fit=fit)
-        prediction, taken = part.predict(readings.drives), away & known
-        observed = readings.pressure[taken]
-        errors.append(prediction.pressure[taken] - observed)
-        scaled.append(errors[-1] / prediction.of_reading[taken])
-        simulated, seen = (readings.drives @ start.T).abs(), known & ~away
-        gain = (simulated[seen] * readings.pressure[seen]).sum() / simulated[seen].square().sum()
-        others.append(gain * simulated[taken] - observed)
-    rms = readings.pressure[known].square().mean().sqrt()
-    error, before = (float(torch.cat(parts).square().mean().sqrt() / rms) for parts in (errors, others))
-    inside = torch.cat(scaled).abs() < _INTERVAL
-    return HeldBack(error, before, float(inside.double().mean()), len(inside))
+        prediction = part.predict(readings.drives)
+        predicted[taken], deviation[taken] = prediction.pressure[taken], prediction.of_reading[taken]
+        scaled[taken] = gain_to(observed[seen], simulated[seen]) * simulated[taken]
+    inside = ((predicted - observed).abs() < _INTERVAL * deviation)[known]
+    errors = (relative_error(one, observed) for one in (predicted, scaled))
+    return HeldBack(*errors, float(inside.double().mean()), len(inside), predicted, scaled)
 
 
 def _parts(known: torch.Tensor, folds: int, seed: int) -> Iterator[torch.Tensor]:

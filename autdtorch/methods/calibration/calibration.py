@@ -53,12 +53,28 @@ class HeldBack(NamedTuple):
         before: rms error of the simulation with one free gain, likewise.
         coverage: share of the readings within the stated 95 % intervals.
         readings: number of readings.
+        predicted: by the calibrations without them (N, P) [Pa], NaN elsewhere.
+        simulated: by the simulation with one free gain (N, P) [Pa], NaN elsewhere.
     """
 
     error: float
     before: float
     coverage: float
     readings: int
+    predicted: torch.Tensor
+    simulated: torch.Tensor
+
+
+def gain_to(observed: torch.Tensor, simulated: torch.Tensor) -> torch.Tensor:
+    """Return the gain of simulated magnitudes that fits observed ones best, where both are known."""
+    known = ~(observed + simulated).isnan()
+    return (simulated * observed)[known].sum() / simulated[known].square().sum()
+
+
+def relative_error(predicted: torch.Tensor, observed: torch.Tensor) -> float:
+    """Return the rms difference over the rms of observed magnitudes, where both are known."""
+    known = ~(observed + predicted).isnan()
+    return float((predicted - observed)[known].norm() / observed[known].norm())
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -67,6 +83,7 @@ class Calibration:
 
     Attributes:
         simulation: before the fit.
+        simulated: its transfer matrix (P, M) [Pa].
         readings: that were fitted.
         settings: prior of the fit.
         fit: the posterior around the likeliest matrix.
@@ -75,6 +92,7 @@ class Calibration:
     """
 
     simulation: Simulation
+    simulated: torch.Tensor
     readings: Readings
     settings: Prior
     fit: CalibrationFit
@@ -229,15 +247,18 @@ class Calibration:
     def _facts(self) -> list[tuple[str, str]]:
         facts = [("readings", f"{self.readings.count} of {len(self.readings)} drives")]
         if (held := self.held_back) is not None:
-            error = f"{held.error:.1%} after, {held.before:.1%} before with one gain"
+            error = f"{_percent(held.error)} after, {_percent(held.before)} before with one gain"
             facts += [
                 ("error at readings held back", error),
-                ("held by 95 % intervals", f"{held.coverage:.0%} of {held.readings}"),
+                ("held by 95 % intervals", f"{100 * held.coverage:.0f} % of {held.readings}"),
             ]
         spread = (self.gain.log() - self.gain.log().mean()).square().mean().sqrt()
         facts += [
             ("scale", f"{self.scale.value:.4g} +- {self.scale.deviation:.2g}"),
-            ("gains", f"spread {float(spread):.1%}, each +- {float(self.gain_deviation.mean()):.1%}"),
+            (
+                "gains",
+                f"spread {_percent(float(spread))}, each +- {_percent(float(self.gain_deviation.mean()))}",
+            ),
             (
                 "phases",
                 f"spread {float(self.phase.square().mean().sqrt()):.3f} rad, each +- "
@@ -256,3 +277,7 @@ class Calibration:
             more = f" and {len(self.outliers) - 5} more" if len(self.outliers) > 5 else ""
             facts.append(("left out", places + more))
         return facts + [("doubt", doubt) for doubt in self.doubts]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
