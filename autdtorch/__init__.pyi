@@ -2,6 +2,7 @@ from . import analytic, hardware
 from .analytic.green import green
 from .hardware.devices.openmpd import OpenMPDBoard
 from .io.array_file import load_array
+from .io.calibration_file import load_calibration, save_calibration
 from .io.drive_file import load_drive, save_drive
 from .io.field_file import save_field
 from .io.readings_file import load_readings, save_readings
@@ -41,6 +42,7 @@ from .objectives.objective import Objective, SimulatedObjective, weakest_focus
 from .objectives.perturbations import Drift, FailedTransducers, Noise, Quantised, true_pressure
 from .objectives.quiet import Contrast, QuietPoints
 from .objectives.readings import Readings
+from .plot.calibration_figure import plot_calibration
 from .plot.costs import plot_pareto, plot_scaling
 from .plot.explore import explore
 from .plot.pressure_maps import plot_plane, plot_planes
@@ -136,6 +138,7 @@ __all__ = [
     "holography",
     "identify",
     "load_array",
+    "load_calibration",
     "load_drive",
     "load_readings",
     "load_results",
@@ -145,6 +148,7 @@ __all__ = [
     "lssg",
     "make_propagator",
     "phases_of",
+    "plot_calibration",
     "plot_convergence",
     "plot_pareto",
     "plot_plane",
@@ -156,6 +160,7 @@ __all__ = [
     "porous",
     "random_search",
     "run",
+    "save_calibration",
     "save_drive",
     "save_field",
     "save_readings",

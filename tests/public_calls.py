@@ -41,7 +41,7 @@ METHODS = ("BayesOpt", "GABS", "GradientAscent", "Holography", "Identify", "LSS"
 NOT_CALLED_BY_USERS = {
     *("Estimate", "Evaluation", "EvaluationLog", "FocusMetrics", "Preflight", "Run", "Solution", "Sweep"),
     *("Adapter", "Device", "Dialect", "Obstacle", "OpenMPDBoard"),
-    *("TMatrixPropagator", "TMatrix", "SimulatedPropagator"),
+    *("Calibration", "TMatrixPropagator", "TMatrix", "SimulatedPropagator"),
     "UsbtmcPort",
     *("EmulatedBench.receive", "EmulatedScope.execute", "Goal", "Method", "State", "Waveform"),
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
@@ -102,6 +102,16 @@ def readings_file(folder: Path) -> Path:
 
 def readings() -> at.Readings:
     return at.Readings(torch.stack([DRIVE, DRIVE]), [1.0, 2.0])
+
+
+@cache
+def calibration() -> at.Calibration:
+    return at.calibrate(MATRIX, at.Readings(torch.eye(4, dtype=torch.complex128), MATRIX.abs().T), folds=0)
+
+
+def calibration_file(folder: Path) -> Path:
+    at.save_calibration(folder / "calibration.npz", calibration())
+    return folder / "calibration.npz"
 
 
 def mesh_file(folder: Path) -> Path:
@@ -202,6 +212,7 @@ ARGUMENTS: dict[str, Any] = {
     "ask": lambda question: "1",
     "backend": Made(lambda _: bench().bus),
     "bench": Made(lambda _: bench()),
+    "calibration": Made(lambda _: calibration()),
     "cell_area": 1e-6,
     "check": hardware.Preflight(torch.ones(4), silence=1.0, threshold=2.0),
     "chip": CHIP,
@@ -309,10 +320,15 @@ OTHERS: dict[str, Any] = {
     "VoxelMask.from_image.name": None,
     "VoxelMask.load.path": Made(lambda folder: saved(folder, "mask.npy", np.ones((2, 2, 2), bool))),
     "animate3d.path": Made(lambda folder: folder / "wave.gif"),
+    "calibrate.folds": 0,
     "cell_centers.scene": AIR_ALONE,
+    "Calibration.predict.drives": DRIVE,
+    "Calibration.predict.points": None,
+    "calibrate.propagator_or_matrix": MATRIX,
     "check_transducers.readings": 1,
     "differentiable_field.density": [50.0],
     "differentiable_field.sound_speed": [340.0],
+    "load_calibration.path": Made(calibration_file),
     "load_state.method": Made(lambda _: made("GABS")),
     "load_state.path": Made(state_file),
     "run.method": Made(lambda _: made("GABS")),
@@ -362,6 +378,7 @@ OTHERS: dict[str, Any] = {
 
 #: Of classes that users do not make themselves.
 INSTANCES = {
+    "Calibration": Made(lambda _: calibration()),
     "SimulatedPropagator": Made(lambda _: at.make_propagator(SCENE, "box", 2e-3, 0.5, max_periods=6)),
     "TMatrixPropagator": Made(lambda _: at.make_propagator(BALL, "tmatrix")),
     "Medium": Made(lambda _: AIR),

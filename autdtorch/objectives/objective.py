@@ -83,14 +83,14 @@ def observe_drives(
     return pressure.reshape(*drive.shape[:-1], -1)
 
 
-def validate_drives(drive: torch.Tensor, transducers: int) -> torch.Tensor:
+def validate_drives(drive: torch.Tensor, transducers: int, name: str = "drive") -> torch.Tensor:
     """Check drives (..., M), at least one, and return them as complex128 on the CPU, without gradient."""
-    drive = validate_drive(drive, transducers)
+    drive = validate_drive(drive, transducers, name)
     if drive.requires_grad and torch.is_grad_enabled():
         _log_lost_gradient()
     drive = drive.detach().cpu()
     if drive.numel() == 0:
-        raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (..., {transducers}), not empty")
+        raise ValueError(f"{name}: shape {tuple(drive.shape)}; must be (..., {transducers}), not empty")
     return drive
 
 

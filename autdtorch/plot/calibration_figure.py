@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from matplotlib.axes import Axes
@@ -15,13 +17,14 @@ from matplotlib.ticker import MaxNLocator
 from autdtorch.methods.calibration.calibration import Calibration, gain_to, relative_error
 from autdtorch.plot import colours
 from autdtorch.plot.data import MM, pressure_unit
-from autdtorch.plot.style import TICK_SIZE, add_legend, new_figure, styled
+from autdtorch.plot.style import TICK_SIZE, add_legend, new_figure, set_ticks, styled
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.spatial import closest_pair
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import require_kind
 
 _SIZE = (9.0, 3.1)  # of the figure [inch]
+_PANEL = 1.9  # of the longer side of the array [inch]
 _BEFORE, _AFTER, _LEFT_OUT = "0.6", "#0072B2", "#D55E00"  # colours
 _MOST_DOTS = 400  # readings, above which dots are small
 _FLAT = 0.5  # least ratio of the distance of neighbours in a drawing to their distance in space
@@ -77,7 +80,12 @@ def plot_calibration(calibration: Calibration) -> Figure:
         else:
             _draw_on_array(ax, places, value, unsure, middle, title)
     if places is not None and np.any(hardly):
-        style = {"marker": "o", "linestyle": "none", "color": "0.8", "markeredgecolor": colours.EDGE_COLOUR}
+        style: Any = {
+            "marker": "o",
+            "linestyle": "none",
+            "color": "0.8",
+            "markeredgecolor": colours.EDGE_COLOUR,
+        }
         handles.append(Line2D([], [], markersize=3, label="hardly determined by the readings", **style))
     add_legend(figure, handles)
     return figure
@@ -110,10 +118,10 @@ def _draw_readings(ax: Axes, calibration: Calibration) -> list[Line2D]:
         (after, _AFTER, "calibrated", errors[1]),
     ):
         ax.scatter(observed[known] / unit, part[known] / unit, size, color=colour, linewidths=0, alpha=0.7)
-        dot = {"marker": "o", "linestyle": "none", "markersize": 4, "color": colour}
+        dot: Any = {"marker": "o", "linestyle": "none", "markersize": 4, "color": colour}
         handles.append(Line2D([], [], label=f"{label}: {100 * error:.1f} % off", **dot))
     if outliers:
-        cross = {"marker": "x", "color": _LEFT_OUT}
+        cross: Any = {"marker": "x", "color": _LEFT_OUT}
         ax.scatter((lost / unit).clamp(max=most), fitted[rejected] / unit, 18, clip_on=False, **cross)
         beyond = " (to the right)" if (lost / unit > most).any() else ""
         label = f"{counted(len(outliers), 'outlier')}{beyond}"
@@ -168,13 +176,23 @@ def _draw_on_array(
     ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), aspect="equal", title=title)
     ax.set(xlabel=f"{axes[0]} [mm]", ylabel=f"{axes[1]} [mm]")
     ax.tick_params(labelsize=TICK_SIZE)
-    bar = ax.get_figure().colorbar(drawn, cax=ax.inset_axes((1.04, 0.0, 0.05, 1.0)))  # as high as the axes
+    lengths = _PANEL * (upper - lower) / (upper - lower).max()
+    for axis, length, *limits in zip((ax.xaxis, ax.yaxis), lengths.tolist(), lower, upper, strict=True):
+        set_ticks(axis, length, (limits[0], limits[1]))
+    bar = ax.figure.colorbar(drawn, cax=ax.inset_axes((1.04, 0.0, 0.05, 1.0)))  # as high as the axes
     bar.ax.tick_params(labelsize=TICK_SIZE)
+    set_ticks(bar.ax.yaxis, float(lengths[1]), bar.ax.get_ylim())
 
 
 def _draw_by_index(ax: Axes, values: Array, deviations: Array, middle: float) -> None:
     ax.axhline(middle, color="0.6", linewidth=0.8)
-    dots = {"linestyle": "none", "marker": "o", "markersize": 2.5, "elinewidth": 0.8, "ecolor": (_AFTER, 0.3)}
+    dots: Any = {
+        "linestyle": "none",
+        "marker": "o",
+        "markersize": 2.5,
+        "elinewidth": 0.8,
+        "ecolor": (_AFTER, 0.3),
+    }
     ax.errorbar(np.arange(len(values)), values, deviations, color=_AFTER, **dots)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("transducer")

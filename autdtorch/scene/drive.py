@@ -124,15 +124,15 @@ def drive_tensor(drive: ArrayLike) -> torch.Tensor:
     return complex_tensor("drive", drive, accepted)
 
 
-def validate_drive(drive: ArrayLike, transducers: int) -> torch.Tensor:
+def validate_drive(drive: ArrayLike, transducers: int, name: str = "drive") -> torch.Tensor:
     """Return `drive` as complex128 after checking that it is complex (..., transducers) with |q| <= 1."""
     drive = drive_tensor(drive)
     if drive.ndim == 0 or drive.shape[-1] != transducers:
-        raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (..., {transducers})")
+        raise ValueError(f"{name}: shape {tuple(drive.shape)}; must be (..., {transducers})")
     if drive.numel():
         largest = float(drive.detach().abs().max())
         if largest > 1 + AMPLITUDE_TOLERANCE:
-            raise ValueError(f"drive: amplitude {largest:.9g}; every |q| must be in [0, 1]")
+            raise ValueError(f"{name}: amplitude {largest:.9g}; every |q| must be in [0, 1]")
     return drive
 
 

@@ -111,6 +111,19 @@ def test_labels_over_trials_are_clear(data: st.DataObject) -> None:
     )
 
 
+@pytest.mark.parametrize(("points", "count", "scale"), [(1, 16, 1e-4), (4, 60, 30.0)])
+def test_labels_of_a_calibration_are_clear(points: int, count: int, scale: float) -> None:
+    array = at.TransducerArray.grid((2, count // 2), 10e-3, (0.0, 0.0, 0.0), source_strength=scale)
+    places = [[0.1, 0.01 * number, 0.0] for number in range(points)]
+    propagator = at.make_propagator(at.Scene(array, at.Medium(1.2, 340.0), 40e3, places))
+    random = np.random.default_rng(0)
+    drives = at.drive_from_phases(6 * random.random((6, count)))
+    pressure = (drives @ propagator.transfer_matrix().T).abs().numpy() * random.uniform(0.5, 2, (6, points))
+    pressure[2, 0] *= 1000
+    for model in (propagator, propagator.transfer_matrix()):
+        require_clear(at.plot_calibration(at.calibrate(model, at.Readings(drives, pressure), folds=0)))
+
+
 POINT_NAMES = ("", "0.5 mm", "gabs,levels=8,passes=3", "W" * 22, "x" * 60, "a name of sixty letters " * 3)
 
 

@@ -1,6 +1,7 @@
 """Figures show their data, with units on every axis, and change no global state."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib as mpl
@@ -250,6 +251,37 @@ def test_scenes_of_other_scales_have_their_own_axis(factor: float, shared: bool)
     assert (first.get_ylim() == second.get_ylim()) == shared
     assert first.get_ylim()[0] == second.get_ylim()[0] == 0
     assert first.get_ylim()[1] >= 2.0
+
+
+def test_a_calibration_is_drawn_on_the_array_or_by_index() -> None:
+    propagator = at.make_propagator(small_scene())
+    matrix = propagator.transfer_matrix()
+    drives = at.drive_from_phases(6 * RANDOM.random((20, 4)))
+    pressure = (drives @ (torch.tensor([1.2, 0.9, 1.0, 1.0j]) * matrix).T).abs()
+    pressure[7, 1] *= 100
+    calibration = at.calibrate(propagator, at.Readings(drives, pressure), at.Prior(rest=0.01))
+    left, gains, phases = at.plot_calibration(calibration).axes[:3]
+    before, after, outlier = (each.get_offsets() for each in left.collections)
+    assert len(before) == len(after) == 59
+    np.testing.assert_allclose(after[:, 1], after[:, 0], atol=0.05 * pressure[:7].max())
+    assert outlier.max() <= left.get_xlim()[1]  # at the edge, so that others can be told apart
+    assert f"{100 * calibration.held_back.before:.1f} %" in left.figure.legends[0].get_texts()[0].get_text()
+    for ax, values in ((gains, calibration.gain), (phases, calibration.phase)):
+        (dots,) = ax.collections
+        np.testing.assert_array_equal(dots.get_array(), values)
+        assert (ax.get_xlabel(), ax.get_ylabel()) == (
+            "y [mm]",
+            "z [mm]",
+        )  # the array is in the plane of y and z
+    of_matrix = at.calibrate(matrix, at.Readings(drives, pressure), folds=0)
+    figure = at.plot_calibration(of_matrix)
+    assert [ax.get_xlabel() for ax in figure.axes] == ["reading [Pa]", "transducer", "transducer"]
+    opposite = at.TransducerArray.grid((2, 2), 8e-3, (23e-3, 12e-3, 12e-3), normal=(-1, 0, 0))
+    two = at.make_propagator(replace(small_scene(), array=small_scene().array + opposite))
+    drives = at.drive_from_phases(6 * RANDOM.random((20, 8)))
+    readings = at.Readings(drives, (drives @ two.transfer_matrix().T).abs())
+    figure = at.plot_calibration(at.calibrate(two, readings, folds=0))
+    assert figure.axes[1].get_xlabel() == "transducer"  # one array would cover the other
 
 
 def test_poses_and_levels_are_drawn_along_the_path_and_across_their_scene() -> None:

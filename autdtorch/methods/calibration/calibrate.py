@@ -59,7 +59,7 @@ def calibrate(
     """
     require_kind("readings", readings, Readings)
     prior = prior_of("prior", prior) or Prior()
-    folds = integer_at_least("folds", folds, 0)
+    folds, seed = integer_at_least("folds", folds, 0), integer_at_least("seed", seed, 0)
     if readings.count == 0:
         raise invalid("readings", readings, "must have at least one reading")
     if folds == 1 or folds > readings.count:
@@ -109,8 +109,8 @@ def _held_back(calibration: Calibration, folds: int, seed: int) -> HeldBack:
         predicted[taken], deviation[taken] = prediction.pressure[taken], prediction.of_reading[taken]
         scaled[taken] = gain_to(observed[seen], simulated[seen]) * simulated[taken]
     inside = ((predicted - observed).abs() < _INTERVAL * deviation)[known]
-    errors = (relative_error(one, observed) for one in (predicted, scaled))
-    return HeldBack(*errors, float(inside.double().mean()), len(inside), predicted, scaled)
+    error, before = relative_error(predicted, observed), relative_error(scaled, observed)
+    return HeldBack(error, before, float(inside.double().mean()), len(inside), predicted, scaled)
 
 
 def _parts(known: torch.Tensor, folds: int, seed: int) -> Iterator[torch.Tensor]:

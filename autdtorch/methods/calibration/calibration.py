@@ -200,7 +200,7 @@ class Calibration:
         Raises:
             ValueError: drives of another shape, or points where a matrix alone was calibrated.
         """
-        played = validate_drives(complex_tensor("drives", drives), self.readings.drives.shape[1])
+        played = validate_drives(complex_tensor("drives", drives), self.readings.drives.shape[1], "drives")
         played = played.reshape(-1, played.shape[-1]).to(**COMPLEX)
         posterior = self.fit.posterior
         if points is not None:
