@@ -89,16 +89,19 @@ def fitted(simulation: Simulation, readings: Readings, prior: Prior) -> Calibrat
     around = prior_around(tangent, simulation.widths, prior)
     unit = around.unit_of(readings.drives, readings.pressure)
     fit = _first(around.times(unit), readings, unit)
-    for _ in range(_ROUNDS):
+    for left in reversed(range(_ROUNDS)):
         before, around = fit, prior_around(tangent, simulation.widths, prior).times(unit)
         trial = Trial(around, fit.before, readings.drives, readings.pressure, phase=readings.phase).fit()
         fit = replace(fit, posterior=trial.posterior, read=trial.read)
         step = fit.amounts - amounts
         if not len(amounts) or (step.abs() < _ENOUGH * fit.deviations[-len(amounts) :]).all():
-            break
-        fit, tangent = _moved(simulation, prior, before, fit, tangent)
-        amounts = tangent.amounts
-        logger.debug("calibration: amounts %s", amounts.tolist())
+            return fit
+        if left:  # the last fit stays at its readings
+            fit, tangent = _moved(simulation, prior, before, fit, tangent)
+            amounts = tangent.amounts
+            logger.debug("calibration: amounts %s", amounts.tolist())
+    names = ", ".join(simulation.changes.names)
+    logger.warning("calibration: %s not converged after %d fits", names, _ROUNDS)
     return fit
 
 
