@@ -29,6 +29,7 @@ SIZE, DISTANCES = 0.175, (0.15, 0.16)
 REACH = 20e-3  # largest shift that is sought first [m]
 COARSE = 2  # pixels of a step of this search
 STRIDE = 6  # of the fitted pixels along both axes
+STEPS = 30  # of the fit at most; those with wrong emitters do not end
 UNITS = np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-3])  # of a pose and a radius in the fit
 
 
@@ -126,7 +127,7 @@ class Scan:
             field = far_field(self.emitters, there.points(pixels)[fitted], there.radius)
             return (field @ read) / (field @ field) * field - read
 
-        best = least_squares(residual, np.array(start.values)[:free] / UNITS[:free])
+        best = least_squares(residual, np.array(start.values)[:free] / UNITS[:free], max_nfev=STEPS)
         return float(best.cost), pose(best.x)
 
 
