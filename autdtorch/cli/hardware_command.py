@@ -10,7 +10,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -20,7 +20,7 @@ from hydra.core.hydra_config import HydraConfig
 from autdtorch import hardware
 from autdtorch.cli.settings import (
     folder_of,
-    given_file,
+    given_readings,
     is_given,
     load_method,
     scene_of,
@@ -32,6 +32,8 @@ from autdtorch.hardware.sensors.sensor import SensorConfig, Setup
 from autdtorch.io.drive_file import save_drive
 from autdtorch.io.goal_section import goal_section, load_goal, score_label
 from autdtorch.io.readings_file import load_readings
+from autdtorch.methods.calibration.calibrate import calibrate
+from autdtorch.methods.calibration.calibration import Calibration
 from autdtorch.methods.problem import Problem
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
@@ -42,9 +44,10 @@ from autdtorch.propagators import make_propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.study.report.hardware_report import write_hardware_report
 from autdtorch.study.run_study import check_goal, name_of, solve
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.progress import Progress, show_progress
-from autdtorch.utils.validation import boolean, indices, invalid, require_known, require_one_of, within
+from autdtorch.utils.validation import boolean, indices, invalid, require_known, require_one_of
 
 logger = logging.getLogger(__name__)
 
@@ -194,6 +197,7 @@ def _ask(question: str) -> str:
 _Measured: TypeAlias = tuple[Solution, torch.Tensor, hardware.Preflight, hardware.EvaluationLog]
 
 _LOG_FILE = "trial.jsonl"
+_MOST_FITTED = 400  # evaluations, so that a calibration of 249 transducers takes less than a minute
 
 
 def hardware_trial(settings: dict[str, Any], modules: list[Any], output: Any, readings: object) -> None:
@@ -251,7 +255,8 @@ class _Trial:
         if self._goal != WEAKEST_FOCUS:  # so that logs from before there were goals go on
             self._settings["goal"] = goal_section(self._goal)
         self.begun = False
-        simulated = SimulatedObjective(self._scene, make_propagator(self._scene, **solver_of(settings)))
+        self._propagator = make_propagator(self._scene, **solver_of(settings))
+        simulated = SimulatedObjective(self._scene, self._propagator)
         bench.emulate(simulated)
         self._simulated = hardware.Played(simulated, bench.device, bench.transducers, bench.limits.amplitude)
         self._settings["largest amplitude"] = round(self._simulated.largest, 4)
@@ -262,11 +267,9 @@ class _Trial:
 
     def _with_readings(self, value: object) -> Readings | None:
         """Read the earlier readings of a file, if any, and return the simulated ones of these drives."""
-        self._readings = None
-        if (file := given_file("readings", value)) is None:
+        self._readings = given_readings(value)
+        if self._readings is None:
             return None
-        with within("readings"):
-            self._readings = load_readings(file)
         self._settings["readings"] = digest_of(self._readings)[:16]
         earlier = Problem.of(self._simulated, readings=self._readings).readings
         assert earlier is not None
@@ -285,7 +288,16 @@ class _Trial:
         save_drive(folder / "drive.npz", solution.drive[0], self._scene.array)
         command = shlex.join(["autdtorch", *sys.argv[1:]])
         report = write_hardware_report(
-            folder, log, solution, again, self._simulated, self._expected, preflight, self._goal, command
+            folder,
+            log,
+            solution,
+            again,
+            self._simulated,
+            self._expected,
+            preflight,
+            self._goal,
+            command,
+            self._calibration(preflight),
         )
         score = _shown(self._goal, again.mean(dim=0))
         print(f"{score}, measured once more; the report is {report}")
@@ -330,6 +342,18 @@ class _Trial:
             if not silent:
                 logger.warning("the sensor reads more than before the trial: are the outputs off?")
         return solution, again, preflight, objective.log
+
+    def _calibration(self, preflight: hardware.Preflight) -> Calibration | str:
+        """Return the simulation fitted to the evaluations, or the reason why there is none."""
+        readings = load_readings(self._folder / _LOG_FILE)
+        drives = readings.drives.clone()
+        drives[:, preflight.failed] = 0
+        rows = torch.linspace(0, len(drives) - 1, min(len(drives), _MOST_FITTED), **REAL).round().long()
+        try:
+            return calibrate(self._propagator, replace(readings, drives=drives)[rows])
+        except Exception as error:  # the trial has succeeded, and its report does not need a fit
+            logger.warning("no calibration: %s", error)
+            return str(error)
 
     def _preflight(
         self, limited: hardware.LimitedLink, sensor: hardware.Sensor, readings: int, progress: Progress

@@ -80,9 +80,11 @@ def main() -> None:
             print(f"autdtorch {autdtorch.__version__}")
         else:
             sweep = is_sweep(arguments)
+            if sweep and command:
+                raise ValueError(f"{command}: a sweep; must be one scene at a time")
             sys.argv[1:] = arguments
             register()
-            _explore() if command == "explore" else _run()
+            {"explore": _explore, "calibrate": _calibrate, None: _run}[command]()
             if sweep:
                 print("autdtorch collect merges the results of a sweep into one table and one report")
     except _Carrier as carrier:
@@ -120,13 +122,28 @@ def _run(config: DictConfig) -> None:
 
 @hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")
 def _explore(config: DictConfig) -> None:
-    from autdtorch.cli.settings import settings_of
+    with _errors_carried():
+        from autdtorch.cli.settings import settings_of
 
-    try:
-        if HydraConfig.get().mode == RunMode.MULTIRUN:
-            raise ValueError("explore: a sweep; must be one scene at a time")
         settings, modules, _ = settings_of(config)
         explore_scene(settings, modules)
+
+
+@hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")
+def _calibrate(config: DictConfig) -> None:
+    with _errors_carried(), warnings.catch_warnings():
+        from autdtorch.cli.calibrate_command import calibrate_scene
+        from autdtorch.cli.settings import settings_of
+
+        warnings.showwarning = _log_warning
+        calibrate_scene(*settings_of(config))
+
+
+@contextlib.contextmanager
+def _errors_carried() -> Iterator[None]:
+    """Carry errors past Hydra."""
+    try:
+        yield
     except Exception as error:
         raise _Carrier from error
 
@@ -193,7 +210,8 @@ def _job(config: DictConfig, sweep: Path | None) -> None:
     from autdtorch.cli.settings import settings_of
 
     settings, modules, output = settings_of(config)
-    settings.pop("explore", None)
+    for command in ("explore", "calibrate"):
+        settings.pop(command, None)
     drive, readings = settings.pop("drive", None), settings.pop("readings", None)
     if settings.get("hardware") is None:
         from autdtorch.cli.study_command import study

@@ -12,14 +12,16 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from autdtorch.io.readings_file import load_readings
 from autdtorch.io.scene_file import load_scene
 from autdtorch.io.yaml_file import TARGET, load_trusted, plain
 from autdtorch.methods.base import Method
 from autdtorch.methods.catalogue import METHODS
+from autdtorch.objectives.readings import Readings
 from autdtorch.propagators import make_propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.study.run_study import StudyMethod
-from autdtorch.utils.validation import invalid, path_of, require_known
+from autdtorch.utils.validation import invalid, path_of, require_known, within
 
 _SETTINGS = (
     "scene",
@@ -36,6 +38,7 @@ _SETTINGS = (
     "drive",
     "readings",
     "explore",
+    "calibrate",
 )
 _PLACES = ("modules", "output")  # settings that change no result
 _NOT_OF_METHODS = ("objective", "trials", "seed", "goal", "score")  # parameters that a study fills
@@ -139,6 +142,20 @@ def given_file(key: str, value: object) -> Path | None:
     if not is_given(key):
         raise invalid(key, value, "must be given on the command line")
     return path_of(key, value)
+
+
+def given_readings(value: object, **settings: Any) -> Readings | None:
+    """Return the readings of the file that the command line gives, or None.
+
+    `settings` are those of `load_readings`.
+    """
+    if (file := given_file("readings", value)) is None:
+        return None
+    try:
+        with within("readings"):
+            return load_readings(file, **settings)
+    except FileNotFoundError as error:
+        raise invalid("readings", str(file), "there is no such file") from error
 
 
 def is_given(key: str) -> bool:

@@ -79,11 +79,28 @@ def test_a_trial_leaves_log_drive_and_report_and_is_not_repeated(trial, tmp_path
     assert float(working[1]) > float(working[2])
     assert report.count("| 1.000 |\n") == 3  # without noise the readings are the simulation's
     assert (out / "convergence.png").exists()
+    # The emulated bench is the simulation, but for the failed transducer, which plays nothing.
+    held = re.search(r"held back from the fit: (\S+) % off with fitted .* phases, (\S+) % with one", report)
+    assert held is not None
+    assert max(map(float, held.groups())) < 0.5
+    assert (out / "calibration.png").exists()
     assert len(load_drive(out / "drive.npz")) == 9
 
     status, _, log = trial(*GABS)
     assert status == 2
     assert "of another trial, whose failed is [4], not []" in log
+
+
+def test_a_calibration_that_fails_does_not_spoil_a_trial(trial, tmp_path, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("the factorisation failed")
+
+    monkeypatch.setattr(autdtorch.cli.hardware_command, "calibrate", fail)
+    status, _, log = trial(*GABS, "hardware.sensor.snr=30")
+    assert (status, "no calibration: the factorisation failed" in log) == (0, True)
+    report = (tmp_path / "out" / "report.md").read_text()
+    assert "## Calibration\n\nNone: the factorisation failed.\n" in report
+    assert "held back" not in report
 
 
 def test_the_log_of_a_running_trial_is_refused_before_a_device_is_touched(trial, tmp_path, monkeypatch):
@@ -417,11 +434,11 @@ def fail_at(monkeypatch):
     def arrange(call, fail):
         real, calls = autdtorch.cli.hardware_command.solve, []
 
-        def solve(*arguments):
+        def solve(*arguments, **keywords):
             calls.append(None)
             if len(calls) == call + 1:
                 fail()
-            return real(*arguments)
+            return real(*arguments, **keywords)
 
         monkeypatch.setattr(autdtorch.cli.hardware_command, "solve", solve)
 

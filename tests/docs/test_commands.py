@@ -329,6 +329,10 @@ RULES = [
     (r"autdtorch .*poses=", runs("solver.spacing=2e-3 poses.count=3")),
     (r"autdtorch --help", starts),
     (r"autdtorch collect ", runs()),
+    (
+        r"autdtorch calibrate ",
+        covered_by("tests/cli/test_calibrate_command.py", "test_a_scene_is_calibrated"),
+    ),
     (r"autdtorch ", runs(SHORT)),
     (r"python -c ", runs()),
 ]

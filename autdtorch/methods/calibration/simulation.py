@@ -14,7 +14,7 @@ from autdtorch.propagators import Propagator
 from autdtorch.propagators.scene_changes import SceneChanges
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid
+from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid, within
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,8 @@ class Simulation:
             matrix = complex_tensor("propagator_or_matrix", model).detach().cpu()
             changes: Changes = _linear(matrix, prior)
         elif isinstance(variants, Mapping):
-            changes = SceneChanges(propagator, tuple(variants), points)
+            with within("prior.variants"):
+                changes = SceneChanges(propagator, tuple(variants), points)
         else:
             matrix = propagator.transfer_matrix(points).detach().to("cpu", torch.complex128)
             changes = _linear(matrix, prior)

@@ -9,6 +9,7 @@ from string import ascii_lowercase
 import numpy as np
 import torch
 
+from autdtorch.methods.calibration.calibration import Calibration
 from autdtorch.methods.catalogue import label_of
 from autdtorch.methods.solution import Solution
 from autdtorch.scene.scene import Scene
@@ -31,6 +32,15 @@ def of_scene(name: str, scene: Scene) -> str:
     if scene.reflectors:
         shown += f", {counted(len(scene.reflectors), 'reflector')}"
     return f"Scene {name} in 3D: {shown}"
+
+
+def of_calibration(calibration: Calibration) -> str:
+    """Return the text of the figure of a calibration: errors before and after, spread of gains and phases."""
+    held, gain, phase = calibration.held_back, calibration.gain, calibration.phase
+    errors = f", {held.before:.1%} off before and {held.error:.1%} after" if held is not None else ""
+    gains = f"gains of the transducers from {gain.min():.2f} to {gain.max():.2f}"
+    phases = f"phases from {phase.min():.2f} to {phase.max():.2f} rad"
+    return f"Predictions against readings{errors}; {gains}, {phases}"
 
 
 def of_planes(pressure: Spread) -> str:

@@ -15,9 +15,11 @@ import autdtorch
 from autdtorch.hardware.log import EvaluationLog
 from autdtorch.hardware.safety import Preflight
 from autdtorch.io.goal_section import score_label
+from autdtorch.methods.calibration.calibration import Calibration
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import Goal
 from autdtorch.objectives.objective import Objective
+from autdtorch.plot.calibration_figure import plot_calibration
 from autdtorch.plot.trials import plot_convergence
 from autdtorch.study.report import alt_texts
 from autdtorch.study.report.document import code, picture, rendered
@@ -26,7 +28,7 @@ from autdtorch.utils.files import naming, replace_file
 from autdtorch.utils.text import in_digits
 
 REPORT_FILE = "report.md"
-_FIGURE = "convergence.png"
+_FIGURE, _CALIBRATION_FIGURE = "convergence.png", "calibration.png"
 
 
 class Comparison(NamedTuple):
@@ -53,12 +55,13 @@ def write_hardware_report(
     preflight: Preflight,
     goal: Goal,
     command: str,
+    calibration: Calibration | str,
 ) -> Path:
-    """Write `report.md` and its figure into a folder; return its path.
+    """Write `report.md` and its figures into a folder; return its path.
 
     The drive of the `solution` on the bench was read `again` (R, P) [Pa]. `expected` is the solution of
     the same method on the `simulated` objective, without noise and with the phase levels of the device. Both
-    maximised the `goal`.
+    maximised the `goal`. The `calibration` is of the evaluations, or a text says why there is none.
     """
     evaluations, scene = log.evaluations, simulated.scene
     working = torch.ones(len(scene.array), **REAL)
@@ -72,6 +75,9 @@ def write_hardware_report(
     label = score_label(f"{goal.name}, best so far", goal.unit)
     with naming(folder / _FIGURE):
         plot_convergence({scene.name: histories}, label=label).savefig(folder / _FIGURE)
+    if isinstance(calibration, Calibration):
+        with naming(folder / _CALIBRATION_FIGURE):
+            plot_calibration(calibration).savefig(folder / _CALIBRATION_FIGURE)
     again_mean = again.mean(dim=0)
     pressures = solution.pressure[0], again_mean, fit.scale * simulated(working * solution.drive)[0]
     times = [datetime.fromisoformat(one.time) for one in evaluations]
@@ -96,6 +102,7 @@ def write_hardware_report(
         fits=_fits(scene.control_points, measured, predicted),
         scale=fit.scale,
         misfit=_percent(fit.misfit),
+        **_calibrated(calibration),
         alone=preflight.pressure[preflight.pressure > preflight.threshold],
         preflight=preflight,
         settings=[
@@ -106,6 +113,19 @@ def write_hardware_report(
     path = folder / REPORT_FILE
     replace_file(path, text.encode())
     return path
+
+
+def _calibrated(calibration: Calibration | str) -> dict[str, Any]:
+    """Return the values of the template that tell of a calibration, or why there is none."""
+    if isinstance(calibration, str):
+        return {"calibration": None, "why_none": calibration}
+    held = calibration.held_back
+    assert held is not None
+    return {
+        "calibration": calibration,
+        "held_back": {"after": _percent(held.error), "before": _percent(held.before)},
+        "calibrated": picture(_CALIBRATION_FIGURE, alt_texts.of_calibration(calibration)),
+    }
 
 
 def _percent(share: float) -> str:
