@@ -1,6 +1,7 @@
 """Files of calibrations: what is loaded is what was saved, and predicts the same."""
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,10 @@ import torch
 from small_scenes import small_scene
 
 import autdtorch as at
+from autdtorch.io import calibration_file
+from autdtorch.methods.calibration.fit import CalibrationFit
+from autdtorch.methods.doubtful_readings import Magnitudes
+from autdtorch.methods.matrix_posterior import MatrixPosterior, MatrixPrior
 
 BALL = at.Sphere((12e-3, 12e-3, 12e-3), radius=3e-3, rigid=True)
 ELSEWHERE = torch.tensor([[19e-3, 8e-3, 13e-3], [20e-3, 15e-3, 9e-3]], dtype=torch.float64)
@@ -54,6 +59,7 @@ def test_a_calibrated_matrix_is_loaded_as_it_was(phase: bool, tmp_path: Path) ->
     calibration = at.calibrate(matrix, readings_of(matrix, phase), prior)
     loaded = saved_and_loaded(calibration, tmp_path)
     assert loaded.summary() == calibration.summary()
+    assert "drive 3 at point 0" in loaded.summary()
     assert loaded.outliers == calibration.outliers == [(3, 0)]
     require_equal_predictions(calibration, loaded, None)
     with pytest.raises(ValueError, match="points"):
@@ -80,8 +86,23 @@ def test_a_calibrated_scene_predicts_the_same_anywhere(
     loaded = saved_and_loaded(calibration, tmp_path)
     assert loaded.scene.equals(calibration.scene)
     assert loaded.amounts == calibration.amounts
+    if names is not None:  # with its unit
+        assert re.search(r"temperature .* K|obstacles\.x .* m", loaded.summary())
     for points in (None, ELSEWHERE):
         require_equal_predictions(calibration, loaded, points)
+
+
+def test_the_file_has_every_field() -> None:
+    parts = {
+        at.Readings: calibration_file._OF_READINGS,
+        MatrixPrior: calibration_file._OF_PRIOR,
+        MatrixPosterior: ("prior", *calibration_file._OF_POSTERIOR),
+        Magnitudes: calibration_file._OF_MAGNITUDES,
+        at.Prior: ("transfer_matrix", "variants", *calibration_file._NUMBERS),  # the first is None
+        CalibrationFit: ("posterior", "read", "drives", "unit"),
+    }
+    for kind, names in parts.items():
+        assert {field.name for field in dataclasses.fields(kind)} == set(names)
 
 
 def test_meshes_are_in_the_file(tmp_path: Path) -> None:

@@ -14,13 +14,14 @@ from autdtorch.methods.doubtful_readings import Magnitudes
 from autdtorch.methods.prior import Prior
 from autdtorch.objectives.objective import validate_drives
 from autdtorch.objectives.readings import Readings
+from autdtorch.propagators.scene_changes import SceneChanges
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.process import cached_property, one_library_thread
-from autdtorch.utils.text import html_facts
+from autdtorch.utils.text import counted, html_facts
 from autdtorch.utils.validation import ArrayLike, complex_tensor, points_tensor
 
-_SHOWN = 0.5  # share of a transducer's prior variance that readings explain, above which they determine it
+_LISTED = 5  # outliers or groups in a summary
 _ALIKE = 0.9999  # cosine of two transducers' derivatives above which readings show them only together
 
 
@@ -245,12 +246,13 @@ class Calibration:
         return html_facts("Calibration", self._facts())
 
     def _facts(self) -> list[tuple[str, str]]:
-        facts = [("readings", f"{self.readings.count} of {len(self.readings)} drives")]
+        (drives, points), count = self.readings.pressure.shape, self.readings.count
+        facts = [("readings", f"{count}, of {counted(drives, 'drive')} at {counted(points, 'point')}")]
         if (held := self.held_back) is not None:
             error = f"{_percent(held.error)} after, {_percent(held.before)} before with one gain"
             facts += [
                 ("error at readings held back", error),
-                ("held by 95 % intervals", f"{100 * held.coverage:.0f} % of {held.readings}"),
+                ("within 95 % intervals", f"{100 * held.coverage:.0f} % of {held.readings}"),
             ]
         spread = (self.gain.log() - self.gain.log().mean()).square().mean().sqrt()
         facts += [
@@ -267,15 +269,18 @@ class Calibration:
             ("noise", f"{self.noise:.3g} Pa"),
             ("determined", f"{self.determined:.0f} of {2 * len(self.gain)} directions of gains and phases"),
         ]
-        facts += [
-            (name, f"{value:.4g} +- {deviation:.2g}") for name, (value, deviation) in self.amounts.items()
-        ]
-        if self.together:
-            facts.append(("seen only together", f"{len(self.together)} groups of transducers"))
+        changes = self.simulation.changes
+        units = changes.units if isinstance(changes, SceneChanges) else [""] * len(changes.names)
+        for (name, amount), unit in zip(self.amounts.items(), units, strict=True):
+            facts.append((name, f"{amount.value:.4g} +- {amount.deviation:.2g} {unit}".rstrip()))
+        if groups := ["+".join(map(str, group)) for group in self.together]:
+            more = ", ..." if len(groups) > _LISTED else ""
+            shown = f"transducers {', '.join(groups[:_LISTED])}{more}"
+            facts.append(("seen only together", shown))
         if self.outliers:
-            places = ", ".join(f"drive {row} point {column}" for row, column in self.outliers[:5])
-            more = f" and {len(self.outliers) - 5} more" if len(self.outliers) > 5 else ""
-            facts.append(("left out", places + more))
+            places = ", ".join(f"drive {row} at point {column}" for row, column in self.outliers[:_LISTED])
+            more = f" and {len(self.outliers) - _LISTED} more" if len(self.outliers) > _LISTED else ""
+            facts.append(("outliers left out", places + more))
         return facts + [("doubt", doubt) for doubt in self.doubts]
 
 
