@@ -182,10 +182,12 @@ class MatrixPosterior:
 
     def outliers(self, drives: torch.Tensor, read: Magnitudes, observed: torch.Tensor) -> torch.Tensor:
         """Return the readings (N, P), bool, of drives (N, M) that are far from this fit to `read`."""
-        line = self.linearised(drives, read)
-        across = line.left[len(drives) :]
-        left = torch.where(read.outliers, observed - line.magnitudes, line.left[: len(drives)])
-        left = torch.cat([left, across]).abs()
+        line, doubted = self.linearised(drives, read), read.outliers
+        left = line.left
+        if doubted.any():  # they are judged as if they were believed, by their phases too
+            believed = replace(read, value=observed.where(doubted, read.value), limit=read.limit & ~doubted)
+            left = self.linearised(drives, believed).left
+        left = left.abs()
         far = left > _HARMLESS * self.matrix.norm(dim=1)
         if not far.any():
             return torch.zeros_like(read.limit)
@@ -205,6 +207,11 @@ class MatrixPosterior:
         line = self.linearised(drives, read)
         shares = (line.shares * line.decided).sum(dim=0)
         return (line.left.square().sum(dim=0) / shares.clamp_min(1)).sqrt()
+
+    @property
+    def changes(self) -> torch.Tensor:
+        """Derivatives (K, P, M) [Pa] of the matrix by the amounts of changes."""
+        return self._scaled()[1]
 
     def _scaled(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return rows (P, M) and changes (K, P, M) of the prior, by the factors."""

@@ -115,6 +115,19 @@ def test_outliers_are_named_and_left_out(matrix):
     assert error(calibration, bench.matrix) < 1.3 * error(clean, bench.matrix) + 0.01
 
 
+def test_wrong_phases_are_named_and_left_out():
+    simulated = at.make_propagator(scene())
+    true = SceneChanges(simulated, ["temperature"]).matrix([4.0])  # takes several linearisations
+    readings = Bench(true, 4, gain=0.02, phase=0.05).readings(60, phase=True)
+    phase = readings.phase.clone()
+    broken = [(3, 0), (17, 2)]
+    for place in broken:
+        phase[place] += 3.0
+    prior = at.Prior(variants={"temperature": 3.0}, gain=0.02, phase=0.05, rest=0.01)
+    calibration = at.calibrate(simulated, dataclasses.replace(readings, phase=phase), prior, folds=0)
+    assert calibration.outliers == broken
+
+
 def test_gaps_are_no_readings(matrix):
     bench = Bench(matrix, 5)
     readings = bench.readings(60)
@@ -171,6 +184,19 @@ def test_named_changes_are_found(names):
     for name, (value, deviation) in calibration.amounts.items():
         assert deviation < names[name]
         assert abs(value - amounts[name]) < 4 * deviation
+
+
+def test_the_prior_for_methods_varies_the_calibrated_matrix():
+    simulated = at.make_propagator(scene())
+    names = {"points.y": 1e-3}
+    bench = Bench(simulated.transfer_matrix(), 11)
+    calibration = at.calibrate(simulated, bench.readings(60), at.Prior(variants=names), folds=0)
+    value, deviation = calibration.amounts["points.y"]
+    changes = SceneChanges(simulated, [*names])
+    here, aside = changes.matrix([value]), changes.matrix([value + 0.01 * deviation])
+    relative = (aside - here) / here  # gains, phases and the scale cancel, and only entries do not
+    variant = calibration.prior.variants[0] / calibration.transfer_matrix - 1
+    assert (variant - 100 * relative).norm() < 0.1 * variant.norm()
 
 
 def test_a_scan_of_a_plane_is_one_drive_at_many_points():

@@ -180,7 +180,7 @@ class Calibration:
     @property
     def prior(self) -> Prior:
         """The prior of a method that reads on at the same points: the matrix, and what is left unsure."""
-        steps = self._deviations[4][:, None, None] * self.fit.posterior.prior.changes
+        steps = self._deviations[4][:, None, None] * self.fit.posterior.changes
         matrix = self.transfer_matrix
         return Prior(
             matrix,
