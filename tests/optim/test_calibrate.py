@@ -159,6 +159,40 @@ def test_a_failed_microphone_is_named_and_left_out(matrix, caplog):
     assert off.norm() < 0.15 * bench.matrix[others].norm()
 
 
+def test_repeats_and_gaps_of_a_point_are_no_failed_microphone(matrix):
+    bench = Bench(matrix, 12)
+    drives = bench.drives(1).expand(40, -1)
+    repeats = at.Readings(drives, bench.pressure(drives).abs())
+    assert not at.calibrate(matrix, repeats, folds=0).doubts
+    readings = bench.readings(40)
+    readings.pressure[:, 1] = torch.nan
+    assert not at.calibrate(matrix, readings, folds=0).doubts
+
+
+@pytest.mark.parametrize("folds", [5, 7])
+def test_each_reading_is_held_back_once(matrix, folds):
+    readings = Bench(matrix, 13).readings(16)
+    readings.pressure[::2, 1] = torch.nan
+    held = at.calibrate(matrix, readings, folds=folds).held_back
+    assert torch.equal(held.predicted.isnan(), readings.pressure.isnan())
+    assert held.readings == 40
+
+
+def test_changes_of_a_microphone_do_not_move_other_points():
+    simulated = at.make_propagator(scene())
+    readings = Bench(SceneChanges(simulated, ["points[1].y"]).matrix([2e-3]), 14).readings(60)
+    calibration = at.calibrate(simulated, readings, at.Prior(variants={"points[1].y": 2e-3}), folds=0)
+    place = simulated.scene.control_points[1]
+    moved = place + torch.tensor([0.0, calibration.amounts["points[1].y"].value, 0.0])
+    alone, beside = (
+        calibration.predict(readings.drives, p) for p in (moved[None], torch.stack([place, moved]))
+    )
+    assert torch.allclose(alone.pressure[:, 0], beside.pressure[:, 1])
+    matrix = at.make_propagator(calibration.scene).transfer_matrix(moved[None])
+    expected = (readings.drives @ matrix.T).abs()
+    assert torch.allclose(alone.pressure, expected, rtol=1e-6)
+
+
 def test_symmetric_drives_show_sums_of_their_transducers_only(matrix):
     bench = Bench(matrix[1:2], 8, phase=0.1)
     drives = bench.drives(80)
@@ -217,6 +251,14 @@ def test_a_scan_of_a_plane_is_one_drive_at_many_points():
     ("settings", "message"),
     [
         ({"folds": 1}, "folds: 1; must be 0, or 2 to"),
+        (
+            {"readings": at.Readings(torch.ones(3, 16).to(torch.complex128), torch.zeros(3, 3))},
+            "at least one reading above 0 Pa",
+        ),
+        (
+            {"readings": at.Readings(torch.zeros(3, 16).to(torch.complex128), torch.ones(3, 3))},
+            "propagator_or_matrix: 0; must make a pressure",
+        ),
         ({"prior": at.Prior(torch.ones(3, 16, dtype=torch.complex128))}, "prior.transfer_matrix"),
         ({"prior": at.Prior(variants={"points.x": 1e-3})}, "prior.variants: .*names need a propagator"),
         ({"readings": "readings.csv"}, "readings: 'readings.csv'"),

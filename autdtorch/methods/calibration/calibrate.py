@@ -15,7 +15,6 @@ from autdtorch.methods.doubtful_readings import saturation_doubts
 from autdtorch.methods.prior import Prior, prior_of
 from autdtorch.objectives.readings import Readings
 from autdtorch.propagators import Propagator
-from autdtorch.utils.array_types import REAL
 from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import ArrayLike, integer_at_least, invalid, require_kind
 
@@ -25,6 +24,7 @@ _INTERVAL = 1.96  # standard deviations of a 95 % interval
 _LEAST_DRIVES = 2  # for each fold, to hold back drives; else readings are held back one by one
 _SHIFTS = (-3, -2, -1, 1, 2, 3)  # rows by which readings and drives may be shifted
 _COMPARED = 24  # least number of drives to look for a shift or a failed sensor
+_VARIES = 0.1  # least relative deviation of the expected readings, to see whether a sensor follows them
 _FOLLOWS = 0.3  # least rank correlation with the drives of a sensor that follows them
 
 
@@ -60,13 +60,15 @@ def calibrate(
     require_kind("readings", readings, Readings)
     prior = prior_of("prior", prior) or Prior()
     folds, seed = integer_at_least("folds", folds, 0), integer_at_least("seed", seed, 0)
-    if readings.count == 0:
-        raise invalid("readings", readings, "must have at least one reading")
+    if not (readings.pressure > 0).any():
+        raise invalid("readings", readings, "must have at least one reading above 0 Pa")
     if folds == 1 or folds > readings.count:
         raise invalid("folds", folds, f"must be 0, or 2 to {readings.count}, the number of readings")
     simulation = Simulation.of(propagator_or_matrix, readings, prior)
     start = simulation.changes.matrix(torch.zeros_like(simulation.widths)).to("cpu", torch.complex128)
     expected = (readings.drives @ start.T).abs()
+    if not (expected > 0).any():
+        raise invalid("propagator_or_matrix", 0, "must make a pressure with the drives of the readings")
     _require_in_step(expected, readings.pressure)
     fit, failed = _fit_without_failed(simulation, readings, prior, expected)
     used = _without(readings, failed.expand_as(readings.pressure))
@@ -116,15 +118,10 @@ def _held_back(calibration: Calibration, folds: int, seed: int) -> HeldBack:
 def _parts(known: torch.Tensor, folds: int, seed: int) -> Iterator[torch.Tensor]:
     """Yield masks (N, P) of readings to hold back: of whole drives, or of readings where drives are few."""
     generator = torch.Generator().manual_seed(seed)
-    if len(known) >= _LEAST_DRIVES * folds:
-        order = torch.randperm(len(known), generator=generator, device="cpu")
-        for part in order.chunk(folds):
-            away = torch.zeros_like(known)
-            away[part] = True
-            yield away
-        return
-    places = known.nonzero()
-    for part in torch.randperm(len(places), generator=generator, device="cpu").chunk(folds):
+    places = known.any(dim=1).nonzero()
+    if len(places) < _LEAST_DRIVES * folds:
+        places = known.nonzero()
+    for part in torch.randperm(len(places), generator=generator, device="cpu").tensor_split(folds):
         away = torch.zeros_like(known)
         away[tuple(places[part].T)] = True
         yield away
@@ -169,9 +166,16 @@ def _fit_without_failed(
 
 
 def _failed(expected: torch.Tensor, observed: torch.Tensor) -> torch.Tensor:
-    """Return the points (P,), bool, whose readings (N, P) do not follow the expected ones."""
-    columns = [_correlation(a[:, None], b[:, None]) for a, b in zip(expected.T, observed.T, strict=True)]
-    return torch.tensor(columns, **REAL) < (_FOLLOWS if len(observed) >= _COMPARED else -1.0)
+    """Return the points (P,), bool, whose readings (N, P) do not follow the expected ones.
+
+    Few readings, and drives that are expected to give nearly the same, show nothing of a sensor.
+    """
+    failed = []
+    for one, other in zip(expected.T, observed.T, strict=True):
+        known = ~other.isnan()
+        judged = int(known.sum()) >= _COMPARED and one[known].std() > _VARIES * one[known].mean()
+        failed.append(judged and _correlation(one[:, None], other[:, None]) < _FOLLOWS)
+    return torch.tensor(failed, dtype=torch.bool, device="cpu")
 
 
 def _correlation(expected: torch.Tensor, observed: torch.Tensor) -> float:
@@ -179,7 +183,14 @@ def _correlation(expected: torch.Tensor, observed: torch.Tensor) -> float:
     levels = []
     for one, other in zip(expected.T, observed.T, strict=True):
         known = ~other.isnan()
-        ranks = torch.stack([each[known].argsort().argsort().double() for each in (one, other)])
+        ranks = torch.stack([_ranks(each[known]) for each in (one, other)])
         if ranks.shape[1] > 2:
             levels.append(torch.corrcoef(ranks)[0, 1].nan_to_num())
     return float(torch.stack(levels).mean()) if levels else 0.0
+
+
+def _ranks(values: torch.Tensor) -> torch.Tensor:
+    """Return the ranks of values (N,), their mean where values are equal."""
+    _, place, counts = torch.unique(values, return_inverse=True, return_counts=True)
+    ranks: torch.Tensor = counts.cumsum(0) - 0.5 * counts.double()
+    return ranks[place]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 
 from autdtorch.methods.calibration.fit import CalibrationFit, prior_around
-from autdtorch.methods.calibration.simulation import Simulation, Tangent
+from autdtorch.methods.calibration.simulation import Simulation
 from autdtorch.methods.doubtful_readings import Magnitudes
 from autdtorch.methods.prior import Prior
 from autdtorch.objectives.objective import validate_drives
@@ -205,8 +205,7 @@ class Calibration:
         played = played.reshape(-1, played.shape[-1]).to(**COMPLEX)
         posterior = self.fit.posterior
         if points is not None:
-            changes = self.simulation.elsewhere(points_tensor("points", points))
-            tangent = Tangent.at(changes, self.fit.amounts)
+            tangent = self.simulation.elsewhere(points_tensor("points", points), self.fit.amounts)
             around = prior_around(tangent, self.simulation.widths, self.settings).times(self.fit.unit)
             entries = around.rows.new_zeros(around.rows.shape)
             variance = posterior.variance.mean().expand_as(around.spread)

@@ -13,7 +13,7 @@ from autdtorch.objectives.readings import Readings
 from autdtorch.propagators import Propagator
 from autdtorch.propagators.scene_changes import SceneChanges
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.array_types import REAL
+from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid, within
 
 
@@ -97,7 +97,8 @@ class Simulation:
                     "must be None with a transfer matrix, whose rows are the points; or give a propagator"
                 )
                 raise invalid("readings.points", points, accepted)
-            matrix = complex_tensor("propagator_or_matrix", model).detach().cpu()
+            accepted = "must be a propagator, as make_propagator makes it, or a transfer matrix (P, M) [Pa]"
+            matrix = complex_tensor("propagator_or_matrix", model, accepted).detach().cpu()
             changes: Changes = _linear(matrix, prior)
         elif isinstance(variants, Mapping):
             with within("prior.variants"):
@@ -119,19 +120,28 @@ class Simulation:
         """Return the scene with amounts (K,) of the changes; None where there is a matrix alone."""
         return self.changes.scene(amounts) if isinstance(self.changes, SceneChanges) else self.scene
 
-    def elsewhere(self, points: torch.Tensor) -> Changes:
-        """Return the matrix by amounts at other points (P, 3) [m]."""
+    def elsewhere(self, points: torch.Tensor, amounts: torch.Tensor) -> Tangent:
+        """Return matrix and derivatives by amounts (K,) at other points (P, 3) [m].
+
+        Changes of one point of the readings do not concern them.
+        """
         if self.propagator is None:
             raise invalid("points", points, "must be None: the calibration knows a matrix, and no propagator")
+        names = self.changes.names
         if isinstance(self.changes, SceneChanges):
-            return SceneChanges(self.propagator, self.changes.names, points)
-        if len(self.changes.names):
+            shared = [place for place, name in enumerate(names) if not name.startswith("points[")]
+            changes = SceneChanges(self.propagator, [names[place] for place in shared], points)
+            tangent = Tangent.at(changes, amounts[shared])
+            derivatives = torch.zeros(len(names), *tangent.matrix.shape, **COMPLEX)
+            derivatives[shared] = tangent.derivatives
+            return Tangent(amounts, tangent.matrix, derivatives)
+        if len(names):
             accepted = (
                 "must be None: variants that are matrices are known at their points alone; name changes"
             )
             raise invalid("points", points, accepted)
         matrix = self.propagator.transfer_matrix(points).detach().to("cpu", torch.complex128)
-        return LinearChanges(matrix, matrix.new_empty(0, *matrix.shape))
+        return Tangent(amounts, matrix, matrix.new_empty(0, *matrix.shape))
 
     def _require_fit(self, readings: Readings) -> None:
         shape = (readings.pressure.shape[1], readings.drives.shape[1])
