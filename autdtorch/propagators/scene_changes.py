@@ -101,6 +101,12 @@ class SceneChanges:
             slopes[number] = (upper - lower) / (2 * step)
         return slopes
 
+    def coarser(self, factor: float) -> SceneChanges:
+        """Return the changes on grids whose cells are larger by a factor; the same where there are none."""
+        if not isinstance(self._propagator, SimulatedPropagator):
+            return self
+        return SceneChanges(self._propagator.coarser(factor), self.names, self._points)
+
     @property
     def simulates(self) -> bool:
         """True if each matrix takes simulations on grids; sums over waves or sources take none."""

@@ -87,6 +87,10 @@ class SimulatedPropagator:
         """Return the propagator of a changed scene, with these settings."""
         return SimulatedPropagator(self.plan.of(scene), self._store)
 
+    def coarser(self, factor: float) -> SimulatedPropagator:
+        """Return the propagator of the same scene with cells larger by a factor."""
+        return SimulatedPropagator(self.plan.at(factor * self.spacing, self.tolerance), self._store)
+
     @property
     def runs(self) -> list[Run]:
         """All simulations in order.

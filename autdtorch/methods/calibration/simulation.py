@@ -16,6 +16,8 @@ from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid, within
 
+_COARSER = 1.5  # cells for derivatives, which Broyden's updates correct; a fifth of the cost
+
 
 @dataclass(frozen=True, eq=False)
 class LinearChanges:
@@ -47,8 +49,10 @@ class Tangent(NamedTuple):
 
     @classmethod
     def at(cls, changes: Changes, amounts: torch.Tensor) -> Tangent:
-        """Return matrix and derivatives at amounts (K,)."""
-        matrix, derivatives = changes.matrix(amounts), changes.derivatives(amounts)
+        """Return matrix and derivatives at amounts (K,); those on grids from larger cells."""
+        matrix = changes.matrix(amounts)
+        coarser = changes.coarser(_COARSER) if isinstance(changes, SceneChanges) else changes
+        derivatives = coarser.derivatives(amounts)
         return cls(amounts, matrix.to("cpu", torch.complex128), derivatives.to("cpu", torch.complex128))
 
     def moved(self, changes: Changes, amounts: torch.Tensor, widths: torch.Tensor) -> Tangent:
