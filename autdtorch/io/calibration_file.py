@@ -89,6 +89,7 @@ def save_calibration(path: str | os.PathLike[str], calibration: Calibration) -> 
         "variants": dict(prior.variants) if isinstance(prior.variants, Mapping) else None,
         "names": simulation.changes.names,
         "unit": fit.unit,
+        "converged": fit.converged,
         "held_back": None if held is None else {n: getattr(held, n) for n in _numbers_of_held_back()},
         "doubts": calibration.doubts,
         "digest": _digest(arrays),
@@ -125,7 +126,11 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
         matrix_prior = MatrixPrior(**_group("prior", tensors))
         posterior = MatrixPosterior(matrix_prior, **_group("posterior", tensors))
         fit = CalibrationFit(
-            posterior, Magnitudes(**_group("read", tensors)), readings.drives, header["unit"]
+            posterior,
+            Magnitudes(**_group("read", tensors)),
+            readings.drives,
+            header["unit"],
+            header["converged"],
         )
         held = None
         if header["held_back"] is not None:

@@ -99,7 +99,7 @@ def test_the_file_has_every_field() -> None:
         MatrixPosterior: ("prior", *calibration_file._OF_POSTERIOR),
         Magnitudes: calibration_file._OF_MAGNITUDES,
         at.Prior: ("transfer_matrix", "variants", *calibration_file._NUMBERS),  # the first is None
-        CalibrationFit: ("posterior", "read", "drives", "unit"),
+        CalibrationFit: ("posterior", "read", "drives", "unit", "converged"),
     }
     for kind, names in parts.items():
         assert {field.name for field in dataclasses.fields(kind)} == set(names)

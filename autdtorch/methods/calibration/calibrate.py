@@ -76,6 +76,9 @@ def calibrate(
         f"point {point} does not follow the drives, and is left out: has its sensor failed?"
         for point in failed.nonzero()[:, 0].tolist()
     ]
+    if not fit.converged:
+        names = ", ".join(simulation.changes.names)
+        doubts.append(f"the amounts of {names} have not converged: their deviations are too small")
     for point in range(len(failed)):
         doubts += saturation_doubts(fit.read, point)
     for doubt in doubts:

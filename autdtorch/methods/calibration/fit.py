@@ -37,12 +37,14 @@ class CalibrationFit:
         read: magnitudes (N, P) and phases; outliers and gaps say nothing.
         drives: (N, M).
         unit: scale of the readings by the simulation before the fit.
+        converged: whether the amounts of the changes have.
     """
 
     posterior: MatrixPosterior
     read: Magnitudes
     drives: torch.Tensor
     unit: float
+    converged: bool = True
 
     @property
     def amounts(self) -> torch.Tensor:
@@ -100,9 +102,7 @@ def fitted(simulation: Simulation, readings: Readings, prior: Prior) -> Calibrat
             fit, tangent = _moved(simulation, prior, before, fit, tangent)
             amounts = tangent.amounts
             logger.debug("calibration: amounts %s", amounts.tolist())
-    names = ", ".join(simulation.changes.names)
-    logger.warning("calibration: %s not converged after %d fits", names, _ROUNDS)
-    return fit
+    return replace(fit, converged=False)
 
 
 def prior_around(tangent: Tangent, widths: torch.Tensor, prior: Prior) -> MatrixPrior:

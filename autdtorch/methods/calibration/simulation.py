@@ -16,6 +16,7 @@ from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid, within
 
+_LEAST_STEP = 0.3  # of Broyden's update, in widths; shorter ones show errors of moved grids
 _COARSER = 1.5  # cells for derivatives, which Broyden's updates correct; a fifth of the cost
 
 
@@ -64,11 +65,11 @@ class Tangent(NamedTuple):
         if not changes.simulates:
             return self.at(changes, amounts)
         matrix, step = changes.matrix(amounts).to("cpu", torch.complex128), amounts - self.amounts
-        left = matrix - self.matrix - (step[:, None, None] * self.derivatives).sum(dim=0)
-        shares = (
-            step / widths.square() / (step / widths).square().sum().clamp_min(torch.finfo(step.dtype).tiny)
-        )
-        return Tangent(amounts, matrix, self.derivatives + shares[:, None, None] * left)
+        length, derivatives = (step / widths).norm(), self.derivatives
+        if length > _LEAST_STEP:
+            left = matrix - self.matrix - (step[:, None, None] * derivatives).sum(dim=0)
+            derivatives = derivatives + (step / widths.square() / length.square())[:, None, None] * left
+        return Tangent(amounts, matrix, derivatives)
 
 
 @dataclass(frozen=True, eq=False)
