@@ -125,7 +125,9 @@ def _of_header(place: str, header: list[str] | None, width: int) -> Iterator[Col
         if len(numbers) > 1 and numbers not in (list(range(len(numbers))), list(range(1, len(numbers) + 1))):
             titles = [column.title for column in members]
             twice = next((f"{title!r} twice" for title in titles if titles.count(title) > 1), None)
-            which = twice or f"{', '.join(titles[:3])}, ..., {titles[-1]}"
+            gaps = [str(n) for n in range(min(1, max(numbers[0], 0)), numbers[-1]) if n not in numbers]
+            among = f"{titles[0]!r} to {titles[-1]!r}"
+            which = twice or (f"{among} without {', '.join(gaps[:3])}" if gaps else among)
             raise ValueError(
                 f"{place}: columns of {what}, {which}; must have the numbers from 0 or 1, each once"
             )

@@ -75,7 +75,10 @@ UNSTATED = Unit()
 
 def pressure_unit(name: str, text: object) -> Unit:
     """Return the unit and kind that a text states, such as "kPa rms", "rms" or "dB re 20 uPa"."""
-    accepted = "must be Pa, kPa or mPa with peak, rms or peak-to-peak, as in 'Pa rms', or dB (re 20 uPa, RMS)"
+    accepted = (
+        "must be Pa, kPa or mPa with peak, rms or peak-to-peak, as in 'Pa rms', or dB (re 20 uPa, RMS); "
+        "divide volts by the sensor's V/Pa"
+    )
     if not isinstance(text, str):
         raise invalid(name, text, accepted)
     words = re.split(r"[\s_,()]+", _RE_20.sub(" ", peak_to_peak_as_word(text)).strip())

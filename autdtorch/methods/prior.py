@@ -46,7 +46,9 @@ class Prior:
         variants: transfer matrices (K, P, M) [Pa] of the scene as it may also be, each simulated with one
             change of the size that is to be expected: an obstacle 2 mm aside, the air 5 K warmer. For
             `calibrate` also names of changes with their standard deviations, such as ``{"obstacles.x": 2e-3,
-            "temperature": 5.0}``; see `SceneChanges`.
+            "temperature": 5.0}``. Names are `x`, `y`, `z` [m] and `turn_x`, `turn_y`, `turn_z` [rad] of
+            `obstacles` (all as one body), `obstacles[i]` and `array`; `x`, `y`, `z` [m] of `points` and
+            `points[i]`; `reflectors[i].distance` [m]; `temperature` [K]; `radius` [m] of transducers.
         gain: standard deviation of the logarithm of a transducer's gain, 1e-6 to 3.
         phase: of a transducer's phase [rad], 1e-6 to 2 pi.
         rest: of an entry, in rms entries of its row, 1e-6 to 10.

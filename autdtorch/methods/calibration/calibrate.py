@@ -8,7 +8,13 @@ from dataclasses import replace
 
 import torch
 
-from autdtorch.methods.calibration.calibration import Calibration, HeldBack, gain_to, relative_error
+from autdtorch.methods.calibration.calibration import (
+    Calibration,
+    HeldBack,
+    fit_doubts,
+    gain_to,
+    relative_error,
+)
 from autdtorch.methods.calibration.fit import CalibrationFit, fitted
 from autdtorch.methods.calibration.simulation import LinearChanges, Simulation
 from autdtorch.methods.doubtful_readings import saturation_doubts
@@ -16,7 +22,8 @@ from autdtorch.methods.prior import Prior, prior_of
 from autdtorch.objectives.readings import Readings
 from autdtorch.propagators import Propagator
 from autdtorch.utils.process import one_library_thread
-from autdtorch.utils.validation import ArrayLike, integer_at_least, invalid, require_kind
+from autdtorch.utils.text import counted
+from autdtorch.utils.validation import ArrayLike, integer_at_least, invalid
 
 logger = logging.getLogger(__name__)
 
@@ -54,10 +61,11 @@ def calibrate(
         seed: of the parts.
 
     Raises:
-        ValueError: readings of another array or other points, variants that do not fit, readings shifted
-            against their drives, or fewer readings than folds.
+        ValueError: readings of another array or other points, variants that do not fit, readings that fit
+            other drives, shifted or conjugate, or fewer readings than folds.
     """
-    require_kind("readings", readings, Readings)
+    if not isinstance(readings, Readings):
+        raise invalid("readings", readings, "must be Readings, which load_readings(path) returns")
     prior = prior_of("prior", prior) or Prior()
     folds, seed = integer_at_least("folds", folds, 0), integer_at_least("seed", seed, 0)
     if not (readings.pressure > 0).any():
@@ -70,19 +78,15 @@ def calibrate(
     if not (expected > 0).any():
         raise invalid("propagator_or_matrix", 0, "must make a pressure with the drives of the readings")
     _require_in_step(expected, readings.pressure)
+    _require_sign((readings.drives.conj() @ start.T).abs(), expected, readings.pressure)
     fit, failed = _fit_without_failed(simulation, readings, prior, expected)
     used = _without(readings, failed.expand_as(readings.pressure))
-    doubts = [
-        f"point {point} does not follow the drives, and is left out: has its sensor failed?"
-        for point in failed.nonzero()[:, 0].tolist()
-    ]
+    doubts = [*_sensor_doubts(failed, expected, readings.pressure)]
     if not fit.converged:
         names = ", ".join(simulation.changes.names)
         doubts.append(f"the amounts of {names} have not converged: their deviations are too small")
     for point in range(len(failed)):
         doubts += saturation_doubts(fit.read, point)
-    for doubt in doubts:
-        logger.warning("calibration: %s", doubt)
     calibration = Calibration(simulation, start, used, prior, fit, None, tuple(doubts))
     for row, column in calibration.outliers:
         logger.warning(
@@ -91,9 +95,12 @@ def calibrate(
             column,
             float(readings.pressure[row, column]),
         )
-    if not folds:
-        return calibration
-    return replace(calibration, held_back=_held_back(calibration, folds, seed))
+    if folds:
+        calibration = replace(calibration, held_back=_held_back(calibration, folds, seed))
+    calibration = replace(calibration, doubts=(*doubts, *fit_doubts(calibration)))
+    for doubt in calibration.doubts:
+        logger.warning("calibration: %s", doubt)
+    return calibration
 
 
 def _held_back(calibration: Calibration, folds: int, seed: int) -> HeldBack:
@@ -101,19 +108,22 @@ def _held_back(calibration: Calibration, folds: int, seed: int) -> HeldBack:
     readings = calibration.readings
     observed, known = readings.pressure, ~readings.pressure.isnan() & ~calibration.fit.read.outliers
     clean = _without(readings, ~known)
+    scored = (
+        known & ~calibration.fit.read.limit
+    )  # a saturated sensor says how far a prediction is off at least
     simulation = calibration.simulation
     linear = LinearChanges(*calibration.fit.changes, simulation.changes.names)
     here = replace(simulation, changes=linear)
     simulated = (readings.drives @ calibration.simulated.T).abs()
     predicted, scaled, deviation = (torch.full_like(observed, torch.nan) for _ in range(3))
     for away in _parts(known, folds, seed):
-        rest, taken, seen = _without(clean, away), away & known, known & ~away
+        rest, taken, seen = _without(clean, away), away & scored, scored & ~away
         fit = fitted(here, rest, calibration.settings)
         part = replace(calibration, simulation=here, readings=rest, fit=fit)
         prediction = part.predict(readings.drives)
         predicted[taken], deviation[taken] = prediction.pressure[taken], prediction.of_reading[taken]
         scaled[taken] = gain_to(observed[seen], simulated[seen]) * simulated[taken]
-    inside = ((predicted - observed).abs() < _INTERVAL * deviation)[known]
+    inside = ((predicted - observed).abs() < _INTERVAL * deviation)[scored]
     error, before = relative_error(predicted, observed), relative_error(scaled, observed)
     return HeldBack(error, before, float(inside.double().mean()), len(inside), predicted, scaled)
 
@@ -145,12 +155,36 @@ def _require_in_step(expected: torch.Tensor, observed: torch.Tensor) -> None:
             (expected[shift:], observed[:-shift]) if shift > 0 else (expected[:shift], observed[-shift:])
         )
         if (shifted := _correlation(one, other)) > max(_FOLLOWS, level + 4 / observed.numel() ** 0.5):
-            where = "before" if shift > 0 else "after"
-            follow = f"they follow the drives {abs(shift)} rows {'later' if shift > 0 else 'earlier'}"
+            follow = f"{counted(abs(shift), 'row')} {'later' if shift > 0 else 'earlier'}"
+            pairs = (f"{shift}:", f":{-shift}") if shift > 0 else (f":{shift}", f"{-shift}:")
             raise ValueError(
-                f"readings.pressure: shifted against the drives: {follow} (correlation {shifted:.2f}, "
-                f"{level:.2f} as given); remove {abs(shift)} rows of the one {where} the other"
+                f"readings.pressure: shifted against the drives: they follow those {follow} (correlation "
+                f"{shifted:.2f}, {level:.2f} as given); must be drives[{pairs[0]}] with pressure[{pairs[1]}]"
             )
+
+
+def _require_sign(conjugate: torch.Tensor, expected: torch.Tensor, observed: torch.Tensor) -> None:
+    """Refuse readings (N, P) that fit the conjugate drives far better than the drives."""
+    if len(observed) < _COMPARED:
+        return
+    level, turned = _correlation(expected, observed), _correlation(conjugate, observed)
+    if turned > max(_FOLLOWS, level + 4 / observed.numel() ** 0.5):
+        raise ValueError(
+            f"readings.drives: the pressures follow their conjugates (correlation {turned:.2f}, {level:.2f} "
+            "as given); must have phases of the other sign: load_readings(..., phases='arg deg' or 'arg rad')"
+        )
+
+
+def _sensor_doubts(failed: torch.Tensor, expected: torch.Tensor, observed: torch.Tensor) -> Iterator[str]:
+    """Describe points whose sensor has `failed` (P,), or reads what is `expected` (N, P) of another."""
+    for point in failed.nonzero()[:, 0].tolist():
+        column = observed[:, point, None]
+        levels = [_correlation(other[:, None], column) for other in expected.T]
+        nearest = max(range(len(levels)), key=levels.__getitem__)
+        cause = "has its sensor failed?"
+        if levels[nearest] > _FOLLOWS + 4 / len(observed) ** 0.5:
+            cause = f"it reads as point {nearest} should: are sensors interchanged?"
+        yield f"point {point} does not follow the drives, and is left out: {cause}"
 
 
 def _fit_without_failed(

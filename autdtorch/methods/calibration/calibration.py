@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -22,6 +22,8 @@ from autdtorch.utils.text import counted, html_facts
 from autdtorch.utils.validation import ArrayLike, complex_tensor, points_tensor
 
 _LISTED = 5  # outliers or groups in a summary
+_SCALED = 20.0  # scale, or its inverse, that no gain of a sensor explains
+_USELESS = 0.3  # relative error at readings held back that is no calibration
 _ALIKE = 0.9999  # cosine of two transducers' derivatives above which readings show them only together
 
 
@@ -253,17 +255,16 @@ class Calibration:
                 ("error at readings held back", error),
                 ("within 95 % intervals", f"{100 * held.coverage:.0f} % of {held.readings}"),
             ]
-        spread = (self.gain.log() - self.gain.log().mean()).square().mean().sqrt()
+        gains, phases = _spreads(self)
         facts += [
             ("scale", f"{self.scale.value:.4g} +- {self.scale.deviation:.2g}"),
             (
                 "gains",
-                f"spread {_percent(float(spread))}, each +- {_percent(float(self.gain_deviation.mean()))}",
+                f"spread {_percent(gains)}, each +- {_percent(float(self.gain_deviation.mean()))}",
             ),
             (
                 "phases",
-                f"spread {float(self.phase.square().mean().sqrt()):.3f} rad, each +- "
-                f"{float(self.phase_deviation.mean()):.3f} rad",
+                f"spread {phases:.3f} rad, each +- {float(self.phase_deviation.mean()):.3f} rad",
             ),
             ("noise", f"{self.noise:.3g} Pa"),
             ("determined", f"{self.determined:.0f} of {2 * len(self.gain)} directions of gains and phases"),
@@ -281,6 +282,33 @@ class Calibration:
             more = f" and {len(self.outliers) - _LISTED} more" if len(self.outliers) > _LISTED else ""
             facts.append(("outliers left out", places + more))
         return facts + [("doubt", doubt) for doubt in self.doubts]
+
+
+def fit_doubts(calibration: Calibration) -> Iterator[str]:
+    """Describe a fit that needs more than the prior expects, or that predicts badly."""
+    if not 1 / _SCALED < calibration.scale.value < _SCALED:
+        yield f"the scale is {calibration.scale.value:.3g}: are pressures in another unit than stated?"
+    settings = calibration.settings
+    most = (
+        1.5 + 3 / (2 * len(calibration.gain)) ** 0.5
+    )  # three deviations of the rms of so many draws, and half
+    gains, phases = _spreads(calibration)
+    causes = "are transducers in another order, or is the prior too narrow?"
+    if gains > most * settings.gain:
+        yield f"gains spread {_percent(gains)}, prior.gain is {_percent(settings.gain)}: {causes}"
+    if phases > most * settings.phase:
+        yield f"phases spread {phases:.2g} rad, prior.phase is {settings.phase:.2g} rad: {causes}"
+    held = calibration.held_back
+    if held is not None and held.error > _USELESS:
+        causes = "are there too few, in another unit (dB), or of other drives or another scene?"
+        yield f"predictions are {_percent(held.error)} off readings held back: {causes}"
+
+
+def _spreads(calibration: Calibration) -> tuple[float, float]:
+    """Return the rms of the logarithms of gains around their mean, and of phases [rad]."""
+    gains = calibration.gain.log()
+    rms = [part.square().mean().sqrt() for part in (gains - gains.mean(), calibration.phase)]
+    return float(rms[0]), float(rms[1])
 
 
 def _percent(share: float) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, TypeAlias
 
@@ -14,6 +14,7 @@ from autdtorch.propagators import Propagator
 from autdtorch.propagators.scene_changes import SceneChanges
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
+from autdtorch.utils.text import counted
 from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid, within
 
 _LEAST_STEP = 0.3  # of Broyden's update, in widths; shorter ones show errors of moved grids
@@ -37,6 +38,8 @@ class LinearChanges:
         """Return the derivatives (K, P, M) of the matrix by the amounts."""
         return self.steps
 
+
+_LARGEST = {"m": 0.1, "rad": 1.0, "K": 50.0}  # standard deviations, beyond which a unit is mistaken
 
 Changes: TypeAlias = SceneChanges | LinearChanges
 
@@ -108,6 +111,7 @@ class Simulation:
         elif isinstance(variants, Mapping):
             with within("prior.variants"):
                 changes = SceneChanges(propagator, tuple(variants), points)
+                _require_small(variants, changes.units)
         else:
             matrix = propagator.transfer_matrix(points).detach().to("cpu", torch.complex128)
             changes = _linear(matrix, prior)
@@ -158,8 +162,15 @@ class Simulation:
             points, transducers = self.changes.start.shape
             expected = (points, transducers)
         if shape != expected:
-            has = f"{shape[0]} points and {shape[1]} transducers"
-            raise invalid("readings", has, f"must be {expected[0]} points and {expected[1]} transducers")
+            has = f"{counted(shape[0], 'point')} and {counted(shape[1], 'transducer')}"
+            raise ValueError(f"readings: {has}; must be {expected[0]} and {expected[1]}, as simulated")
+
+
+def _require_small(widths: Mapping[str, float], units: Sequence[str]) -> None:
+    for (name, width), unit in zip(widths.items(), units, strict=True):
+        if width > _LARGEST[unit]:
+            accepted = f"must be at most {_LARGEST[unit]:g} {unit}, the standard deviation in SI units"
+            raise ValueError(f"{name!r}: {width:g} {unit}; {accepted}")
 
 
 def _linear(matrix: torch.Tensor, prior: Prior) -> LinearChanges:
