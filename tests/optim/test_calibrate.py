@@ -142,8 +142,50 @@ def test_gaps_are_no_readings(matrix):
 @pytest.mark.parametrize("shift", [-2, -1, 1, 3])
 def test_shifted_rows_are_refused(matrix, shift):
     readings = Bench(matrix, 6, phase=0.2).readings(60)
-    with pytest.raises(ValueError, match=rf"follow the drives {abs(shift)} rows"):
+    pairs = (
+        rf"drives\[:{-shift}\] .* pressure\[{shift}:\]"
+        if shift > 0
+        else rf"drives\[{-shift}:\] .* pressure\[:{shift}\]"
+    )
+    with pytest.raises(ValueError, match=pairs):
         at.calibrate(matrix, dataclasses.replace(readings, pressure=readings.pressure.roll(shift, 0)))
+
+
+def test_phases_of_the_other_sign_are_refused(matrix):
+    readings = Bench(matrix, 6, phase=0.2).readings(60)
+    with pytest.raises(ValueError, match="phases of the other sign"):
+        at.calibrate(matrix, dataclasses.replace(readings, drives=readings.drives.conj()))
+
+
+def test_interchanged_sensors_and_another_unit_are_doubted(matrix):
+    readings = Bench(matrix, 6, phase=0.2).readings(60)
+    interchanged = dataclasses.replace(readings, pressure=1000 * readings.pressure[:, [1, 0, 2]])
+    doubts = at.calibrate(matrix, interchanged, folds=0).doubts
+    assert "point 0 does not follow the drives, and is left out: it reads as point 1 should" in doubts[0]
+    assert "in another unit" in doubts[2]
+
+
+def test_transducers_in_another_order_are_doubted(matrix):
+    readings = Bench(matrix, 6, phase=0.2).readings(60)
+    mixed = dataclasses.replace(readings, drives=readings.drives.roll(3, dims=1))
+    assert "in another order" in " ".join(at.calibrate(matrix, mixed).doubts)
+
+
+def test_saturated_readings_do_not_count_as_errors(matrix):
+    readings = Bench(matrix, 6).readings(60)
+    pressure = readings.pressure.clamp(max=float(readings.pressure.median()))
+    held = at.calibrate(matrix, dataclasses.replace(readings, pressure=pressure)).held_back
+    assert held.readings < 0.6 * readings.count
+    assert held.error < 0.1  # with the saturated ones, 0.4 or more
+
+
+def test_widths_in_millimetres_are_refused():
+    propagator = at.make_propagator(scene())
+    readings = at.Readings(
+        torch.ones(2, 16, dtype=torch.complex128), torch.ones(2, len(scene().control_points))
+    )
+    with pytest.raises(ValueError, match=r"'points.x': 2 m; must be at most 0.1 m"):
+        at.calibrate(propagator, readings, at.Prior(variants={"points.x": 2.0}))
 
 
 def test_a_failed_microphone_is_named_and_left_out(matrix, caplog):
