@@ -306,7 +306,7 @@ def test_a_scan_of_a_plane_is_one_drive_at_many_points():
         ({"readings": "readings.csv"}, "readings: 'readings.csv'"),
         (
             {"readings": at.Readings(torch.ones(3, 5).to(torch.complex128), torch.ones(3, 3))},
-            "16 transducers",
+            "5 transducers; must be 3 and 16",
         ),
     ],
 )

@@ -287,11 +287,10 @@ class Calibration:
 def fit_doubts(calibration: Calibration) -> Iterator[str]:
     """Describe a fit that needs more than the prior expects, or that predicts badly."""
     if not 1 / _SCALED < calibration.scale.value < _SCALED:
-        yield f"the scale is {calibration.scale.value:.3g}: are pressures in another unit, or is source_strength wrong?"
+        causes = "are pressures in another unit, or is source_strength wrong?"
+        yield f"the scale is {calibration.scale.value:.3g}: {causes}"
     settings = calibration.settings
-    most = (
-        1.5 + 3 / (2 * len(calibration.gain)) ** 0.5
-    )  # three deviations of the rms of so many draws, and half
+    most = 1.5 + 3 / (2 * len(calibration.gain)) ** 0.5  # and three deviations of the rms of so many draws
     gains, phases = _spreads(calibration)
     causes = "are transducers in another order, or is the prior too narrow?"
     if gains > most * settings.gain:
