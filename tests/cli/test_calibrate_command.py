@@ -79,7 +79,7 @@ def test_units_changes_and_folds_are_settings(bench, run, tmp_path, capsys):
             "calibrate.prior.variants={wind: 1}",
             "calibrate: prior.variants: names: 'wind'; must be a change: obstacles.(",
         ),
-        ("scene=homogeneous", "calibrate: readings: '2 points and 4 transducers'; must be 4 points and 16"),
+        ("scene=homogeneous", "calibrate: readings: 2 points and 4 transducers; must be 4 and 16"),
         ("-m", "calibrate: a sweep; must be one scene at a time"),
     ],
 )
