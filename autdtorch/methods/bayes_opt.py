@@ -23,6 +23,7 @@ from autdtorch.objectives.readings import Readings
 from autdtorch.scene.drive import AMPLITUDE_TOLERANCE, drive_from_phases, phases_of
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.process import one_library_thread
+from autdtorch.utils.text import counted
 from autdtorch.utils.validation import integer_at_least, invalid, number_between, require_one_of
 
 if TYPE_CHECKING:
@@ -127,8 +128,13 @@ class BayesOpt(Method):
             raise invalid("prior", self.prior, 'must be None without the model "foci"')
 
     def check(self, problem: Problem) -> None:
-        """Check the number of transducers, and the prior."""
+        """Check the number of transducers, the prior, and earlier readings."""
         require_transducer(self._fixed(problem.transducers), problem.transducers)
+        earlier = _usable(problem.readings)
+        if self.model == "foci" and earlier is not None and not (read := earlier.pressure.any(dim=0)).all():
+            point = int((~read).nonzero()[0])
+            accepted = "must not be 0 throughout: the sensor of this control point has failed"
+            raise invalid(f"readings.pressure[:, {point}]", 0.0, accepted, "Pa")
         if self.prior is not None:
             prior_mean(self.prior, problem)
 
@@ -192,7 +198,10 @@ class BayesOpt(Method):
         if self.model == "foci":  # processes of the points that were played
             points = self._points(problem.quantise(self._drives(points)))
         fit, rows = self._fitted(problem, search, points, generators, left)
-        acquisition = self._acquisition(problem.goal, search["values"], points, fit, rows)
+        values = search["values"]
+        if rows is not None:  # outliers are as the matrix fits them
+            values = torch.where(search["outliers"], search["fitted_values"], values)
+        acquisition = self._acquisition(problem.goal, values, points, fit, rows)
         if left == 0:
             return Step(self._drives(points[:, :0]), {**search, "answer": acquisition.best})
         point = acquisition.next_points(generators, last=left == 1)[:, None]
@@ -219,6 +228,13 @@ class BayesOpt(Method):
             every = sum(map(len, told))
             text = f"{unused} of {every} readings are not used: they have gaps or amplitudes below 1"
             doubts = [[text, *texts] for texts in doubts or [[]]]
+        if state.done and "outliers" in state.search:
+            counts = state.search["outliers"].sum(dim=(1, 2)).tolist()
+            texts = [f"left out, far from the fit: {counted(count, 'pressure')}" for count in counts]
+            doubts = [
+                [text, *others] if count else others
+                for count, text, others in zip(counts, texts, doubts, strict=True)
+            ]
         return doubts
 
     def _with(
@@ -289,12 +305,13 @@ class BayesOpt(Method):
 
         observed = search["values"]
         drives = problem.quantise(self._drives(search["points"]))
-        power = mean_intensity(observed)
+        power = mean_intensity(_believed(search))
         variance = None if isinstance(self.noise, str) else 0.5 * self.noise / (1 + self.noise) * power
         prior = None if self.prior is None else matrix_prior(self.prior, problem)
         fits = posteriors(prior, search, drives, observed, generators, variance)
         search |= tensors_of(fits)
         mean = torch.stack([fit.posterior.matrix for fit in fits])
+        search["fitted_values"] = (drives @ mean.mT).abs()
         each = zip(fits, drives, generators, strict=True)
         sampled = torch.stack([fit.posterior.sample(drives, fit.read, draws) for fit, drives, draws in each])
         spread = (sampled - mean).abs().square().mean(dim=-1)
@@ -325,6 +342,16 @@ def _usable(readings: Readings | None) -> Readings | None:
     full = (readings.drives.abs() > 1 - AMPLITUDE_TOLERANCE).all(dim=1)
     usable = full & ~readings.pressure.isnan().any(dim=1)
     return readings[usable] if usable.any() else None
+
+
+def _believed(search: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    """Return the values (T, N, P), those that were outliers in the fit before as this fitted them."""
+    values = search["values"]
+    if "fitted_values" not in search:
+        return values
+    count = search["outliers"].shape[1]
+    known = torch.where(search["outliers"], search["fitted_values"], values[:, :count])
+    return torch.cat([known, values[:, count:]], dim=1)
 
 
 def require_transducer(fixed_transducer: int, transducers: int) -> None:

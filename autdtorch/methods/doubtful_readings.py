@@ -149,7 +149,7 @@ def sensor_doubts(drives: torch.Tensor, read: Magnitudes, fitted: torch.Tensor) 
         read: magnitudes (N, P).
         fitted: magnitudes (N, P) [Pa] by the fitted matrix.
     """
-    silent = _silent(read.nearest(fitted), fitted, 2 * drives.shape[1] - 1)
+    silent = _silent(read.nearest(fitted), fitted, 2 * drives.shape[1] - 1) & _differ(drives)
     for point in range(len(silent)):
         if silent[point]:
             reads = f"control point {point} reads up to {float(read.value[:, point].max()):.3g} Pa"
@@ -175,6 +175,12 @@ def _silent(observed: torch.Tensor, fitted: torch.Tensor, unknowns: int) -> torc
     if unknowns == 1 or spare < 1:  # one transducer alone makes the same magnitude at any phase
         return constant & (observed.amax(dim=0) == 0)
     return constant | ((total - rest) / unknowns < _RESPONSE * rest / spare)
+
+
+def _differ(drives: torch.Tensor) -> torch.Tensor:
+    """Return whether drives (N, M) differ in more than a common phase, and may make other magnitudes."""
+    common = (drives @ drives[0].conj()).sgn()[:, None] * drives[0]
+    return (drives - common).abs().max() > _EQUAL
 
 
 def reading_doubts(

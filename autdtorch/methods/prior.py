@@ -101,6 +101,8 @@ def prior_mean(prior: Prior, problem: Problem) -> torch.Tensor:
         raise invalid("prior.transfer_matrix", None, "must be given where the objective has none")
     shape = problem.foci, problem.transducers
     matrix = validate_matrix("prior.transfer_matrix", matrix, *shape)
+    if not matrix.any():
+        raise invalid("prior.transfer_matrix", 0, "must not be 0 throughout")
     if isinstance(prior.variants, torch.Tensor) and prior.variants.shape[1:] != shape:
         accepted = f"must be (K, {shape[0]}, {shape[1]})"
         raise ValueError(f"prior.variants: shape {tuple(prior.variants.shape)}; {accepted}")
@@ -135,8 +137,6 @@ def gaussian_prior(
     """
     each = torch.ones(matrix.shape[1], **REAL)
     entries = matrix.abs().square().mean(dim=1).sqrt()
-    if not entries.any():
-        raise invalid("prior.transfer_matrix", 0, "must not be 0 throughout")
     spread = prior.rest * entries.clamp_min(_DARK * float(entries.max()))
     rows = matrix if amounts is None else matrix - (amounts[:, None, None] * changes).sum(dim=0)
     of_all = each.new_tensor([_SCALE, _TURN])

@@ -275,6 +275,16 @@ def test_the_prior_for_methods_varies_the_calibrated_matrix():
     assert (variant - 100 * relative).norm() < 0.1 * variant.norm()
 
 
+def test_nothing_is_predicted_within_a_rigid_obstacle():
+    box = at.Box((40e-3, 0.0, 0.0), (20e-3, 20e-3, 20e-3), rigid=True)
+    settings = {"spacing": 2e-3, "tolerance": 0.1, "cache": False}
+    simulated = at.make_propagator(scene(1, (2, 2), obstacles=(box,)), **settings)
+    readings = Bench(simulated.transfer_matrix(), 15).readings(8)
+    prediction = at.calibrate(simulated, readings, folds=0).predict(readings.drives, [[40e-3, 0.0, 0.0]])
+    assert not prediction.pressure.any()
+    assert not prediction.deviation.any()
+
+
 def test_a_scan_of_a_plane_is_one_drive_at_many_points():
     y, z = torch.meshgrid(*2 * [torch.linspace(-20e-3, 20e-3, 12, dtype=torch.float64)], indexing="ij")
     points = torch.stack([torch.full_like(y, 60e-3), y, z], dim=-1).reshape(-1, 3)

@@ -161,6 +161,32 @@ def test_an_outlier_among_earlier_readings_is_left_out_and_named(make_objective,
     assert "earlier reading 7 at control point 1" in caplog.text
 
 
+def test_an_outlier_among_earlier_readings_harms_no_search_of_foci(bench, caplog):
+    readings = readings_of(bench, 30)
+    wrong = at.Readings(readings.drives, readings.pressure.clone())
+    wrong.pressure[3, 1] *= 100
+    method = at.BayesOpt(evaluations=4, initial=2, **FOCI)
+    score = [at.run(method, bench, readings=each).score for each in (readings, wrong)]
+    assert torch.allclose(*score, rtol=0.02)  # the matrix is known from 29 drives of 5 transducers
+    assert "left out, far from the fit: 1 pressure" in caplog.text
+
+
+def test_repeats_of_a_drive_accuse_no_sensor(make_objective, random_matrix, caplog):
+    matrix = random_matrix(3, 5, 0)
+    objective = make_objective(matrix)
+    readings = readings_of(objective, 1)[[0] * 20]
+    problem = at.Problem.of(objective, readings=readings)
+    at.Identify(evaluations=5, prior=at.Prior(matrix)).start(problem)
+    assert "sensor" not in caplog.text
+
+
+def test_a_search_of_foci_refuses_a_sensor_that_never_read_anything(bench):
+    readings = readings_of(bench, 20)
+    readings.pressure[:, 1] = 0
+    with pytest.raises(ValueError, match=r"readings.pressure\[:, 1\]: 0.0 Pa; must not be 0 throughout"):
+        at.bo_foci(bench, 6, readings=readings)
+
+
 def test_readings_take_the_place_of_initial_drives(bench):
     for count, asked in ((2, 3), (5, 1), (9, 1)):
         for method in (at.BayesOpt(8, 5), at.BayesOpt(8, 5, **FOCI)):
