@@ -147,8 +147,11 @@ def _counted(place: str, header: list[str] | None, width: int, kinds: list[str])
 
 
 def _titled(place: str, header: list[str] | None, named: Named) -> Iterator[Column]:
-    """Yield the columns of a table whose titles the call names."""
-    titles = header or []
+    """Yield the columns of a table whose titles the call names, each once.
+
+    Columns of a pattern follow each other by their numbers, if these differ: ch2 comes before ch10.
+    """
+    titles, taken = header or [], set[int]()
     for what, names in named.items():
         for name in [names] if isinstance(names, str) else names if not isinstance(names, int) else []:
             matching = [index for index, title in enumerate(titles) if title == name]
@@ -160,9 +163,24 @@ def _titled(place: str, header: list[str] | None, named: Named) -> Iterator[Colu
                 raise ValueError(
                     f"columns[{what!r}]: {name!r}; must be a title in {place}, which has {shown}"
                 )
-            for index in matching:
-                with within(place):
-                    yield _column(index, titles[index], what) or Column(index, titles[index], what)
+            if twice := taken & {*matching}:
+                accepted = "must be of one quantity, and named once"
+                raise ValueError(f"columns: {titles[min(twice)]!r} in {place} twice; {accepted}")
+            taken |= {*matching}
+            with within(place):
+                yield from _by_number([_titled_column(index, titles[index], what) for index in matching])
+
+
+def _titled_column(index: int, title: str, what: str) -> Column:
+    return _column(index, title, what) or Column(index, title, what)
+
+
+def _by_number(columns: list[Column]) -> list[Column]:
+    """Return columns in the order of their numbers, or as they are where some have none or one number."""
+    numbers = [column.number for column in columns if column.number is not None]
+    if len({*numbers}) < len(columns):
+        return columns
+    return sorted(columns, key=lambda column: column.number or 0)
 
 
 def _column(index: int, title: str, what: str | None = None) -> Column | None:

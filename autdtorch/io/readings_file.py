@@ -66,8 +66,8 @@ def load_readings(
         source: path of a file, or a data frame.
         columns: where the titles do not say what columns hold: the number of columns of each quantity, in
             order, such as ``{"phase": 16, "pressure": 4}``, with "skip" for others; or the titles to read,
-            such as ``{"phase": "ch*", "pressure": ["mic1", "mic2"]}``. Quantities are x, y, z, phase,
-            amplitude, pressure and pressure phase.
+            such as ``{"phase": "ch*", "pressure": ["mic1", "mic2"]}``, those of a pattern by their numbers.
+            Quantities are x, y, z, phase, amplitude, pressure and pressure phase.
         phases: unit of the drive's phases: "rad", "deg", "arg rad", "arg deg", a number of levels in a turn
             such as 32, or the device whose levels they are, such as "sonicsurface".
         pressure: unit and kind of the pressures, such as "Pa rms", "kPa peak" or "mPa peak-to-peak", or what

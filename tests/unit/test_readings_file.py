@@ -78,6 +78,9 @@ def test_a_table_is_read_in_any_spelling(load, text, arguments):
 
 def test_columns_are_sorted_by_their_numbers_and_others_skipped_by_the_call(load):
     close(load("p_rms_Pa,phase 2 [deg],phase 1 [deg]\n1.5,90,0\n,45.5,180").drives, Q)
+    titled = {"phase": "ch*", "pressure": "mic"}  # in the order of text
+    phases = load("ch1,ch10,ch2,mic\n1,10,2,3", columns=titled, phases="rad", pressure="Pa peak").drives
+    close(phases, torch.exp(-1j * torch.tensor([[1, 2, 10]], dtype=torch.float64)))
     counted = {"skip": 1, "phase": 2, "pressure": 1}
     close(
         load("09:00,0,90,1.5\n09:01,180,45.5,2", columns=counted, phases="deg", pressure="mPa peak").drives, Q
@@ -280,6 +283,11 @@ def rows_of(title, numbers):
             TABLE,
             {"columns": {"phase": "phi*", "pressure": "p*"}},
             r"columns\['phase'\]: 'phi\*'; must be a title",
+        ),
+        (
+            "ch1,mic\n1,3",
+            {"columns": {"phase": "*", "pressure": "mic"}, **STATED},
+            "columns: 'mic' in .* twice",
         ),
         (
             "0,9o,1\n1,2,3",
