@@ -48,6 +48,20 @@ def command_of(arguments: list[str]) -> str | None:
     return None
 
 
+def settings_first(arguments: Sequence[str]) -> list[str]:
+    """Return arguments with the settings before all options, between which Hydra takes none."""
+    options = [
+        word.startswith("-") or bool(place and _OPTIONS.get(arguments[place - 1]))
+        for place, word in enumerate(arguments)
+    ]
+    return [
+        word
+        for kind in (False, True)
+        for word, is_option in zip(arguments, options, strict=True)
+        if is_option is kind
+    ]
+
+
 def is_sweep(arguments: Sequence[str]) -> bool:
     """Return whether the arguments ask for a sweep.
 

@@ -129,6 +129,8 @@ def _of_hydra(error: BaseException, text: str) -> str:
     if isinstance(error, OverrideParseException):
         why = text.partition("\n")[0]
         accepted = "must be KEY=VALUE, a value with signs in quotes: 'KEY=\"a=b\"'"
+        if re.search(r"=\{.*(?<!\\)\[\d+\]\S*:", error.override or ""):
+            accepted = r"in {...}, brackets of a name have backslashes, as in {obstacles\[0\].x: 2e-3}"
         return f"argument {error.override!r}: {why}; {accepted}"
     lines = [line.strip() for line in text.splitlines()]
     return "; ".join(line for line in lines if line and not line.startswith("See https://"))

@@ -29,7 +29,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 import autdtorch
-from autdtorch.cli.arguments import command_of, is_sweep, prepare_streams, quoted
+from autdtorch.cli.arguments import command_of, is_sweep, prepare_streams, quoted, settings_first
 from autdtorch.cli.config_files import CONFIGS, register
 from autdtorch.cli.errors import AGAIN, FULL_ERROR, FailedJob, in_one_line, stop
 
@@ -79,6 +79,7 @@ def main() -> None:
         elif arguments == ["--version"]:
             print(f"autdtorch {autdtorch.__version__}")
         else:
+            arguments = settings_first(arguments)
             sweep = is_sweep(arguments)
             if sweep and command:
                 raise ValueError(f"{command}: a sweep; must be one scene at a time")

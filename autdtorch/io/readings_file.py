@@ -96,6 +96,8 @@ def load_readings(
         return readings_of(frame_table(source), named, units, rows, places)
     path = path_of("source", source, "a file, or a data frame")
     path = path / _LOG if path.is_dir() else path
+    if not (path.suffix or path.exists()):
+        raise FileNotFoundError(f"source: {path}; there is no such file or folder")
     path = path_of("source", path, suffixes=(".csv", ".npz", ".jsonl"))
     if not path.is_file():
         raise FileNotFoundError(f"source: {path}; there is no such file")

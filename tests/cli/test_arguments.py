@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+from autdtorch.cli.arguments import settings_first
+
 
 @pytest.mark.parametrize("name", ["für_andré", "結果", "a'b", "a#b", "with space", "a\\'b"])
 def test_a_folder_may_have_any_name(run, tmp_path, name):
@@ -62,3 +64,9 @@ def test_a_program_without_a_console_runs(run, tmp_path, monkeypatch):
     assert run("scene=none_such") == 2
     for made in (sys.stdout, sys.stderr):
         made.close()
+
+
+def test_settings_may_follow_options():
+    words = ["scene=bench", "--config-dir", "my bench", "readings=a.csv", "-m", "--cfg=job", "seed=1"]
+    settings = ["scene=bench", "readings=a.csv", "seed=1"]
+    assert settings_first(words) == [*settings, "--config-dir", "my bench", "-m", "--cfg=job"]
