@@ -82,8 +82,8 @@ def test_units_changes_and_folds_are_settings(bench, run, tmp_path, capsys):
         ("scene=homogeneous", "calibrate: readings: 2 points and 4 transducers; must be 4 and 16"),
         (
             "calibrate.prior.variants={points[0].x: 1}",
-            "argument 'calibrate.prior.variants={points[0].x: 1}': no viable alternative at input '{points['; "
-            "in {...}, brackets of a name have backslashes",
+            "argument 'calibrate.prior.variants={points[0].x: 1}': no viable alternative at input "
+            "'{points['; in {...}, brackets of a name have backslashes",
         ),
         ("-m", "calibrate: a sweep; must be one scene at a time"),
     ],

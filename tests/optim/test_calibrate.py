@@ -162,7 +162,7 @@ def test_interchanged_sensors_and_another_unit_are_doubted(matrix):
     interchanged = dataclasses.replace(readings, pressure=1000 * readings.pressure[:, [1, 0, 2]])
     doubts = at.calibrate(matrix, interchanged, folds=0).doubts
     assert "point 0 does not follow the drives, and is left out: it reads as point 1 should" in doubts[0]
-    assert "in another unit" in doubts[2]
+    assert "pressures or points in another unit" in doubts[2]
 
 
 def test_transducers_in_another_order_are_doubted(matrix):

@@ -287,7 +287,7 @@ class Calibration:
 def fit_doubts(calibration: Calibration) -> Iterator[str]:
     """Describe a fit that needs more than the prior expects, or that predicts badly."""
     if not 1 / _SCALED < calibration.scale.value < _SCALED:
-        causes = "are pressures in another unit, or is source_strength wrong?"
+        causes = "are pressures or points in another unit, or is source_strength wrong?"
         yield f"the scale is {calibration.scale.value:.3g}: {causes}"
     settings = calibration.settings
     most = 1.5 + 3 / (2 * len(calibration.gain)) ** 0.5  # and three deviations of the rms of so many draws
