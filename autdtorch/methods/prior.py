@@ -95,7 +95,7 @@ def prior_of(name: str, value: object) -> Prior | None:
 
 
 def prior_mean(prior: Prior, problem: Problem) -> torch.Tensor:
-    """Return the simulated matrix (P, M) [Pa], after checking shapes against the problem."""
+    """Return the simulated matrix (P, M) [Pa], after checking the prior against the problem."""
     matrix = problem.transfer_matrix if prior.transfer_matrix is None else prior.transfer_matrix
     if matrix is None:
         raise invalid("prior.transfer_matrix", None, "must be given where the objective has none")
@@ -103,7 +103,10 @@ def prior_mean(prior: Prior, problem: Problem) -> torch.Tensor:
     matrix = validate_matrix("prior.transfer_matrix", matrix, *shape)
     if not matrix.any():
         raise invalid("prior.transfer_matrix", 0, "must not be 0 throughout")
-    if isinstance(prior.variants, torch.Tensor) and prior.variants.shape[1:] != shape:
+    if isinstance(prior.variants, Mapping):
+        accepted = "must be transfer matrices (K, P, M) here; calibrate takes names, and gives a prior"
+        raise invalid("prior.variants", [*prior.variants], accepted)
+    if prior.variants is not None and prior.variants.shape[1:] != shape:
         accepted = f"must be (K, {shape[0]}, {shape[1]})"
         raise ValueError(f"prior.variants: shape {tuple(prior.variants.shape)}; {accepted}")
     return matrix
@@ -112,10 +115,9 @@ def prior_mean(prior: Prior, problem: Problem) -> torch.Tensor:
 def matrix_prior(prior: Prior, problem: Problem) -> MatrixPrior:
     """Return the Gaussian prior of the transfer matrix of a problem."""
     matrix = prior_mean(prior, problem)
-    if isinstance(prior.variants, Mapping):
-        accepted = "must be transfer matrices (K, P, M) here; calibrate takes names, and gives a prior"
-        raise invalid("prior.variants", [*prior.variants], accepted)
-    changes = matrix.new_empty(0, *matrix.shape) if prior.variants is None else prior.variants - matrix
+    changes = matrix.new_empty(0, *matrix.shape)
+    if isinstance(prior.variants, torch.Tensor):
+        changes = prior.variants - matrix
     return gaussian_prior(prior, matrix, changes, torch.ones(len(changes), **REAL))
 
 

@@ -172,6 +172,9 @@ def test_a_prior_of_another_problem_is_refused(make_objective, random_matrix, me
         method(objective, prior=at.Prior(random_matrix(3, 4, 0)))
     with pytest.raises(ValueError, match=r"prior.variants: shape \(1, 3, 4\); must be \(K, 3, 5\)"):
         method(objective, prior=at.Prior(random_matrix(3, 5, 0), random_matrix(3, 4, 1)[None]))
+    named = at.Prior(random_matrix(3, 5, 0), {"temperature": 5.0})
+    with pytest.raises(ValueError, match=r"prior.variants: .*calibrate takes names"):  # before any reading
+        at.Identify(prior=named).start(at.Problem.of(objective))
     with pytest.raises(ValueError, match=r"prior\.transfer_matrix: 0; must not be 0 throughout"):
         method(objective, prior=at.Prior(0 * random_matrix(3, 5, 0)))
     with pytest.raises(ValueError, match="prior: 'simulated'; must be a Prior"):
