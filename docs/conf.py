@@ -16,7 +16,9 @@ version = release = autdtorch.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 nitpicky = True
-nitpick_ignore_regex = [("py:class", r"(?!autdtorch\.).*|autdtorch\.utils\.images\..*")]  # not described here
+nitpick_ignore_regex = [  # not described here
+    ("py:class", r"(?!autdtorch\.).*|autdtorch\.(utils\.images|methods\.calibration\.(fit|simulation))\..*")
+]
 default_role = "py:obj"
 
 html_theme = "furo"
