@@ -54,6 +54,7 @@ INSIDE_METHODS = {"advance", "begin", "check", "most_at_once", "most_evaluations
 INSIDE_METHODS |= {
     "by_waves",
     "checked",
+    "coarser",
     "for_scene",
     "forward",
     "levels",

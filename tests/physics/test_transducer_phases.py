@@ -61,7 +61,7 @@ def test_a_calibrated_array_takes_no_runs_of_its_own(method):
     """Control points, and points beside, whose pressure a box takes from what it radiates."""
     settings = {"dtype": "float64", "spacing": 1.3e-3}
     before = make_propagator(scene_of(PLAIN, (BALL,)), method, **settings)
-    after = before.of(scene_of(PLAIN.calibrated(GAINS, PHASES), (BALL,)))
+    after = before.for_scene(scene_of(PLAIN.calibrated(GAINS, PHASES), (BALL,)))
     for points in (POINTS, torch.cat([POINTS + 1e-3, POINTS - 1e-3])):
         expected = before.transfer_matrix(points) * GAINS * TURN
         assert relative_error(after.transfer_matrix(points), expected) < ROUNDING
