@@ -59,7 +59,8 @@ def main(page: Page, scenes: str, drives: str, seeds: int, outliers: str) -> Non
         for kind in drives.split(",")
         for share in outliers.split(",")
     ]
-    page.add(table(header, rows))
+    caption = f"Medians of {seeds} benches; an AUTD3 of discs, four points, magnitudes with noise of -{NOISE:.0f} dB:"
+    page.write(caption, table(header, rows))
 
 
 def scene_of(name: str) -> at.Scene:

@@ -20,6 +20,9 @@ logger = logging.getLogger(__name__)
 
 _ROUNDS = 12  # linearisations by the amounts of changes
 _ENOUGH = 0.1  # change of the amounts, in their standard deviations, at which they have converged
+_ENOUGH_ON_GRIDS = (
+    0.5  # of simulated matrices: moved grids change them by 0.3 %, which is as much of an amount
+)
 _HALVINGS = 3  # of a step of the amounts that fits worse, or that the scene cannot take
 _TEMPERED = (1000.0, 300.0, 100.0, 30.0, 10.0, 3.0)
 """Factors of the assumed noise in the first fits: the maximum is followed from one that noise makes wide, and
@@ -91,12 +94,13 @@ def fitted(simulation: Simulation, readings: Readings, prior: Prior) -> Calibrat
     around = prior_around(tangent, simulation.widths, prior)
     unit = around.unit_of(readings.drives, readings.pressure)
     fit = _first(around.times(unit), readings, unit)
+    enough = _ENOUGH_ON_GRIDS if simulation.changes.simulates else _ENOUGH
     for left in reversed(range(_ROUNDS)):
         before, around = fit, prior_around(tangent, simulation.widths, prior).times(unit)
         trial = Trial(around, fit.before, readings.drives, readings.pressure, phase=readings.phase).fit()
         fit = replace(fit, posterior=trial.posterior, read=trial.read)
         step = fit.amounts - amounts
-        if not len(amounts) or (step.abs() < _ENOUGH * fit.deviations[-len(amounts) :]).all():
+        if not len(amounts) or (step.abs() < enough * fit.deviations[-len(amounts) :]).all():
             return fit
         if left:  # the last fit stays at its readings
             fit, tangent = _moved(simulation, prior, before, fit, tangent)
