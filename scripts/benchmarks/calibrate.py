@@ -59,7 +59,8 @@ def main(page: Page, scenes: str, drives: str, seeds: int, outliers: str) -> Non
         for kind in drives.split(",")
         for share in outliers.split(",")
     ]
-    caption = f"Medians of {seeds} benches; an AUTD3 of discs, four points, magnitudes with noise of -{NOISE:.0f} dB:"
+    noise = f"noise of -{NOISE:.0f} dB"
+    caption = f"Medians of {seeds} benches: an AUTD3 of discs, magnitudes at four points with {noise}."
     page.write(caption, table(header, rows))
 
 
