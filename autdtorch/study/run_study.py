@@ -124,7 +124,7 @@ def run_study(
             if isinstance(method, Method):
                 points, transducers = len(scene.control_points), len(scene.array)
                 # In place of the matrix that the simulation will give: a prior needs one, of this shape.
-                blank = torch.zeros(points, transducers, **COMPLEX)
+                blank = torch.ones(points, transducers, **COMPLEX)
                 problem = Problem(transducers, points, goal, scene, blank)
                 with within(f"method {name}"):
                     method.require_fit(problem, min(counts[name], method.block))

@@ -177,8 +177,8 @@ SEARCHES = {
     "lss": "",
     "lssg": "before foci order weights",
     "gabs": "before order weights",
-    "bayes_opt": "answer ends entries factors fitted generators length_scale noise outliers points spread "
-    "values variance",
+    "bayes_opt": "answer ends entries factors fitted fitted_values generators length_scale noise outliers "
+    "points spread values variance",
     "identify": "answer drives ends entries factors fitted generators numbers observed outliers random "
     "spread variance",
     "random_search": "generators",
