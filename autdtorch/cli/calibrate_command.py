@@ -10,7 +10,15 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 
-from autdtorch.cli.settings import folder_of, given_readings, is_given, scene_of, section_of, solver_of
+from autdtorch.cli.settings import (
+    folder_of,
+    given_readings,
+    is_given,
+    require_effective,
+    scene_of,
+    section_of,
+    solver_of,
+)
 from autdtorch.io.calibration_file import save_calibration
 from autdtorch.io.scene_file import save_scene, scene_sections
 from autdtorch.methods.calibration.calibrate import calibrate
@@ -32,10 +40,7 @@ def calibrate_scene(settings: dict[str, Any], modules: list[Any], output: Any) -
         ValueError: a setting that is unknown, out of range or without effect here, or readings that do not
             fit.
     """
-    for override in HydraConfig.get().overrides.task:
-        if not _EFFECTIVE.match(override):
-            accepted = "has no effect on calibrate; give scene, readings, calibrate.KEY, solver.KEY or output"
-            raise ValueError(f"{override}: {accepted}")
+    require_effective("calibrate", _EFFECTIVE, "scene, readings, calibrate.KEY, solver.KEY or output")
     section = section_of(settings, "calibrate")
     require_known("calibrate", section, _KEYS)
     prior = prior_of("calibrate.prior", section["prior"]) or Prior()

@@ -155,16 +155,13 @@ def explore_scene(settings: dict[str, Any], modules: list[Any]) -> None:
     Raises:
         ValueError: a setting of `explore` that is unknown or out of range, or one that has no effect here.
     """
-    from autdtorch.cli.settings import given_file, scene_of, section_of, solver_of
+    from autdtorch.cli.settings import given_file, require_effective, scene_of, section_of, solver_of
     from autdtorch.io.drive_file import load_drive
     from autdtorch.plot.explore import explore
     from autdtorch.utils.process import signals_restored
     from autdtorch.utils.validation import require_known, within
 
-    for override in HydraConfig.get().overrides.task:
-        if not _EXPLORE_SETTINGS.match(override):
-            accepted = "has no effect on explore; give scene, modules, solver.spacing or explore.KEY"
-            raise ValueError(f"{override}: {accepted}")
+    require_effective("explore", _EXPLORE_SETTINGS, "scene, modules, solver.spacing or explore.KEY")
     section = section_of(settings, "explore")
     require_known("explore", section, _EXPLORE_KEYS)
     drive = None

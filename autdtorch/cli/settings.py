@@ -144,6 +144,13 @@ def given_file(key: str, value: object) -> Path | None:
     return path_of(key, value)
 
 
+def require_effective(command: str, effective: re.Pattern[str], accepted: str) -> None:
+    """Refuse overrides of the command line that have no effect on a command."""
+    for override in HydraConfig.get().overrides.task:
+        if not effective.match(override):
+            raise ValueError(f"{override}: has no effect on {command}; give {accepted}")
+
+
 def given_readings(value: object, **settings: Any) -> Readings | None:
     """Return the readings of the file that the command line gives, or None.
 
