@@ -119,23 +119,18 @@ def test_phases_are_phi_unless_arg_q_or_levels_are_stated(load, titles, phases, 
     assert load(f"{titles},p [Pa peak]\n{phases},1").drives.angle().item() == pytest.approx(argument)
 
 
-def test_the_call_states_levels_and_the_sign(load):
-    close(
-        load("phase,p\n8,1", phases=32, pressure="Pa peak").drives,
-        torch.tensor([[1j]], dtype=torch.complex128),
-    )
-    close(
-        load("phase,p\n8,1", phases="sonicsurface", pressure="Pa peak").drives,
-        torch.tensor([[1j]], dtype=torch.complex128),
-    )
-    close(
-        load("level,p\n16,1", phases=64, pressure="Pa peak").drives,
-        torch.tensor([[1j]], dtype=torch.complex128),
-    )
-    close(
-        load("phase,p\n90,1", phases="arg deg", pressure="Pa peak").drives,
-        torch.tensor([[1j]], dtype=torch.complex128),
-    )
+@pytest.mark.parametrize(
+    ("text", "phases"),
+    [
+        ("phase,p\n8,1", 32),
+        ("phase,p\n8,1", "sonicsurface"),
+        ("level,p\n16,1", 64),
+        ("phase,p\n90,1", "arg deg"),
+    ],
+)
+def test_the_call_states_levels_and_the_sign(load, text, phases):
+    drives = load(text, phases=phases, pressure="Pa peak").drives
+    close(drives, torch.tensor([[1j]], dtype=torch.complex128))
 
 
 @pytest.mark.parametrize("name", ["autd3", "openmpd", "sonicsurface", "ultraino"])
