@@ -89,8 +89,7 @@ def fitted(simulation: Simulation, readings: Readings, prior: Prior) -> Calibrat
     The matrix is linearised by the amounts of changes, fitted, and linearised again at the fitted amounts
     until they no longer change (Gauss-Newton). A step that fits worse than the one before is halved.
     """
-    amounts = torch.zeros_like(simulation.widths)
-    tangent = Tangent.at(simulation.changes, amounts)
+    tangent = Tangent.at(simulation.changes, torch.zeros_like(simulation.widths))
     around = prior_around(tangent, simulation.widths, prior)
     unit = around.unit_of(readings.drives, readings.pressure)
     fit = _first(around.times(unit), readings, unit)
@@ -99,13 +98,12 @@ def fitted(simulation: Simulation, readings: Readings, prior: Prior) -> Calibrat
         before, around = fit, prior_around(tangent, simulation.widths, prior).times(unit)
         trial = Trial(around, fit.before, readings.drives, readings.pressure, phase=readings.phase).fit()
         fit = replace(fit, posterior=trial.posterior, read=trial.read)
-        step = fit.amounts - amounts
-        if not len(amounts) or (step.abs() < enough * fit.deviations[-len(amounts) :]).all():
+        step = fit.amounts - tangent.amounts
+        if not len(step) or (step.abs() < enough * fit.deviations[-len(step) :]).all():
             return fit
         if left:  # the last fit stays at its readings
             fit, tangent = _moved(simulation, prior, before, fit, tangent)
-            amounts = tangent.amounts
-            logger.debug("calibration: amounts %s", amounts.tolist())
+            logger.debug("calibration: amounts %s", tangent.amounts.tolist())
     return replace(fit, converged=False)
 
 
