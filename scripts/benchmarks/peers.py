@@ -302,15 +302,22 @@ def requirements(steady: Sequence[Point]) -> str:
 
 
 def times(steady: Sequence[Point]) -> str:
-    """Return a table of the run times to each error."""
-    cases, lines = list(dict.fromkeys(p.case for p in steady)), []
-    pairs = dict.fromkeys((p.case, p.program) for p in steady)
-    for case, program in sorted(pairs, key=lambda pair: cases.index(pair[0])):
-        seconds = [time_to(error, steady, case, program) for error in ERRORS]
-        best = min(p.error for p in steady if (p.case, p.program) == (case, program))
-        cells = ["" if time is None else f"{time:.3g} s" for time in seconds]
-        lines.append([case, NAMES.get(program, program), *cells, percent(best)])
-    return table(["scene", "program", *(f"to {percent(error)}" for error in ERRORS), "best error"], lines)
+    """Return a table of the run times to each error, and of the least error; a column for each program."""
+    programs = list(dict.fromkeys(p.program for p in steady))
+    lines = []
+    for case in dict.fromkeys(p.case for p in steady):
+        for error in ERRORS:
+            seconds = [time_to(error, steady, case, program) for program in programs]
+            cells = ["" if time is None else f"{time:.3g}" for time in seconds]
+            lines.append([f"{case}, to {percent(error)} [s]", *cells])
+        least = [
+            min((p.error for p in steady if (p.case, p.program) == (case, program)), default=None)
+            for program in programs
+        ]
+        lines.append(
+            [f"{case}, best error [%]", *("" if error is None else f"{100 * error:.3g}" for error in least)]
+        )
+    return table(["scene", *(NAMES.get(program, program) for program in programs)], lines)
 
 
 def figure(points: Sequence[Point]) -> Figure:

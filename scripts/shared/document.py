@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -10,6 +11,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+NUMBER = re.compile(r"[-+\d.,e]+ (?P<unit>%|s|mm|GiB)")
 DOCS = Path(__file__).parents[2] / "docs"
 
 
@@ -25,8 +27,9 @@ class Page:
         """Write a copy of the page with the paragraphs as the block, after machine, date and command."""
         from autdtorch.utils.process import thread_count
 
-        machine = f"{os.cpu_count()} cores ({thread_count()} threads)"
-        measured = f"Measured on {machine}, {date.today().isoformat()}:\n\n    {command_line()}"
+        threads, cores = thread_count(), os.cpu_count()
+        machine = f"{cores} cores" if threads == cores else f"{threads} of {cores} cores"
+        measured = f"`{command_line()}` ({machine}, {date.today().isoformat()})"
         text = (DOCS / self.name).read_text(encoding="utf-8")
         self._file(self.name).write_text(
             with_block(text, self.command, "\n\n".join((measured, *parts))), encoding="utf-8"
@@ -50,10 +53,12 @@ class Page:
 
 def with_block(text: str, command: str, block: str) -> str:
     """Replace the text between the two marks of a command; ValueError without exactly one pair of them."""
-    begin, end = (f"<!-- written by scripts/{command}: {which} -->" for which in ("begin", "end"))
-    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
-        raise ValueError(f"text: must have {begin!r} and then {end!r} once each")
-    return f"{text.partition(begin)[0]}{begin}\n\n{block}\n\n{end}{text.partition(end)[2]}"
+    begin, end = f"<!-- from scripts/{command} -->", "<!-- end -->"
+    before, _, after = text.partition(begin)
+    old, marked, after = after.partition(end)
+    if text.count(begin) != 1 or not marked or "<!--" in old:
+        raise ValueError(f"text: must have {begin!r} once and then {end!r}")
+    return f"{before}{begin}\n\n{block}\n\n{end}{after}"
 
 
 def command_line() -> str:
@@ -62,9 +67,16 @@ def command_line() -> str:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    """Return a Markdown table; a unit that all numbers of a column share is in its header."""
+    columns = []
+    for title, *cells in zip(header, *rows, strict=True):
+        numbers = [NUMBER.fullmatch(cell) for cell in cells if cell]
+        units = {number["unit"] for number in numbers if number}
+        if None not in numbers and len(units) == 1:
+            cells = [cell.split(" ")[0] for cell in cells]
+            title = f"{title} [{units.pop()}]"
+        columns.append([title, "---", *cells])
+    return "\n".join(f"| {' | '.join(line)} |" for line in zip(*columns, strict=True))
 
 
 def printed(rows: Iterable[Sequence[str]]) -> list[Sequence[str]]:

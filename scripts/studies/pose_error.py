@@ -46,11 +46,10 @@ def main(page: Page, poses: int, spacing: float) -> None:
         for loss in losses(name, poses, 1e-3 * spacing):
             rows.append(loss)
             print(f"{name}, {loss.error:g} {loss.unit}: {percent(float(loss.same.median()))}", flush=True)
-    head = ["scene", "pose error", "left, median", "left in 95 % of the directions"]
     page.write(
         "![Share of the weakest focus that is left, over shifts and turns of the obstacles](pose_errors.png)",
-        f"Weakest focus relative to that at the assumed pose, {poses} directions each:",
-        table(head, [cells(loss) for loss in rows if loss.error in SHOWN[loss.unit]]),
+        f"Share of the weakest focus that is left [%]: median of {poses} directions (least of 95 %)",
+        shares(rows),
     )
     page.save("pose_errors.png", plot_losses(rows))
 
@@ -121,7 +120,11 @@ def plot_losses(losses: Sequence[Losses]) -> Figure:
     return figure
 
 
-def cells(loss: Losses) -> list[str]:
-    """Return the cells of a row of the table."""
-    shares = [percent(float(loss.same.quantile(share))) for share in (0.5, 0.05)]
-    return [readable(loss.scene), f"{loss.error:g} {loss.unit}", *shares]
+def shares(losses: Sequence[Losses]) -> str:
+    """Return the table of the pose errors shown, a column for each scene."""
+    lines: dict[str, list[str]] = {}
+    for loss in losses:
+        if loss.error in SHOWN[loss.unit]:
+            median, least = (100 * float(loss.same.quantile(share)) for share in (0.5, 0.05))
+            lines.setdefault(f"{loss.error:g} {loss.unit}", []).append(f"{median:.3g} ({least:.3g})")
+    return table(["pose error", *map(readable, SCENES)], [[error, *cells] for error, cells in lines.items()])
