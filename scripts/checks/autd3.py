@@ -59,13 +59,12 @@ def main(page: Page, resolution: float) -> None:
     """Compare, and write the block."""
     grid = plane(resolution)
     lines, factor = rows(grid)
-    peak, late = math.sqrt(2) * abs(factor), math.degrees(cmath.phase(factor))
+    late = math.degrees(cmath.phase(factor))
     page.write(
         f"{', '.join(f'{name} {version(name)}' for name in PACKAGES)}.",
         table(("theirs", "ours", "relative difference", "what explains it"), lines),
         f"Transducer positions agree within {1e9 * largest_shift():.0f} nm. The emulator's instant field is "
-        f"{abs(factor):.4f} times ours and {late:.1f} degrees late, by its model of a transducer; its "
-        f"peak is {peak:.3f} times the RMS field of the emulator, where a sine has the square root of 2.",
+        f"{abs(factor):.4f} times ours and {late:.1f} degrees late, by its model of a transducer.",
     )
 
 
