@@ -12,21 +12,19 @@ and of up to twice as many more degrees as powers, in a frame with z along the n
 from __future__ import annotations
 
 import functools
-import math
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
 
-from autdtorch.analytic.spherical_waves import harmonics, outgoing_waves
-from autdtorch.scene.geometry import plane_basis, sphere_points
+from autdtorch.analytic.spherical_waves import outgoing_waves
+from autdtorch.analytic.wave_frames import turned, turns
+from autdtorch.scene.geometry import plane_basis
 
 _ERROR = 1e-10
 """Size of the first power that is left out, relative to the wave at the centre."""
 
 _MOST_POWERS = 24
-
-_SAMPLES = 2
-"""Directions for each harmonic of the highest degree, by which a turn is found."""
 
 
 def powers_needed(degree: int, wavenumber: complex, distance: float, radius: float) -> int | None:
@@ -43,49 +41,65 @@ def powers_needed(degree: int, wavenumber: complex, distance: float, radius: flo
     return None
 
 
-def mean_waves(
-    degree: int,
-    wavenumber: complex,
-    offsets: torch.Tensor,
-    normal: torch.Tensor,
-    radius: float,
-    axes: torch.Tensor,
-    powers: int,
-) -> torch.Tensor:
-    """Return the means (M, N) over discs of h_l(kr) Y_lm^*, the harmonics along `axes`.
+class MeanWaves(NamedTuple):
+    """The means over M discs of h_l(kr) Y_lm^*, as products that are taken in the order that costs least.
 
-    Args:
-        degree: the largest l.
-        wavenumber: k [rad/m].
-        offsets: centres of the discs (M, 3) [m] from the centre of the waves, differentiable.
-        normal: of all discs (3,).
-        radius: of all discs [m].
-        axes: columns (3, 3), differentiable.
-        powers: of the series, see `powers_needed`.
+    Attributes:
+        waves: of more degrees at the centres (..., M, K), in a frame with z along the normal.
+        means: for each order the places of its waves, those of their means, and the map from all to these.
+        maps: of each degree's harmonics to those along the axes.
     """
-    frame = torch.stack([*plane_basis(normal), normal], dim=1)
-    waves = outgoing_waves(degree + 2 * powers, wavenumber, offsets @ frame, conjugate=True)
-    sources, targets, means = zip(*_means(degree, wavenumber * radius, powers), strict=True)
-    parts = [waves[:, source] @ mean for source, mean in zip(sources, means, strict=True)]
-    return turned_waves(torch.cat(parts, dim=1)[:, torch.cat(targets).argsort()], frame.mT @ axes)
 
+    waves: torch.Tensor
+    means: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]
+    maps: list[torch.Tensor]
 
-def turned_waves(waves: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
-    """Return waves (M, N) of Y_lm^* as waves along other axes, the columns of a matrix (3, 3) in these.
+    @classmethod
+    def of(
+        cls,
+        degree: int,
+        wavenumber: complex,
+        offsets: torch.Tensor,
+        normal: torch.Tensor,
+        radius: float,
+        axes: torch.Tensor,
+        powers: int,
+    ) -> Self:
+        """Return the means over discs of all waves up to a degree, differentiable.
 
-    Harmonics of a degree turn into those of the same degree, by a map that their values at a few directions
-    decide.
-    """
-    directions, inverses = _directions(math.isqrt(waves.shape[1]) - 1)
-    after = harmonics(len(inverses) - 1, directions @ turn).conj()
-    parts = [slice(n * n, (n + 1) ** 2) for n in range(len(inverses))]
-    pairs = zip(parts, inverses, strict=True)
-    return torch.cat([waves[:, part] @ (inverse @ after[:, part]) for part, inverse in pairs], dim=1)
+        Args:
+            degree: the largest l.
+            wavenumber: k [rad/m].
+            offsets: centres of the discs (..., M, 3) [m] from the centre of the waves.
+            normal: of all discs (3,).
+            radius: of all discs [m].
+            axes: of the harmonics, columns (..., 3, 3).
+            powers: of the series, see `powers_needed`.
+        """
+        frame = torch.stack([*plane_basis(normal), normal], dim=1)
+        waves = outgoing_waves(degree + 2 * powers, wavenumber, offsets @ frame, conjugate=True)
+        maps = [each.conj() for each in turns(degree, frame.mT @ axes)]
+        return cls(waves, _means(degree, wavenumber * radius, powers), maps)
+
+    @property
+    def matrix(self) -> torch.Tensor:
+        """The means (..., M, N)."""
+        parts = [self.waves[..., source] @ mean for source, _, mean in self.means]
+        place = torch.cat([target for _, target, _ in self.means]).argsort()
+        return turned(torch.cat(parts, dim=-1)[..., place], self.maps)
+
+    def weighted(self, weights: torch.Tensor) -> torch.Tensor:
+        """Return the sums (..., P, M) of the means with weights (..., P, N)."""
+        before = turned(weights, [each.mT for each in self.maps])
+        parts = [before[..., target] @ mean.mT for _, target, mean in self.means]
+        places = torch.cat([source for source, _, _ in self.means])
+        none = weights.new_zeros((*before.shape[:-1], self.waves.shape[-1]))  # of higher orders
+        return none.index_copy(-1, places, torch.cat(parts, dim=-1)) @ self.waves.mT
 
 
 @functools.lru_cache(16)
 def _means(degree: int, size: complex, powers: int) -> list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """Return for each order the places of its waves, those of their means, and the map from all to these."""
+    """Return `MeanWaves.means`."""
     result = []
     for least in range(degree + 1):
         every = np.arange(least, degree + 2 * powers + 1)
@@ -101,11 +115,3 @@ def _means(degree: int, size: complex, powers: int) -> list[tuple[torch.Tensor, 
             places = torch.from_numpy(every**2 + every + order)
             result.append((places, places[: means.shape[1]], means))
     return result
-
-
-@functools.lru_cache(8)
-def _directions(degree: int) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Return directions (n, 3), and the inverse (2 l + 1, n) of the Y_lm^* of each degree at these."""
-    directions = sphere_points((0.0, 0.0, 0.0), 1.0, _SAMPLES * (2 * degree + 1))
-    values = harmonics(degree, directions).conj()
-    return directions, [torch.linalg.pinv(values[:, n * n : (n + 1) ** 2]) for n in range(degree + 1)]

@@ -12,7 +12,7 @@ from __future__ import annotations
 import cmath
 import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -121,16 +121,98 @@ def outgoing_waves(
 
     With `conjugate`, Y_lm is conjugated and h_l is not.
     """
-    distance = torch.linalg.vector_norm(offsets, dim=-1, keepdim=True)
-    angular = harmonics(degree, offsets / distance)
+    settings = degree, complex(wavenumber), conjugate
+    waves: torch.Tensor = _Outgoing.apply(offsets.reshape(-1, 3), *settings)  # type: ignore[no-untyped-call]
+    return waves.mT.reshape(*offsets.shape[:-1], -1)
+
+
+class _Outgoing(torch.autograd.Function):
+    """Outgoing waves (N, P), whose derivatives are waves of the neighbouring degrees."""
+
+    @staticmethod
+    def forward(offsets: torch.Tensor, degree: int, wavenumber: complex, conjugate: bool) -> torch.Tensor:
+        return torch.from_numpy(_outgoing(degree, wavenumber, offsets.detach().numpy(), conjugate))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: torch.Tensor) -> None:
+        offsets, *ctx.settings = inputs
+        ctx.save_for_backward(offsets)
+        ctx.save_for_forward(offsets)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        slopes = _slopes(ctx.saved_tensors[0], *ctx.settings)
+        parts = [(gradient.mT.conj() * slope).sum(dim=1).real for slope in slopes]
+        return torch.stack(parts, dim=1), None, None, None
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: torch.Tensor, *_: None) -> torch.Tensor:
+        slopes = _slopes(ctx.saved_tensors[0], *ctx.settings)
+        parts = zip(tangent.unbind(dim=1), slopes, strict=True)
+        return torch.stack([(part[:, None] * slope).mT for part, slope in parts]).sum(dim=0)
+
+
+def _outgoing(degree: int, wavenumber: complex, offsets: AnyArray, conjugate: bool) -> ComplexArray:
+    """Return the waves (N, P) at offsets (P, 3); the recurrences are those of `harmonics`."""
+    table = _recurrence(degree)
+    distance = np.sqrt(np.einsum("pc,pc->p", offsets, offsets))
+    x, y, z = offsets.T / distance
+    turn = np.ones((degree + 1, len(z)), np.complex128)
+    turn[1:] = x - 1j * y if conjugate else x + 1j * y
+    np.cumprod(turn, axis=0, out=turn)
     inverse = 1 / (wavenumber * distance)
-    radial = [torch.exp(1j * wavenumber * distance) * inverse / 1j]
-    if degree:
-        radial.append(radial[0] * (inverse - 1j))
-    for n in range(1, degree):
-        radial.append((2 * n + 1) * inverse * radial[-1] - radial[-2])
-    spread = torch.cat(radial, dim=-1)[..., degrees(degree).to(offsets.device)]
-    return spread * (angular.conj() if conjugate else angular)
+    before, radial = 0.0 * turn[0], np.exp(1j * wavenumber * distance) * inverse / 1j
+    waves = np.empty(((degree + 1) ** 2, len(z)), np.complex128)
+    last = legendre = np.zeros((0, len(z)))  # P_lm / sin^m of m = 0 to l
+    for n in range(degree + 1):
+        above = z * legendre
+        above[: n - 1] -= table.back[n].numpy()[:, None] * last
+        above *= table.factor[n].numpy()[:, None]
+        last, legendre = legendre, np.concatenate([above, np.full((1, len(z)), table.tops[n])])
+        upper = legendre * turn[: n + 1]
+        middle = n * n + n
+        np.multiply(upper, radial, out=waves[middle : middle + n + 1])
+        lower = waves[n * n : middle][::-1]
+        np.multiply(upper[1:].conj(), radial, out=lower)
+        np.negative(lower[::2], out=lower[::2])
+        rising = (2 * n + 1) * inverse * radial - before if n else radial * (inverse - 1j)
+        before, radial = radial, rising
+    return waves
+
+
+def _slopes(
+    offsets: torch.Tensor, degree: int, wavenumber: complex, conjugate: bool
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return the derivatives (P, N) of outgoing waves by x, y and z, of the waves with a degree more."""
+    waves = outgoing_waves(degree + 1, wavenumber, offsets, conjugate)
+    up, down, along = (
+        (factor[:, 0] * waves[:, place[:, 0]] + factor[:, 1] * waves[:, place[:, 1]]) * wavenumber
+        for place, factor in _ladder(degree)
+    )
+    if conjugate:  # d/dx - i d/dy of Y_lm^* are neighbours of m + 1
+        up, down = down, up
+    return (up + down) / 2, (up - down) / 2j, along
+
+
+@functools.lru_cache(8)
+def _ladder(degree: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Return the places (N, 2) of neighbours and their factors, for d/dx + i d/dy, d/dx - i d/dy and d/dz.
+
+    Martin, Multiple Scattering (2006), section 3.7. Factors over k.
+    """
+    n, m = degrees(degree).to(torch.float64), orders(degree).to(torch.float64)
+    upward, downward = 1 / ((2 * n + 1) * (2 * n + 3)), 1 / (4 * n * n - 1).abs()
+    rise = [(n + m + 2) * (n + m + 1), (n - m + 2) * (n - m + 1), (n + 1) ** 2 - m * m]
+    fall = [(n - m) * (n - m - 1), (n + m) * (n + m - 1), n * n - m * m]
+    signs = ((1, 1), (-1, -1), (-1, 1))
+    result = []
+    for step, above, below, (one, other) in zip((1, -1, 0), rise, fall, signs, strict=True):
+        factor = torch.stack([one * (above * upward).sqrt(), other * (below * downward).sqrt()], dim=1)
+        order = orders(degree) + step
+        neighbours = [degrees(degree) + 1, degrees(degree) - 1]
+        place = torch.stack([each * each + each + order for each in neighbours], dim=1)
+        result.append((torch.where(factor != 0, place, 0), factor))
+    return result
 
 
 def regular_waves(degree: int, wavenumber: complex, offsets: torch.Tensor) -> torch.Tensor:

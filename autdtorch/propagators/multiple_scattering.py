@@ -64,19 +64,30 @@ class Scatterer(Protocol):
 
 
 def solved(
-    maps: Sequence[torch.Tensor], between: Sequence[Sequence[torch.Tensor]], incident: Sequence[torch.Tensor]
+    maps: Sequence[torch.Tensor],
+    between: Sequence[Sequence[torch.Tensor | None]],
+    incident: Sequence[torch.Tensor],
 ) -> torch.Tensor:
-    """Return the outgoing waves (N, M) of all bodies, given their maps T_i (n, n) and S_ij as matrices.
+    """Return the outgoing waves (..., N, M) of all bodies, given their maps T_i (n, n) and S_ij as matrices.
 
-    `incident` are the waves (n, M) on each body. The diagonal of `between`, the waves that come back from a
-    body, is 0 without reflectors.
+    `incident` are the waves (..., n, M) on each body. The diagonal of `between` is what reflectors send back
+    to a body; None stands for no waves.
     """
-    alone = torch.cat([matrix @ waves for matrix, waves in zip(maps, incident, strict=True)])
-    if len(maps) == 1 and not between[0][0].any():
+    pairs = zip(maps, incident, strict=True)
+    alone = torch.cat(
+        [waves.mT @ matrix.mT for matrix, waves in pairs], dim=-1
+    ).mT  # one product for all poses
+    if all(each is None for row in between for each in row):
         return alone
-    rows = [torch.cat(list(row), dim=1) for row in between]
-    coupled = torch.cat([matrix @ row for matrix, row in zip(maps, rows, strict=True)])
-    outgoing: torch.Tensor = torch.linalg.solve(torch.eye(len(alone), **COMPLEX) - coupled, alone)
+    rows = []
+    for matrix, row in zip(maps, between, strict=True):
+        none = torch.zeros((len(matrix), max(map(len, maps))), **COMPLEX)
+        blocks = [
+            none[:, : len(other)] if each is None else each for each, other in zip(row, maps, strict=True)
+        ]
+        rows.append(matrix @ torch.cat([each.expand(*alone.shape[:-2], -1, -1) for each in blocks], dim=-1))
+    coupled = torch.cat(rows, dim=-2)
+    outgoing: torch.Tensor = torch.linalg.solve(torch.eye(alone.shape[-2], **COMPLEX) - coupled, alone)
     return outgoing
 
 

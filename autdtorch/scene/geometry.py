@@ -107,14 +107,15 @@ def _rotation_matrix(rotation: Vector) -> torch.Tensor:
 def composed_rotation(
     cosines: Sequence[float] | torch.Tensor, sines: Sequence[float] | torch.Tensor
 ) -> torch.Tensor:
-    """Return the matrix of `rotation_matrix` from cosines and sines (3,), differentiable in tensors."""
+    """Return the matrices (..., 3, 3) of rotations by angles (..., 3), from their cosines and sines."""
+    cosines, sines = torch.as_tensor(cosines, **REAL), torch.as_tensor(sines, **REAL)
     matrix = torch.eye(3, **REAL)
-    for axis, (cosine, sine) in enumerate(zip(cosines, sines, strict=True)):
+    for axis in range(3):
         first, second = (axis + 1) % 3, (axis + 2) % 3
-        turn = torch.eye(3, **REAL)
-        turn[first, first] = turn[second, second] = cosine
-        turn[second, first] = sine
-        turn[first, second] = -sine
+        turn = torch.eye(3, **REAL).repeat(*cosines.shape[:-1], 1, 1)
+        turn[..., first, first] = turn[..., second, second] = cosines[..., axis]
+        turn[..., second, first] = sines[..., axis]
+        turn[..., first, second] = -sines[..., axis]
         matrix = turn @ matrix
     return matrix
 

@@ -67,11 +67,22 @@ def angles(name: str, value: object, degrees: object = None) -> Vector:
 
 
 def turn_tensor(value: ArrayLike, degrees: ArrayLike | None) -> torch.Tensor:
-    """Return the angles `rotation` (3,) [rad], as of `angles`, as a tensor with its gradient."""
-    angles("rotation", value, degrees)
+    """Return the angles `rotation` (..., 3) [rad], as of `angles`, as a tensor with its gradient."""
     if degrees is None:
-        return real_tensor("rotation", value, "rad")
-    return torch.deg2rad(real_tensor("rotation_degrees", degrees, "degrees"))
+        turns = real_tensor("rotation", value, "rad")
+        angles("rotation", _largest("rotation", turns))
+        return turns
+    turns = real_tensor("rotation_degrees", degrees, "degrees")
+    angles("rotation", value, _largest("rotation_degrees", turns))
+    return torch.deg2rad(turns)
+
+
+def _largest(name: str, turns: torch.Tensor) -> torch.Tensor:
+    """Return the row (3,) of turns (..., 3) with the largest angle."""
+    if turns.ndim == 0 or turns.shape[-1] != 3 or not turns.numel():
+        raise ValueError(f"{name}: shape {tuple(turns.shape)}; must be (3,), or (..., 3) for many poses")
+    rows = turns.detach().reshape(-1, 3)
+    return rows[rows.abs().amax(dim=1).argmax()]
 
 
 def real_wavenumber(value: object) -> float:

@@ -14,7 +14,7 @@ from scipy.special import sph_harm_y
 from small_scenes import assert_slopes, relative_error
 
 import autdtorch as at
-from autdtorch.analytic.disc_waves import mean_waves, powers_needed
+from autdtorch.analytic.disc_waves import MeanWaves, powers_needed
 from autdtorch.analytic.sphere import fluid_sphere, impedance_sphere, rigid_sphere
 from autdtorch.analytic.spherical_waves import (
     degrees,
@@ -25,6 +25,7 @@ from autdtorch.analytic.spherical_waves import (
     regular_waves,
     sphere_coefficients,
 )
+from autdtorch.analytic.wave_frames import translation
 from autdtorch.propagators import make_propagator
 from autdtorch.scene.geometry import rotation_matrix
 
@@ -73,9 +74,11 @@ def test_means_of_waves_over_discs_are_those_over_their_nodes(wavenumber, normal
     expected = torch.einsum("mnk,n->mk", waves, weights.to(torch.complex128))
     offsets = discs.positions - center
     powers = powers_needed(12, wavenumber, float(offsets.norm(dim=1).min()) - 4.5e-3, 4.5e-3)
-    means = mean_waves(12, wavenumber, offsets, discs.normals[0], 4.5e-3, axes, powers)
-    errors = (means - expected).norm(dim=0) / expected.norm(dim=0)
+    means = MeanWaves.of(12, wavenumber, offsets, discs.normals[0], 4.5e-3, axes, powers)
+    errors = (means.matrix - expected).norm(dim=0) / expected.norm(dim=0)
     assert errors.max() < 1e-7  # of the nodes, for waves of high degrees at this distance
+    weights = torch.randn(2, 169, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
+    assert relative_error(means.weighted(weights), weights @ means.matrix.mT) < 1e-12  # rounding
 
 
 def test_a_series_for_a_disc_next_to_the_centre_takes_too_many_powers():
@@ -93,6 +96,34 @@ def test_waves_add_up_to_a_point_source(wavenumber):
     distance = (near - far).norm(dim=1)
     exact = torch.exp(1j * wavenumber * distance) / distance
     assert relative_error(4j * math.pi * wavenumber * (regular * outgoing).sum(dim=1), exact) < 1e-10
+
+
+@pytest.mark.parametrize("wavenumber", [WAVENUMBER, complex(WAVENUMBER, 3.0)])
+@pytest.mark.parametrize("conjugate", [False, True])
+def test_derivatives_of_outgoing_waves_are_those_of_finite_differences(wavenumber, conjugate):
+    def waves(lengths: torch.Tensor) -> torch.Tensor:  # in units of 1 / k
+        return outgoing_waves(3, wavenumber, lengths / WAVENUMBER, conjugate)
+
+    offsets = (4 * unit_vectors(3)).requires_grad_(True)
+    assert torch.autograd.gradcheck(waves, offsets, check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(waves, offsets)
+
+
+@pytest.mark.parametrize(("degree", "distance", "mirrored_axes"), [(0, 0.02, False), (3, 0.05, True)])
+def test_waves_around_one_centre_are_waves_around_another(degree, distance, mirrored_axes):
+    generator = torch.Generator().manual_seed(degree)
+    axes, other_axes = (
+        rotation_matrix(tuple(torch.randn(3, generator=generator).tolist())) for _ in range(2)
+    )
+    if mirrored_axes:  # of a body's image
+        other_axes = other_axes * other_axes.new_tensor([1.0, -1.0, 1.0])
+    shift = torch.nn.functional.normalize(torch.randn(3, generator=generator).double(), dim=0) * distance
+    near = distance / 20 * unit_vectors(4)
+    outgoing = outgoing_waves(degree, WAVENUMBER, (near + shift) @ other_axes)
+    moved = translation(WAVENUMBER, shift, (15, axes), (degree, other_axes))
+    regular = regular_waves(15, WAVENUMBER, near @ axes)
+    # higher degrees are left out: j_16(k r) / j_3(k r) is below 1e-10 at r = 2.5 mm
+    assert relative_error(regular @ moved, outgoing) < 1e-9
 
 
 MATERIALS = [
@@ -169,6 +200,26 @@ def test_a_cube_turned_by_a_right_angle_is_itself(cube):
         angles = [math.pi / 2 if own == axis else 0.0 for own in range(3)]
         found = cube.moved(rotation=angles).transfer_matrix(ARRAY, POINTS)
         assert relative_error(found, cube.transfer_matrix(ARRAY, POINTS)) < 5e-3
+
+
+@pytest.mark.parametrize("radius", [0.0, 4.5e-3])
+@pytest.mark.parametrize("count", [2, 8])  # fewer and more points than transducers
+def test_many_poses_at_once_are_each_on_its_own(cube, radius, count):
+    array = replace(ARRAY, radius=radius)
+    points = (POINTS[0] + 1e-3 * torch.arange(count, dtype=torch.float64)[:, None]).expand(2, 1, count, 3)
+    offsets = torch.tensor([[0.0, 0, 0], [1e-3, -2e-3, 0], [0, 0, 1e-3]])
+    other = cube.moved((0, 25e-3, 0))
+    bodies = [cube.moved(offsets, (0.1, 0.2, 0.3)), other.moved(rotation_degrees=offsets * 1e4)]
+    several = at.TMatrixCluster(bodies).transfer_matrix(array, points)
+    assert several.shape == (2, 3, count, 6)
+    for number, offset in enumerate(offsets):
+        pair = [cube.moved(offset, (0.1, 0.2, 0.3)), other.moved(rotation_degrees=offset * 1e4)]
+        alone = at.TMatrixCluster(pair).transfer_matrix(array, points[0, 0])
+        assert relative_error(several[1, number], alone) < 1e-9  # powers of a series, chosen for all
+    with pytest.raises(ValueError, match=r"offset: shape \(3, 3\) beside a rotation of \(2, 3\)"):
+        cube.moved(offsets, torch.zeros(2, 3))
+    with pytest.raises(ValueError, match=r"center: shape \(3, 3\); a file holds one pose"):
+        bodies[0].save("cube.npz")
 
 
 @pytest.mark.parametrize("radius", [0.0, 4.5e-3])

@@ -21,7 +21,8 @@ from autdtorch.propagators.simulation import Run
 from autdtorch.propagators.store import Store
 from autdtorch.propagators.tmatrix.bodies import ObstacleGroup, are_outside, bodies_of, has_closed_form
 from autdtorch.propagators.tmatrix.body import Placed, Solver, placed
-from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster, scattered_waves, waves_at
+from autdtorch.propagators.tmatrix.scattering import scattered_waves, waves_at
+from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene, require_clear, require_in_front
 from autdtorch.utils.array_types import COMPLEX, REAL
@@ -238,7 +239,7 @@ class TMatrixPropagator:
 
     def _converged(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return G (P, M) at points (P, 3), and where (P,) the waves have converged to the tolerance."""
-        waves, scattered = waves_at(self.bodies, points, self.scene.images), self._scattered
+        waves, scattered = waves_at(self.bodies.bodies, points, self.scene.images), self._scattered
         direct = free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber, self.scene.images)
         matrix = waves @ scattered[0] + direct
         left_out = self._left_out(waves.detach(), scattered)
@@ -248,7 +249,8 @@ class TMatrixPropagator:
     def _scattered(self) -> list[torch.Tensor]:
         """Outgoing waves (N, M) of all bodies, by all degrees and with the highest ones left out."""
         with torch.inference_mode(False):
-            return scattered_waves(self.bodies, self.scene.array, self.scene.images, (0, _FEWER, 2 * _FEWER))
+            bodies, scene = self.bodies.bodies, self.scene
+            return scattered_waves(bodies, scene.array, scene.images, (0, _FEWER, 2 * _FEWER))
 
     @staticmethod
     def _left_out(waves: torch.Tensor, scattered: Sequence[torch.Tensor]) -> torch.Tensor:

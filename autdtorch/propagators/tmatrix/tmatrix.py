@@ -17,25 +17,23 @@ from typing import Literal
 import numpy as np
 import torch
 
-from autdtorch.analytic.disc_waves import mean_waves, powers_needed
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.analytic.spherical_waves import degrees, harmonics, mirrored, outgoing_waves, regular_radial
+from autdtorch.analytic.spherical_waves import mirrored
 from autdtorch.fdtd.kernels.choice import available_kernel
-from autdtorch.propagators.multiple_scattering import solved
 from autdtorch.propagators.store import store_in
 from autdtorch.propagators.tmatrix.body import Solver, placed
-from autdtorch.scene.arrays import TransducerArray, apertures_of, complex_strengths_of
+from autdtorch.propagators.tmatrix.scattering import scattered_field
+from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import composed_rotation
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.reflectors import Reflector, require_arrangement
 from autdtorch.scene.scene import require_in_front
-from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.files import read_arrays, write_arrays
 from autdtorch.utils.hints import renamed_keywords
-from autdtorch.utils.images import Image, distinct, images_of
-from autdtorch.utils.process import one_library_thread, require_memory
+from autdtorch.utils.images import images_of
+from autdtorch.utils.process import one_library_thread, spread
 from autdtorch.utils.units import turn_tensor, warn_user
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
@@ -53,16 +51,7 @@ from autdtorch.utils.validation import (
 )
 
 _AT_ONCE = 200_000
-"""Waves at points that are computed at once: 3 MB, which fit into a cache."""
-
-_SHELLS = (0.55, 0.7, 0.85, 0.99)
-"""Radii of shells, relative to the circumscribed sphere: j_l is small on one of them at most."""
-
-_ALIKE = 4
-"""Discs of one radius and direction from which on their means are `mean_waves`, and not those over nodes."""
-
-_ENTRY_BYTES = 48.0
-"""Memory of a pair of waves in the system of equations [bytes]."""
+"""Waves of transducers in many poses that are computed at once: 3 MB, which fit into a cache."""
 
 _ARRAYS = ("matrix", "center", "axes", "radius", "wavenumber")
 
@@ -78,8 +67,8 @@ class TMatrix:
             degree N^(1/2) - 1.
         wavenumber: in the medium [rad/m], complex.
         radius: of the circumscribed sphere [m]; points and transducers must lie outside.
-        center: of the sphere (3,) [m].
-        axes: of the body in the scene, the columns of a matrix (3, 3).
+        center: of the sphere (3,) [m], or (..., 3) of many poses.
+        axes: of the body in the scene, the columns of a matrix (3, 3), or (..., 3, 3).
     """
 
     matrix: torch.Tensor
@@ -157,22 +146,35 @@ class TMatrix:
         """Return the body after a shift, and a rotation about its centre.
 
         Args:
-            offset: (3,) [m].
-            rotation: angles (3,) [rad] about the fixed axes x, y, z, in this order.
-            rotation_degrees: these angles (3,) in degrees, in place of `rotation`.
+            offset: (3,) [m], or (..., 3) for many poses at once.
+            rotation: angles (3,) or (..., 3) [rad] about the fixed axes x, y, z, in this order.
+            rotation_degrees: these angles (3,) or (..., 3) in degrees, in place of `rotation`.
 
-        Gradients of all pass.
+        Gradients of all pass. Transfer matrices of many poses have their leading dimensions.
         """
         shift, angles = real_tensor("offset", offset, "m"), turn_tensor(rotation, rotation_degrees)
-        if shift.shape != (3,):
-            raise ValueError(f"offset: shape {tuple(shift.shape)}; must be (3,)")
+        if shift.ndim == 0 or shift.shape[-1] != 3:
+            raise ValueError(f"offset: shape {tuple(shift.shape)}; must be (3,), or (..., 3) for many poses")
         axes = composed_rotation(angles.cos(), angles.sin()) @ self.axes
-        return replace(self, center=self.center + shift, axes=axes)
+        center = self.center + shift
+        try:
+            poses = np.broadcast_shapes(center.shape[:-1], axes.shape[:-2])
+        except ValueError:
+            shapes = f"{tuple(shift.shape)} beside a rotation of {tuple(angles.shape)}"
+            raise ValueError(f"offset: shape {shapes}; leading dimensions must broadcast") from None
+        return replace(self, center=center, axes=axes)._in_poses(poses)
+
+    def _in_poses(self, poses: Sequence[int]) -> TMatrix:
+        """Return the body with poses of these leading dimensions."""
+        return replace(self, center=self.center.expand(*poses, 3), axes=self.axes.expand(*poses, 3, 3))
+
+    def _some(self, first: int, count: int) -> TMatrix:
+        """Return the body in some of its poses, counted over all leading dimensions."""
+        some = slice(first, first + count)
+        return replace(self, center=self.center.reshape(-1, 3)[some], axes=self.axes.reshape(-1, 3, 3)[some])
 
     def transfer_matrix(self, array: TransducerArray, points: ArrayLike) -> torch.Tensor:
-        """Return transfer matrices (..., P, M), complex128 [Pa], of an array at points (..., P, 3) [m].
-
-        Gradients of the body's place and turn pass.
+        """Return transfer matrices (..., P, M) [Pa]; see `TMatrixCluster.transfer_matrix`.
 
         Raises:
             ValueError: a point or transducer within the circumscribed sphere. `make_propagator` serves those.
@@ -182,6 +184,8 @@ class TMatrix:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the T-matrix to a .npz file."""
         path = path_of("path", path, suffixes=(".npz",))
+        if self.center.ndim > 1:
+            raise ValueError(f"center: shape {tuple(self.center.shape)}; a file holds one pose, (3,)")
         values = {name: getattr(self, name) for name in _ARRAYS}
         tensors = (name for name, value in values.items() if isinstance(value, torch.Tensor))
         values |= {name: values[name].detach() for name in tensors}
@@ -232,7 +236,8 @@ class TMatrixCluster:
             if abs(body.wavenumber - bodies[0].wavenumber) > 1e-9 * abs(bodies[0].wavenumber):
                 raise invalid(f"bodies[{number}].wavenumber", body.wavenumber, "must be that of the first")
             for other in bodies[:number]:
-                apart, least = float((body.center - other.center).detach().norm()), body.radius + other.radius
+                least = body.radius + other.radius
+                apart = float((body.center - other.center).detach().norm(dim=-1).min())
                 if apart < least - LENGTH_TOLERANCE:
                     accepted = f"must be at least {least:.4g} m from that of another body"
                     raise invalid(f"bodies[{number}].center", f"{apart:.4g} m apart", accepted)
@@ -241,7 +246,7 @@ class TMatrixCluster:
         require_arrangement(reflectors, bodies[0].wavenumber)
         for number, body in enumerate(bodies):
             for index, reflector in enumerate(reflectors):
-                height = float(reflector.mirror.height(body.center.detach()))
+                height = float(reflector.mirror.height(body.center.detach()).min())
                 if height < body.radius - LENGTH_TOLERANCE:
                     accepted = f"must be at least {body.radius:.4g} m in front of reflector {index}"
                     raise invalid(f"bodies[{number}].center", f"{height:.4g} m", accepted)
@@ -253,11 +258,17 @@ class TMatrixCluster:
         warn_user("TMatrixCluster.operators is now TMatrixCluster.bodies", DeprecationWarning)
         return self.bodies
 
+    @property
+    def poses(self) -> tuple[int, ...]:
+        """The leading dimensions of the bodies' poses; none for a single pose."""
+        return np.broadcast_shapes(*(body.center.shape[:-1] for body in self.bodies))
+
     @one_library_thread()
     def transfer_matrix(self, array: TransducerArray, points: ArrayLike) -> torch.Tensor:
         """Return transfer matrices (..., P, M), complex128 [Pa], of an array at points (..., P, 3) [m].
 
-        Gradients of the bodies' places and turns pass.
+        Leading dimensions of the points and of the bodies' poses are broadcast. Gradients of points, places
+        and turns pass.
 
         Raises:
             ValueError: a point or transducer within a circumscribed sphere.
@@ -268,130 +279,24 @@ class TMatrixCluster:
         for name, places in (("points", targets.detach()), ("array.positions", array.positions)):
             require_in_front(self.reflectors, name, places.reshape(-1, 3))
         everything = torch.cat(
-            [targets.detach(), array.positions, *(body.center[None] for body in self.bodies)]
+            [targets.detach(), array.positions, *(body.center.reshape(-1, 3) for body in self.bodies)]
         )
         size = float((everything.amax(dim=0) - everything.amin(dim=0)).norm().detach())
         mirrors = [reflector.mirror for reflector in self.reflectors]
         images = images_of(mirrors, self.bodies[0].wavenumber, size)
-        direct = free_space_matrix(targets, array, self.bodies[0].wavenumber, images)
-        (scattered,) = scattered_waves(self, array, images)
-        parts = [waves_at(self, part, images) @ scattered for part in parts_of(targets, len(scattered))]
-        return (direct + torch.cat(parts)).reshape(*grid, -1)
+        direct = free_space_matrix(targets, array, self.bodies[0].wavenumber, images).reshape(*grid, -1)
+        if not self.poses:
+            return direct + scattered_field(self.bodies, array, targets, images).reshape(direct.shape)
+        every = np.broadcast_shapes(self.poses, grid[:-1])
+        sets = targets.reshape(*grid, 3).expand(*every, -1, -1).reshape(-1, grid[-1], 3)
+        bodies = [body._in_poses(every) for body in self.bodies]
+        count = 1 + _AT_ONCE // (len(array) * sum(len(body.matrix) for body in bodies))
+        gradients = torch.is_grad_enabled()
 
+        def scattered(first: int) -> torch.Tensor:
+            with torch.set_grad_enabled(gradients):  # which holds in one thread only
+                some = [body._some(first, count) for body in bodies]
+                return scattered_field(some, array, sets[first : first + count], images)
 
-def parts_of(points: torch.Tensor, waves: int) -> tuple[torch.Tensor, ...]:
-    """Return points (P, ..., 3) in parts, so that few of so many waves at them are in memory at once."""
-    each = points[0].numel() // 3
-    return torch.split(points, max(1, _AT_ONCE // (each * waves)))
-
-
-def waves_at(cluster: TMatrixCluster, points: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:
-    """Return the outgoing waves (P, N) of all bodies and their images at points (P, 3) [m]."""
-    return torch.cat([_outgoing_waves(body, points, images) for body in cluster.bodies], dim=1)
-
-
-def scattered_waves(
-    cluster: TMatrixCluster, array: TransducerArray, images: Sequence[Image], left_out: Sequence[int] = (0,)
-) -> list[torch.Tensor]:
-    """Return the coefficients (N, M) [Pa] of all bodies' outgoing waves under unit drives of an array.
-
-    Once for each number of highest degrees that are left out, whose coefficients are 0. Images of a body add
-    no unknowns: their waves are its own, mirrored.
-    """
-    incident = [_incoming_waves(body, array, images) for body in cluster.bodies]
-    count = sum(map(len, incident))
-    require_memory("bodies", f"{count} waves", _ENTRY_BYTES * count**2)
-    between = [
-        [_regular_waves(body, other, images[1:] if other is body else images) for other in cluster.bodies]
-        for body in cluster.bodies
-    ]
-    return [
-        solved([_without_highest(body, fewer) for body in cluster.bodies], between, incident)
-        for fewer in left_out
-    ]
-
-
-def _incoming_waves(body: TMatrix, array: TransducerArray, images: Sequence[Image]) -> torch.Tensor:
-    """Return the coefficients (N, M) [Pa] of the regular waves of unit drives around a body."""
-    transducers = apertures_of(array)
-    _offsets(body, "array.positions", transducers.positions)
-    waves = torch.zeros((len(array), len(body.matrix)), **COMPLEX)
-    for index in transducers.alike():
-        some = transducers.chosen(index)
-        for image in distinct(images, some.positions):
-            waves = waves.index_add(0, index, image.weight * _incoming_from(body, some, image))
-    return 4j * math.pi * body.wavenumber * complex_strengths_of(array) * waves.mT
-
-
-def _incoming_from(body: TMatrix, sources: Apertures, image: Image) -> torch.Tensor:
-    """Return the regular waves (M, N) around a body, of images of points or of discs of one kind."""
-    if sources.normals is not None and sources.radii is not None and len(sources.positions) >= _ALIKE:
-        normal, radius = image.matrix @ sources.normals[0], float(sources.radii[0])
-        offsets = image.of(sources.positions.mean(dim=1)) - body.center
-        nearest = float(offsets.detach().norm(dim=1).min()) - radius
-        powers = powers_needed(body.degree, body.wavenumber, nearest, radius)
-        if powers is not None:
-            return mean_waves(body.degree, body.wavenumber, offsets, normal, radius, body.axes, powers)
-    offsets = _offsets(body, "array.positions", image.of(sources.positions))
-    means = [
-        torch.einsum(
-            "mnk,n->mk",
-            outgoing_waves(body.degree, body.wavenumber, some, conjugate=True),
-            sources.weights.to(torch.complex128),
-        )
-        for some in parts_of(offsets, len(body.matrix))
-    ]
-    return torch.cat(means)
-
-
-def _outgoing_waves(body: TMatrix, points: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:
-    """Return the outgoing waves (P, N) of a body and its images at points (P, 3) [m].
-
-    A mirrored wave at a point is the wave at the mirrored point.
-    """
-    offsets = (_offsets(body, "points", image.of(points)) for image in images)
-    waves = (outgoing_waves(body.degree, body.wavenumber, each) for each in offsets)
-    none = torch.zeros((), **COMPLEX)
-    return sum((image.weight * each for image, each in zip(images, waves, strict=True)), start=none)
-
-
-def _regular_waves(body: TMatrix, other: TMatrix, images: Sequence[Image]) -> torch.Tensor:
-    """Return S (N, K): outgoing waves of another body's images as regular waves around this one.
-
-    The waves of the other are sampled on shells inside this body's sphere, where they are regular, and
-    their harmonics are divided by j_l in the least-squares sense over shells.
-    """
-    if not images:
-        return torch.zeros((len(body.matrix), len(other.matrix)), **COMPLEX)
-    heights, weights = np.polynomial.legendre.leggauss(body.degree + other.degree + 1)
-    count = 2 * (body.degree + other.degree + 1)
-    turns = 2 * math.pi * torch.arange(count, **REAL) / count
-    height = torch.from_numpy(heights)[:, None]
-    across = (1 - height.square()).sqrt()
-    places = across * turns.cos(), across * turns.sin(), height.expand(-1, count)
-    directions = torch.stack(places, dim=-1).reshape(-1, 3)
-    area = torch.from_numpy(np.repeat(weights * 2 * math.pi / count, count))
-    back = (harmonics(body.degree, directions).conj() * area[:, None]).mT
-    radii = torch.tensor(_SHELLS, **REAL) * body.radius
-    sizes = regular_radial(body.degree, body.wavenumber * radii[:, None])
-    waves: torch.Tensor = torch.zeros((len(body.matrix), len(other.matrix)), **COMPLEX)
-    for radius, size in zip(radii, sizes, strict=True):
-        shell = body.center + radius * directions @ body.axes.mT
-        waves = waves + size.conj()[:, None] * (back @ _outgoing_waves(other, shell, images))
-    return waves / sizes.abs().square().sum(dim=0)[:, None]
-
-
-def _without_highest(body: TMatrix, fewer: int) -> torch.Tensor:
-    """Return T (N, N) with 0 in place of its `fewer` highest degrees."""
-    low = degrees(body.degree) <= body.degree - fewer
-    return torch.where(low[:, None] & low, body.matrix, 0) if fewer else body.matrix
-
-
-def _offsets(body: TMatrix, name: str, positions: torch.Tensor) -> torch.Tensor:
-    """Return positions (..., 3) in the coordinates of a body, after checking that they are outside."""
-    offsets = positions - body.center
-    nearest = float(torch.linalg.vector_norm(offsets, dim=-1).detach().amin())
-    if nearest < body.radius - LENGTH_TOLERANCE:
-        accepted = f"must be at least {body.radius:.4g} m from the centre of the body"
-        raise ValueError(f"{name}: {nearest:.4g} m at the nearest; {accepted}")
-    return offsets @ body.axes
+        parts = spread(scattered, range(0, len(sets), count))
+        return direct + torch.cat(parts).reshape(*every, *direct.shape[-2:])

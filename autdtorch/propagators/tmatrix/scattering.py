@@ -1,0 +1,220 @@
+"""The field that bodies with known T-matrices scatter, from an array to points.
+
+It is a product, W (1 - T S)^-1 T D: incoming waves D of the transducers, translations S between the bodies,
+and outgoing waves W at the points. It is computed from the side with fewer columns or rows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+
+from autdtorch.analytic.disc_waves import MeanWaves, powers_needed
+from autdtorch.analytic.spherical_waves import degrees, outgoing_waves
+from autdtorch.analytic.wave_frames import translation
+from autdtorch.propagators.multiple_scattering import solved
+from autdtorch.scene.arrays import TransducerArray, apertures_of, complex_strengths_of, radii_of
+from autdtorch.utils.array_types import COMPLEX
+from autdtorch.utils.images import Image, distinct
+from autdtorch.utils.process import require_memory
+from autdtorch.utils.validation import LENGTH_TOLERANCE
+
+if TYPE_CHECKING:
+    from autdtorch.propagators.tmatrix.tmatrix import TMatrix
+
+_AT_ONCE = 200_000
+"""Waves at points that are computed at once: 3 MB, which fit into a cache."""
+
+_ALIKE = 4
+"""Discs of one radius and direction from which on their means are `MeanWaves`, and not those over nodes."""
+
+_ENTRY_BYTES = 48.0
+"""Memory of a pair of waves in the system of equations [bytes]."""
+
+
+def parts_of(points: torch.Tensor, waves: int) -> tuple[torch.Tensor, ...]:
+    """Return points (P, ..., 3) in parts, so that few of so many waves at them are in memory at once."""
+    each = points[0].numel() // 3
+    return torch.split(points, max(1, _AT_ONCE // (each * waves)))
+
+
+def scattered_field(
+    bodies: Sequence[TMatrix], array: TransducerArray, points: torch.Tensor, images: Sequence[Image]
+) -> torch.Tensor:
+    """Return the field (..., P, M) [Pa] that bodies scatter to points (..., P, 3) [m], of unit drives.
+
+    Leading dimensions are those of the bodies' poses.
+    """
+    maps, sizes = [body.matrix for body in bodies], [len(body.matrix) for body in bodies]
+    if points.shape[-2] < len(array):  # the transposed product
+        incident = [IncomingWaves.of(body, array, images) for body in bodies]
+        between = [list(column) for column in zip(*_between(bodies, images), strict=True)]
+        waves = torch.split(waves_at(bodies, points, images).mT, sizes, dim=-2)
+        turned = [[None if each is None else each.mT for each in row] for row in between]
+        weights = solved([matrix.mT for matrix in maps], turned, waves).mT
+        parts = zip(incident, torch.split(weights, sizes, dim=-1), strict=True)
+        return torch.stack([each.weighted(part) for each, part in parts]).sum(dim=0)
+    (scattered,) = scattered_waves(bodies, array, images)
+    if scattered.ndim > 2:
+        return waves_at(bodies, points, images) @ scattered
+    return torch.cat(
+        [waves_at(bodies, part, images) @ scattered for part in parts_of(points, len(scattered))]
+    )
+
+
+def waves_at(bodies: Sequence[TMatrix], points: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:
+    """Return the outgoing waves (..., P, N) of all bodies and their images at points (..., P, 3) [m].
+
+    A mirrored wave at a point is the wave at the mirrored point.
+    """
+    none = torch.zeros((), **COMPLEX)
+    parts = []
+    for body in bodies:
+        offsets = (_offsets(body, "points", image.of(points)) for image in images)
+        waves = [
+            image.weight * outgoing_waves(body.degree, body.wavenumber, each)
+            for image, each in zip(images, offsets, strict=True)
+        ]
+        parts.append(sum(waves, start=none))
+    return torch.cat(parts, dim=-1)
+
+
+def scattered_waves(
+    bodies: Sequence[TMatrix], array: TransducerArray, images: Sequence[Image], left_out: Sequence[int] = (0,)
+) -> list[torch.Tensor]:
+    """Return the coefficients (..., N, M) [Pa] of all bodies' outgoing waves under unit drives of an array.
+
+    Once for each number of highest degrees that are left out, whose coefficients are 0. Images of a body add
+    no unknowns: their waves are its own, mirrored.
+    """
+    incident = [IncomingWaves.of(body, array, images).matrix for body in bodies]
+    between = _between(bodies, images)
+    return [
+        solved([_without_highest(body, fewer) for body in bodies], between, incident) for fewer in left_out
+    ]
+
+
+@dataclass(frozen=True)
+class IncomingWaves:
+    """The coefficients of regular waves around a body, of unit drives of M transducers.
+
+    Attributes:
+        parts: for transducers alike and an image of them, their places in the array, and their waves: the
+            means over discs, or (..., M, N).
+        strengths: factors (M,) of all.
+    """
+
+    parts: list[tuple[torch.Tensor, complex, MeanWaves | torch.Tensor]]
+    strengths: torch.Tensor
+
+    @classmethod
+    def of(cls, body: TMatrix, array: TransducerArray, images: Sequence[Image]) -> IncomingWaves:
+        """Return the waves of an array around a body; one inside its sphere raises."""
+        _offsets(body, "array.positions", array.positions)
+        parts = [
+            (index, image.weight, _incoming_from(body, array, index, image))
+            for index in _alike(array)
+            for image in distinct(images, array.positions[index])
+        ]
+        return cls(parts, 4j * math.pi * body.wavenumber * complex_strengths_of(array))
+
+    @property
+    def matrix(self) -> torch.Tensor:
+        """The coefficients (..., N, M) [Pa]."""
+        each = [(index, weight, _dense(waves).mT) for index, weight, waves in self.parts]
+        return self._summed(each)
+
+    def weighted(self, weights: torch.Tensor) -> torch.Tensor:
+        """Return the sums (..., P, M) of the coefficients with weights (..., P, N)."""
+        each = [
+            (index, weight, waves.weighted(weights) if isinstance(waves, MeanWaves) else weights @ waves.mT)
+            for index, weight, waves in self.parts
+        ]
+        return self._summed(each)
+
+    def _summed(self, parts: Sequence[tuple[torch.Tensor, complex, torch.Tensor]]) -> torch.Tensor:
+        total = torch.zeros((*parts[0][2].shape[:-1], len(self.strengths)), **COMPLEX)
+        for index, weight, part in parts:
+            total = total.index_add(-1, index, weight * part)
+        return self.strengths * total
+
+
+def _dense(waves: MeanWaves | torch.Tensor) -> torch.Tensor:
+    return waves.matrix if isinstance(waves, MeanWaves) else waves
+
+
+def _alike(array: TransducerArray) -> list[torch.Tensor]:
+    """Return the indices (n,) of the transducers of each direction and radius; points are all alike."""
+    radii = radii_of(array)
+    if not radii.any():
+        return [torch.arange(len(array), dtype=torch.int64, device="cpu")]
+    kinds = torch.cat([array.normals, radii[:, None]], dim=1)
+    _, kind = torch.unique(kinds, dim=0, return_inverse=True)
+    return [torch.nonzero(kind == number)[:, 0] for number in range(int(kind.max()) + 1)]
+
+
+def _incoming_from(
+    body: TMatrix, array: TransducerArray, index: torch.Tensor, image: Image
+) -> MeanWaves | torch.Tensor:
+    """Return the waves around a body of images of transducers alike, by unit strengths over 4 pi i k."""
+    centers, radius = image.of(array.positions[index]), float(radii_of(array)[index[0]])
+    offsets = centers - body.center[..., None, :]
+    if radius and len(index) >= _ALIKE:
+        normal = image.matrix @ array.normals[index[0]]
+        nearest = float(offsets.detach().norm(dim=-1).min()) - radius
+        powers = powers_needed(body.degree, body.wavenumber, nearest, radius)
+        if powers is not None:
+            return MeanWaves.of(body.degree, body.wavenumber, offsets, normal, radius, body.axes, powers)
+    if not radius:
+        return outgoing_waves(body.degree, body.wavenumber, offsets @ body.axes, conjugate=True)
+    nodes = apertures_of(array).chosen(index)
+    _offsets(body, "array.positions", image.of(nodes.positions.reshape(-1, 3)))
+    means = []
+    for node in nodes.positions.unbind(dim=1):
+        each = (image.of(node) - body.center[..., None, :]) @ body.axes
+        means.append(outgoing_waves(body.degree, body.wavenumber, each, conjugate=True))
+    return torch.einsum("q...,q->...", torch.stack(means), nodes.weights.to(torch.complex128))
+
+
+def _between(bodies: Sequence[TMatrix], images: Sequence[Image]) -> list[list[torch.Tensor | None]]:
+    """Return S_ij (..., n, n): waves of body j's images as regular waves around body i; None without any."""
+    if len(bodies) > 1 or len(images) > 1:
+        count = sum(len(body.matrix) for body in bodies)
+        poses = max(math.prod(body.center.shape[:-1]) for body in bodies)
+        require_memory("bodies", f"{count} waves", _ENTRY_BYTES * poses * count**2)
+    return [
+        [_regular_waves(body, other, images[1:] if other is body else images) for other in bodies]
+        for body in bodies
+    ]
+
+
+def _regular_waves(body: TMatrix, other: TMatrix, images: Sequence[Image]) -> torch.Tensor | None:
+    """Return S (..., N, K): outgoing waves of another body's images as regular waves around this one."""
+    waves: torch.Tensor | None = None
+    for image in images:
+        center = (other.center - image.offset) @ image.matrix
+        axes = image.matrix.mT @ other.axes
+        shift = body.center - center
+        part = translation(body.wavenumber, shift, (body.degree, body.axes), (other.degree, axes))
+        waves = image.weight * part if waves is None else waves + image.weight * part
+    return waves
+
+
+def _without_highest(body: TMatrix, fewer: int) -> torch.Tensor:
+    """Return T (N, N) with 0 in place of its `fewer` highest degrees."""
+    low = degrees(body.degree) <= body.degree - fewer
+    return torch.where(low[:, None] & low, body.matrix, 0) if fewer else body.matrix
+
+
+def _offsets(body: TMatrix, name: str, positions: torch.Tensor) -> torch.Tensor:
+    """Return positions (..., P, 3) in the coordinates of a body, after checking that they are outside."""
+    offsets = positions - body.center[..., None, :]
+    nearest = float(torch.linalg.vector_norm(offsets.detach(), dim=-1).amin())
+    if nearest < body.radius - LENGTH_TOLERANCE:
+        accepted = f"must be at least {body.radius:.4g} m from the centre of the body"
+        raise ValueError(f"{name}: {nearest:.4g} m at the nearest; {accepted}")
+    return offsets @ body.axes
