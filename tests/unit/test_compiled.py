@@ -2,6 +2,7 @@
 
 import ast
 import contextlib
+import gc
 import importlib.util
 import os
 from collections.abc import Iterator
@@ -77,6 +78,22 @@ def test_what_is_damaged_is_compiled_again(kernel, suffix, caplog):
         after = made()
         assert after(3) == 6
         assert hits(after) == 1
+
+
+def test_processes_that_compile_two_dtypes_at_once_write_two_files(kernel, monkeypatch):
+    made, folder = kernel
+    with monkeypatch.context() as patch:
+        patch.setattr(compiled._CheckedFiles, "_load_index", lambda self: {})  # neither sees the other's
+        assert (made()(3), made()(1.5)) == (6, 3.0)
+    assert len(list(folder.rglob("*.nbc"))) == 2
+    assert made()(1.5) == 3.0
+    assert made()(3) == 6
+
+
+def test_garbage_is_collected_after_a_compilation(kernel):
+    made, _ = kernel
+    made()(3)
+    assert gc.isenabled()
 
 
 def test_without_a_folder_to_write_to_kernels_run_and_say_so_once(kernel, monkeypatch, caplog):
