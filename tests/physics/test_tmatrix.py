@@ -222,6 +222,17 @@ def test_many_poses_at_once_are_each_on_its_own(cube, radius, count):
         bodies[0].save("cube.npz")
 
 
+@pytest.mark.parametrize("count", [2, 8])  # fewer and more points than transducers
+def test_bodies_that_move_as_one_are_those_placed_each(cube, count):
+    points = POINTS[0] + 1e-3 * torch.arange(count, dtype=torch.float64)[:, None]
+    still = at.TMatrixCluster([cube, cube.moved((0, 20e-3, 0), (0.3, 0, 0)), cube.moved((0, -15e-3, 3e-3))])
+    moved = still.moved((1e-3, 2e-3, 0)).moved(rotation=[[0.0, 0, 0], [0.1, -0.2, 0.3]])
+    each = at.TMatrixCluster(moved.bodies).transfer_matrix(ARRAY, points)
+    assert relative_error(moved.transfer_matrix(ARRAY, points), each) < 1e-10  # rounding
+    shape, other = (torch.cdist(*2 * [torch.stack([b.center for b in c.bodies], -2)]) for c in (still, moved))
+    assert torch.allclose(shape, other, rtol=1e-12, atol=0)
+
+
 @pytest.mark.parametrize("radius", [0.0, 4.5e-3])
 def test_gradients_by_the_pose_are_those_of_finite_differences(cube, radius):
     array = replace(ARRAY, radius=radius)

@@ -43,27 +43,51 @@ def parts_of(points: torch.Tensor, waves: int) -> tuple[torch.Tensor, ...]:
 
 
 def scattered_field(
-    bodies: Sequence[TMatrix], array: TransducerArray, points: torch.Tensor, images: Sequence[Image]
+    bodies: Sequence[TMatrix],
+    array: TransducerArray,
+    points: torch.Tensor,
+    images: Sequence[Image],
+    together: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Return the field (..., P, M) [Pa] that bodies scatter to points (..., P, 3) [m], of unit drives.
 
-    Leading dimensions are those of the bodies' poses.
+    Leading dimensions are those of the bodies' poses. `together` is what `joined` returns, if it is known.
     """
-    maps, sizes = [body.matrix for body in bodies], [len(body.matrix) for body in bodies]
     if points.shape[-2] < len(array):  # the transposed product
         incident = [IncomingWaves.of(body, array, images) for body in bodies]
-        between = [list(column) for column in zip(*_between(bodies, images), strict=True)]
-        waves = torch.split(waves_at(bodies, points, images).mT, sizes, dim=-2)
-        turned = [[None if each is None else each.mT for each in row] for row in between]
-        weights = solved([matrix.mT for matrix in maps], turned, waves).mT
+        waves, sizes = waves_at(bodies, points, images), [len(body.matrix) for body in bodies]
+        weights = _weights(bodies, waves, images) if together is None else waves @ together
         parts = zip(incident, torch.split(weights, sizes, dim=-1), strict=True)
         return torch.stack([each.weighted(part) for each, part in parts]).sum(dim=0)
-    (scattered,) = scattered_waves(bodies, array, images)
+    if together is None:
+        (scattered,) = scattered_waves(bodies, array, images)
+    else:
+        each = [IncomingWaves.of(body, array, images).matrix for body in bodies]
+        scattered = together @ torch.cat(each, dim=-2)
     if scattered.ndim > 2:
         return waves_at(bodies, points, images) @ scattered
     return torch.cat(
         [waves_at(bodies, part, images) @ scattered for part in parts_of(points, len(scattered))]
     )
+
+
+def _weights(bodies: Sequence[TMatrix], waves: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:
+    """Return the weights (..., P, N) of incoming waves in what waves (..., P, N) bring to points."""
+    maps = [body.matrix.mT for body in bodies]
+    between = [
+        [None if each is None else each.mT for each in column]
+        for column in zip(*_between(bodies, images), strict=True)
+    ]
+    return solved(maps, between, torch.split(waves.mT, [len(matrix) for matrix in maps], dim=-2)).mT
+
+
+def joined(bodies: Sequence[TMatrix], images: Sequence[Image]) -> torch.Tensor:
+    """Return the map (N, N) from the regular waves on all bodies to the outgoing waves of all."""
+    maps, one = (
+        [body.matrix for body in bodies],
+        torch.eye(sum(len(body.matrix) for body in bodies), **COMPLEX),
+    )
+    return solved(maps, _between(bodies, images), torch.split(one, [len(matrix) for matrix in maps]))
 
 
 def waves_at(bodies: Sequence[TMatrix], points: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -22,7 +22,7 @@ from autdtorch.analytic.spherical_waves import mirrored
 from autdtorch.fdtd.kernels.choice import available_kernel
 from autdtorch.propagators.store import store_in
 from autdtorch.propagators.tmatrix.body import Solver, placed
-from autdtorch.propagators.tmatrix.scattering import scattered_field
+from autdtorch.propagators.tmatrix.scattering import joined, scattered_field
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import composed_rotation
 from autdtorch.scene.medium import Medium
@@ -32,8 +32,8 @@ from autdtorch.scene.scene import require_in_front
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.files import read_arrays, write_arrays
 from autdtorch.utils.hints import renamed_keywords
-from autdtorch.utils.images import images_of
-from autdtorch.utils.process import one_library_thread, spread
+from autdtorch.utils.images import NO_MIRRORS, images_of
+from autdtorch.utils.process import cached_property, one_library_thread, spread
 from autdtorch.utils.units import turn_tensor, warn_user
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
@@ -210,9 +210,14 @@ class TMatrix:
             return cls(matrix, complex(arrays["wavenumber"]), radius, center, axes)
 
 
+def _varies(body: TMatrix) -> bool:
+    """Return whether gradients by a body are asked for."""
+    return any(part.requires_grad for part in (body.matrix, body.center, body.axes))
+
+
 @dataclass(frozen=True, eq=False)
 class TMatrixCluster:
-    """Bodies that move on their own; `TMatrix.moved` places each.
+    """Bodies that move on their own, by `TMatrix.moved`, or as one, by `moved`.
 
     Attributes:
         bodies: their T-matrices, all with one wavenumber. Their circumscribed spheres must not overlap;
@@ -225,6 +230,9 @@ class TMatrixCluster:
 
     bodies: tuple[TMatrix, ...]
     reflectors: tuple[Reflector, ...]
+    _before: TMatrixCluster | None = field(
+        init=False, repr=False
+    )  # the bodies, at rest, that have moved as one
 
     @renamed_keywords(operators="bodies")
     def __init__(self, bodies: Iterable[TMatrix], reflectors: Iterable[Reflector] = ()) -> None:
@@ -251,12 +259,49 @@ class TMatrixCluster:
                     accepted = f"must be at least {body.radius:.4g} m in front of reflector {index}"
                     raise invalid(f"bodies[{number}].center", f"{height:.4g} m", accepted)
         object.__setattr__(self, "reflectors", reflectors)
+        object.__setattr__(self, "_before", None)
 
     @property
     def operators(self) -> tuple[TMatrix, ...]:
         """The bodies, by a name of version 0.1."""
         warn_user("TMatrixCluster.operators is now TMatrixCluster.bodies", DeprecationWarning)
         return self.bodies
+
+    def moved(
+        self,
+        offset: ArrayLike = (0.0, 0.0, 0.0),
+        rotation: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        rotation_degrees: ArrayLike | None = None,
+    ) -> TMatrixCluster:
+        """Return the bodies after a shift, and a rotation about the mean of their centres, as one.
+
+        Reflectors stay. Without any, the bodies' T-matrices are joined once for all these poses.
+
+        Args:
+            offset: (3,) [m], or (..., 3) for many poses at once.
+            rotation: angles (3,) or (..., 3) [rad] about the fixed axes x, y, z, in this order.
+            rotation_degrees: these angles (3,) or (..., 3) in degrees, in place of `rotation`.
+        """
+        pivot = torch.stack([body.center.expand(*self.poses, 3) for body in self.bodies]).mean(dim=0)
+        bodies = []
+        for body in self.bodies:
+            alone = body.moved(offset, rotation, rotation_degrees=rotation_degrees)
+            turn = alone.axes @ body.axes.mT
+            aside = (turn @ (body.center - pivot)[..., None])[..., 0] - (body.center - pivot)
+            bodies.append(replace(alone, center=alone.center + aside))
+        cluster = TMatrixCluster(bodies, self.reflectors)
+        is_still = not self.poses and not any(_varies(body) for body in self.bodies)
+        if self._before is not None or (is_still and not self.reflectors and len(bodies) > 1):
+            object.__setattr__(cluster, "_before", self._before or self)
+        return cluster
+
+    @cached_property
+    @torch.inference_mode(False)
+    @one_library_thread()
+    def _joined(self) -> torch.Tensor:
+        """The map (N, N) from regular waves on all bodies to outgoing waves of all."""
+        return joined(self.bodies, NO_MIRRORS)
 
     @property
     def poses(self) -> tuple[int, ...]:
@@ -284,19 +329,21 @@ class TMatrixCluster:
         size = float((everything.amax(dim=0) - everything.amin(dim=0)).norm().detach())
         mirrors = [reflector.mirror for reflector in self.reflectors]
         images = images_of(mirrors, self.bodies[0].wavenumber, size)
+        together = None if self._before is None else self._before._joined
         direct = free_space_matrix(targets, array, self.bodies[0].wavenumber, images).reshape(*grid, -1)
         if not self.poses:
-            return direct + scattered_field(self.bodies, array, targets, images).reshape(direct.shape)
+            scattered = scattered_field(self.bodies, array, targets, images, together)
+            return direct + scattered.reshape(direct.shape)
         every = np.broadcast_shapes(self.poses, grid[:-1])
         sets = targets.reshape(*grid, 3).expand(*every, -1, -1).reshape(-1, grid[-1], 3)
         bodies = [body._in_poses(every) for body in self.bodies]
         count = 1 + _AT_ONCE // (len(array) * sum(len(body.matrix) for body in bodies))
         gradients = torch.is_grad_enabled()
 
-        def scattered(first: int) -> torch.Tensor:
+        def of_poses(first: int) -> torch.Tensor:
             with torch.set_grad_enabled(gradients):  # which holds in one thread only
                 some = [body._some(first, count) for body in bodies]
-                return scattered_field(some, array, sets[first : first + count], images)
+                return scattered_field(some, array, sets[first : first + count], images, together)
 
-        parts = spread(scattered, range(0, len(sets), count))
+        parts = spread(of_poses, range(0, len(sets), count))
         return direct + torch.cat(parts).reshape(*every, *direct.shape[-2:])
