@@ -1,8 +1,9 @@
 """The live view: memory, and the time from a slider's move to the new field in a browser.
 
-A headless Chromium on the same machine moves a slider; the time ends with the frame of the new field. Then
-the obstacle is moved many times more, for the memory of the process. The picture of the page is taken, too.
-Takes about four minutes on 2 idle cores.
+A headless Chromium on the same machine moves a slider; the time ends with the frame of the new field, or with
+its error. The scenes are the paper's two cubes, and an AUTD3 of discs below a tilted phone. Then an obstacle
+is moved many times more, for the memory of the process. The picture of the page is taken, too. Takes about
+six minutes on 2 idle cores.
 """
 
 import gc
@@ -21,86 +22,107 @@ import autdtorch as at
 
 DOCUMENT = "explore.md"
 OPTIONS = {
-    "--scene": {"default": "two_cubes", "help": "scene of the paper"},
-    "--moves": {"type": int, "default": 50, "help": "moves that are timed, dragged and let go"},
+    "--moves": {"type": int, "default": 25, "help": "moves that are timed, dragged and let go"},
     "--more": {"type": int, "default": 500, "help": "moves while memory is watched"},
 }
 
 _WINDOW = {"width": 1280, "height": 900}  # pixels
 _SWITCHES = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"]
 _AT_REST = 500  # ms between two moves, so that no calculation is left
+_LONGEST = 120_000  # ms until the first field
 _SOME = 50  # moves between two readings of the memory
 
-# Resolves with the time [ms] until a frame came after the readings of the new field.
+# Resolves with the times [ms] until a frame came after the readings of the new field, and until its error.
 _MOVE = """([name, value, letGo]) => new Promise((resolve, reject) => {
     const section = document.querySelector('section.picture');
     const image = document.querySelector('.view img');
+    const summary = document.getElementById('summary');
     const slider = document.getElementById(name);
     const before = Number(section.dataset.shown);
     const begun = performance.now();
+    let frame = 0;
     const watch = new MutationObserver(changes => {
-        const isCoarse = document.getElementById('summary').textContent.includes('Coarse');
-        const isNew = Number(section.dataset.shown) > before && (isCoarse !== letGo);
-        if (isNew && changes.some(change => change.target === image)) {
-            watch.disconnect();
-            requestAnimationFrame(() => resolve(performance.now() - begun));
-        }
+        const isCoarse = summary.textContent.includes('Coarse');
+        if (Number(section.dataset.shown) <= before || isCoarse === letGo) return;
+        if (!frame && changes.some(change => change.target === image)) frame = performance.now() - begun;
+        if (!frame || letGo && !summary.textContent.includes('error')) return;
+        watch.disconnect();
+        requestAnimationFrame(() => resolve([frame, performance.now() - begun]));
     });
     watch.observe(section, {attributes: true, attributeFilter: ['data-shown']});
     watch.observe(image, {attributes: true, attributeFilter: ['src']});
+    watch.observe(summary, {childList: true, characterData: true, subtree: true});
     slider.value = value;
     slider.dispatchEvent(new Event('input', {bubbles: true}));
     if (letGo) slider.dispatchEvent(new Event('change', {bubbles: true}));
-    setTimeout(() => reject(new Error('the view did not follow')), 20000);
+    setTimeout(() => reject(new Error('the view did not follow')), 60000);
 })"""
 
 
-def main(page: Page, scene: str, moves: int, more: int) -> None:
+def main(page: Page, moves: int, more: int) -> None:
     """Measure and write the block."""
-    explorer = at.explore(paper_scene(scene))
     program = shutil.which("chromium") or shutil.which("google-chrome")
-    place = places()
+    rows, megabytes = [], []
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=_SWITCHES)
-        tab = browser.new_page(viewport=_WINDOW)
-        tab.goto(explorer.address)
-        tab.wait_for_selector("section.picture[aria-busy=false]")
-        tab.get_by_text("Estimated error").wait_for()
-        tab.screenshot(path=page.folder / "explore.png")
-        times(tab, place, 3)  # what is done once
-        seconds = times(tab, place, moves)
-        megabytes = memory(tab, place, more)
+        for label, scene in (("AUTD3 and phone", phone_scene()), ("two cubes", paper_scene("two_cubes"))):
+            explorer = at.explore(scene)
+            tab = browser.new_page(viewport=_WINDOW)
+            tab.set_default_timeout(_LONGEST)
+            tab.goto(explorer.address)
+            tab.wait_for_selector("section.picture[aria-busy=false]")
+            tab.get_by_text("Estimated error").wait_for()
+            tab.screenshot(path=page.folder / "explore.png")
+            place = places(1e3 * explorer.scene.obstacles[0].center[1])
+            times(tab, place, 3)  # what is done once
+            rows += [[label, kind, *row_of(spent)] for kind, spent in times(tab, place, moves).items()]
+            if scene.name == "two_cubes":
+                megabytes = memory(tab, place, more)
+            tab.close()
+            explorer.close()
         browser.close()
-    explorer.close()
-    rows = []
-    for label, spent in zip(
-        ("dragged, cells of 2 mm", "let go, cells of 1 mm"), seconds.values(), strict=True
-    ):
-        shares = statistics.quantiles(spent, n=20, method="inclusive")
-        rows.append([label, f"{shares[9]:.2f} s", f"{shares[18]:.2f} s"])
     parts = [
-        f"From a slider's move to the frame with the new field, `{scene}`, {moves} moves each:",
-        table(("the slider is", "median", "95 % within"), rows),
-        f"Memory of the process: {megabytes[0]:.0f} MB before {more} more moves, after every {_SOME} "
-        f"{min(megabytes[1:]):.0f} to {max(megabytes[1:]):.0f} MB, {megabytes[-1]:.0f} MB at the end.",
+        f"From a slider's move to the frame with the new field, {moves} moves each:",
+        table(("scene", "the slider is", "median", "95 % within"), rows),
+        f"Memory of the process: {megabytes[0]:.0f} MB before {more} more moves of a cube, after every "
+        f"{_SOME} {min(megabytes[1:]):.0f} to {max(megabytes[1:]):.0f} MB, {megabytes[-1]:.0f} MB at last.",
     ]
     page.write(*parts)
     print("\n\n".join(parts))
 
 
-def places() -> Iterator[str]:
-    """Yield places of the obstacle [mm], in steps of the slider, each unlike the one before."""
+def phone_scene() -> at.Scene:
+    """Return an AUTD3 of discs with a phone above it, tilted, and three foci behind the phone."""
+    phone = at.Box((0, 0, 80e-3), (150e-3, 75e-3, 8e-3), rotation_degrees=(0, 20, 0), rigid=True)
+    above = (0, 0, 150e-3)
+    foci = at.circle_points(above, 25e-3, 3, (0, 0, 1))
+    plane = at.Plane(above, (0, 0, 1), (200e-3, 160e-3))
+    array = at.TransducerArray.autd3((0, 0, 0), normal=(0, 0, 1))
+    return at.Scene(array, at.Medium.air(), 40e3, foci, (phone,), plane, name="phone")
+
+
+def places(middle: float) -> Iterator[str]:
+    """Yield places of the obstacle around one [mm], in steps of the slider, each unlike the one before."""
     for step in itertools.count():
-        yield f"{50.1 + 0.1 * (37 * step % 50):.1f}"
+        yield f"{middle + 0.1 + 0.1 * (37 * step % 50):.1f}"
 
 
-def times(tab: Any, place: Iterator[str], moves: int) -> dict[bool, list[float]]:
-    """Return the times [s] of moves, by whether the slider was let go."""
-    seconds: dict[bool, list[float]] = {False: [], True: []}
+def row_of(spent: list[float]) -> list[str]:
+    """Return the median and the 95th percentile of times [s]."""
+    shares = statistics.quantiles(spent, n=20, method="inclusive")
+    return [f"{shares[9]:.2f} s", f"{shares[18]:.2f} s"]
+
+
+def times(tab: Any, place: Iterator[str], moves: int) -> dict[str, list[float]]:
+    """Return the times [s] of moves by a slider that is dragged, or let go."""
+    kinds = dragged, let_go, known = "dragged", "let go", "let go, until the error is known"
+    seconds: dict[str, list[float]] = {kind: [] for kind in kinds}
     for _ in range(moves):
-        for let_go, spent in seconds.items():
+        for shown in ((dragged,), (let_go, known)):
             tab.wait_for_timeout(_AT_REST)
-            spent.append(1e-3 * tab.evaluate(_MOVE, ["body_y", next(place), let_go]))
+            spent = tab.evaluate(_MOVE, ["body_y", next(place), let_go in shown])
+            for kind, milliseconds in zip(shown, spent, strict=False):
+                seconds[kind].append(1e-3 * milliseconds)
     return seconds
 
 
