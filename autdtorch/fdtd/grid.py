@@ -101,6 +101,11 @@ class Grid:
         """Return positions (..., 3) [m] in cells; cell centres are whole numbers."""
         return np.asarray((points.numpy() - np.array(self.origin)) / self.spacing, np.float64)
 
+    def deeper(self, depth: int) -> tuple[slice, ...]:
+        """Return the slices of the interior without `depth` cells at its rim."""
+        ends = zip(self.first, self.last, strict=True)
+        return tuple(slice(first + depth, last - depth) for first, last in ends)
+
     def centers_of(self, index: Index) -> Array:
         """Return the centres (n, 3) [m] of cells of flat `index` (n,)."""
         return np.asarray(np.array(self.origin) + self.spacing * places_of(index, self.shape), np.float64)

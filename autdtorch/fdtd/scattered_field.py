@@ -17,6 +17,7 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from autdtorch.fdtd.face_nodes import FaceNodes
 from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.region import Shape
@@ -33,6 +34,7 @@ from autdtorch.utils.process import cached_property
 # point.
 _BESIDE = 1.25
 _TOGETHER = 16  # Targets whose waves are computed at once
+_FEWER = 0.7  # Most nodes of the Huygens surface that are worth their errors, relative to its cells
 _NEAREST = 0.5  # Distance [cells] from a source at which the singular incident field is cut off
 
 
@@ -123,11 +125,34 @@ class ScatteredField:
     ) -> Tensor:
         """Return fields (P, R) at points (P, 3) [m] of the Huygens surface with amplitudes (n, R) [Pa m].
 
-        By default with all images of it.
+        By default with all images of it. To points at a distance, few nodes radiate instead of the cells.
         """
-        return self.waves(
-            points, self.surface[0], amplitude, images=self.images if images is None else images
-        )
+        images = self.images if images is None else images
+        far = self._far(points.centers if isinstance(points, Discs) else points, images)
+        field = torch.zeros((len(far), amplitude.shape[1]), **COMPLEX)
+        if not far.all():
+            field[~far] = self.waves(_chosen(points, ~far), self.surface[0], amplitude, images=images)
+        if far.any():
+            assert self._nodes
+            nodes = torch.from_numpy(self._nodes.positions @ self.axes)
+            amplitude = self._nodes.amplitudes(amplitude)
+            field[far] = self.waves(_chosen(points, far), nodes, amplitude, images=images)
+        return field
+
+    def _far(self, points: Tensor, images: Sequence[Image]) -> Tensor:
+        """Return the mask of points (P, 3) that the surface's nodes and their images reach."""
+        if self._nodes is None:
+            return torch.zeros(len(points), dtype=torch.bool, device="cpu")
+        seen = [self._on_axes((points - image.offset) @ image.matrix).numpy() for image in images]
+        return torch.from_numpy(np.all([self._nodes.reach(each) for each in seen], axis=0))
+
+    @cached_property
+    def _nodes(self) -> FaceNodes | None:
+        """Nodes that radiate like the surface, if they are fewer; None in double precision."""
+        if self.assembly.dtype != torch.float32:
+            return None
+        nodes = FaceNodes.of(self.assembly.grid, self._radiating, self.wavenumber.real)
+        return nodes if len(nodes.positions) < _FEWER * len(self._radiating) else None
 
     def inside(self, points: Tensor) -> Tensor:
         """Return the mask of points (..., 3) read from the grid; others are clear of the Huygens surface."""
@@ -165,18 +190,21 @@ class ScatteredField:
         return cells, place.reshape(around.shape)
 
     @cached_property
+    def _radiating(self) -> Index:
+        """Flat indices (n,) of the cells of the Huygens surface: two and three from the interior's rim."""
+        grid = self.assembly.grid
+        radiating = np.zeros(grid.shape, bool)
+        radiating[grid.deeper(2)], radiating[grid.deeper(4)] = True, False
+        return np.flatnonzero(radiating)
+
+    @cached_property
     def surface(self) -> tuple[Tensor, Index, csr_array]:
         """Positions (n, 3) of the Huygens surface, the cells (m,) it reads, and their weights (n, m)."""
         assembly = self.assembly
         grid, stencil = assembly.grid, assembly.stencil
 
-        def inside(depth: int) -> tuple[slice, ...]:
-            ends = zip(grid.first, grid.last, strict=True)
-            return tuple(slice(first + depth, last - depth) for first, last in ends)
-
-        chi, radiating = np.zeros(grid.shape), np.zeros(grid.shape, bool)
-        chi[inside(3)], radiating[inside(2)], radiating[inside(4)] = 1, True, False
-        index = np.flatnonzero(radiating)
+        chi, index = np.zeros(grid.shape), self._radiating
+        chi[grid.deeper(3)] = 1
         around = index[:, None] + flat_offsets(grid.shape)
         step = chi.ravel()[around] - chi.ravel()[index, None]
         cells, place = np.unique(around[step != 0], return_inverse=True)
@@ -185,6 +213,11 @@ class ScatteredField:
         value = factor / assembly.stencil.source_factor(float(assembly.steps_per_period))
         value = value * stencil.weights[column] * step[row, column]
         return self.positions(index), cells, csr_array((value, (row, place)), (len(index), len(cells)))
+
+
+def _chosen(points: Tensor | Discs, mask: Tensor) -> Tensor | Discs:
+    """Return the points or discs of a mask (P,)."""
+    return Discs(*(part[mask] for part in points)) if isinstance(points, Discs) else points[mask]
 
 
 def _seen(sources: Tensor | Discs, image: Image) -> Tensor | Discs:
