@@ -7,12 +7,14 @@ fewer runs, which begin at them (reciprocity).
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import logging
 import math
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -328,9 +330,10 @@ class BoxSimulation(Simulation):
         drives = [self.imaged(*drive) for drive in zip(sources, strength, strict=True)]
         some = receivers.chosen(slice(None, None, every))
         transforms = [box.near_to_far(receivers) for box in self.boxes]
-        readings = [transform.matrices(every) for transform in transforms]
         sizes = [len(transform.cells) for transform in transforms]
-        incident = self._incident(sources, strength, some)
+        with self._kernels_compiled():
+            readings = [transform.matrices(every) for transform in transforms]
+            incident = self._incident(sources, strength, some)
         audible = (~self.silent(some.positions)).to(incident.dtype)[:, None]
         floors = [[self._silence(some.positions[group], *drive) for group in groups] for drive in drives]
 
@@ -368,6 +371,15 @@ class BoxSimulation(Simulation):
         phasors = torch.stack([each.pressure for each in steady], dim=1)
         runs = list(map(Run.of, steady, seconds))
         return Solved(transforms, torch.split(phasors, sizes), runs), runs
+
+    def _kernels_compiled(self) -> AbstractContextManager[None]:
+        """Compile all kernels of a simulation as soon as one is missing."""
+        if self.plan.kernel != "cpu":
+            return contextlib.nullcontext()
+        from autdtorch.fdtd.kernels.cpu import CpuKernel  # loads numba
+
+        assembly = self.assemblies[0]
+        return CpuKernel().compiled_ahead(assembly.grid.shape, assembly.coefficients)
 
     @cached_property
     def _in_one_box(self) -> BoxSimulation:

@@ -5,6 +5,8 @@ import contextlib
 import gc
 import importlib.util
 import os
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
@@ -16,7 +18,7 @@ import torch
 from small_scenes import CUBE, small_scene
 
 import autdtorch as at
-from autdtorch.fdtd.kernels import compiled
+from autdtorch.fdtd.kernels import compiled, cpu, cpu_waves
 
 
 def test_any_change_of_the_kernels_changes_the_digest(tmp_path):
@@ -37,6 +39,10 @@ from autdtorch.fdtd.kernels.compiled import entry
 @entry(Path(__file__).parent)
 def doubled(x):
     return 2 * x
+
+@entry(Path(__file__).parent)
+def tripled(x):
+    return 3 * x
 """
 
 
@@ -46,11 +52,12 @@ def kernel(tmp_path, monkeypatch):
     (tmp_path / "module.py").write_text(SOURCE, "utf-8")
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
 
-    def made():
+    def made(name="doubled"):
         spec = importlib.util.spec_from_file_location("module", tmp_path / "module.py")
         module = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, "module", module)
         spec.loader.exec_module(module)
-        return module.doubled
+        return getattr(module, name)
 
     return made, tmp_path / "cache"
 
@@ -94,6 +101,52 @@ def test_garbage_is_collected_after_a_compilation(kernel):
     made, _ = kernel
     made()(3)
     assert gc.isenabled()
+
+
+needs_fork = pytest.mark.skipif(sys.platform != "linux", reason="compiles in one process")
+
+
+@needs_fork
+def test_another_process_compiles_what_is_needed_next(kernel, monkeypatch):
+    made, _ = kernel
+    monkeypatch.setattr(compiled, "thread_count", lambda: 2)
+    ahead = made("tripled")
+    with compiled.meanwhile(lambda: ahead(3)):
+        assert made()(3) == 6
+    assert ahead(3) == 9
+    assert hits(ahead) == 1
+    with compiled.meanwhile(lambda: ahead(3)):
+        made()(3)  # loaded from disk
+    assert not compiled._children
+
+
+def test_kernels_are_compiled_ahead_for_the_types_of_a_simulation(monkeypatch):
+    calls = []
+
+    def noted(*some):
+        calls.extend(some)
+        return contextlib.nullcontext()
+
+    monkeypatch.setattr(cpu, "meanwhile", noted)
+    at.make_propagator(small_scene((CUBE,)), "box", 2e-3, cache=False).transfer_matrix()
+    kernels = cpu._advance, cpu_waves._sum_at_points, cpu_waves._sum_over_sources
+    before = [set(kernel.signatures) for kernel in kernels]
+    for call in calls:
+        call()
+    assert calls
+    assert [set(kernel.signatures) for kernel in kernels] == before
+
+
+@needs_fork
+def test_a_process_that_hangs_is_not_waited_for(kernel, monkeypatch):
+    made, _ = kernel
+    monkeypatch.setattr(compiled, "thread_count", lambda: 2)
+    monkeypatch.setattr(compiled, "_PATIENCE", 0.1)
+    with compiled.meanwhile(lambda: time.sleep(600)):
+        made()(3)
+    begin = time.monotonic()
+    assert made("tripled")(3) == 9
+    assert time.monotonic() - begin < 60
 
 
 def test_without_a_folder_to_write_to_kernels_run_and_say_so_once(kernel, monkeypatch, caplog):

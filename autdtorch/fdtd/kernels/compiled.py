@@ -8,6 +8,11 @@ import gc
 import hashlib
 import io
 import logging
+import os
+import signal
+import sys
+import time
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,12 +26,16 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.compiler_machinery import AnalysisPass, register_pass
 from numba.core.typed_passes import AnnotateTypes
 
-from autdtorch.utils.process import hold_at_fork
+from autdtorch.utils.process import hold_at_fork, thread_count
 
 logger = logging.getLogger(__name__)
 
 _HERE = Path(__file__).parent
 _entries: set[Any] = set()
+_calls: list[Callable[[], object]] = []  # see `meanwhile`
+_children: list[int] = []  # processes that compile
+_PATIENCE = 100.0  # [s] after which a process that compiles is taken to hang
+_POLL = 0.01  # [s] between looks at such a process
 
 
 class _InnerLibrary(JITCodeLibrary):
@@ -99,6 +108,8 @@ class _Compilation(event.Listener):
             logger.info("compiling %s (once per machine)", function.__name__)
             self._paused = gc.isenabled()
             gc.disable()
+            while _calls:
+                _fork(_calls.pop())
 
     def on_end(self, event: Any) -> None:
         if self._paused and event.data["dispatcher"] in _entries:
@@ -109,12 +120,58 @@ event.register("numba:compile", _Compilation())  # type: ignore[no-untyped-call]
 hold_at_fork(global_compiler_lock)
 
 
+@contextlib.contextmanager
+def meanwhile(*calls: Callable[[], object]) -> Iterator[None]:
+    """Make calls in processes of their own as soon as a kernel is compiled here, so that theirs are too.
+
+    They write them to disk, from where this process loads them. Without a fork or a second processor, this
+    process compiles all kernels.
+    """
+    if sys.platform == "linux" and thread_count() > 1:
+        _calls.extend(calls)
+    try:
+        yield
+    finally:
+        _calls.clear()
+
+
+def _fork(call: Callable[[], object]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of other threads: see utils/process.py
+        child = os.fork()
+    if child:
+        _children.append(child)
+        return
+    try:
+        _calls.clear()
+        _children.clear()
+        logging.disable()
+        call()
+    finally:
+        os._exit(0)
+
+
+def _wait_for_children() -> None:
+    """Wait until no other process compiles for this one."""
+    while _children:
+        child, end = _children.pop(), time.monotonic() + _PATIENCE
+        with contextlib.suppress(ChildProcessError):  # another thread has waited for it
+            while os.waitpid(child, os.WNOHANG) == (0, 0):
+                time.sleep(_POLL)
+                if time.monotonic() > end:
+                    os.kill(child, signal.SIGKILL)
+
+
 class _CheckedFiles(IndexDataCacheFile):
     """Numba's files of a kernel with a checksum at their ends, which pickle ignores, named by their content.
 
     Numba would run files that a crash or a full disk has cut off. Such files are compiled again. Numba also
     numbers files, and two processes could write kernels of two dtypes to one.
     """
+
+    def load(self, key: Any) -> Any:
+        _wait_for_children()
+        return super().load(key)  # type: ignore[no-untyped-call]
 
     def save(self, key: Any, data: Any) -> None:
         number = int.from_bytes(hashlib.sha256(repr(key).encode()).digest()[:8])

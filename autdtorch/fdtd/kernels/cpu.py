@@ -15,14 +15,22 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 
 import numpy as np
 import torch
 from numba import njit
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.kernels.compiled import INNER, entry
-from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, WaveState
+from autdtorch.fdtd.kernels.compiled import INNER, entry, meanwhile
+from autdtorch.fdtd.kernels.contract import (
+    Coefficients,
+    Columns,
+    Receivers,
+    Sources,
+    WaveState,
+    uniform_state,
+)
 from autdtorch.fdtd.kernels.cpu_intrinsics import (
     add_to_counter,
     give_way,
@@ -32,8 +40,9 @@ from autdtorch.fdtd.kernels.cpu_intrinsics import (
 )
 from autdtorch.fdtd.kernels.cpu_layers import FlatMemory, plane_profiles, rows_profile, stretch
 from autdtorch.fdtd.kernels.cpu_sweep import sweep_planes
+from autdtorch.fdtd.kernels.cpu_waves import superposition
 from autdtorch.fdtd.stencil import OFFSETS
-from autdtorch.utils.array_types import AnyArray
+from autdtorch.utils.array_types import COMPLEX, REAL, AnyArray
 from autdtorch.utils.process import spread, thread_count
 
 # Fewest cells and planes of a chunk, for which a second thread and the sums at its ends pay
@@ -319,6 +328,21 @@ class CpuKernel:
         memory.give_back()
         now, before = (state.now, state.before) if len(signal) % 2 == 0 else (state.before, state.now)
         return WaveState(now, before, state.memory), recorded
+
+    def compiled_ahead(self, shape: tuple[int, int, int], c: Coefficients) -> AbstractContextManager[None]:
+        """Compile `advance` and the sums over sources in other processes while others are compiled here."""
+        none = torch.zeros((0, 1), dtype=torch.int64, device="cpu")
+        silent = torch.zeros((0, 1), dtype=c.layer_decay.dtype, device="cpu")
+
+        def step() -> None:
+            state = uniform_state(shape, c, 0.0)
+            self.advance(state, c, Sources(none[:, 0], silent), Receivers(none, silent), silent)
+
+        def add() -> None:
+            places = torch.eye(3, **REAL)
+            superposition(places[:1], places[1:], torch.ones((2, 1), **COMPLEX), 1.0, dtype=silent.dtype)
+
+        return meanwhile(step, add)
 
     def _work(self, advance: Callable[[], object], chunks: int) -> None:
         """Step on as many threads as chunks and free processors; workers that wait are slower than one."""
