@@ -62,6 +62,11 @@ def set_threads() -> Iterator[Any]:
     torch.set_num_threads(before)
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """Return one process more than cores, as a tenth of the time is spent in waiting."""
+    return (os.cpu_count() or 1) + 1
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         item.add_marker(item.path.relative_to(TESTS).parts[0])

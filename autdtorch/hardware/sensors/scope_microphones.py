@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import math
 import re
@@ -164,6 +165,8 @@ class ScopeSensor:
         self._frequency = number_between("frequency", frequency, *FREQUENCIES, "Hz")
         self._microphones = members("microphones", microphones, Microphone)
         self._captures = integer_at_least("captures", captures, 1)
+        # Captures are alike, and a fit takes longer to prepare than to apply.
+        self._prepared = functools.lru_cache(maxsize=1)(functools.partial(LockIn, self._frequency))
         volts = [one._volts for one in self._microphones]
         self._volts_per_pascal = torch.tensor(volts, **REAL)
         self._coarsest = {
@@ -228,7 +231,7 @@ class ScopeSensor:
         if len(moments) > 1:
             raise SensorError(f"inputs differ in time step and number of samples: {sorted(moments)}")
         try:
-            return LockIn(self._frequency, *moments.pop())
+            return self._prepared(*moments.pop())
         except ValueError as error:
             raise SensorError(f"capture does not suit the frequency: {error}") from error
 
