@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
 from scipy.special import j1
 
-from autdtorch.scene.arrays import TransducerArray, complex_strengths_of
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.images import NO_MIRRORS, Image, distinct
-from autdtorch.utils.process import require_memory
 from autdtorch.utils.spatial import distances
 from autdtorch.utils.units import real_wavenumber
 from autdtorch.utils.validation import (
@@ -28,7 +24,6 @@ from autdtorch.utils.validation import (
     unit_vector,
 )
 
-PAIR_BYTES = 80.0  # Memory for each entry of a transfer matrix while it is computed [bytes]
 _SMALL = 1e-8  # Argument up to which 2 J_1(v) / v is 1; J_1 of the least numbers is 0
 _HALVINGS = 30  # Halvings of the angle along the rim of a piston towards the point nearest to the receiver
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
@@ -58,27 +53,6 @@ def green(points: ArrayLike, sources: ArrayLike, wavenumber: complex) -> torch.T
         accepted = f"lies on source {source}, must be at least {LENGTH_TOLERANCE:g} m away"
         raise invalid(f"points[{point}]", tuple(targets[point].tolist()), accepted, "m")
     return torch.polar(torch.exp(-alpha * r) / (4 * math.pi * r), k * r)
-
-
-def free_space_matrix(
-    points: ArrayLike, array: TransducerArray, wavenumber: complex, images: Sequence[Image] = NO_MIRRORS
-) -> torch.Tensor:
-    """Return the transfer matrix (P, M), complex128, of an array without obstacles: S e^{i k r} / r (Eq. 2).
-
-    The mean over discs is that over `array.nodes`. Arguments and errors as for `green`; pressure [Pa] per
-    unit drive. `images` are those of the space in reflectors, `Scene.images`.
-    """
-    positions, weights = array.nodes
-    points = differentiable_points("points", points)
-    require_memory("points", tuple(points.shape), PAIR_BYTES * len(points) * len(array))
-    # node by node, with memory for one matrix only
-    terms = (
-        image.weight * w * green(points, at, wavenumber)
-        for image in distinct(images, positions)
-        for at, w in zip(image.of(positions).unbind(1), weights, strict=True)
-    )
-    none = torch.zeros((), **COMPLEX)
-    return 4 * math.pi * complex_strengths_of(array).to(points.device) * sum(terms, start=none)
 
 
 def piston_field(

@@ -24,7 +24,7 @@ from autdtorch.fdtd.region import Shape
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.turning import turned_shape
-from autdtorch.utils.apertures import Apertures, Discs
+from autdtorch.utils.apertures import Apertures, Discs, image_of
 from autdtorch.utils.array_types import COMPLEX, Array, Index
 from autdtorch.utils.images import NO_MIRRORS, SPACE_ITSELF, Image
 from autdtorch.utils.process import cached_property
@@ -86,7 +86,7 @@ class ScatteredField:
         from autdtorch.fdtd.kernels.cpu_waves import superposition  # loads numba
 
         def of(image: Image) -> Tensor:
-            seen = sources if image is SPACE_ITSELF else _seen(sources, image)
+            seen = sources if image is SPACE_ITSELF else image_of(sources, image)
             field = superposition(points, seen, amplitude, self.wavenumber, nearest, self.assembly.dtype)
             return field if image is SPACE_ITSELF else image.weight * field
 
@@ -95,15 +95,11 @@ class ScatteredField:
             total = total + of(image)
         return total
 
-    def incident(self, points: Tensor, sources: Apertures, strength: Tensor, nearest: float = 0.0) -> Tensor:
+    def incident(
+        self, points: Tensor | Discs, sources: Apertures, strength: Tensor, nearest: float = 0.0
+    ) -> Tensor:
         """Return the incident field (P,) at points (P, 3) [m] of sources with strengths (N,) [Pa m]."""
-        far = sources.far_from(points, self.wavenumber)
-        near, of_near = sources.chosen(~far), strength[~far]
-        amplitude = of_near.repeat_interleave(len(near.weights)) * near.weights.repeat(len(of_near))
-        field = self.waves(points, near.positions.reshape(-1, 3), amplitude[:, None], nearest)[:, 0]
-        if far.any():
-            field = field + self.waves(points, sources.chosen(far).discs, strength[far, None])[:, 0]
-        return field
+        return self.waves(points, sources.places, strength[:, None], nearest)[:, 0]
 
     def driving(self, sources: Apertures, strength: Tensor) -> Tensor:
         """Return the incident field (n,) at the `driven` positions; see `incident`."""
@@ -111,8 +107,8 @@ class ScatteredField:
 
     def near_to_far(self, targets: Apertures) -> NearToFar:
         """Return the transform to P targets, which take the mean over their nodes or discs."""
-        positions, surface, outward = self.surface
-        far = targets.far_from(positions, self.wavenumber)
+        _, surface, outward = self.surface
+        far = ~self.inside(targets.positions).any(dim=1)
         nodes = targets.positions[~far]
         within = self.inside(nodes)
         inner = self.assembly.interpolation(self._on_axes(nodes[within]))
@@ -220,20 +216,13 @@ def _chosen(points: Tensor | Discs, mask: Tensor) -> Tensor | Discs:
     return Discs(*(part[mask] for part in points)) if isinstance(points, Discs) else points[mask]
 
 
-def _seen(sources: Tensor | Discs, image: Image) -> Tensor | Discs:
-    """Return the image of sources."""
-    if isinstance(sources, Discs):
-        return sources._replace(centers=image.of(sources.centers), normals=sources.normals @ image.matrix.mT)
-    return image.of(sources)
-
-
 @dataclass(frozen=True)
 class NearToFar:
     """The near-to-far-field transform from phasors of a box's cells to the scattered field at P targets."""
 
     box: ScatteredField
     targets: Apertures
-    far: Tensor  # mask of the targets that are discs far from the box (P,)
+    far: Tensor  # mask of the targets none of whose nodes is in the box (P,)
     within: Tensor  # mask of the other targets' nodes in the box, where its cells are read (Q, n)
     cells: Index  # flat indices (k,) of the cells whose phasors are needed
     outward: csr_array  # amplitudes of the Huygens surface from those phasors
@@ -259,7 +248,7 @@ class NearToFar:
         mean = torch.zeros((len(self.far), runs), **COMPLEX)
         mean[~self.far] = torch.einsum("pnr,n->pr", field, near.weights.to(field.dtype))
         if self.far.any():
-            mean[self.far] = self.box.radiated(amplitude, self.targets.chosen(self.far).discs)
+            mean[self.far] = self.box.radiated(amplitude, self.targets.chosen(self.far).places)
         return mean
 
     def amplitudes(self, phasors: Tensor) -> Tensor:
@@ -277,8 +266,8 @@ class NearToFar:
         received[:, ~far] = self._received(some, weights * ~within, False, self.box.images)
         if self.box.echoes and within.any():
             received[:, ~far] += self._received(some, weights * within, False, self.box.echoes)
-        discs, ones = self.targets.chosen(chosen[far]), weights.sum().expand(int(far.sum()), 1)
-        received[:, far] = self._received(discs, ones, True, self.box.images)
+        others, ones = self.targets.chosen(chosen[far]), weights.sum().expand(int(far.sum()), 1)
+        received[:, far] = self._received(others, ones, True, self.box.images)
         read = torch.zeros_like(self.within)
         read[near] = within
         row, node = torch.nonzero(within, as_tuple=True)
@@ -289,7 +278,7 @@ class NearToFar:
     def _received(self, targets: Apertures, weights: Tensor, far: bool, images: Sequence[Image]) -> Tensor:
         """Return waves (m, P) from the Huygens surface to P targets, with weights (P, n) of their nodes.
 
-        Targets that are `far` discs have one weight each.
+        Targets that are `far` have one weight each.
         """
         waves = [torch.zeros((len(self.box.surface[0]), 0), **COMPLEX)]
         for first in range(0, len(weights), _TOGETHER):
@@ -298,7 +287,7 @@ class NearToFar:
             columns = torch.arange(len(of_nodes), device="cpu").repeat_interleave(of_nodes.shape[1])
             amplitude = torch.zeros((of_nodes.numel(), len(of_nodes)), **COMPLEX)
             amplitude[torch.arange(len(columns), device="cpu"), columns] = of_nodes.flatten().to(amplitude)
-            sources = some.discs if far else some.positions.flatten(0, 1)
+            sources = some.places if far else some.positions.flatten(0, 1)
             waves.append(self.box.waves(self.box.surface[0], sources, amplitude, images=images))
         return torch.cat(waves, dim=1)
 

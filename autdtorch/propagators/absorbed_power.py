@@ -9,14 +9,18 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from autdtorch.scene.arrays import complex_strengths_of
+from autdtorch.scene.arrays import apertures_of, complex_strengths_of
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.array_types import REAL
+from autdtorch.utils.apertures import Discs, image_of
+from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.images import Mirror, images_of
 from autdtorch.utils.validation import invalid
 
 _MORE = 20
 """Degrees of a far field beyond wavenumber times radius: those that are left out are below 1e-6."""
+
+_SMALL = 1e-8
+"""Argument v up to which the directivity 2 J_1(v) / v of a disc is 1."""
 
 _AT_ONCE = 4_000_000
 """Pairs of a direction and a source whose waves are in memory at once."""
@@ -30,19 +34,16 @@ class AbsorbedPower(NamedTuple):
 
 
 class Radiators(NamedTuple):
-    """Monopoles that radiate as an array, and as the bodies in front of mirrors, without images."""
+    """Points or discs that radiate as an array, or as the bodies in front of mirrors, without images."""
 
-    places: torch.Tensor  # (n, 3) [m]
+    places: torch.Tensor | Discs  # points (n, 3) [m]
     amplitude: torch.Tensor  # (n, R) [Pa m] in R runs
     mirrors: tuple[int, ...] = ()  # numbers of those whose images they hold
 
 
 def radiators_of_array(scene: Scene, drive: torch.Tensor) -> Radiators:
-    """Return the transducers of a scene as monopoles, for drives (R, M)."""
-    positions, weights = scene.array.nodes
-    strength = (complex_strengths_of(scene.array) * drive).mT
-    amplitude = strength[:, None] * weights[:, None].to(strength.dtype)
-    return Radiators(positions.reshape(-1, 3), amplitude.reshape(-1, len(drive)))
+    """Return the transducers of a scene, for drives (R, M)."""
+    return Radiators(apertures_of(scene.array).places, (complex_strengths_of(scene.array) * drive).mT)
 
 
 def power_into_reflectors(scene: Scene, parts: Sequence[Radiators], runs: int) -> torch.Tensor:
@@ -72,20 +73,36 @@ def _power_behind(
     scene: Scene, mirror: Mirror, others: Mapping[int, Mirror], parts: Sequence[Radiators]
 ) -> torch.Tensor:
     """Return the power (R,) [W] that radiators and their images in other mirrors send behind a mirror."""
-    everything: list[tuple[torch.Tensor, torch.Tensor]] = []
+    everything: list[tuple[torch.Tensor | Discs, torch.Tensor]] = []
     for part in parts:
         missing = [other for number, other in others.items() if number not in part.mirrors]
         for image in images_of(missing, scene.complex_wavenumber, 1.0):
-            everything.append((image.of(part.places), image.weight * part.amplitude))
-    places, amplitude = (torch.cat(each) for each in zip(*everything, strict=True))
-    middle = (places.amax(dim=0) + places.amin(dim=0)) / 2
-    reach = float((places - middle).norm(dim=1).max())
-    total = torch.zeros(amplitude.shape[1], **REAL)
-    for directions, area in _half_sphere(math.ceil(scene.wavenumber * reach) + _MORE, mirror, len(places)):
-        turn = -scene.wavenumber * directions @ (places - middle).mT
-        far = torch.polar(torch.ones((), **REAL), turn) @ amplitude.to(torch.complex128)
-        total += area @ far.abs().square()
+            everything.append((image_of(part.places, image), image.weight * part.amplitude.to(**COMPLEX)))
+    centers = torch.cat([each.centers if isinstance(each, Discs) else each for each, _ in everything])
+    middle = (centers.amax(dim=0) + centers.amin(dim=0)) / 2
+    radii = [float(each.radii.max()) for each, _ in everything if isinstance(each, Discs)]
+    reach = float((centers - middle).norm(dim=1).max()) + max(radii, default=0.0)
+    total = torch.zeros(everything[0][1].shape[1], **REAL)
+    for directions, area in _half_sphere(math.ceil(scene.wavenumber * reach) + _MORE, mirror, len(centers)):
+        parts_of = [
+            _far_waves(directions, each, middle, scene.wavenumber) @ part for each, part in everything
+        ]
+        total += area @ torch.stack(parts_of).sum(dim=0).abs().square()
     return total / (2 * scene.medium.density * scene.medium.sound_speed)
+
+
+def _far_waves(
+    directions: torch.Tensor, places: torch.Tensor | Discs, middle: torch.Tensor, wavenumber: float
+) -> torch.Tensor:
+    """Return the far field (n, N) in directions (n, 3) of points or discs, relative to that of the middle."""
+    centers = places.centers if isinstance(places, Discs) else places
+    waves = torch.polar(torch.ones((), **REAL), -wavenumber * directions @ (centers - middle).mT)
+    if not isinstance(places, Discs):
+        return waves
+    sine = (1 - (directions @ places.normals.mT) ** 2).clamp(min=0).sqrt()
+    argument = (wavenumber * places.radii * sine).clamp(min=_SMALL)
+    directivity: torch.Tensor = 2 * torch.special.bessel_j1(argument) / argument
+    return waves * directivity
 
 
 def _half_sphere(degree: int, mirror: Mirror, count: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:

@@ -310,10 +310,8 @@ class BoxSimulation(Simulation):
         self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures
     ) -> torch.Tensor:
         """Return the incident field (P, R) [Pa] at P receivers in R runs; see `_run`."""
-        points, weights = receivers.positions, receivers.weights.to(torch.complex128)
         drives = [self.imaged(*drive) for drive in zip(sources, strength, strict=True)]
-        fields = [self.boxes[0].incident(points.reshape(-1, 3), *drive) for drive in drives]
-        return torch.stack([field.reshape(points.shape[:-1]) @ weights for field in fields], dim=1)
+        return torch.stack([self.boxes[0].incident(receivers.places, *drive) for drive in drives], dim=1)
 
     def _simulate(
         self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures, stepped: Stepped

@@ -30,8 +30,8 @@ _AIR_SPACING, _AIR_RIM = 1e-3, 28
 _PILOT_CELLS = 6
 """Cells per wavelength of the coarse grid that symmetries are found on."""
 
-_NODE_SECONDS = 4e-8
-"""Time [s] of a pair of a point and a node of a transducer in free space."""
+_PAIR_SECONDS = 1e-8
+"""Time [s] of a pair of a point and a transducer in free space."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,8 @@ def estimate(
     spacing = positive("spacing", spacing, "m")
     planned = plan(scene, method, spacing, tolerance, kernel=kernel, dtype=dtype, device=device)
     if planned.method == "free_space" or not planned.runs:
-        nodes = len(scene.array) * len(scene.control_points) * len(scene.array.nodes.weights)
-        return Estimate(planned.method, None, 0, 0, planned.memory, _NODE_SECONDS * nodes)
+        pairs = len(scene.array) * len(scene.control_points)
+        return Estimate(planned.method, None, 0, 0, planned.memory, _PAIR_SECONDS * pairs)
     # a multiple of the spacing: a scene that is symmetric on one grid mostly is on the other
     factor = max(1, math.floor(planned.region.wavelength / _PILOT_CELLS / spacing))
     pilot = planned.at(spacing * factor, planned.tolerance)

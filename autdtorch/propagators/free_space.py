@@ -1,23 +1,68 @@
-"""The propagator of free space."""
+"""The transfer matrix and the propagator of free space."""
 
 from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from typing import Literal, overload
 
 import torch
 
-from autdtorch.analytic.green import free_space_matrix
+from autdtorch.analytic.discs import waves_of
 from autdtorch.propagators.absorbed_power import AbsorbedPower, power_into_reflectors, radiators_of_array
 from autdtorch.propagators.behind import silent_behind
+from autdtorch.scene.arrays import TransducerArray, apertures_of, complex_strengths_of
 from autdtorch.scene.drive import validate_drive
-from autdtorch.scene.scene import Scene, require_in_front
-from autdtorch.utils.array_types import REAL
+from autdtorch.scene.scene import Scene, require_clear, require_in_front
+from autdtorch.utils.array_types import COMPLEX, REAL
+from autdtorch.utils.images import NO_MIRRORS, Image
+from autdtorch.utils.process import require_memory
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import ArrayLike, boolean, differentiable_points, points_grid, require_kind
 
 logger = logging.getLogger(__name__)
+
+PAIR_BYTES = 40.0
+"""Memory for each entry of a transfer matrix while it is computed [bytes]."""
+
+_FEW = 100_000
+"""Pairs of a point and a transducer up to which no compiled code is loaded: 0.02 s."""
+
+
+def free_space_matrix(
+    points: ArrayLike, array: TransducerArray, wavenumber: complex, images: Sequence[Image] = NO_MIRRORS
+) -> torch.Tensor:
+    """Return the transfer matrix (P, M), complex128, of an array without obstacles: S e^{i k r} / r (Eq. 2).
+
+    The mean of it over discs. On the device of the points (P, 3) [m], and differentiable by them; pressure
+    [Pa] per unit drive. `images` are those of the space in reflectors, `Scene.images`.
+
+    Raises:
+        ValueError: points have another shape, or one is on a transducer.
+    """
+    points = differentiable_points("points", points)
+    require_clear(array, "points", points.detach())
+    require_memory("points", tuple(points.shape), PAIR_BYTES * len(points) * len(array))
+    transducers, weights = apertures_of(array).with_images(images)
+    amplitude = weights * complex_strengths_of(array).repeat(len(weights) // len(array))
+    count = len(array)
+    if len(points) * len(weights) > _FEW and points.device.type == "cpu" and not _is_differentiated(points):
+        from autdtorch.fdtd.kernels.cpu_waves import wave_matrix  # loads numba
+
+        return wave_matrix(points.detach(), transducers.places, amplitude, count, wavenumber)
+    matrix = torch.zeros((), **COMPLEX).to(points.device)
+    for first in range(0, len(weights), count):  # image by image, with memory for one
+        part = slice(first, first + count)
+        waves = waves_of(points, transducers.chosen(part).places, complex(wavenumber))
+        matrix = matrix + amplitude[part].to(points.device) * waves
+    return matrix
+
+
+def _is_differentiated(points: torch.Tensor) -> bool:
+    """Return whether derivatives by the points may be asked for, backward or forward."""
+    forward = torch.autograd.forward_ad.unpack_dual(points).tangent is not None  # type: ignore[no-untyped-call]
+    return points.requires_grad or forward or torch._C._functorch.is_functorch_wrapped_tensor(points)
 
 
 class FreeSpacePropagator:

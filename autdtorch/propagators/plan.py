@@ -6,10 +6,8 @@ import logging
 from dataclasses import dataclass, fields, replace
 from typing import Self
 
-import numpy as np
 import torch
 
-from autdtorch.analytic.green import PAIR_BYTES
 from autdtorch.fdtd.costs import Costs
 from autdtorch.fdtd.grid import MAX_CELLS, coarsest_spacing, require_spacing, second_spacing
 from autdtorch.fdtd.grid_errors import Law
@@ -18,10 +16,11 @@ from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels.choice import available_kernel, precision_of
 from autdtorch.fdtd.reflection import require_domain, require_sharp, whole_region
 from autdtorch.fdtd.region import Region
+from autdtorch.propagators.free_space import PAIR_BYTES
 from autdtorch.propagators.scene_region import region_of, with_rigid
 from autdtorch.propagators.store import key_of
 from autdtorch.propagators.tmatrix.bodies import waves_to_simulate
-from autdtorch.scene.arrays import apertures_of, radii_of
+from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.process import cached_property, require_memory
@@ -144,14 +143,11 @@ class Plan:
         array, points, region = self.scene.array, len(self.scene.control_points), self.region
         if self.method == "full":
             region = whole_region(region)
-        transducers = apertures_of(array)
-        around = np.array([corner for shape in region.shapes for corner in (shape.lower, shape.upper)])
-        far = transducers.far_from(torch.from_numpy(around.reshape(-1, 3)), region.wavenumber)
         in_boxes = self.method != "full"
         return Costs(
             region, self.grouping, self.spacing, self.kernel, self.runs, self.dtype.itemsize, in_boxes,
-            receivers=max(points, len(array) if in_boxes else transducers.positions[..., 0].numel()),
-            terms=max(points, int(np.where(far, 2, len(transducers.weights)).sum())),
+            receivers=max(points, len(array) if in_boxes else array.nodes.positions[..., 0].numel()),
+            terms=max(points, 2 * len(array)),  # a disc takes twice the time of a point
             meshes=tuple(isinstance(shape, Mesh) for shape in region.shapes),
         )  # fmt: skip
 

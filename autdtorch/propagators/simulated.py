@@ -10,11 +10,11 @@ from typing import Literal, Protocol, overload, runtime_checkable
 
 import torch
 
-from autdtorch.analytic.green import PAIR_BYTES, free_space_matrix
 from autdtorch.fdtd.grid_errors import errors_by_grids, grid_errors, rigid_errors, shape_errors, sizes
 from autdtorch.propagators.absorbed_power import AbsorbedPower
 from autdtorch.propagators.behind import silent_behind
 from autdtorch.propagators.box import BoxSimulation
+from autdtorch.propagators.free_space import PAIR_BYTES, free_space_matrix
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.propagators.notices import Notices, warn_of_unsettled
 from autdtorch.propagators.plan import Plan

@@ -22,7 +22,7 @@ from autdtorch.utils.array_types import REAL
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.images import Image, images_of
 from autdtorch.utils.process import cached_property
-from autdtorch.utils.spatial import nearest, require_distinct
+from autdtorch.utils.spatial import require_distinct
 from autdtorch.utils.text import counted, html_facts
 from autdtorch.utils.units import DECIBELS, angles, warn_user
 from autdtorch.utils.units import ScaleWarning as ScaleWarning
@@ -46,6 +46,7 @@ _FREQUENCIES = 1e-3, 1e12  # [Hz]
 _LOWEST = 1000.0  # [Hz], below which a frequency may be in kHz
 _MOST_ABSORPTION = 3.0  # [dB per wavelength]: the model assumes a small imaginary part of the wavenumber
 _MOST_OF_OBSTACLE = 27.0  # [dB per wavelength], an imaginary part of half the wavenumber
+_AT_ONCE = 1_000_000  # pairs of a point and a transducer whose distances are in memory at once
 
 
 class OverlapWarning(UserWarning):
@@ -406,13 +407,19 @@ def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
 
 def require_clear(array: TransducerArray, name: str, points: torch.Tensor) -> None:
     """Refuse points (N, 3) [m] on a transducer."""
-    nodes = array.nodes.positions
-    gap, node = nearest(points, nodes.reshape(-1, 3))
-    if gap.min() < LENGTH_TOLERANCE:
-        point = int(gap.argmin())
-        transducer = int(node[point]) // nodes.shape[1]
-        accepted = f"lies on transducer {transducer}, must be at least {LENGTH_TOLERANCE:g} m away"
-        raise invalid(f"{name}[{point}]", points[point], accepted, "m")
+    reach = radii_of(array)[:, None]
+    axes = torch.cat([torch.eye(3, **REAL), array.normals[:1]])  # flat arrays are thin along their normal
+    half = reach * (1 - (array.normals @ axes.mT) ** 2).clamp(min=0).sqrt() + LENGTH_TOLERANCE
+    centers, along = array.positions @ axes.mT, points.cpu() @ axes.mT
+    near = (along >= (centers - half).amin(dim=0)) & (along <= (centers + half).amax(dim=0))
+    for some in torch.split(near.all(dim=1).nonzero()[:, 0], 1 + _AT_ONCE // len(array)):
+        between = points[some].cpu()[:, None] - array.positions
+        height = (between * array.normals).sum(dim=-1).abs()
+        on = (height < LENGTH_TOLERANCE) & (between.norm(dim=-1) < reach[:, 0] + LENGTH_TOLERANCE)
+        if on.any():
+            row, transducer = on.nonzero()[0].tolist()
+            accepted = f"lies on transducer {transducer}, must be at least {LENGTH_TOLERANCE:g} m away"
+            raise invalid(f"{name}[{int(some[row])}]", points[some[row]], accepted, "m")
 
 
 def require_inside(domain: tuple[Vector, Vector], name: str, points: torch.Tensor, fix: str = "") -> None:

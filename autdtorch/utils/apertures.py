@@ -1,25 +1,35 @@
-"""Points and discs that radiate or receive: the monopoles that stand for them, and the far field of discs."""
+"""Points and discs that radiate or receive: the monopoles that stand for them, and the waves of discs."""
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
 import torch
 
-from autdtorch.utils.array_types import COMPLEX, REAL, AnyArray, Array
+from autdtorch.utils.array_types import COMPLEX, REAL, Array, Index
 from autdtorch.utils.images import Image, distinct
 
-PATTERN_TERMS = 13
-"""Powers of the square of the sine of an angle in a far-field pattern."""
+TOGETHER = 3
+"""Degrees of the waves of a disc that are summed at once."""
 
-_ORDERS = 4  # of the expansion in 1 / r
-_LARGEST = 6.0  # k a of the largest discs: the first power that is left out is below 1e-7 of the axis
-# A disc is far at so many radii and where k a^2 / 2r is at most this: the orders that are left out are below
-# 3e-5 of the pressure on the axis
-_FAR_RADII, _FAR_PHASE = 10.0, 0.14
-_RINGS, _RING_NODES = 5, 16  # of the monopoles that stand for a disc
+_ERROR = 1e-8
+"""Limit for the waves of a disc that are left out, in all, relative to a point of its strength."""
+
+_REACH, _REACHES = 1.5, 20
+"""Least distance of these waves, in radii, and the number of distances by factors of 2^(1/4)."""
+
+_POINT = 1e-4
+"""k a of discs that are points: their factor differs by (k a)^2 / 8."""
+
+RIM_DIGITS, RIM_TURNS, RIM_STRIP, RIM_LEAST = 20.0, 1.2, 2.164, 1e-5
+"""Rule for the integral along a rim: -log of its error, growth of a wave in the complex plane with k a
+[rad], coth(1 / 2), and the least ratio of the distances to the nearest and the farthest point of the rim."""
+
+_RINGS, _RING_NODES = 5, 16  # of the monopoles that stand for a disc on a grid
 
 
 class Apertures(NamedTuple):
@@ -62,20 +72,11 @@ class Apertures(NamedTuple):
         )
 
     @property
-    def discs(self) -> Discs:
-        """The discs that the monopoles stand for."""
-        assert self.normals is not None
-        assert self.radii is not None
+    def places(self) -> torch.Tensor | Discs:
+        """The points (N, 3), or the discs."""
+        if self.normals is None or self.radii is None:
+            return self.positions[:, 0]
         return Discs(self.positions.mean(dim=1), self.normals, self.radii)
-
-    def far_from(self, points: torch.Tensor, wavenumber: complex) -> torch.Tensor:
-        """Return which of them (N,) are discs far enough from all points (P, 3) for `Discs.pattern`."""
-        if self.radii is None or len(points) == 0:
-            return torch.zeros(len(self.positions), dtype=torch.bool, device="cpu")
-        center, size = self.positions.mean(dim=1), abs(wavenumber) * self.radii
-        beyond = torch.maximum(points.amin(dim=0) - center, center - points.amax(dim=0)).clamp(min=0)
-        least = self.radii * (size / (2 * _FAR_PHASE)).clamp(min=_FAR_RADII)
-        return torch.gt(beyond.norm(dim=1), least) & (size <= _LARGEST)
 
 
 class Discs(NamedTuple):
@@ -85,29 +86,75 @@ class Discs(NamedTuple):
     normals: torch.Tensor  # (N, 3)
     radii: torch.Tensor  # (N,) [m]
 
+    def are_points(self, wavenumber: complex) -> bool:
+        """Return whether discs of equal radius are so small that they are points."""
+        return abs(wavenumber) * float(self.radii[0]) < _POINT
+
     def of_equal_radius(self) -> Iterator[tuple[torch.Tensor, Self]]:
         """Yield the indices (n,) of the discs of each radius, and these discs."""
-        for radius in np.unique(self.radii.numpy()):
+        for radius in torch.unique(self.radii).tolist():
             index = torch.nonzero(self.radii == radius)[:, 0]
             yield index, type(self)(*(part[index] for part in self))
 
-    def pattern(self, wavenumber: complex) -> Array:
-        """Return the factor on e^{i k r} / r far from discs of equal radius, with parts (orders, 2, terms).
 
-        It is a polynomial in 1 / r and in u, the square of the sine of the angle from the normal. Order zero
-        is 2 J1(v) / v with v^2 = (k a)^2 u. The recursion of Atkinson (1949) and Wilcox (1956) gives order n,
-        2 i k n F_n = n (n - 1) F_(n-1) + B F_(n-1). B is the Laplacian on the sphere.
-        """
-        power = np.arange(PATTERN_TERMS, dtype=np.float64)
-        factor = -((wavenumber * float(self.radii[0])) ** 2) / 4
-        orders: list[AnyArray] = [
-            np.cumprod(np.concatenate(([1.0 + 0j], factor / (power[1:] * (power[1:] + 1)))))
-        ]
-        for order in range(1, _ORDERS):
-            laplacian = -2 * power * (2 * power + 1) * orders[-1]
-            laplacian[:-1] += 4 * power[1:] ** 2 * orders[-1][1:]
-            orders.append((order * (order - 1) * orders[-1] + laplacian) / (2j * wavenumber * order))
-        return np.stack((np.real(orders), np.imag(orders)), axis=1)
+def image_of(places: torch.Tensor | Discs, image: Image) -> torch.Tensor | Discs:
+    """Return the image of points (N, 3) or discs."""
+    if not isinstance(places, Discs):
+        return image.of(places)
+    return places._replace(centers=image.of(places.centers), normals=places.normals @ image.matrix.mT)
+
+
+class EvenWaves(NamedTuple):
+    """The mean of e^{ikR} / R over a disc as outgoing waves: e^{ikr} / r sum_n c_n H_n P_2n(cos t).
+
+    The angle from the normal is t. With v = 1 / r^2, waves follow from the two before, degree by degree:
+    H_(n+1) = (alpha v - beta) H_n - gamma H_(n-1) and P_2(n+1) = (A cos^2 t - B) P_2n - C P_2(n-1), from
+    H_(-1) = -1 - i / kr and H_0 = P_0 = 1.
+    """
+
+    first: complex  # c_0
+    steps: Array  # Re alpha, Im alpha, beta, gamma, A, B, C, Re c_(n+1), Im c_(n+1), by n (N, 9)
+    reaches: Array  # distances (K,) [m]; nearer than the first the series is slow
+    counts: Index  # numbers of steps that suffice from each distance on (K,)
+
+
+@functools.lru_cache(64)
+def even_waves(wavenumber: complex, radius: float) -> EvenWaves:
+    """Return the waves of a disc of radius a [m].
+
+    With spherical Bessel functions, c_n h_2n = (4n + 1) P_2n(0) 2 / a^2 int_0^a j_2n(ks) s ds h_2n(kr) up to
+    e^{ikr} / r (Stenzel 1935). High degrees fall as (a / r)^2n. H_n are h_2n of size 1 at the least distance.
+    """
+    from scipy.special import eval_legendre, spherical_jn
+
+    size = wavenumber * radius
+    count = TOGETHER * math.ceil((abs(size) / 2 + 24) / TOGETHER)
+    degrees = 2 * np.arange(count + 1)
+    abscissa, weights = np.polynomial.legendre.leggauss(count + 30)
+    places = (abscissa + 1) / 2
+    means = spherical_jn(degrees[:, None], size * places) @ (weights * places)
+    l = 2.0 * np.arange(count)  # noqa: E741 - the degree in the formulas
+    alpha, gamma = (2 * l + 1) * (2 * l + 3), (2 * l + 3) / (2 * l - 1)
+    a = alpha / ((l + 1) * (l + 2))
+    b = a * ((l + 1) ** 2 / alpha + l**2 / ((2 * l + 1) * (2 * l - 1)))
+    c = a * l * (l - 1) / ((2 * l + 1) * (2 * l - 1))
+    reaches = _REACH * radius * 2 ** (np.arange(_REACHES) / 4)
+    nearness = 1 / (wavenumber * reaches)
+    scales, sizes = [1.0], [np.ones(_REACHES)]
+    before, wave = -1 - 1j * nearness, 1 + 0j * nearness
+    for n in range(count):
+        after = (alpha[n] * nearness**2 - 1 - gamma[n]) * wave - scales[-1] * gamma[n] * before
+        scales.append(1 / abs(after[0]))
+        before, wave = wave, scales[-1] * after
+        sizes.append(abs(wave))
+    scale = np.array(scales)
+    amplitude = (2 * degrees + 1) * eval_legendre(degrees, 0.0) * means / np.cumprod(scale)
+    left_out = np.cumsum((abs(amplitude)[:, None] * sizes)[:0:-1], axis=0)[::-1]
+    counts = TOGETHER * np.ceil((left_out > _ERROR).sum(axis=0) / TOGETHER)
+    alpha = scale[1:] * alpha / wavenumber**2
+    beta, gamma = scale[1:] * (1 + gamma), scale[1:] * scale[:-1] * gamma
+    parts = alpha.real, alpha.imag, beta, gamma, a, b, c, amplitude[1:].real, amplitude[1:].imag
+    return EvenWaves(complex(amplitude[0]), np.stack(parts, axis=1), reaches, counts.astype(np.int64))
 
 
 def disc_rule() -> tuple[torch.Tensor, torch.Tensor]:

@@ -22,8 +22,8 @@ from shared.document import Page, table
 from shared.scenes import relative_error
 
 import autdtorch as at
-from autdtorch.analytic.green import free_space_matrix
 from autdtorch.hardware import AUTD3
+from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.scene.arrays import TRANSDUCER_RADIUS
 
 DOCUMENT = "benchmarks.md"

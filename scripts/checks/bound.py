@@ -15,7 +15,7 @@ from shared.scenes import paper_objectives
 from shared.timing import timed
 
 import autdtorch as at
-from autdtorch.analytic.green import free_space_matrix
+from autdtorch.propagators.free_space import free_space_matrix
 
 OPTIONS = {
     "--scenes": {"type": int, "default": 1000, "help": "number of random scenes"},

@@ -18,7 +18,7 @@ from shared.timing import timed
 
 import autdtorch as at
 from autdtorch import analytic
-from autdtorch.analytic.green import free_space_matrix
+from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.scene.geometry import plane_basis
 
 CUBE_MATRICES = DOCS / "reference" / "cubes.json"

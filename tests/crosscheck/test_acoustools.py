@@ -22,7 +22,7 @@ from shared.cases import simulate, sphere_case
 from shared.scenes import relative_error
 
 import autdtorch as at
-from autdtorch.analytic.green import free_space_matrix
+from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.scene.arrays import TRANSDUCER_RADIUS
 
 

@@ -56,7 +56,7 @@ def objective(make_objective, random_matrix):
 @pytest.fixture(scope="session")
 def paper_objective():
     """The paper's array and four foci in empty air."""
-    from autdtorch.analytic.green import free_space_matrix
+    from autdtorch.propagators.free_space import free_space_matrix
     from autdtorch.scene.geometry import circle_points
 
     array = TransducerArray.grid((4, 4), pitch=10e-3, center=(1e-3, 50e-3, 50e-3))

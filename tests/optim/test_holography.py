@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import autdtorch
-from autdtorch.analytic.green import free_space_matrix
 from autdtorch.methods.holography.algorithms import SOLVERS, within_largest
 from autdtorch.methods.holography.holography import Holography, holography
 from autdtorch.methods.holography.sequence import drive_sequence
@@ -16,6 +15,7 @@ from autdtorch.methods.run import run
 from autdtorch.objectives.bound import focus_bound
 from autdtorch.objectives.goals import TargetPressures, WeakestFocus
 from autdtorch.objectives.quiet import QuietPoints
+from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import circle_points
 

@@ -9,11 +9,11 @@ import torch
 from small_scenes import AIR, CUBE, relative_error, scene_of_all_kinds, small_scene
 
 from autdtorch.analytic import rigid_sphere
-from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.grid import make_box
 from autdtorch.fdtd.grouping import cheapest_boxes, one_box
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.propagators import SimulatedPropagator, assembled_box, make_propagator
+from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.propagators.store import BODIES

@@ -12,11 +12,11 @@ from small_scenes import AIR, CUBE, relative_error, small_scene
 
 import autdtorch as at
 from autdtorch import analytic
-from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.grid import RATIO, coarsest_spacing, second_spacing
 from autdtorch.fdtd.grid_errors import Law, errors_by_grids, grid_errors
 from autdtorch.propagators import FreeSpacePropagator, make_propagator
 from autdtorch.propagators import estimate as simulation_estimate
+from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.obstacles import Sphere, VoxelMask

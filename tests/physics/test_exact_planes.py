@@ -15,7 +15,7 @@ from exact_planes import (
 )
 
 from autdtorch import analytic
-from autdtorch.analytic.green import free_space_matrix
+from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.scene.arrays import TransducerArray
 
 RADIUS, SOURCE = 8e-3, np.array([[0.02, 0.01, 0.06]])

@@ -8,7 +8,6 @@ import pytest
 import torch
 from small_scenes import AIR, CUBE, relative_error, small_scene
 
-from autdtorch.analytic.green import free_space_matrix
 from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.propagators import (
     FreeSpacePropagator,
@@ -16,6 +15,7 @@ from autdtorch.propagators import (
     differentiable_field,
     make_propagator,
 )
+from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import drive_from_phases
 from autdtorch.scene.geometry import plane_basis

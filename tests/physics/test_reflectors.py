@@ -129,7 +129,7 @@ def test_corners_of_planes(count, radius):
     matrix = make_propagator(at.Scene(array, AIR, 40e3, points, reflectors=reflectors)).transfer_matrix()
     nodes, weights = array.nodes
     waves = corner(points, nodes.reshape(-1, 3), K, planes).reshape(2, 2, -1) @ weights.to(matrix.dtype)
-    assert relative_error(matrix, 4 * math.pi * array.source_strength * waves) < 1e-10
+    assert relative_error(matrix, 4 * math.pi * array.source_strength * waves) < 1e-6  # of the nodes
 
 
 @settings(max_examples=15)

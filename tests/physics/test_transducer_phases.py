@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from small_scenes import AIR, relative_error, small_scene
 
 import autdtorch as at
-from autdtorch.analytic.green import free_space_matrix
 from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.propagators import differentiable_field, make_propagator
+from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.scene.arrays import complex_strengths_of, phase_offsets_of, strengths_of
 from autdtorch.scene.changes import changed_array
 

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from small_scenes import AIR, NO_RECEIVERS, NO_SOURCES, relative_error, small_scene
 
 from autdtorch import analytic
-from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stepping import assemble
 from autdtorch.fdtd.thin_walls import Thickened, thickened, thin_wall
 from autdtorch.propagators import make_propagator
+from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.scene_region import difference_from_rigid, region_of
 from autdtorch.scene.arrays import TransducerArray

@@ -26,10 +26,10 @@ from small_scenes import small_scene
 from studies.conditions import CONDITIONS, Method, outcome
 
 import autdtorch as at
-from autdtorch.analytic.green import free_space_matrix
 from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.plot.costs import fit_power
 from autdtorch.propagators import FreeSpacePropagator
+from autdtorch.propagators.free_space import free_space_matrix
 
 FOLDERS = {"benchmark": "benchmarks", "check": "checks", "study": "studies"}
 PATHS = os.pathsep.join((str(SCRIPTS), str(SCRIPTS.parent)))

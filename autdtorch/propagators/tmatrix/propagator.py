@@ -11,10 +11,10 @@ from typing import Literal, overload
 
 import torch
 
-from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.grid_errors import grid_errors, rigid_errors, shape_errors, sizes
 from autdtorch.propagators.absorbed_power import AbsorbedPower
 from autdtorch.propagators.behind import silent_behind
+from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.propagators.simulation import Run

@@ -1,0 +1,110 @@
+"""The field of points and discs, differentiable: the mean over each of e^{ikR} / R.
+
+From 1.5 radii on it is a sum of even outgoing waves, nearer an integral along the rim (see `piston_field`),
+1 / (pi a) oint (a - o cos u) / (R + z) sinc(k (R - z) / 2) e^{ik (R + z) / 2} du, at the height z and the
+distance o from the axis. `fdtd.kernels.cpu_waves` computes the same by compiled code.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from autdtorch.utils.apertures import RIM_DIGITS, RIM_LEAST, RIM_STRIP, RIM_TURNS, Discs, even_waves
+from autdtorch.utils.array_types import COMPLEX
+from autdtorch.utils.validation import LENGTH_TOLERANCE
+
+_SMALL = 1e-3
+"""Argument up to which a sine is the first two terms of its series: the next one is below 1e-14."""
+
+
+def waves_of(points: torch.Tensor, sources: torch.Tensor | Discs, wavenumber: complex) -> torch.Tensor:
+    """Return the waves (P, N) at points (P, 3) [m] of points (N, 3) or discs of strength 1 Pa m."""
+    if not isinstance(sources, Discs):
+        return _wave((points[:, None] - sources.to(points)).norm(dim=-1), wavenumber)
+    waves = torch.zeros((len(points), len(sources.radii)), **COMPLEX).to(points.device)
+    for index, some in sources.of_equal_radius():
+        radius = float(some.radii[0])
+        between, normals = points[:, None] - some.centers.to(points), some.normals.to(points)
+        if some.are_points(wavenumber):
+            part = _wave(between.norm(dim=-1), wavenumber)
+        else:
+            part = _disc_waves(between, normals.expand_as(between), radius, wavenumber)
+        waves = waves.index_copy(1, index.to(points.device), part)
+    return waves
+
+
+def _wave(r: torch.Tensor, wavenumber: complex) -> torch.Tensor:
+    """Return e^{i k r} / r."""
+    return torch.polar(torch.exp(-wavenumber.imag * r) / r, wavenumber.real * r)
+
+
+def _disc_waves(
+    between: torch.Tensor, normals: torch.Tensor, radius: float, wavenumber: complex
+) -> torch.Tensor:
+    """Return the waves (P, N) of discs with normals (P, N, 3), from their centres to points (P, N, 3) [m]."""
+    apart = between.detach().norm(dim=-1)
+    near = apart < even_waves(wavenumber, radius).reaches[0]
+    if not near.any():
+        return _series(between, normals, radius, wavenumber)
+    waves = torch.zeros(apart.shape, **COMPLEX).to(apart.device)
+    if not near.all():
+        waves = waves.index_put((~near,), _series(between[~near], normals[~near], radius, wavenumber))
+    return waves.index_put((near,), _along_rim(between[near], normals[near], radius, wavenumber))
+
+
+def _series(between: torch.Tensor, normals: torch.Tensor, radius: float, wavenumber: complex) -> torch.Tensor:
+    """Return the sum of even waves (...) at places (..., 3) from the centre; see `EvenWaves`."""
+    series, r = even_waves(wavenumber, radius), between.norm(dim=-1)
+    nearness = 1 / r
+    square, cosine = nearness**2, ((between * normals).sum(dim=-1) * nearness) ** 2
+    before, wave = -1 - 1j / wavenumber * nearness, torch.ones_like(r).to(torch.complex128)
+    lower, legendre = torch.zeros_like(r), torch.ones_like(r)
+    total = series.first * wave
+    place = int((series.reaches <= float(r.detach().min())).sum()) - 1
+    for re, im, beta, gamma, a, b, c, c_re, c_im in series.steps[: series.counts[place]].tolist():
+        before, wave = wave, (complex(re, im) * square - beta) * wave - gamma * before
+        lower, legendre = legendre, (a * cosine - b) * legendre - c * lower
+        total = total + complex(c_re, c_im) * (legendre * wave)
+    return total * _wave(r, wavenumber)
+
+
+def _along_rim(
+    between: torch.Tensor, normals: torch.Tensor, radius: float, wavenumber: complex
+) -> torch.Tensor:
+    """Return the integral (Q,) along the rim at places (Q, 3) from the centre.
+
+    With tan(u / 2) = e tan(v / 2), e <= 1, equal steps of v are closest next to the place. Their error falls
+    as e^(-n s), where the integrand is analytic and moderate for |Im v| < s: up to the nearest point of the
+    rim, and up to |Im u| = 1 on the far side.
+    """
+    along = (between * normals).sum(dim=-1, keepdim=True)
+    aside = between - along * normals
+    # the nodes stand still in derivatives, which are as smooth
+    offset, height = aside.detach().norm(dim=1), along.detach()[:, 0]
+    across = torch.linalg.cross(normals, torch.eye(3).to(normals)[normals.abs().argmin(dim=1)])
+    towards = torch.where(offset[:, None] > LENGTH_TOLERANCE, aside.detach(), across)
+    towards = towards / towards.norm(dim=1, keepdim=True)
+    sideways = torch.linalg.cross(normals, towards)
+    ratio = torch.hypot(height, offset - radius) / torch.hypot(height, offset + radius)
+    squeeze = (RIM_STRIP * ratio.clamp(min=RIM_LEAST)).clamp(max=1).sqrt()
+    turns = RIM_DIGITS + RIM_TURNS * abs(wavenumber) * offset.clamp(max=radius)
+    count = math.ceil(float((turns / torch.atanh(squeeze / RIM_STRIP)).max()) / 2)
+    angle = math.pi * ((torch.arange(count).to(between) + 0.5) / count - 0.5)  # v / 2
+    squeeze = squeeze[:, None]
+    sine, cosine = squeeze * torch.sin(angle), torch.cos(angle)
+    size = sine**2 + cosine**2
+    weight = squeeze / size * 2 / (count * radius)
+    first, second = (cosine**2 - sine**2) / size, 2 * sine * cosine / size
+    rim = first[..., None] * towards[:, None] + second[..., None] * sideways[:, None]
+    ahead = (aside[:, None] * rim).sum(dim=-1)
+    z = along.abs()
+    path = (aside**2).sum(dim=-1, keepdim=True) + radius**2 - 2 * radius * ahead  # R^2 - z^2
+    both = torch.sqrt(z**2 + path) + z
+    half = wavenumber / 2 * path / both
+    small = half.abs() < _SMALL
+    safe = torch.where(small, 1.0, half)
+    sinc = torch.where(small, 1 - half**2 / 6, torch.sin(safe) / safe)
+    waves: torch.Tensor = weight * (radius - ahead) / both * sinc * torch.exp(0.5j * wavenumber * both)
+    return waves.sum(dim=1)

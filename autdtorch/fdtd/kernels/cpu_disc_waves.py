@@ -1,0 +1,150 @@
+"""The waves of a disc at a block of places, from those of a point; see `utils.apertures.EvenWaves`."""
+
+from __future__ import annotations
+
+import cmath
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from torch import Tensor
+
+from autdtorch.fdtd.kernels.compiled import INNER
+from autdtorch.utils.apertures import (
+    RIM_DIGITS,
+    RIM_LEAST,
+    RIM_STRIP,
+    RIM_TURNS,
+    TOGETHER,
+    Discs,
+    even_waves,
+)
+
+LANES = 64
+"""Places in a block; their waves stay in the first-level cache."""
+
+# unsigned, see cpu_sweep.py
+BLOCK, X, Y, Z = np.uint64(LANES), np.uint64(0), np.uint64(1), np.uint64(2)
+
+NUMBERS = 16
+"""Numbers of each place, in one array whose parts the compiler knows not to overlap."""
+
+WAVE, ALSO, APART, NEAR, SIDE, WORK = np.arange(6, dtype=np.uint64) * BLOCK
+"""Places of the first of them: the parts of the wave, its distance and the inverse, two for work."""
+
+# 1 / r^2 and the squared cosine, Legendre polynomials and the parts of waves of two degrees, their sum
+_SQUARE, _COSINE, _OLD, _NEW, _RE_OLD = np.arange(6, 11, dtype=np.uint64) * BLOCK
+_RE_NEW, _IM_OLD, _IM_NEW, _RE, _IM = np.arange(11, NUMBERS, dtype=np.uint64) * BLOCK
+
+_SMALL = 1e-3  # Argument up to which a sine is the first two terms of its series
+
+
+def disc_numbers(places: Tensor | Discs, wavenumber: complex, number: type) -> tuple[Any, ...]:
+    """Return the waves of discs of equal radius, for `turn_into_disc`; points have none."""
+    wavenumber = complex(wavenumber)
+    if not isinstance(places, Discs) or not len(places.radii) or places.are_points(wavenumber):
+        return np.zeros((0, 9), number), np.zeros((0, 2), number), 0.0, wavenumber
+    radius = float(places.radii[0])
+    first, steps, reaches, counts = even_waves(wavenumber, radius)
+    head = first.real, first.imag, (1 / wavenumber).real, (1 / wavenumber).imag, 1 / reaches[0], 0, 0, 0, 0
+    ends = np.stack((1 / reaches, counts), axis=1)
+    return np.vstack((head, steps)).astype(number), ends.astype(number), radius, wavenumber
+
+
+@njit(**INNER)
+def _coefficients(steps, n):  # type: ignore[no-untyped-def]
+    c = steps[n]
+    return c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8]
+
+
+@njit(**INNER)
+def _head(steps):  # type: ignore[no-untyped-def]
+    """Return the parts of c_0 and of 1 / k, and the inverse of the least distance; see `disc_numbers`."""
+    c = steps[0]
+    return c[0], c[1], c[2], c[3], c[4]
+
+
+@njit(**INNER)
+def _next_wave(c, square, cosine, old, new, re_old, re_new, im_old, im_new, re, im):  # type: ignore[no-untyped-def]
+    """Return the next polynomial and wave, and the sums with their product; see `EvenWaves`."""
+    legendre = (c[4] * cosine - c[5]) * new - c[6] * old
+    a, b = c[0] * square - c[2], c[1] * square
+    re_wave, im_wave = a * re_new - b * im_new - c[3] * re_old, a * im_new + b * re_new - c[3] * im_old
+    x, y = legendre * re_wave, legendre * im_wave
+    return legendre, re_wave, im_wave, re + (c[7] * x - c[8] * y), im + (c[7] * y + c[8] * x)
+
+
+@njit(**INNER)
+def _add_degrees(steps, n, lanes):  # type: ignore[no-untyped-def]
+    """Add the terms of three degrees, all of whose numbers stay in registers."""
+    first, second, third = _coefficients(steps, n), _coefficients(steps, n + 1), _coefficients(steps, n + 2)
+    for k in range(BLOCK):
+        square, cosine, re, im = lanes[_SQUARE + k], lanes[_COSINE + k], lanes[_RE + k], lanes[_IM + k]
+        p, q = lanes[_OLD + k], lanes[_NEW + k]
+        a, b, x, y = lanes[_RE_OLD + k], lanes[_RE_NEW + k], lanes[_IM_OLD + k], lanes[_IM_NEW + k]
+        p, a, x, re, im = _next_wave(first, square, cosine, p, q, a, b, x, y, re, im)
+        q, b, y, re, im = _next_wave(second, square, cosine, q, p, b, a, y, x, re, im)
+        p, a, x, re, im = _next_wave(third, square, cosine, p, q, a, b, x, y, re, im)
+        lanes[_OLD + k], lanes[_NEW + k], lanes[_RE + k], lanes[_IM + k] = q, p, re, im
+        lanes[_RE_OLD + k], lanes[_RE_NEW + k], lanes[_IM_OLD + k], lanes[_IM_NEW + k] = b, a, y, x
+
+
+@njit(**INNER)
+def turn_into_disc(place, others, first, disc, lanes):  # type: ignore[no-untyped-def]
+    """Turn the waves of a point into those of a disc at a place with a normal (6,)."""
+    steps, ends, radius, wavenumber = disc
+    start, also, re_inverse, im_inverse, least = _head(steps)
+    x, y, z = place[0], place[1], place[2]
+    along_x, along_y, along_z = place[3], place[4], place[5]
+    for k in range(BLOCK):
+        dx, dy, dz = others[X, first + k] - x, others[Y, first + k] - y, others[Z, first + k] - z
+        cosine = (dx * along_x + dy * along_y + dz * along_z) * lanes[NEAR + k]
+        lanes[_COSINE + k] = cosine * cosine
+    for k in range(BLOCK):
+        near = min(lanes[NEAR + k], least)
+        lanes[_SQUARE + k] = near * near
+        lanes[_OLD + k], lanes[_NEW + k], lanes[_RE_NEW + k], lanes[_IM_NEW + k] = 0, 1, 1, 0
+        lanes[_RE_OLD + k], lanes[_IM_OLD + k] = im_inverse * near - 1, -re_inverse * near
+        lanes[_RE + k], lanes[_IM + k] = start, also
+    most = lanes[NEAR]
+    for k in range(BLOCK):
+        most = max(most, lanes[NEAR + k])
+    number = 0
+    while number + 1 < len(ends) and most <= ends[number + 1, 0]:
+        number += 1
+    for n in range(0, int(ends[number, 1]), TOGETHER):
+        _add_degrees(steps, 1 + n, lanes)
+    for k in range(BLOCK):
+        re, im, a, b = lanes[WAVE + k], lanes[ALSO + k], lanes[_RE + k], lanes[_IM + k]
+        lanes[WAVE + k], lanes[ALSO + k] = a * re - b * im, a * im + b * re
+    if most > least:
+        for k in range(BLOCK):
+            if lanes[NEAR + k] > least:
+                dx, dy, dz = others[X, first + k] - x, others[Y, first + k] - y, others[Z, first + k] - z
+                along = dx * along_x + dy * along_y + dz * along_z
+                dx, dy, dz = dx - along * along_x, dy - along * along_y, dz - along * along_z
+                wave = _along_rim(abs(along), math.sqrt(dx * dx + dy * dy + dz * dz), radius, wavenumber)
+                lanes[WAVE + k], lanes[ALSO + k] = wave.real, wave.imag
+
+
+@njit(**INNER)
+def _along_rim(height, offset, radius, wavenumber):  # type: ignore[no-untyped-def]
+    """Return the mean of e^{ikR} / R over a disc, by half of its rim; see `analytic.discs`."""
+    ratio = math.sqrt((height**2 + (offset - radius) ** 2) / (height**2 + (offset + radius) ** 2))
+    squeeze = math.sqrt(min(RIM_STRIP * max(ratio, RIM_LEAST), 1.0))
+    turns = RIM_DIGITS + RIM_TURNS * abs(wavenumber) * min(offset, radius)
+    count = math.ceil(turns / math.atanh(squeeze / RIM_STRIP) / 4)
+    total = 0j
+    for j in range(count):
+        angle = math.pi / 2 * (j + 0.5) / count
+        sine, cosine = squeeze * math.sin(angle), math.cos(angle)
+        size = sine * sine + cosine * cosine
+        turned = 2 * sine * sine / size  # 1 - cos, without cancellation next to the rim
+        path = (radius - offset) ** 2 + 2 * radius * offset * turned
+        both = math.sqrt(height * height + path) + height
+        half = wavenumber / 2 * path / both
+        sinc = 1 - half * half / 6 if abs(half) < _SMALL else cmath.sin(half) / half
+        edge = (radius - offset + offset * turned) / (size * both)
+        total += edge * sinc * cmath.exp(0.5j * wavenumber * both)
+    return total * (2 * squeeze / (count * radius))
