@@ -12,7 +12,7 @@ import math
 import torch
 
 from autdtorch.utils.apertures import RIM_DIGITS, RIM_LEAST, RIM_STRIP, RIM_TURNS, Discs, even_waves
-from autdtorch.utils.array_types import COMPLEX
+from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 _SMALL = 1e-3
@@ -83,7 +83,7 @@ def _along_rim(
     aside = between - along * normals
     # the nodes stand still in derivatives, which are as smooth
     offset, height = aside.detach().norm(dim=1), along.detach()[:, 0]
-    across = torch.linalg.cross(normals, torch.eye(3).to(normals)[normals.abs().argmin(dim=1)])
+    across = torch.linalg.cross(normals, torch.eye(3, **REAL).to(normals)[normals.abs().argmin(dim=1)])
     towards = torch.where(offset[:, None] > LENGTH_TOLERANCE, aside.detach(), across)
     towards = towards / towards.norm(dim=1, keepdim=True)
     sideways = torch.linalg.cross(normals, towards)
@@ -91,7 +91,7 @@ def _along_rim(
     squeeze = (RIM_STRIP * ratio.clamp(min=RIM_LEAST)).clamp(max=1).sqrt()
     turns = RIM_DIGITS + RIM_TURNS * abs(wavenumber) * offset.clamp(max=radius)
     count = math.ceil(float((turns / torch.atanh(squeeze / RIM_STRIP)).max()) / 2)
-    angle = math.pi * ((torch.arange(count).to(between) + 0.5) / count - 0.5)  # v / 2
+    angle = math.pi * ((torch.arange(count, **REAL).to(between) + 0.5) / count - 0.5)  # v / 2
     squeeze = squeeze[:, None]
     sine, cosine = squeeze * torch.sin(angle), torch.cos(angle)
     size = sine**2 + cosine**2

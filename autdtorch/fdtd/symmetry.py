@@ -20,7 +20,7 @@ from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.stencil import OFFSETS, places_of
 from autdtorch.fdtd.stepping import Assembly
-from autdtorch.utils.apertures import Apertures
+from autdtorch.utils.apertures import Apertures, Discs
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.images import Mirror
 from autdtorch.utils.validation import LENGTH_TOLERANCE
@@ -44,7 +44,7 @@ class Symmetry:
         """Return the index (P,) of the point that each of the points (P, 3) [m] is mapped to, or -1."""
         if (self.matrix == np.eye(3)).all():
             return np.arange(len(points))
-        return _matched(points[:, None].numpy(), np.ones(1), self.matrix, self.center)
+        return _matched(points.numpy(), self.matrix, self.center)
 
     def keeps(self, mirrors: Sequence[Mirror]) -> bool:
         """Return whether it maps each mirror to one of the same reflection."""
@@ -122,31 +122,35 @@ def symmetries(assemblies: Sequence[Assembly], along: Array, transducers: Apertu
     assembly = assemblies[0]
     grid, cells = assembly.grid, assembly.heterogeneous
     center = (np.array(grid.origin) + grid.spacing * (np.array(grid.shape) - 1) / 2) @ along
-    positions, weights = transducers.positions.numpy(), transducers.weights.numpy()
-    result = [Symmetry(np.eye(3), center, np.arange(len(positions)))]
+    result = [Symmetry(np.eye(3), center, np.arange(len(transducers.positions)))]
     turns = itertools.product(itertools.permutations(range(3)), itertools.product((1, -1), repeat=3))
     for axes, signs in itertools.islice(turns, 1, None if len(assemblies) == 1 else 1):
         turn = np.diag(signs) @ np.eye(3, dtype=np.int64)[list(axes)]
         if (np.abs(turn) @ grid.shape != grid.shape).any():
             continue
         matrix = along.T @ turn @ along
-        images = _matched(positions, weights, matrix, center)
+        images = _matched_places(transducers.places, matrix, center)
         if (images != _NONE).all() and _maps_cells(cells, grid, turn, _ROUNDING * assembly.stencil.face):
             result.append(Symmetry(matrix, center, images))
     return result
 
 
-def _matched(groups: Array, weights: Array, matrix: Array, center: Array) -> Index:
-    """Map groups of places (N, n, 3) [m] with weights (n,); return the group (N,) of each image, or -1."""
-    count = len(weights)
-    places = (groups - center).reshape(-1, 3)
+def _matched_places(places: torch.Tensor | Discs, matrix: Array, center: Array) -> Index:
+    """Map points (N, 3) [m] or discs; return the number (N,) of each image, or -1."""
+    if not isinstance(places, Discs):
+        return _matched(places.numpy(), matrix, center)
+    centers, normals, radii = (part.numpy() for part in places)
+    images = _matched(centers, matrix, center)
+    turned, others = normals @ matrix.T, normals[images]
+    apart = np.minimum(np.abs(turned - others).max(axis=1), np.abs(turned + others).max(axis=1))
+    return np.where((apart < _TURNED) & (radii == radii[images]), images, _NONE)
+
+
+def _matched(points: Array, matrix: Array, center: Array) -> Index:
+    """Map points (N, 3) [m]; return the number (N,) of each image, or -1."""
+    places = points - center
     gap, nearest = KDTree(places).query(places @ matrix.T, distance_upper_bound=LENGTH_TOLERANCE)
-    # a place without a match has the index one past the last
-    group, node = np.divmod(np.where(np.isfinite(gap), nearest, 0), count)
-    same = np.isfinite(gap) & (weights[node] == np.tile(weights, len(groups)))
-    group, same = group.reshape(-1, count), same.reshape(-1, count)
-    whole = same.all(axis=1) & (group == group[:, :1]).all(axis=1)
-    return np.asarray(np.where(whole, group[:, 0], _NONE), np.int64)
+    return np.asarray(np.where(np.isfinite(gap), nearest, _NONE), np.int64)
 
 
 def _maps_cells(cells: HeterogeneousCells, grid: Grid, matrix: Index, rounding: float) -> bool:
