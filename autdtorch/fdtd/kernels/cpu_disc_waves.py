@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cmath
 import math
 from typing import Any
 
@@ -37,19 +36,25 @@ WAVE, ALSO, APART, NEAR, SIDE, WORK = np.arange(6, dtype=np.uint64) * BLOCK
 _SQUARE, _COSINE, _OLD, _NEW, _RE_OLD = np.arange(6, 11, dtype=np.uint64) * BLOCK
 _RE_NEW, _IM_OLD, _IM_NEW, _RE, _IM = np.arange(11, NUMBERS, dtype=np.uint64) * BLOCK
 
-_SMALL = 1e-3  # Argument up to which a sine is the first two terms of its series
+_SMALL = 1e-5  # Phase up to which a difference of two waves is two terms of its series
 
 
 def disc_numbers(places: Tensor | Discs, wavenumber: complex, number: type) -> tuple[Any, ...]:
     """Return the waves of discs of equal radius, for `turn_into_disc`; points have none."""
     wavenumber = complex(wavenumber)
     if not isinstance(places, Discs) or not len(places.radii) or places.are_points(wavenumber):
-        return np.zeros((0, 9), number), np.zeros((0, 2), number), 0.0, wavenumber
+        return np.zeros((0, 9), number), np.zeros((0, 2), number), 0.0, 0.0, 0.0
     radius = float(places.radii[0])
     first, steps, reaches, counts = even_waves(wavenumber, radius)
     head = first.real, first.imag, (1 / wavenumber).real, (1 / wavenumber).imag, 1 / reaches[0], 0, 0, 0, 0
     ends = np.stack((1 / reaches, counts), axis=1)
-    return np.vstack((head, steps)).astype(number), ends.astype(number), radius, wavenumber
+    return (
+        np.vstack((head, steps)).astype(number),
+        ends.astype(number),
+        radius,
+        wavenumber.real,
+        wavenumber.imag,
+    )
 
 
 @njit(**INNER)
@@ -93,7 +98,7 @@ def _add_degrees(steps, n, lanes):  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def turn_into_disc(place, others, first, disc, lanes):  # type: ignore[no-untyped-def]
     """Turn the waves of a point into those of a disc at a place with a normal (6,)."""
-    steps, ends, radius, wavenumber = disc
+    steps, ends, radius, re_k, im_k = disc
     start, also, re_inverse, im_inverse, least = _head(steps)
     x, y, z = place[0], place[1], place[2]
     along_x, along_y, along_z = place[3], place[4], place[5]
@@ -124,27 +129,38 @@ def turn_into_disc(place, others, first, disc, lanes):  # type: ignore[no-untype
                 dx, dy, dz = others[X, first + k] - x, others[Y, first + k] - y, others[Z, first + k] - z
                 along = dx * along_x + dy * along_y + dz * along_z
                 dx, dy, dz = dx - along * along_x, dy - along * along_y, dz - along * along_z
-                wave = _along_rim(abs(along), math.sqrt(dx * dx + dy * dy + dz * dz), radius, wavenumber)
-                lanes[WAVE + k], lanes[ALSO + k] = wave.real, wave.imag
+                a, b = _along_rim(abs(along), math.sqrt(dx * dx + dy * dy + dz * dz), radius, re_k, im_k)
+                lanes[WAVE + k] = im_inverse * a + re_inverse * b
+                lanes[ALSO + k] = im_inverse * b - re_inverse * a
 
 
 @njit(**INNER)
-def _along_rim(height, offset, radius, wavenumber):  # type: ignore[no-untyped-def]
-    """Return the mean of e^{ikR} / R over a disc, by half of its rim; see `analytic.discs`."""
+def _along_rim(height, offset, radius, re_k, im_k):  # type: ignore[no-untyped-def]
+    """Return i k times the mean of e^{ikR} / R over a disc, by half of its rim; see `analytic.discs`."""
     ratio = math.sqrt((height**2 + (offset - radius) ** 2) / (height**2 + (offset + radius) ** 2))
     squeeze = math.sqrt(min(RIM_STRIP * max(ratio, RIM_LEAST), 1.0))
-    turns = RIM_DIGITS + RIM_TURNS * abs(wavenumber) * min(offset, radius)
-    count = math.ceil(turns / math.atanh(squeeze / RIM_STRIP) / 4)
-    total = 0j
+    turns = RIM_DIGITS + RIM_TURNS * re_k * min(offset, radius)
+    count = 1 + int(turns / (2 * math.log((RIM_STRIP + squeeze) / (RIM_STRIP - squeeze))))
+    fading = math.exp(-im_k * height)
+    re_height, im_height = fading * math.cos(re_k * height), fading * math.sin(re_k * height)
+    re_total = im_total = 0.0
     for j in range(count):
         angle = math.pi / 2 * (j + 0.5) / count
         sine, cosine = squeeze * math.sin(angle), math.cos(angle)
         size = sine * sine + cosine * cosine
         turned = 2 * sine * sine / size  # 1 - cos, without cancellation next to the rim
         path = (radius - offset) ** 2 + 2 * radius * offset * turned
-        both = math.sqrt(height * height + path) + height
-        half = wavenumber / 2 * path / both
-        sinc = 1 - half * half / 6 if abs(half) < _SMALL else cmath.sin(half) / half
-        edge = (radius - offset + offset * turned) / (size * both)
-        total += edge * sinc * cmath.exp(0.5j * wavenumber * both)
-    return total * (2 * squeeze / (count * radius))
+        distance = math.sqrt(height * height + path)
+        apart = path / (distance + height)
+        if re_k * apart > _SMALL:
+            fading = math.exp(-im_k * distance)
+            re = fading * math.cos(re_k * distance) - re_height
+            im = fading * math.sin(re_k * distance) - im_height
+        else:
+            x, y = -im_k * apart, re_k * apart
+            a, b = x + (x * x - y * y) / 2, y + x * y
+            re, im = a * re_height - b * im_height, a * im_height + b * re_height
+        edge = (radius - offset + offset * turned) / (size * path)
+        re_total, im_total = re_total + edge * re, im_total + edge * im
+    factor = 2 * squeeze / (count * radius)
+    return factor * re_total, factor * im_total
