@@ -7,6 +7,7 @@ so that help is quick.
 from __future__ import annotations
 
 import contextlib
+import gc
 import hashlib
 import logging
 import os
@@ -124,7 +125,8 @@ def _run(config: DictConfig) -> None:
 @hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")
 def _explore(config: DictConfig) -> None:
     with _errors_carried():
-        from autdtorch.cli.settings import settings_of
+        with _importing():
+            from autdtorch.cli.settings import settings_of
 
         settings, modules, _ = settings_of(config)
         explore_scene(settings, modules)
@@ -133,11 +135,23 @@ def _explore(config: DictConfig) -> None:
 @hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")
 def _calibrate(config: DictConfig) -> None:
     with _errors_carried(), warnings.catch_warnings():
-        from autdtorch.cli.calibrate_command import calibrate_scene
-        from autdtorch.cli.settings import settings_of
+        with _importing():
+            from autdtorch.cli.calibrate_command import calibrate_scene
+            from autdtorch.cli.settings import settings_of
 
         warnings.showwarning = _log_warning
         calibrate_scene(*settings_of(config))
+
+
+@contextlib.contextmanager
+def _importing() -> Iterator[None]:
+    """Look for no garbage meanwhile: imports leave none, and the search takes a tenth of their time."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @contextlib.contextmanager
@@ -205,7 +219,8 @@ def _named(prefix: str) -> Iterator[None]:
 
 def _job(config: DictConfig, sweep: Path | None) -> None:
     """Run a study, or a hardware trial if there is a section `hardware`."""
-    from autdtorch.cli.settings import settings_of
+    with _importing():
+        from autdtorch.cli.settings import settings_of
 
     settings, modules, output = settings_of(config)
     for command in ("explore", "calibrate"):

@@ -23,7 +23,7 @@ from autdtorch.plot.style import TICK_SIZE, label_of, new_figure, readable, set_
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.reflectors import Reflector, are_in_front
-from autdtorch.utils.array_types import Array
+from autdtorch.utils.array_types import REAL, Array
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
@@ -322,13 +322,18 @@ def _plane_axis(plane: Plane, side: int, cells: int) -> tuple[str, Array]:
 
 def _outline(ax: Axes, plane: Plane, obstacle: Obstacle, reflectors: Sequence[Reflector]) -> None:
     """Draw the intersection of an obstacle's surface, in front of reflectors, with the plane."""
-    points = plane.points(max(plane.size) / _OUTLINE_CELLS)
+    edge = max(plane.size) / _OUTLINE_CELLS
+    points = plane.points(edge)
+    lower, upper = torch.tensor(obstacle.lower, **REAL), torch.tensor(obstacle.upper, **REAL)
+    near = ((points > lower - 2 * edge) & (points < upper + 2 * edge)).all(dim=2).numpy()
+    some = [near.any(axis=1), near.any(axis=0)]  # rows and columns
+    points = points[np.ix_(*some)]
     distance = obstacle.signed_distance(points).numpy()
     distance[~are_in_front(reflectors, points).numpy()] = np.nan
     if not np.nanmin(distance, initial=np.inf) < 0 < np.nanmax(distance, initial=-np.inf):
         return
-    edges = (_plane_axis(plane, side, cells)[1] for side, cells in enumerate(distance.shape))
-    centers = ((along[:-1] + along[1:]) / 2 for along in edges)
+    edges = (_plane_axis(plane, side, cells)[1] for side, cells in enumerate(near.shape))
+    centers = ((along[:-1] + along[1:])[part] / 2 for along, part in zip(edges, some, strict=True))
     lines = ax.contour(*centers, distance.T, levels=[0.0], colors="white", linewidths=1.0)
     lines.set_path_effects([withStroke(linewidth=2.2, foreground="black")])
 
