@@ -51,6 +51,7 @@ from .plot.trials import plot_convergence, plot_poses, plot_trials
 from .plot.view3d import animate3d, view3d
 from .propagators import SteadyStateWarning, cell_centers, differentiable_field, make_propagator, volume_field
 from .propagators.estimate import Estimate, estimate
+from .propagators.nearby import NearbyPoses
 from .propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
 from .scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
 from .scene.drive import amplitudes_of, drive_from_phases, focus_phases, phases_of
@@ -86,6 +87,7 @@ __all__ = [
     "Medium",
     "Mesh",
     "Method",
+    "NearbyPoses",
     "Noise",
     "Objective",
     "Obstacle",

@@ -152,6 +152,35 @@ def changed_scene(scene: Scene, amounts: Amounts) -> Scene:
         )
 
 
+def seen_from_obstacles(scene: Scene, offset: torch.Tensor, rotation: Vector) -> Scene:
+    """Return a scene seen from its obstacles after they move as one body, as in `Scene.moved`.
+
+    The obstacles stay, and all else moves back. Pressures are those of the moved scene.
+    """
+    (center, _), turn, array = circumscribed(scene.obstacles), rotation_matrix(rotation), scene.array
+
+    def back(places: torch.Tensor) -> torch.Tensor:
+        return center + (places - center - offset) @ turn
+
+    planes = []
+    for plane in scene.reflectors:
+        point, normal = torch.tensor([plane.point, plane.normal], **REAL)
+        planes.append(Reflector(back(point), normal @ turn, plane.reflection))
+    array = replace(array, positions=back(array.positions), normals=array.normals @ turn)
+    points = back(scene.control_points)
+    with warnings.catch_warnings():  # of the scene before
+        warnings.simplefilter("ignore", OverlapWarning)
+        warnings.simplefilter("ignore", ScaleWarning)
+        return replace(
+            scene,
+            array=array,
+            control_points=points,
+            reflectors=tuple(planes),
+            domain=_domain_with(scene, array, points),
+            observation_plane=None,
+        )
+
+
 def changed_points(points: torch.Tensor, amounts: Amounts) -> torch.Tensor:
     """Return points of observation (P, 3) [m] after changes by amounts."""
     places = points + move_of("points", amounts)[0]

@@ -1,0 +1,53 @@
+"""Poses near a simulated one: against simulations of each, and scenes seen from their obstacles."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from small_scenes import relative_error, small_scene
+
+from autdtorch.propagators import make_propagator
+from autdtorch.propagators.nearby import NearbyPoses
+from autdtorch.scene.changes import seen_from_obstacles
+from autdtorch.scene.obstacles import Cylinder, Sphere
+from autdtorch.scene.reflectors import Reflector
+
+BALL = Sphere((12e-3, 14e-3, 14e-3), 2.5e-3, rigid=True)
+ROD = Cylinder((13e-3, 8e-3, 12e-3), 2e-3, 6e-3, axis=(1, 2, 1), rigid=True)
+SCENE = small_scene((BALL, ROD), radius=3e-3)
+SHIFT, TURN = (0.4e-3, -0.3e-3, 0.2e-3), (0.03, -0.02, 0.05)
+
+
+def test_a_scene_seen_from_its_moved_obstacles_is_the_moved_scene():
+    balls = BALL, Sphere((13e-3, 6e-3, 10e-3), 2e-3, rigid=True)
+    scene = replace(SCENE, obstacles=balls, reflectors=(Reflector((0, 0, -4e-3), (0, 0, 1), 0.8),))
+    moved, seen = scene.moved(SHIFT, TURN), seen_from_obstacles(scene, torch.tensor(SHIFT).double(), TURN)
+    assert seen.obstacles == balls
+    one, other, start = (make_propagator(each).transfer_matrix() for each in (moved, seen, scene))
+    assert relative_error(other, one) < 1e-8  # means over discs in other frames: a series to 1e-10
+    assert relative_error(start, one) > 0.01
+
+
+def test_poses_are_those_simulated_afresh_to_the_error_told():
+    propagator = make_propagator(SCENE, "box", 1e-3, 5e-3, cache=False)
+    nearby = NearbyPoses(propagator)
+    same, none = nearby.transfer_matrix(return_error=True)
+    assert none == 0
+    assert relative_error(same, propagator.transfer_matrix()) < 1e-12
+    matrix, told = nearby.transfer_matrix(SHIFT, TURN, return_error=True)
+    seen = propagator.for_scene(seen_from_obstacles(SCENE, torch.tensor(SHIFT).double(), TURN))
+    fresh, coarse = seen.transfer_matrix(), seen.coarser(1.6).transfer_matrix()
+    assert relative_error(propagator.transfer_matrix(), fresh) > 0.02
+    error = relative_error(matrix, fresh)
+    assert error < 0.3 * relative_error(coarse, fresh)
+    assert told / 3 < error < 3 * told
+    assert torch.equal(NearbyPoses(propagator).transfer_matrix(SHIFT, TURN), matrix)
+
+
+def test_propagators_without_coarser_grids_are_refused():
+    with pytest.raises(ValueError, match="propagator: 'of method full'; must be of method box"):
+        NearbyPoses(make_propagator(SCENE, "full", 1e-3))
+    with pytest.raises(ValueError, match=r"propagator.spacing: 0.0015 m; must be at most 0.001133 m: 2.5"):
+        NearbyPoses(make_propagator(SCENE, "box", 1.5e-3))
+    with pytest.raises(ValueError, match="propagator"):
+        NearbyPoses(make_propagator(SCENE, "tmatrix"))
