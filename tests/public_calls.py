@@ -321,6 +321,7 @@ OTHERS: dict[str, Any] = {
     "VoxelMask.from_image.name": None,
     "VoxelMask.load.path": Made(lambda folder: saved(folder, "mask.npy", np.ones((2, 2, 2), bool))),
     "animate3d.path": Made(lambda folder: folder / "wave.gif"),
+    **{f"{name}.evaluations": 4 for name in ("bayes_opt", "bo_foci")},
     "calibrate.folds": 0,
     "cell_centers.scene": AIR_ALONE,
     "Calibration.predict.drives": DRIVE,

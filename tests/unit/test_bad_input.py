@@ -50,10 +50,11 @@ class Accepted(Exception):
 
 
 @pytest.fixture(autouse=True)
-def nothing_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
-    def stop() -> None:
+def nothing_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(*_: Any) -> None:
         raise Accepted
 
+    monkeypatch.setattr("autdtorch.plot.pressure_maps._draw_plane", stop)
     monkeypatch.setattr("autdtorch.plot.view3d.require_rendering", stop)
     monkeypatch.setattr(explore, "require_rendering", stop)
 
