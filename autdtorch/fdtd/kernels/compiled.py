@@ -69,6 +69,8 @@ class _MakeLibrary(AnalysisPass):
 
     def run_pass(self, state: Any) -> bool:
         codegen, name = state.targetctx.codegen(), state.func_id.func_qualname
+        if state.targetctx.data_model_manager[state.return_type].contains_nrt_meminfo():
+            raise TypeError(f"{name} returns an array, whose references its caller would count")
         state.library = _InnerLibrary(codegen, name)  # type: ignore[no-untyped-call]
         return False
 
@@ -84,9 +86,11 @@ class _InnerCompiler(CompilerBase):
 # Options of functions that compiled functions call: no wrappers for Python, no checks of division by zero.
 # `fastmath` must stay off. It lets the compiler reorder sums, in a different way wherever a call is inlined:
 # a kernel loaded from disk then rounds differently from the one just compiled.
+# References to arrays are not counted: those that make arrays must set `_nrt`, and none returns one.
 INNER: Any = {
     "error_model": "numpy",
     "nogil": True,
+    "_nrt": False,
     "no_cpython_wrapper": True,
     "no_cfunc_wrapper": True,
     "pipeline_class": _InnerCompiler,

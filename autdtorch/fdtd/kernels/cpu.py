@@ -133,7 +133,7 @@ def _finish_chunk(c, q, medium, cells, losses, outermost, sources, row, sound_ha
         q[sound_hard[n]] = 0
 
 
-@njit(**INNER)
+@njit(**INNER | {"_nrt": True})
 def _stretch_columns(p, columns, beside, place, memory, terms):  # type: ignore[no-untyped-def]
     """Advance the columns' memory and write their terms (L, m), with summands from `beside` at `place`."""
     index, offset, weight, b_half, a_half, b_cell, a_cell = columns
@@ -156,7 +156,7 @@ def _stretch_columns(p, columns, beside, place, memory, terms):  # type: ignore[
     )  # fmt: skip
 
 
-@njit(**INNER)
+@njit(**INNER | {"_nrt": True})
 def _finish_columns(p, q, columns, memory):  # type: ignore[no-untyped-def]
     """Add the terms of interfaces through the layers."""
     (cut, crossed, crossing), (cut_memory, crossed_memory) = columns, memory

@@ -118,6 +118,16 @@ def _add_waves(total, r, a, b, lanes):  # type: ignore[no-untyped-def]
         total[1, r, k] += a * imaginary + b * real
 
 
+@njit(**INNER)
+def _move(total, fields, block):  # type: ignore[no-untyped-def]
+    """Add the total to fields, and set it to zero; for slices numba would compile messages of shapes."""
+    for part in range(2):
+        for r in range(total.shape[1]):
+            for k in range(BLOCK):
+                fields[part, r, block, k] += total[part, r, k]
+                total[part, r, k] = 0
+
+
 @entry()
 def _sum_at_points(points, first, last, sources, amplitude, wave, disc, room, fields):  # type: ignore[no-untyped-def]
     """Write the parts of fields (2, R, P / LANES, LANES) at the blocks `first` to `last` of points.
@@ -132,8 +142,7 @@ def _sum_at_points(points, first, last, sources, amplitude, wave, disc, room, fi
             for r in range(runs):
                 _add_waves(total, r, amplitude[0, r, s], amplitude[1, r, s], room[1])
             if (s + 1) % LANES == 0 or s + 1 == count:  # limits rounding
-                fields[:, :, block] += total
-                total[:] = 0
+                _move(total, fields, block)
 
 
 @njit(**INNER)

@@ -66,6 +66,13 @@ def _back_propagate(matrix, wanted, first, last, free, drive):  # type: ignore[n
 
 
 @njit(**INNER)
+def _copy(source, target):  # type: ignore[no-untyped-def]
+    """Copy numbers one by one; for slices numba would compile messages of shapes."""
+    for k in range(np.uint64(len(source))):
+        target[k] = source[k]
+
+
+@njit(**INNER)
 def _pack(matrix, wanted, first, points, transducers, a, b, t, begin):  # type: ignore[no-untyped-def]
     """Copy the sets from `first` on, of flat arrays, to lanes; lanes beyond the last set repeat it."""
     one, two, entries = np.uint64(1), np.uint64(2), points * transducers
@@ -213,12 +220,12 @@ def _solve(matrix, wanted, first, last, algorithm, iterations, free, drive):  # 
         _pack(flat, targets, np.uint64(block) * _LANES, points, transducers, a, b, t, begin)
         if algorithm == _GS_PAT:
             _products(a, b, c, d, points, transducers)
-            y[:] = t
+            _copy(t, y)
             w[:] = 0
             for _ in range(iterations):
                 _imposed(y, w, t, count)
-                v[:] = y
-                u[:] = w
+                _copy(y, v)
+                _copy(w, u)
                 _forward(c, d, v, u, y, w, points, points)
             for k in range(count):
                 factor = t[k] * t[k] / max(y[k] * y[k] + w[k] * w[k], kind.type(TINY))
@@ -227,7 +234,8 @@ def _solve(matrix, wanted, first, last, algorithm, iterations, free, drive):  # 
             _back(a, b, y, w, x, z, size, points, transducers, free)
         else:
             x[:], z[:] = 1, 0
-            weight[:], highest[:] = t, 0
+            _copy(t, weight)
+            highest[:] = 0
             x_best[:], z_best[:] = np.nan, np.nan  # stays so where a matrix is not finite
             _forward(a, b, x, z, y, w, points, transducers)
             for _ in range(iterations):
@@ -238,7 +246,8 @@ def _solve(matrix, wanted, first, last, algorithm, iterations, free, drive):  # 
                     _reweighted(y, w, t, weight, level, count)
                     _store_best(x, z, level, highest, x_best, z_best, transducers)
             if algorithm == _WGS:
-                x[:], z[:] = x_best, z_best
+                _copy(x_best, x)
+                _copy(z_best, z)
         for lane in range(_LANES):
             number = np.uint64(block) * _LANES + lane
             if number < np.uint64(len(matrix)):
