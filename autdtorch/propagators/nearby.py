@@ -114,8 +114,9 @@ class NearbyPoses:
         """
         with_error = boolean("return_error", return_error)
         shift, turn = finite_vector("offset", offset), angles("rotation", rotation, rotation_degrees)
-        self.propagator.scene.moved(shift, turn)  # refuses obstacles that hold a point
-        scene = seen_from_obstacles(self.propagator.scene, torch.tensor(shift, **REAL), turn)
+        start = self.propagator.scene
+        moved = start.moved(shift, turn)
+        scene, _ = seen_from_obstacles(moved, start.obstacles, torch.tensor(shift, **REAL), turn)
         coarse, difference = self._coarse(scene)
         before, change, factor = self._start
         matrix = coarse + factor * difference + before

@@ -10,9 +10,19 @@ from autdtorch.propagators.free_space import FreeSpacePropagator
 from autdtorch.propagators.simulated import Propagator, SimulatedPropagator
 from autdtorch.propagators.tmatrix.moved_bodies import MovedBodies
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
-from autdtorch.scene.changes import Amounts, changed_points, changed_scene, lever, require_change, unit_of
+from autdtorch.scene.changes import (
+    Amounts,
+    changed_and_seen,
+    changed_points,
+    changed_scene,
+    lever,
+    move_of,
+    require_change,
+    unit_of,
+)
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX
+from autdtorch.utils.images import SPACE_ITSELF, Image
 from autdtorch.utils.process import cached_property, one_library_thread
 from autdtorch.utils.validation import ArrayLike, invalid, points_tensor, real_tensor
 
@@ -29,7 +39,8 @@ class SceneChanges:
 
     Names and units of amounts are those of `autdtorch.scene.changes.KINDS`; the scene itself has amounts of
     0. Each matrix is computed for the changed scene. T-matrices are moved, not simulated again;
-    at other temperatures they are interpolated between simulations 12 K apart.
+    at other temperatures they are interpolated between simulations 12 K apart. Grids of method "box" turn
+    with obstacles that turn as one body.
 
     Attributes:
         names: of the changes.
@@ -64,9 +75,10 @@ class SceneChanges:
         if len(set(self.names)) < len(self.names):
             raise invalid("names", self.names, "must be there once each")
         self.units = tuple(map(unit_of, self.names))
-        self._last: tuple[Amounts, FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator] | None = (
-            None
+        self._last: (
+            tuple[Amounts, FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator, Image] | None
         )
+        self._last = None
 
     def scene(self, amounts: ArrayLike) -> Scene:
         """Return the scene changed by amounts (K,).
@@ -118,7 +130,7 @@ class SceneChanges:
             return True
         if self._bodies is None or not self._bodies.stay(amounts):
             return False
-        propagator = self._propagator_of(amounts)
+        propagator, _ = self._propagator_of(amounts)
         assert isinstance(propagator, TMatrixPropagator)
         return bool(propagator.by_waves(self._points_by(amounts))[1].all())
 
@@ -139,24 +151,39 @@ class SceneChanges:
 
     def _matrix(self, amounts: Amounts) -> torch.Tensor:
         points = None if self._points is None else changed_points(self._points, amounts)
-        return self._propagator_of(amounts).transfer_matrix(points)
+        propagator, view = self._propagator_of(amounts)
+        return propagator.transfer_matrix(None if points is None else view.of(points))
 
     def _points_by(self, amounts: Amounts) -> torch.Tensor:
         return changed_points(self._base.control_points if self._points is None else self._points, amounts)
 
     def _scene(self, amounts: Amounts) -> Scene:
-        if self._points is not None:
-            amounts = {name: each for name, each in amounts.items() if not name.startswith("points")}
-        return changed_scene(self._base, amounts)
+        return changed_scene(self._base, self._of_scene(amounts))
+
+    def _of_scene(self, amounts: Amounts) -> Amounts:
+        """Return the amounts of changes of the scene."""
+        if self._points is None:
+            return amounts
+        return {name: each for name, each in amounts.items() if not name.startswith("points")}
+
+    def _seen(self, amounts: Amounts) -> tuple[Scene, Image]:
+        """Return the changed scene and the map from its places to those in it: as turned obstacles see it."""
+        amounts, base, before = self._of_scene(amounts), self._base, self._propagator
+        if len(base.obstacles) == 1 and not any(name.startswith("obstacles.") for name in amounts):
+            amounts = {name.replace("obstacles[0].", "obstacles."): each for name, each in amounts.items()}
+        on_grids = isinstance(before, SimulatedPropagator) and before.method == "box" and not base.reflectors
+        if on_grids and any(move_of("obstacles", amounts)[1]):
+            return changed_and_seen(base, amounts)
+        return changed_scene(base, amounts), SPACE_ITSELF
 
     def _propagator_of(
         self, amounts: Amounts
-    ) -> FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator:
-        """Return the propagator of the changed scene; the last one is at hand."""
+    ) -> tuple[FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator, Image]:
+        """Return the propagator of the changed scene, and the map to its places; the last are at hand."""
         before = self._propagator
         if self._last is not None and self._last[0] == amounts:
-            return self._last[1]
-        scene = self._scene(amounts)
+            return self._last[1:]
+        scene, view = self._seen(amounts)
         after: FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator
         if isinstance(before, FreeSpacePropagator):
             after = FreeSpacePropagator(scene)
@@ -164,8 +191,8 @@ class SceneChanges:
             after = before.for_scene(scene, self._bodies.cluster(amounts))
         else:
             after = before.for_scene(scene)
-        self._last = dict(amounts), after
-        return after
+        self._last = dict(amounts), after, view
+        return after, view
 
     @cached_property
     def _bodies(self) -> MovedBodies | None:

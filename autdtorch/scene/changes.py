@@ -24,6 +24,7 @@ from autdtorch.scene.reflectors import Reflector, is_panel
 from autdtorch.scene.scene import OverlapWarning, ScaleWarning, Scene
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.hints import did_you_mean
+from autdtorch.utils.images import Image
 from autdtorch.utils.text import within
 from autdtorch.utils.validation import Vector, finite_vector, invalid
 
@@ -152,33 +153,46 @@ def changed_scene(scene: Scene, amounts: Amounts) -> Scene:
         )
 
 
-def seen_from_obstacles(scene: Scene, offset: torch.Tensor, rotation: Vector) -> Scene:
-    """Return a scene seen from its obstacles after they move as one body, as in `Scene.moved`.
+def changed_and_seen(scene: Scene, amounts: Amounts) -> tuple[Scene, Image]:
+    """Return a changed scene seen from its obstacles, and the map from its places to those seen.
 
-    The obstacles stay, and all else moves back. Pressures are those of the moved scene.
+    The obstacles' moves as one body are undone, and all else moves back. Pressures are those of the changed
+    scene.
     """
-    (center, _), turn, array = circumscribed(scene.obstacles), rotation_matrix(rotation), scene.array
+    changed = changed_scene(scene, amounts)
+    alone = {name: amount for name, amount in amounts.items() if not name.startswith("obstacles.")}
+    obstacles = changed_obstacles(_in_medium(scene, changed.medium), alone)
+    return seen_from_obstacles(changed, obstacles, *move_of("obstacles", amounts))
 
-    def back(places: torch.Tensor) -> torch.Tensor:
-        return center + (places - center - offset) @ turn
 
-    planes = []
+def seen_from_obstacles(
+    scene: Scene, obstacles: tuple[Obstacle, ...], offset: torch.Tensor, rotation: Vector
+) -> tuple[Scene, Image]:
+    """Return a scene, whose obstacles have moved as one body, seen from these; see `changed_and_seen`.
+
+    `obstacles` are those before, offset (3,) [m] and rotation [rad] as in `Scene.moved`.
+    """
+    (center, _), turn = circumscribed(obstacles), rotation_matrix(rotation)
+    view = Image(turn.mT, center - (center + offset) @ turn, 1.0)
+    array, planes = scene.array, []
     for plane in scene.reflectors:
         point, normal = torch.tensor([plane.point, plane.normal], **REAL)
-        planes.append(Reflector(back(point), normal @ turn, plane.reflection))
-    array = replace(array, positions=back(array.positions), normals=array.normals @ turn)
-    points = back(scene.control_points)
+        planes.append(Reflector(view.of(point), normal @ turn, plane.reflection))
+    array = replace(array, positions=view.of(array.positions), normals=array.normals @ turn)
+    points = view.of(scene.control_points)
     with warnings.catch_warnings():  # of the scene before
         warnings.simplefilter("ignore", OverlapWarning)
         warnings.simplefilter("ignore", ScaleWarning)
-        return replace(
+        seen = replace(
             scene,
             array=array,
             control_points=points,
+            obstacles=obstacles,
             reflectors=tuple(planes),
             domain=_domain_with(scene, array, points),
             observation_plane=None,
         )
+    return seen, view
 
 
 def changed_points(points: torch.Tensor, amounts: Amounts) -> torch.Tensor:

@@ -21,7 +21,9 @@ SHIFT, TURN = (0.4e-3, -0.3e-3, 0.2e-3), (0.03, -0.02, 0.05)
 def test_a_scene_seen_from_its_moved_obstacles_is_the_moved_scene():
     balls = BALL, Sphere((13e-3, 6e-3, 10e-3), 2e-3, rigid=True)
     scene = replace(SCENE, obstacles=balls, reflectors=(Reflector((0, 0, -4e-3), (0, 0, 1), 0.8),))
-    moved, seen = scene.moved(SHIFT, TURN), seen_from_obstacles(scene, torch.tensor(SHIFT).double(), TURN)
+    moved = scene.moved(SHIFT, TURN)
+    seen, view = seen_from_obstacles(moved, balls, torch.tensor(SHIFT).double(), TURN)
+    assert torch.equal(view.of(scene.control_points), seen.control_points)
     assert seen.obstacles == balls
     one, other, start = (make_propagator(each).transfer_matrix() for each in (moved, seen, scene))
     assert relative_error(other, one) < 1e-8  # means over discs in other frames: a series to 1e-10
@@ -35,7 +37,9 @@ def test_poses_are_those_simulated_afresh_to_the_error_told():
     assert none == 0
     assert relative_error(same, propagator.transfer_matrix()) < 1e-12
     matrix, told = nearby.transfer_matrix(SHIFT, TURN, return_error=True)
-    seen = propagator.for_scene(seen_from_obstacles(SCENE, torch.tensor(SHIFT).double(), TURN))
+    moved = SCENE.moved(SHIFT, TURN)
+    scene, _ = seen_from_obstacles(moved, SCENE.obstacles, torch.tensor(SHIFT).double(), TURN)
+    seen = propagator.for_scene(scene)
     fresh, coarse = seen.transfer_matrix(), seen.coarser(1.6).transfer_matrix()
     assert relative_error(propagator.transfer_matrix(), fresh) > 0.02
     error = relative_error(matrix, fresh)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from small_scenes import AIR, relative_error, small_scene
 
-from autdtorch.propagators import TMatrixPropagator, make_propagator
+from autdtorch.propagators import TMatrixPropagator, assembled_box, make_propagator
 from autdtorch.propagators.scene_changes import SceneChanges
 from autdtorch.propagators.tmatrix.tmatrix import TMatrixCluster
 from autdtorch.propagators.tmatrix.waves import BodyWaves
@@ -17,7 +17,7 @@ from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.changes import KINDS
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.medium import Medium
-from autdtorch.scene.obstacles import Box, Sphere, VoxelMask
+from autdtorch.scene.obstacles import Box, Cylinder, Sphere, VoxelMask
 from autdtorch.scene.reflectors import Reflector
 from autdtorch.scene.scene import OverlapWarning, Scene
 
@@ -103,6 +103,23 @@ def test_derivatives_of_places_are_those_of_automatic_differentiation():
     # half a step of 6e-7 rad, and rounding
     assert relative_error(slope[:, 1, 2], expected.reshape(-1)) < 1e-6
     assert not slope[6:, 0].any()
+
+
+def test_grids_turn_with_obstacles_that_turn_as_one_body():
+    scene = with_ball(Cylinder((12e-3, 5e-3, 12e-3), 2e-3, 6e-3, axis=(1, 2, 1), rigid=True))
+    points = torch.tensor([[20e-3, 10e-3, 9e-3], [22e-3, 14e-3, 12e-3]]).double()
+    names = "obstacles.turn_x", "obstacles.z", "obstacles[0].y", "points.x", "temperature"
+    for some in (None, points):
+        changes = changes_of(scene, *names, method="box", points=some, spacing=1e-3)
+        matrix = changes.matrix(amounts := [0.3, 0.5e-3, 0.2e-3, 0.3e-3, 2.0])
+        propagator = make_propagator(changes.scene(amounts), "box", **COARSE | {"spacing": 1e-3})
+        afresh = propagator.transfer_matrix(changes.points(amounts))
+        assert relative_error(changes.matrix([0.0, *amounts[1:]]), afresh) > 0.1
+        assert relative_error(matrix, afresh) < 0.01  # cells along other axes
+    with mock.patch.object(assembled_box, "assemble_on", wraps=assembled_box.assemble_on) as assembled:
+        for turn in (0.1, 0.2):
+            changes_of(scene, names[0], method="box", spacing=0.9e-3).matrix([turn])
+    assert assembled.call_count == 1
 
 
 SIMULATED = replace(DISCS, obstacles=(TILTED,))
