@@ -122,7 +122,7 @@ def symmetries(assemblies: Sequence[Assembly], along: Array, transducers: Apertu
     assembly = assemblies[0]
     grid, cells = assembly.grid, assembly.heterogeneous
     center = (np.array(grid.origin) + grid.spacing * (np.array(grid.shape) - 1) / 2) @ along
-    result = [Symmetry(np.eye(3), center, np.arange(len(transducers.positions)))]
+    result = [Symmetry(np.eye(3), center, np.arange(len(transducers.centers)))]
     turns = itertools.product(itertools.permutations(range(3)), itertools.product((1, -1), repeat=3))
     for axes, signs in itertools.islice(turns, 1, None if len(assemblies) == 1 else 1):
         turn = np.diag(signs) @ np.eye(3, dtype=np.int64)[list(axes)]

@@ -45,7 +45,6 @@ from autdtorch.propagators.simulation import (
     mean_of_images,
 )
 from autdtorch.propagators.store import MOST_BYTES
-from autdtorch.scene.arrays import apertures_of
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.obstacles.moving import circumscribed
 from autdtorch.scene.scene import require_clear, require_in_front
@@ -70,7 +69,7 @@ class Judged(NamedTuple):
     @classmethod
     def of(cls, receivers: Apertures) -> Judged:
         """Return at most `MOST_JUDGED` of the receivers, in one group."""
-        return cls(receivers, math.ceil(len(receivers.positions) / MOST_JUDGED), (slice(None),))
+        return cls(receivers, math.ceil(len(receivers.centers) / MOST_JUDGED), (slice(None),))
 
 
 @dataclass(frozen=True)
@@ -218,7 +217,7 @@ class BoxSimulation(Simulation):
         if not radiation.reaches(self._everywhere(points)):  # the boxes were simulated as one
             return self._matrix_of_orbits(points, orbits_of_transducers(points, self.symmetries))
         array = self.plan.scene.array
-        alone = [apertures_of(array).chosen(slice(index, index + 1)) for index in range(len(array))]
+        alone = [self.transducers.chosen(slice(index, index + 1)) for index in range(len(array))]
         return self._total(radiation, alone, torch.ones((len(array), 1), **COMPLEX), points)
 
     def _fields(self, drive: torch.Tensor, points: torch.Tensor) -> PressureMap:
@@ -238,7 +237,7 @@ class BoxSimulation(Simulation):
 
     def _everywhere(self, points: torch.Tensor) -> torch.Tensor:
         """Return points (P, 3) and their images on grids."""
-        return self.seen_twice(Apertures.of_points(points))[0].positions[:, 0]
+        return self.seen_twice(Apertures.of_points(points))[0].centers
 
     @cached_property
     def _keeps_surfaces(self) -> bool:
@@ -253,8 +252,7 @@ class BoxSimulation(Simulation):
         """
         representative, symmetry = orbits_of_array(self.symmetries)
         first, place = np.unique(representative, return_inverse=True)
-        array = self.plan.scene.array
-        alone = [apertures_of(array).chosen(slice(index, index + 1)) for index in first]
+        alone = [self.transducers.chosen(slice(index, index + 1)) for index in first]
         radiation = self._radiation(alone, torch.ones((len(alone), 1), **COMPLEX))
         amplitudes = []
         for box, part in zip(radiation.boxes, radiation.amplitudes, strict=True):

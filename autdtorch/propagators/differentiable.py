@@ -108,7 +108,7 @@ def differentiable_field(
     cells = (cells_of_maps if by_maps else cells_of_obstacles)(region, grid, *given)
     assembly = cells.assembly(grid, region, precision, time_step)
     receivers, stepper = assembly.receivers(targets), make_kernel(kernel)
-    nodes, weights = apertures_of(scene.array).with_images(scene.images)
+    nodes, weights = apertures_of(scene.array, scene.wavenumber).with_images(scene.images)
     images = len(weights) // len(scene.array)
     steps, block = block_of(assembly.steps_per_period)
     signal = drive_signal(assembly.steps_per_period, 0, steps * math.ceil(periods / block)).to(precision)

@@ -23,7 +23,7 @@ from autdtorch.utils.validation import ArrayLike, boolean, differentiable_points
 
 logger = logging.getLogger(__name__)
 
-PAIR_BYTES = 40.0
+PAIR_BYTES = 48.0
 """Memory for each entry of a transfer matrix while it is computed [bytes]."""
 
 _FEW = 100_000

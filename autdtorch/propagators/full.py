@@ -68,7 +68,7 @@ class DomainSimulation(Simulation):
         points = assembly.interpolation(receivers.positions, receivers.weights)
         cells = np.unique(points.index)
         reading = points.matrix(cells)
-        every = math.ceil(len(receivers.positions) / MOST_JUDGED)
+        every = math.ceil(len(receivers.centers) / MOST_JUDGED)
         judged = reading[::every]
         rows, runs = [], []
         for source, amplitude in zip(sources, strength, strict=True):

@@ -213,7 +213,7 @@ class Simulation(ABC):
         if len(images) == 1:
             return receivers, None
         everywhere, weights = receivers.with_images(images)
-        return everywhere, weights.reshape(-1, len(receivers.positions)) / len(images)
+        return everywhere, weights.reshape(-1, len(receivers.centers)) / len(images)
 
     def absorbed_power(self, drive: torch.Tensor) -> AbsorbedPower:
         """Simulate drives (R, M), none of them silent; return the power [W] by obstacle and reflector."""
@@ -249,14 +249,18 @@ class Simulation(ABC):
     @cached_property
     def symmetries(self) -> list[Symmetry]:
         """Symmetries of the scene on its grid."""
-        scene, axes = self.plan.scene, self.plan.grouping.axes[0]
-        every = symmetries(self.assemblies, axes, apertures_of(scene.array))
+        axes = self.plan.grouping.axes[0]
+        every = symmetries(self.assemblies, axes, self.transducers)
         return [each for each in every if each.keeps(self.plan.region.mirrors)]
+
+    @cached_property
+    def transducers(self) -> Apertures:
+        """The transducers as sources or receivers."""
+        return apertures_of(self.plan.scene.array, self.plan.scene.wavenumber)
 
     def sources_of(self, drive: torch.Tensor) -> tuple[list[Apertures], torch.Tensor]:
         """Return the sources of runs of drives (R, M) and their strengths (R, M) [Pa m]."""
-        array = self.plan.scene.array
-        return [apertures_of(array)] * len(drive), complex_strengths_of(array) * drive
+        return [self.transducers] * len(drive), complex_strengths_of(self.plan.scene.array) * drive
 
     def imaged(self, sources: Apertures, strength: torch.Tensor) -> tuple[Apertures, torch.Tensor]:
         """Return sources of strength (N,) [Pa m] with all their images in the scene's reflectors."""
@@ -331,8 +335,7 @@ class Simulation(ABC):
 
     def _matrix_of_orbits(self, points: torch.Tensor, orbits: Orbits) -> PressureMap:
         """Simulate the transfer matrix of unit strengths by a run for each of the orbits' representatives."""
-        array = self.plan.scene.array
-        targets, transducers = Apertures.of_points(points), apertures_of(array)
+        targets, transducers = Apertures.of_points(points), self.transducers
         sources, receivers = (targets, transducers) if orbits.from_points else (transducers, targets)
         begins = "points" if orbits.from_points else "transducers"
         logger.debug("transfer matrix: %d runs serve %d %s", orbits.runs, len(orbits.representative), begins)
@@ -387,7 +390,7 @@ class Simulation(ABC):
         It is -80 dB, or the least whose tolerance is above rounding, relative to free space, as if the
         sources of strength (N,) [Pa m] did not cancel each other.
         """
-        distance = torch.cdist(points.mean(dim=1), sources.positions.mean(dim=1))
+        distance = torch.cdist(points.mean(dim=1), sources.centers)
         faintest = max(SILENCE, torch.finfo(self.plan.dtype).eps / self.plan.tolerance)
         return faintest * float((strength.abs() / distance.clamp(min=self.plan.spacing / 2)).norm())
 

@@ -12,7 +12,7 @@ import torch
 from autdtorch.scene.drive import warn_of_degrees
 from autdtorch.scene.geometry import Coordinates, in_plane, plane_basis
 from autdtorch.scene.transducer_values import disc_radius, for_each, unit_normals
-from autdtorch.utils.apertures import Apertures, disc_rule
+from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.process import require_memory
@@ -270,9 +270,11 @@ class TransducerArray:
 
         A disc of radius a has 5 rings at Gauss points in r^2, each of 16 equal angles and turned by half a
         step against the next (Peirce, J. SIAM 5 (1957) 66-73). For k a <= 6 the error in the far field is
-        1e-6 at all angles. At a distance of a/2 from the disc it is 1e-4 of the largest pressure.
+        1e-6 at all angles. At a distance of a/2 from the disc it is 1e-4 of the largest pressure. Fields are
+        those of the discs; grids take as many monopoles as k a needs.
         """
-        return Nodes(*apertures_of(self)[:2])
+        apertures = apertures_of(self)
+        return Nodes(apertures.positions, apertures.weights)
 
     @property
     def half_extents(self) -> torch.Tensor:
@@ -399,16 +401,14 @@ def range_text(values: torch.Tensor, factor: float = 1.0) -> str:
     return least if least == most else f"{least} to {most}"
 
 
-def apertures_of(array: TransducerArray) -> Apertures:
-    """Return the transducers as sources or receivers: their nodes, and what their far field needs."""
+def apertures_of(array: TransducerArray, wavenumber: float = 0.0) -> Apertures:
+    """Return the transducers as sources or receivers, of waves that monopoles in their stead can resolve."""
     radii = radii_of(array)
     if not radii.any():
-        return Apertures.of_points(array.positions)
-    disc, weights = disc_rule()
+        return Apertures(array.positions)
     normals, facing = torch.unique(array.normals, dim=0, return_inverse=True)  # most arrays have one
-    axes = torch.stack([torch.stack(plane_basis(normal)) for normal in normals])[facing]
-    positions = array.positions[:, None] + radii[:, None, None] * disc @ axes
-    return Apertures(positions, weights, array.normals, radii)
+    axes = torch.stack([torch.stack([*plane_basis(normal), normal]) for normal in normals])[facing]
+    return Apertures(array.positions, axes, radii, wavenumber * float(radii.max()))
 
 
 def _autd3_places(count_x: int, count_y: int) -> torch.Tensor:

@@ -29,54 +29,61 @@ RIM_DIGITS, RIM_TURNS, RIM_STRIP, RIM_LEAST = 20.0, 1.2, 2.164, 1e-5
 """Rule for the integral along a rim: -log of its error, growth of a wave in the complex plane with k a
 [rad], coth(1 / 2), and the least ratio of the distances to the nearest and the farthest point of the rim."""
 
-_RINGS, _RING_NODES = 5, 16  # of the monopoles that stand for a disc on a grid
+_RINGS, _RING_NODES = 5, 16
+"""Rings of the monopoles that stand for a disc on a grid, and monopoles of each, up to k a = 6."""
 
 
 class Apertures(NamedTuple):
-    """N sources or receivers with n monopoles each, in float64."""
+    """N sources or receivers, points or discs, in float64."""
 
-    positions: torch.Tensor  # of the monopoles (N, n, 3) [m]
-    weights: torch.Tensor  # (n,), with the sum 1
-    normals: torch.Tensor | None = None  # of discs (N, 3)
+    centers: torch.Tensor  # (N, 3) [m]
+    axes: torch.Tensor | None = None  # of discs (N, 3, 3), one a row: two in the plane and the normal
     radii: torch.Tensor | None = None  # of discs (N,) [m]
+    size: float = 0.0  # k a of the largest disc
 
     @classmethod
     def of_points(cls, points: torch.Tensor) -> Self:
         """Return points (P, 3) as sources or receivers."""
-        return cls(points[:, None], torch.ones(1, **REAL))
+        return cls(points)
+
+    @property
+    def positions(self) -> torch.Tensor:
+        """The positions (N, n, 3) [m] of monopoles that stand for each, one for a point."""
+        if self.axes is None or self.radii is None:
+            return self.centers[:, None]
+        return self.centers[:, None] + self.radii[:, None, None] * disc_rule(self.size)[0] @ self.axes[:, :2]
+
+    @property
+    def weights(self) -> torch.Tensor:
+        """The weights (n,) of the monopoles, with the sum 1."""
+        return torch.ones(1, **REAL) if self.axes is None else disc_rule(self.size)[1]
 
     def chosen(self, index: slice | torch.Tensor) -> Self:
         """Return some of the sources or receivers."""
-        normals, radii = (None if part is None else part[index] for part in (self.normals, self.radii))
-        return self._replace(positions=self.positions[index], normals=normals, radii=radii)
-
-    def alike(self) -> list[torch.Tensor]:
-        """Return the indices (n,) of the discs of each direction and radius; points are all alike."""
-        if self.normals is None or self.radii is None:
-            return [torch.arange(len(self.positions), dtype=torch.int64, device="cpu")]
-        kinds = torch.cat([self.normals, self.radii[:, None]], dim=1)
-        _, kind = torch.unique(kinds, dim=0, return_inverse=True)
-        return [torch.nonzero(kind == number)[:, 0] for number in range(int(kind.max()) + 1)]
+        axes, radii = (None if part is None else part[index] for part in (self.axes, self.radii))
+        return self._replace(centers=self.centers[index], axes=axes, radii=radii)
 
     def with_images(self, images: Sequence[Image]) -> tuple[Self, torch.Tensor]:
         """Return all images of the apertures, one image after the other, and their weights (G N,)."""
-        parts = distinct(images, self.positions)
-        turned = (
-            None if self.normals is None else torch.cat([self.normals @ each.matrix.mT for each in parts])
-        )
-        positions = torch.cat([image.of(self.positions) for image in parts])
+        spanning = self.centers
+        if self.axes is not None and self.radii is not None:
+            rims = self.centers[:, None] + self.radii[:, None, None] * self.axes[:, :2]
+            spanning = torch.cat([self.centers, rims.flatten(0, 1)])
+        parts = distinct(images, spanning)
+        axes = None if self.axes is None else torch.cat([self.axes @ each.matrix.mT for each in parts])
         radii = None if self.radii is None else self.radii.repeat(len(parts))
         weights = torch.tensor([complex(image.weight) for image in parts], **COMPLEX)
-        return self._replace(positions=positions, normals=turned, radii=radii), weights.repeat_interleave(
-            len(self.positions)
+        everything = self._replace(
+            centers=torch.cat([image.of(self.centers) for image in parts]), axes=axes, radii=radii
         )
+        return everything, weights.repeat_interleave(len(self.centers))
 
     @property
     def places(self) -> torch.Tensor | Discs:
         """The points (N, 3), or the discs."""
-        if self.normals is None or self.radii is None:
-            return self.positions[:, 0]
-        return Discs(self.positions.mean(dim=1), self.normals, self.radii)
+        if self.axes is None or self.radii is None:
+            return self.centers
+        return Discs(self.centers, self.axes[:, 2], self.radii)
 
 
 class Discs(NamedTuple):
@@ -157,11 +164,16 @@ def even_waves(wavenumber: complex, radius: float) -> EvenWaves:
     return EvenWaves(complex(amplitude[0]), np.stack(parts, axis=1), reaches, counts.astype(np.int64))
 
 
-def disc_rule() -> tuple[torch.Tensor, torch.Tensor]:
-    """Return nodes (n, 2) and weights (n,) of a quadrature rule for the mean over the unit disc."""
-    abscissa, weights = np.polynomial.legendre.leggauss(_RINGS)
+@functools.lru_cache(64)
+def disc_rule(size: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return nodes (n, 2) and weights (n,) of a quadrature rule for the mean over the unit disc.
+
+    For waves of k a up to `size` the error is 1e-6 at most.
+    """
+    rings, count = max(_RINGS, math.ceil(size / 3 + 3)), max(_RING_NODES, 2 * math.ceil(0.75 * size + 3.5))
+    abscissa, weights = np.polynomial.legendre.leggauss(rings)
     radius = np.sqrt((abscissa + 1) / 2)[:, None]
-    ring, step = np.indices((_RINGS, _RING_NODES))
-    angle = 2 * np.pi / _RING_NODES * (step + ring % 2 / 2)
+    ring, step = np.indices((rings, count))
+    angle = 2 * np.pi / count * (step + ring % 2 / 2)
     disc = np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=-1).reshape(-1, 2)
-    return torch.from_numpy(disc), torch.from_numpy(np.repeat(weights / (2 * _RING_NODES), _RING_NODES))
+    return torch.from_numpy(disc), torch.from_numpy(np.repeat(weights / (2 * count), count))

@@ -195,7 +195,7 @@ def _incoming_from(
             return MeanWaves.of(body.degree, body.wavenumber, offsets, normal, radius, body.axes, powers)
     if not radius:
         return outgoing_waves(body.degree, body.wavenumber, offsets @ body.axes, conjugate=True)
-    nodes = apertures_of(array).chosen(index)
+    nodes = apertures_of(array, abs(body.wavenumber)).chosen(index)
     _offsets(body, "array.positions", image.of(nodes.positions.reshape(-1, 3)))
     means = []
     for node in nodes.positions.unbind(dim=1):
