@@ -15,6 +15,9 @@ from autdtorch.utils.apertures import RIM_DIGITS, RIM_LEAST, RIM_STRIP, RIM_TURN
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
+_AT_ONCE = 1 << 18
+"""Pairs of a place and a node on a rim that are in memory at once, but for gradients."""
+
 _SMALL = 1e-3
 """Argument up to which a sine is the first two terms of its series: the next one is below 1e-14."""
 
@@ -79,20 +82,38 @@ def _along_rim(
     as e^(-n s), where the integrand is analytic and moderate for |Im v| < s: up to the nearest point of the
     rim, and up to |Im u| = 1 on the far side.
     """
-    along = (between * normals).sum(dim=-1, keepdim=True)
-    aside = between - along * normals
-    # the nodes stand still in derivatives, which are as smooth
-    offset, height = aside.detach().norm(dim=1), along.detach()[:, 0]
-    across = torch.linalg.cross(normals, torch.eye(3, **REAL).to(normals)[normals.abs().argmin(dim=1)])
-    towards = torch.where(offset[:, None] > LENGTH_TOLERANCE, aside.detach(), across)
-    towards = towards / towards.norm(dim=1, keepdim=True)
-    sideways = torch.linalg.cross(normals, towards)
+    place = between.detach()
+    height = (place * normals).sum(dim=-1)
+    offset = (place - height[:, None] * normals).norm(dim=-1)
     ratio = torch.hypot(height, offset - radius) / torch.hypot(height, offset + radius)
     squeeze = (RIM_STRIP * ratio.clamp(min=RIM_LEAST)).clamp(max=1).sqrt()
     turns = RIM_DIGITS + RIM_TURNS * abs(wavenumber) * offset.clamp(max=radius)
-    count = math.ceil(float((turns / torch.atanh(squeeze / RIM_STRIP)).max()) / 2)
+    levels = torch.log2(turns / (2 * torch.atanh(squeeze / RIM_STRIP))).ceil().to(torch.int64)
+    waves = torch.zeros(len(between), **COMPLEX).to(between.device)
+    for level in levels.unique().tolist():  # places with as many nodes
+        for index in torch.split((levels == level).nonzero()[:, 0], max(1, _AT_ONCE >> level)):
+            part = between[index], normals[index], squeeze[index, None]
+            waves = waves.index_put((index,), _by_nodes(*part, 2**level, radius, wavenumber))
+    return waves
+
+
+def _by_nodes(
+    between: torch.Tensor,
+    normals: torch.Tensor,
+    squeeze: torch.Tensor,
+    count: int,
+    radius: float,
+    wavenumber: complex,
+) -> torch.Tensor:
+    """Return the integral of `_along_rim` by so many nodes, which stand still in derivatives."""
+    along = (between * normals).sum(dim=-1, keepdim=True)
+    aside = between - along * normals
+    across = torch.linalg.cross(normals, torch.eye(3, **REAL).to(normals)[normals.abs().argmin(dim=1)])
+    off_axis = aside.detach().norm(dim=1, keepdim=True) > LENGTH_TOLERANCE
+    towards = torch.where(off_axis, aside.detach(), across)
+    towards = towards / towards.norm(dim=1, keepdim=True)
+    sideways = torch.linalg.cross(normals, towards)
     angle = math.pi * ((torch.arange(count, **REAL).to(between) + 0.5) / count - 0.5)  # v / 2
-    squeeze = squeeze[:, None]
     sine, cosine = squeeze * torch.sin(angle), torch.cos(angle)
     size = sine**2 + cosine**2
     weight = squeeze / size * 2 / (count * radius)

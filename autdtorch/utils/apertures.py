@@ -56,7 +56,7 @@ class Apertures(NamedTuple):
     @property
     def weights(self) -> torch.Tensor:
         """The weights (n,) of the monopoles, with the sum 1."""
-        return torch.ones(1, **REAL) if self.axes is None else disc_rule(self.size)[1]
+        return torch.ones(1, **REAL) if self.axes is None else disc_rule(self.size)[1].clone()
 
     def chosen(self, index: slice | torch.Tensor) -> Self:
         """Return some of the sources or receivers."""
