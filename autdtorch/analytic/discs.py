@@ -90,7 +90,7 @@ def _along_rim(
     turns = RIM_DIGITS + RIM_TURNS * abs(wavenumber) * offset.clamp(max=radius)
     levels = torch.log2(turns / (2 * torch.atanh(squeeze / RIM_STRIP))).ceil().to(torch.int64)
     waves = torch.zeros(len(between), **COMPLEX).to(between.device)
-    for level in levels.unique().tolist():  # places with as many nodes
+    for level in torch.unique(levels).tolist():  # places with as many nodes
         for index in torch.split((levels == level).nonzero()[:, 0], max(1, _AT_ONCE >> level)):
             part = between[index], normals[index], squeeze[index, None]
             waves = waves.index_put((index,), _by_nodes(*part, 2**level, radius, wavenumber))
