@@ -186,13 +186,14 @@ def test_what_passes_a_heavy_plate_counts_in_its_shadow(density, thickness):
     plate = Box((0.0, 0.0, 0.0), (60e-3, 60e-3, thickness), density=density, sound_speed=1200.0)
     array = TransducerArray([(x, 2e-3, -25e-3) for x in (-8e-3, 0.0, 8e-3)], (0, 0, 1))
     scene = Scene(array, AIR, 40e3, [(3e-3, 1e-3, 12e-3), (-5e-3, 4e-3, 14e-3)], (plate,))
-    asked = 0.1
+    asked, spacing = 0.1, 1.3e-3
     matrix, claimed = make_propagator(scene, "box", None, asked).transfer_matrix(return_error=True)
-    fine = make_propagator(scene, "box", 0.9e-3, 1e-3).transfer_matrix()
-    assert relative_error(matrix, fine) < asked
+    soft = make_propagator(scene, "box", spacing, 1e-3).transfer_matrix()
+    # 0.017 was measured between this grid and one of 0.9 mm
+    assert relative_error(matrix, soft) < asked - 0.02
     assert claimed < asked
-    soft, rigid = (make_propagator(scene, "box", 1.3e-3, tolerance) for tolerance in (1e-3, 0.1))
-    true = relative_error(rigid.transfer_matrix(), soft.transfer_matrix())
+    rigid = make_propagator(scene, "box", spacing, asked)
+    true = relative_error(rigid.transfer_matrix(), soft)
     assert true > 0.03
     assert rigid.transfer_matrix(return_error=True)[1] > true / 3
 
