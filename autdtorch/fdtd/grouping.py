@@ -5,10 +5,11 @@ The unit of time is one step of one cell of air. Constants fit runs on one core 
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, permutations
 
 import numpy as np
@@ -26,7 +27,7 @@ from autdtorch.fdtd.region import Region, bounds
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil
-from autdtorch.fdtd.turning import FlatFaces, axes_along, flat_faces, is_turned, turned_shape
+from autdtorch.fdtd.turning import FlatFaces, axes_along, flat_faces, turned_shape
 from autdtorch.utils.array_types import Array
 
 logger = logging.getLogger(__name__)
@@ -35,6 +36,9 @@ MOST_PASSES = 12  # Most passes of the iteration between boxes; beyond, one box 
 _MOST_OBSTACLES = 64  # Most obstacles that are grouped; more share one box
 # Periods of a usual run among obstacles, relative to the fewest; 1.0 to 3.5 depending on the resonances
 USUAL_PERIODS = 1.7
+# The first axis of a grid of at least so many cells whose shortest axis is at most this part of the next: the
+# kernel is 1.8 times as fast where that is the shortest (432 x 432 x 29 cells)
+_LARGE, _FLAT = 250_000, 0.5
 # Time of a step of a cell in a boundary layer, of a run in a box beside its steps, and of a term of a sum
 # over Green's function
 _LAYER, _BOX_RUN, _PAIR = 4.0, 2_000_000, 1.0
@@ -138,7 +142,7 @@ def choose_grids(
     gain = runs * domain.grids[0].work / boxes.box_cost(runs)
     first, last = region.domain
     outside = any((np.less(one.lower, first) | np.greater(one.upper, last)).any() for one in region.shapes)
-    tilted = any(map(is_turned, boxes.axes))
+    tilted = any((np.abs(axes).max(axis=1) < 1).any() for axes in boxes.axes)
     method, grouping = ("full", domain) if walls or not (outside or tilted or gain > 1) else ("box", boxes)
     logger.debug(
         "method auto: %s; full would take %.2g times as long as box (walls through the boundary layer: %s,"
@@ -212,7 +216,12 @@ class _Outline:
             axes = axes_along(faces)
             shapes = [turned_shape(body.shape, axes) for body in bodies]
         aligned = all(each.all_aligned(axes) for each in faces)
-        return cls(tuple(group), axes, bodies_extent(shapes, region.wavelength), aligned, near)
+        extent = bodies_extent(shapes, region.wavelength)
+        if turns := _turns_to_flat(extent.interior(spacing)):
+            axes = np.roll(axes, turns, axis=0)
+            roll = functools.partial(np.roll, shift=turns)
+            extent = replace(extent, lower=roll(extent.lower), upper=roll(extent.upper))
+        return cls(tuple(group), axes, extent, aligned, near)
 
     @classmethod
     def of_domain(cls, region: Region, spacing: float) -> _Outline:
@@ -230,6 +239,14 @@ class _Outline:
     def half(self) -> Array:
         """Half of the lengths of its edges (3,) [m]."""
         return np.asarray(np.subtract(self.extent.upper, self.extent.lower) / 2)
+
+
+def _turns_to_flat(interior: tuple[int, int, int]) -> int:
+    """Return by how many places axes are rolled so that the shortest of a large flat grid comes first."""
+    shortest, middle, _ = sorted(interior)
+    if shortest > _FLAT * middle or math.prod(interior) < _LARGE:
+        return 0
+    return -interior.index(shortest) % 3
 
 
 def _grids(region: Region, spacing: float, boxes: Sequence[_Outline], passes: int = 1) -> Grouping:

@@ -261,13 +261,15 @@ class NearToFar:
         far = self.far[chosen]
         near = (torch.cumsum(~self.far, 0) - 1)[chosen[~far]]  # their numbers among all near targets
         within, some = self.within[near], self.targets.chosen(chosen[~far])
-        received = torch.zeros((len(self.box.surface[0]), len(far)), **COMPLEX)
+        single = self.box.assembly.dtype == torch.float32
+        kind = torch.complex64 if single else torch.complex128
+        received = torch.zeros((len(self.box.surface[0]), len(far)), dtype=kind, device="cpu")
         # reciprocity of Green's function
-        received[:, ~far] = self._received(some, weights * ~within, False, self.box.images)
+        self._receive(received, ~far, some, weights * ~within, False, self.box.images)
         if self.box.echoes and within.any():
-            received[:, ~far] += self._received(some, weights * within, False, self.box.echoes)
+            self._receive(received, ~far, some, weights * within, False, self.box.echoes)
         others, ones = self.targets.chosen(chosen[far]), weights.sum().expand(int(far.sum()), 1)
-        received[:, far] = self._received(others, ones, True, self.box.images)
+        self._receive(received, far, others, ones, True, self.box.images)
         read = torch.zeros_like(self.within)
         read[near] = within
         row, node = torch.nonzero(within, as_tuple=True)
@@ -275,12 +277,20 @@ class NearToFar:
         mean = csr_array((weights[node].numpy(), place), (len(far), len(row)))
         return FieldMatrices(self.outward, received, csr_array(mean @ self.inward[read[self.within].numpy()]))
 
-    def _received(self, targets: Apertures, weights: Tensor, far: bool, images: Sequence[Image]) -> Tensor:
-        """Return waves (m, P) from the Huygens surface to P targets, with weights (P, n) of their nodes.
+    def _receive(
+        self,
+        received: Tensor,
+        kind: Tensor,
+        targets: Apertures,
+        weights: Tensor,
+        far: bool,
+        images: Sequence[Image],
+    ) -> None:
+        """Add waves from the Huygens surface to the targets of a `kind` (P,) to columns of `received` (m, P).
 
-        Targets that are `far` have one weight each.
+        Weights are those of their nodes (p, n); targets that are `far` have one each.
         """
-        waves = [torch.zeros((len(self.box.surface[0]), 0), **COMPLEX)]
+        numbers = torch.nonzero(kind)[:, 0]
         for first in range(0, len(weights), _TOGETHER):
             rows = slice(first, first + _TOGETHER)
             some, of_nodes = targets.chosen(rows), weights[rows]
@@ -288,8 +298,8 @@ class NearToFar:
             amplitude = torch.zeros((of_nodes.numel(), len(of_nodes)), **COMPLEX)
             amplitude[torch.arange(len(columns), device="cpu"), columns] = of_nodes.flatten().to(amplitude)
             sources = some.places if far else some.positions.flatten(0, 1)
-            waves.append(self.box.waves(self.box.surface[0], sources, amplitude, images=images))
-        return torch.cat(waves, dim=1)
+            waves = self.box.waves(self.box.surface[0], sources, amplitude, images=images)
+            received[:, numbers[rows]] += waves.to(received.dtype)
 
 
 @dataclass(frozen=True)
@@ -303,4 +313,6 @@ class FieldMatrices:
     def field(self, phasors: Tensor) -> Tensor:
         """Return the scattered field (P, R) at the targets, from the cells' phasors (k, R)."""
         amplitude = torch.from_numpy(self.outward @ phasors.numpy())
-        return self.received.mT @ amplitude + torch.from_numpy(self.inner @ phasors.numpy())
+        # by NumPy: in single precision PyTorch may take products of a few bits
+        outside = self.received.numpy().T @ amplitude.to(self.received.dtype).numpy()
+        return torch.from_numpy(outside + self.inner @ phasors.numpy())

@@ -27,7 +27,7 @@ from autdtorch.utils.array_types import COMPLEX, Index
 Phasors = NDArray[np.complex128]
 Echo = Callable[[Tensor], Sources]
 """The sources of a run whose cells have phasors (k,): a linear map, and a constant."""
-MOST_JUDGED = 64
+MOST_JUDGED = 32
 """Receivers of a kind whose pressure decides when a run has converged."""
 
 # Fewest periods of a block. Shorter blocks cost more overhead, and their phasors cover less time.

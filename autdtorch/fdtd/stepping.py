@@ -29,7 +29,7 @@ from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, Wa
 from autdtorch.fdtd.region import Region, Shape
 from autdtorch.fdtd.stability import whole_steps
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
-from autdtorch.utils.array_types import REAL
+from autdtorch.utils.array_types import REAL, Index
 from autdtorch.utils.validation import invalid
 
 logger = logging.getLogger(__name__)
@@ -41,6 +41,7 @@ RAMP_PERIODS = 8
 # Initial uniform pressure, relative to the largest force. From exact zeros the wave's precursors would decay
 # into subnormal numbers, on which processors are slow (2.4 times, measured at 120^3 in float32).
 _BACKGROUND = 1e-20
+_FEWEST_IDLE = 32  # Cells of a row from which it is quicker to skip them than to step them
 _ONE_NODE = torch.ones(1, **REAL)  # Weight of a point with a single node
 
 
@@ -180,6 +181,7 @@ def assembly_of(
         loss_index=torch.from_numpy(cells.index[:0] if losses is None else cells.index[losses.place]),
         loss_weight=loss.to(dtype),
         loss_ground=ground.to(dtype),
+        idle=torch.from_numpy(_idle(grid, cells)),
     )
     logger.debug(
         "grid %s at %.3g mm, %d heterogeneous cells; %d steps in %d periods: %.4g us, %.1f %% of the limit",
@@ -187,6 +189,18 @@ def assembly_of(
         steps_per_period.denominator, 1e6 / (steps * frequency), 100 * fewest / steps,
     )  # fmt: skip
     return Assembly(grid, stencil, steps_per_period, coefficients, cells)
+
+
+def _idle(grid: Grid, cells: HeterogeneousCells) -> Index:
+    """Return the runs (g, 2) of cells behind the shell of rigid bodies; see `Coefficients`."""
+    if len(cells.rigid) == len(cells.shell):
+        return np.zeros((0, 2), np.int64)
+    mask, behind = np.zeros((2, math.prod(grid.shape)), bool)
+    mask[cells.rigid], mask[cells.shell] = True, False
+    inner = tuple(map(slice, grid.first, grid.last))
+    behind.reshape(grid.shape)[inner] = mask.reshape(grid.shape)[inner]
+    runs = np.flatnonzero(np.diff(behind, prepend=False, append=False)).reshape(-1, 2)
+    return runs[np.diff(runs, axis=1)[:, 0] >= _FEWEST_IDLE]
 
 
 def _wanted_steps(fewest: float, time_step: float | None, frequency: float) -> float:

@@ -17,8 +17,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from autdtorch.utils.array_types import AnyArray, Index
+from autdtorch.utils.process import cached_property
+
+_MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)  # odd, of the golden ratio: digests of rows
+_SHARE_DISTINCT = 0.5  # Share of distinct rows from which a table of them does not save memory traffic
 
 
 class Layer(NamedTuple):
@@ -58,6 +65,10 @@ def _no_cells() -> Tensor:
     return torch.zeros(0, dtype=torch.int64, device="cpu")
 
 
+def _no_runs() -> Tensor:
+    return torch.zeros((0, 2), dtype=torch.int64, device="cpu")
+
+
 def _no_rows() -> Tensor:
     return torch.zeros((0, 27), dtype=torch.float32, device="cpu")
 
@@ -92,11 +103,29 @@ class Coefficients:
     loss_index: Tensor = field(default_factory=_no_cells)
     loss_weight: Tensor = field(default_factory=_no_rows)  # their rows on the change of a step (l, 27)
     loss_ground: Tensor = field(default_factory=_no_numbers)  # their stiffness against silence (l,)
+    # runs of cells behind the sound-hard ones, which need no steps: flat indices of the first cell and of one
+    # past the last (g, 2) int64, ascending; none of them ends in another row or is in a layer
+    idle: Tensor = field(default_factory=_no_runs)
 
     @property
     def layer_cells(self) -> int:
         """Thickness of the boundary layers."""
         return len(self.layer_decay) // 2
+
+    @cached_property
+    def distinct_rows(self) -> tuple[Index, AnyArray]:
+        """The number (n,) of each heterogeneous cell's row in a table, and the table (k, 27).
+
+        At flat faces few rows are distinct. All are, where two of them have the same digest.
+        """
+        rows = self.heterogeneous_weight.numpy()
+        digest = np.zeros(len(rows), np.uint64)
+        for column in rows.view(np.dtype(f"u{rows.itemsize}")).T:
+            digest = digest * _MULTIPLIER + column
+        _, first, kind = np.unique(digest, return_index=True, return_inverse=True)
+        if len(first) > _SHARE_DISTINCT * len(rows) or (rows[first][kind] != rows).any():
+            return np.arange(len(rows)), rows
+        return kind, rows[first]
 
 
 @dataclass

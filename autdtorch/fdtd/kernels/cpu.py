@@ -47,12 +47,14 @@ from autdtorch.utils.process import spread, thread_count
 
 # Fewest cells and planes of a chunk, for which a second thread and the sums at its ends pay
 _CHUNK_CELLS, _CHUNK_PLANES = 200_000, 32
+_FLAT_CELLS, _FLAT_PLANES = 500_000, 12  # The same for two chunks of large planes
 _GROUP_CELLS = 3000  # Cells of the layers across an axis that are computed at once
 # Shares of the processors' time that workers got: below the first a single worker continues, above the second
 # several again
 _CROWDED, _FREE = 0.75, 0.9
 _COUNTERS = 32  # Numbers that hold the two counters, 0 at first
 _CLAIMED, _FINISHED = 0, 16  # Their places, on separate cache lines
+_UNROLLED = 32  # Cells that a compiled loop computes at once: the lanes of four vectors
 _TICKS = 10  # Fewest ticks of the thread clock for a meaningful time
 # Polls of the counter before a waiting worker yields: a few microseconds, less than waking costs
 _LOOKS = 2000
@@ -88,9 +90,10 @@ def _sweep_chunk(c, p, q, medium, layers, cells, room):  # type: ignore[no-untyp
     memory = (psi_y, zeta_y), (psi_z, zeta_z), (psi_yz, zeta_yz)
     first, last = np.uint64(cuts[c]), np.uint64(cuts[c + 1])
     shape, weights, profile, profiles = medium[4:7], medium[7:12], medium[12:14], medium[14:17]
+    idle = medium[17:19]
     sweep_planes(
         p, q, first, last, shape, weights, (psi_x, zeta_x), profile, memory, profiles, cells, starts,
-        room_of_chunk,
+        idle, room_of_chunk,
     )  # fmt: skip
 
 
@@ -117,7 +120,7 @@ def _finish_chunk(c, q, medium, cells, losses, outermost, sources, row, sound_ha
             for j in range(1, ny - 1):
                 for k in range(j * nz + 1, j * nz + nz - 1):
                     q[at * plane + k] += outermost[other, (1 - end) * plane + k]
-    index, _, _, scale, _, new, swept = cells
+    index, _, _, _, scale, _, new, swept = cells
     for n in range(starts[cuts[c]], starts[cuts[c + 1]]):
         absorbed = scale[n] * (q[index[n]] - swept[n]) if scale[n] != 0 else scale[n]
         q[index[n]] = new[n] + absorbed
@@ -195,7 +198,7 @@ def _advance(  # type: ignore[no-untyped-def]
                 first, last = np.uint64(c * read // chunks), np.uint64((c + 1) * read // chunks)
                 _record(now, receivers, first, last, recorded[step - 1])
             if swept and step < steps:
-                _damp_chunk(c, now, new, losses, cells[2])
+                _damp_chunk(c, now, new, losses, cells[3])
         if kind == swept and step < steps:
             _sweep_chunk(c, now, new, medium, layers, cells, room)
         elif kind == swept + 1:
@@ -210,7 +213,9 @@ def _advance(  # type: ignore[no-untyped-def]
 def _cuts(shape: tuple[int, ...]) -> NDArray[np.int64]:
     """Return the first planes of the chunks, each thicker than a boundary layer, and one past the last."""
     planes = shape[0] - 2
-    most = min(math.prod(shape) // _CHUNK_CELLS, planes // _CHUNK_PLANES)
+    cells = math.prod(shape)
+    flat = min(cells // _FLAT_CELLS, planes // _FLAT_PLANES)
+    most = max(min(cells // _CHUNK_CELLS, planes // _CHUNK_PLANES), min(flat, 2))
     chunks = 1 << max(0, most.bit_length() - 1)  # a power of two, which most numbers of cores divide
     return np.linspace(1, 1 + planes, chunks + 1).astype(np.int64)
 
@@ -231,19 +236,32 @@ def _room(chunks: int, shape: torch.Size, layer_cells: int, dtype: type) -> tupl
     return tuple(np.zeros((chunks, size), dtype) for size in sizes)
 
 
+def _idle(runs: AnyArray, shape: torch.Size) -> tuple[AnyArray, AnyArray]:
+    """Return idle runs (g, 2), by cells of their planes, and the number of the first run of each plane.
+
+    They begin a little later, so that loops over the cells between them have no remainder.
+    """
+    plane, row = shape[1] * shape[2], shape[2]
+    starts, (first, last) = np.searchsorted(runs[:, 0], plane * np.arange(shape[0] + 1)), runs.T % plane
+    before = np.roll(last, 1)
+    before[starts[:-1][np.diff(starts) > 0]] = row + 1
+    first = before + _UNROLLED * -((before - first) // _UNROLLED)
+    return np.stack((np.minimum(first, last), last), axis=1).astype(np.uint64), starts
+
+
 def _columns(c: Coefficients, columns: Columns) -> tuple[AnyArray, ...]:
     count = len(columns.index)
     return columns.index.numpy(), columns.offset.numpy(), columns.weight.numpy(), *rows_profile(c, count)
 
 
 def _heterogeneous_cells(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, ...]:
-    """Return indices, weights, offsets of rows, layer scale, weights of air, and workspace."""
-    index, weight = c.heterogeneous_index.numpy(), c.heterogeneous_weight.numpy()
+    """Return indices, kinds, weights by kind, offsets, layer scale, weights of air, and workspace."""
+    index, (kind, weight) = c.heterogeneous_index.numpy(), c.distinct_rows
     air = np.array((c.center, c.face, c.edge, c.corner), weight.dtype)[np.abs(OFFSETS).sum(axis=1)]
     scale = np.zeros_like(weight, shape=len(index))
     scale[np.searchsorted(index, c.layer_index.numpy())] = c.layer_scale.numpy()
     new, swept = np.empty_like(scale), np.empty_like(scale)
-    return index, weight.reshape(-1), row_offsets(shape), scale, air, new, swept
+    return index, kind, weight.reshape(-1), row_offsets(shape), scale, air, new, swept
 
 
 def _losses(c: Coefficients, plane: int, cuts: NDArray[np.int64], dtype: type) -> tuple[AnyArray, ...]:
@@ -283,8 +301,9 @@ class CpuKernel:
         self._crowded = False
 
     def at_once(self, shape: tuple[int, int, int]) -> int:
-        """Return the number of threads if the grid is one chunk, else 1."""
-        return thread_count() if len(_cuts(shape)) == 2 else 1
+        """Return as many as threads allow with one for each chunk, of grids of more than two chunks 1."""
+        chunks = len(_cuts(shape)) - 1
+        return max(1, thread_count() // chunks) if chunks <= 2 else 1
 
     def advance(
         self, state: WaveState, c: Coefficients, sources: Sources, receivers: Receivers, signal: torch.Tensor
@@ -304,6 +323,7 @@ class CpuKernel:
             c.layer_decay.numpy(),
             c.layer_gain.numpy(),
             *plane_profiles(c, shape, _group(shape, c.layer_cells)),
+            *_idle(c.idle.numpy(), shape),
         )
         memory = FlatMemory(state.memory)
         arguments = (

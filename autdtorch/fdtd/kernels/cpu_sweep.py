@@ -9,6 +9,8 @@ pressure gives two planes, A and B, and the new pressure is
 The last A is added when plane i + 2 reads it. The boundary layers across y and z stretch T_y and T_z:
 `cpu_layers.py` adds the resulting terms to A and B, and the terms of the layers across x to new_i.
 
+Cells inside rigid bodies are skipped: A is zero there, and the pressure stays as it is.
+
 All arrays are flat with unsigned indices: array views cost numba more than a short row, and possibly negative
 indices a test. Loops run over whole planes, or all rows of a layer, as if they were one row. The values that
 this mixes into the ring at both ends of each row are set to zero at the end.
@@ -44,11 +46,11 @@ def _sweep(p, at, n, row, q, old, back, across, here, behind, weights):  # type:
 @njit(**INNER)
 def _heterogeneous(p, q, cells, first, last, keep):  # type: ignore[no-untyped-def]
     """Compute new pressures of heterogeneous cells; in layers also the result of the sweep in them."""
-    index, weight, offset, scale, air, new, swept = cells
+    index, kind, weight, offset, scale, air, new, swept = cells
     for n in range(first, last):
         cell = index[n]
         here, before = p[cell], q[cell]
-        new[n] = here + keep * (here - before) + sum_of_rows(p, cell, offset, weight, n * len(air))
+        new[n] = here + keep * (here - before) + sum_of_rows(p, cell, offset, weight, kind[n] * len(air))
         if scale[n] != 0:
             swept[n] = here + keep * (here - before) + sum_of_rows(p, cell, offset, air, 0)
 
@@ -63,7 +65,7 @@ def _silence_row_ends(u, base, shape):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def sweep_planes(  # type: ignore[no-untyped-def]
-    p, q, first, last, shape, weights, x_layer, x_profile, layers, profiles, cells, starts, room
+    p, q, first, last, shape, weights, x_layer, x_profile, layers, profiles, cells, starts, idle, room
 ):
     """Step planes first .. last - 1 as if others were zero; `room` then holds A for the neighbours."""
     nx, ny, nz = shape
@@ -79,10 +81,17 @@ def sweep_planes(  # type: ignore[no-untyped-def]
         old, back = (q, (i - two) * plane) if i > first + one else (outermost, _U(0))
         if i < last:
             _heterogeneous(p, q, cells, starts[i], starts[i + one], weights[4])
-            _sweep(
-                p, i * plane + inside, n, nz, q, old, back + inside, across, here + inside, behind + inside,
-                weights,
-            )  # fmt: skip
+            at = inside
+            for run in range(idle[1][i], idle[1][i + one] + 1):  # one more: the cells behind the last run
+                end, ahead = inside + n, inside + n
+                if run < idle[1][i + one]:
+                    end, ahead = idle[0][run, 0], idle[0][run, 1]
+                _sweep(
+                    p, i * plane + at, end - at, nz, q, old, back + at, across, here + at, behind + at,
+                    weights,
+                )  # fmt: skip
+                across[here + end : here + ahead] = 0
+                at = ahead
         else:
             for k in range(plane):
                 old[back + k] += across[behind + k]
