@@ -9,11 +9,13 @@ discrete Huygens surface).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from torch import Tensor
 
@@ -26,6 +28,7 @@ from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.turning import turned_shape
 from autdtorch.utils.apertures import Apertures, Discs, image_of
 from autdtorch.utils.array_types import COMPLEX, Array, Index
+from autdtorch.utils.distinct import distinct_cells, places_among
 from autdtorch.utils.images import NO_MIRRORS, SPACE_ITSELF, Image
 from autdtorch.utils.process import cached_property
 
@@ -112,7 +115,8 @@ class ScatteredField:
         nodes = targets.positions[~far]
         within = self.inside(nodes)
         inner = self.assembly.interpolation(self._on_axes(nodes[within]))
-        cells = np.unique(np.concatenate((surface, inner.index.ravel())))
+        read = np.concatenate((surface, inner.index.ravel()))
+        cells = distinct_cells(read, math.prod(self.assembly.grid.shape))
         picked = Interpolation(surface[:, None], np.ones((len(surface), 1))).matrix(cells)
         return NearToFar(self, targets, far, within, cells, outward @ picked, inner.matrix(cells))
 
@@ -130,10 +134,17 @@ class ScatteredField:
             field[~far] = self.waves(_chosen(points, ~far), self.surface[0], amplitude, images=images)
         if far.any():
             assert self._nodes
-            nodes = torch.from_numpy(self._nodes.positions @ self.axes)
-            amplitude = self._nodes.amplitudes(amplitude)
+            nodes, amplitude = self.places_of(self._nodes), self._nodes.amplitudes(amplitude)
             field[far] = self.waves(_chosen(points, far), nodes, amplitude, images=images)
         return field
+
+    def nodes_for(self, points: Tensor) -> FaceNodes | None:
+        """Return the nodes that radiate like the surface to all points (P, 3) and by all images, or None."""
+        return self._nodes if self._far(points, self.images).all() else None
+
+    def places_of(self, nodes: FaceNodes) -> Tensor:
+        """Return the positions (m, 3) [m] of nodes."""
+        return torch.from_numpy(nodes.positions @ self.axes)
 
     def _far(self, points: Tensor, images: Sequence[Image]) -> Tensor:
         """Return the mask of points (P, 3) that the surface's nodes and their images reach."""
@@ -179,11 +190,11 @@ class ScatteredField:
         return points @ torch.from_numpy(self.axes.T)
 
     @cached_property
-    def _driven(self) -> tuple[Index, Index]:
+    def _driven(self) -> tuple[Index, NDArray[np.int32]]:
         """Cells where the incident field is needed, and the neighbours (n, 27) by their place among them."""
         around = self.assembly.heterogeneous.index[:, None] + flat_offsets(self.assembly.grid.shape)
-        cells, place = np.unique(around, return_inverse=True)
-        return cells, place.reshape(around.shape)
+        cells = distinct_cells(around, count := math.prod(self.assembly.grid.shape))
+        return cells, places_among(cells, around, count)
 
     @cached_property
     def _radiating(self) -> Index:
@@ -203,7 +214,9 @@ class ScatteredField:
         chi[grid.deeper(3)] = 1
         around = index[:, None] + flat_offsets(grid.shape)
         step = chi.ravel()[around] - chi.ravel()[index, None]
-        cells, place = np.unique(around[step != 0], return_inverse=True)
+        read = around[step != 0]
+        cells = distinct_cells(read, chi.size)
+        place = places_among(cells, read, chi.size)
         row, column = np.nonzero(step)
         factor = assembly.coefficients.face / stencil.face * grid.spacing
         value = factor / assembly.stencil.source_factor(float(assembly.steps_per_period))
@@ -263,30 +276,34 @@ class NearToFar:
         within, some = self.within[near], self.targets.chosen(chosen[~far])
         single = self.box.assembly.dtype == torch.float32
         kind = torch.complex64 if single else torch.complex128
-        received = torch.zeros((len(self.box.surface[0]), len(far)), dtype=kind, device="cpu")
+        nodes = self.box.nodes_for(self.targets.chosen(chosen).positions.flatten(0, 1))
+        radiating = self.box.surface[0] if nodes is None else self.box.places_of(nodes)
+        received = torch.zeros((len(radiating), len(far)), dtype=kind, device="cpu")
         # reciprocity of Green's function
-        self._receive(received, ~far, some, weights * ~within, False, self.box.images)
+        self._receive(received, radiating, ~far, some, weights * ~within, False, self.box.images)
         if self.box.echoes and within.any():
-            self._receive(received, ~far, some, weights * within, False, self.box.echoes)
+            self._receive(received, radiating, ~far, some, weights * within, False, self.box.echoes)
         others, ones = self.targets.chosen(chosen[far]), weights.sum().expand(int(far.sum()), 1)
-        self._receive(received, far, others, ones, True, self.box.images)
+        self._receive(received, radiating, far, others, ones, True, self.box.images)
         read = torch.zeros_like(self.within)
         read[near] = within
         row, node = torch.nonzero(within, as_tuple=True)
         place = torch.nonzero(~far)[row, 0].numpy(), np.arange(len(row))
         mean = csr_array((weights[node].numpy(), place), (len(far), len(row)))
-        return FieldMatrices(self.outward, received, csr_array(mean @ self.inward[read[self.within].numpy()]))
+        inner = csr_array(mean @ self.inward[read[self.within].numpy()])
+        return FieldMatrices(self.outward, nodes, received, inner)
 
     def _receive(
         self,
         received: Tensor,
+        radiating: Tensor,
         kind: Tensor,
         targets: Apertures,
         weights: Tensor,
         far: bool,
         images: Sequence[Image],
     ) -> None:
-        """Add waves from the Huygens surface to the targets of a `kind` (P,) to columns of `received` (m, P).
+        """Add waves from places `radiating` (m, 3) to the targets of a `kind` (P,) to their columns (m, P).
 
         Weights are those of their nodes (p, n); targets that are `far` have one each.
         """
@@ -298,7 +315,7 @@ class NearToFar:
             amplitude = torch.zeros((of_nodes.numel(), len(of_nodes)), **COMPLEX)
             amplitude[torch.arange(len(columns), device="cpu"), columns] = of_nodes.flatten().to(amplitude)
             sources = some.places if far else some.positions.flatten(0, 1)
-            waves = self.box.waves(self.box.surface[0], sources, amplitude, images=images)
+            waves = self.box.waves(radiating, sources, amplitude, images=images)
             received[:, numbers[rows]] += waves.to(received.dtype)
 
 
@@ -307,12 +324,14 @@ class FieldMatrices:
     """The scattered field at P targets, as matrices that are built once for many phasors."""
 
     outward: csr_array  # amplitudes of the Huygens surface from phasors (n, k)
-    received: Tensor  # waves from the surface to the targets (n, P)
+    nodes: FaceNodes | None  # those that stand for the surface, where they reach all targets
+    received: Tensor  # waves from the surface, or from its nodes, to the targets (n, P)
     inner: csr_array  # field at the targets in the box from phasors (P, k)
 
     def field(self, phasors: Tensor) -> Tensor:
         """Return the scattered field (P, R) at the targets, from the cells' phasors (k, R)."""
         amplitude = torch.from_numpy(self.outward @ phasors.numpy())
+        amplitude = self.nodes.amplitudes(amplitude) if self.nodes else amplitude
         # by NumPy: in single precision PyTorch may take products of a few bits
         outside = self.received.numpy().T @ amplitude.to(self.received.dtype).numpy()
         return torch.from_numpy(outside + self.inner @ phasors.numpy())

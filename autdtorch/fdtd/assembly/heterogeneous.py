@@ -8,6 +8,7 @@ elements add theirs. K is symmetric: reciprocity and a conserved energy at any c
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -30,6 +31,7 @@ from autdtorch.fdtd.assembly.losses import COUPLING, GROUND, MASS, condensed_los
 from autdtorch.fdtd.region import Shape
 from autdtorch.fdtd.stencil import Stencil, flat_offsets, places_of
 from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.distinct import distinct_cells, distinct_rows, places_among
 
 logger = logging.getLogger(__name__)
 
@@ -101,7 +103,7 @@ def heterogeneous_cells(
     """
     x, y, z = elements.material.shape
     shape = (x + 1, y + 1, z + 1)
-    touched = np.unique(_vertices(elements, shape))
+    touched = distinct_cells(_vertices(elements, shape), math.prod(shape))
     touched = touched[_inner(touched, shape)]
     coupling, mass, hard, interface = _without_rigid(elements, touched, shape, stencil)
     walls = elements.materials.rigid.any()
@@ -123,7 +125,7 @@ def heterogeneous_cells(
     uniform = _uniform_cells(elements, touched, hard, shape, stencil)
     index, weight, mass, loss = (np.concatenate(part) for part in zip(surface, uniform, strict=True))
     order = np.argsort(index)
-    around = np.unique(_neighbours(touched, shape))
+    around = distinct_cells(_neighbours(touched, shape), math.prod(shape))
     shell = around[hard[around] & _inner(around, shape)]
     rows = index[order], weight[order], mass[order]
     losses = elements.materials.losses
@@ -229,18 +231,22 @@ def condensed(interface: InterfaceElements, out: NDArray[np.bool_]) -> Interface
     Their pressure takes the value of least energy. To remove their coupling could make the energy negative.
     """
     some = np.flatnonzero(out.any(axis=1))
-    gone = out[some]
-    matrix = stiffness_matrix(interface.coupling[some])
+    # at flat faces nearly all elements are equal
+    parts = interface.coupling[some], interface.loss[some], out[some].astype(float)
+    first, kind = distinct_rows(np.concatenate(parts, axis=1))
+    gone = out[some[first]]
+    matrix = stiffness_matrix(interface.coupling[some[first]])
     both = gone[:, :, None] & gone[:, None, :]
     inverse = np.linalg.pinv(np.where(both, matrix, 0), rcond=_NULL_EIGENVALUE, hermitian=True)
     across = np.where(gone[:, None, :], matrix, 0)
     matrix = matrix - across @ inverse @ across.transpose(0, 2, 1)
     matrix[gone[:, :, None] | gone[:, None, :]] = 0
     coupling = interface.coupling.copy()
-    coupling[some] = -matrix[:, PAIRS[:, 0], PAIRS[:, 1]]
+    coupling[some] = -matrix[:, PAIRS[:, 0], PAIRS[:, 1]][kind]
     loss = interface.loss.copy()
     if loss.shape[1]:
-        loss[some] = condensed_loss(loss[some], -inverse @ across.transpose(0, 2, 1), gone)
+        inner = condensed_loss(loss[some[first]], -inverse @ across.transpose(0, 2, 1), gone)
+        loss[some] = inner[kind]
     return interface._replace(coupling=coupling, mass=np.where(out, 0, interface.mass), loss=loss)
 
 
@@ -248,23 +254,26 @@ def _assembled(
     elements: Elements, parts: Sequence[Array], touched: Index, shape: GridShape
 ) -> tuple[Array, Array]:
     """Return coupling (n, 27) and mass (n,) of the touched cells, summed over `parts` as of `_stiffness`."""
-    coupling, mass = np.zeros((len(touched), 27)), np.zeros(len(touched))
-    cube = coupling.reshape(-1, 3, 3, 3)
     places = places_of(touched, shape)
     cells = tuple(cells - 1 for cells in shape)
     # elements by kind: of one material, then those that surfaces intersect
     count = len(elements.materials.density)
     kind = elements.material.astype(np.int64).ravel()
     kind[elements.index] = count + np.arange(len(elements.index))
-    of_pairs, masses = parts
-    pairs = np.zeros((len(masses), 8, 8))
+    # at flat faces many elements are equal, and many cells are among equal ones
+    first, equal = distinct_rows(np.concatenate(parts, axis=1))
+    of_pairs, masses = (part[first] for part in parts)
+    kind = equal[kind]
+    around = [kind[np.ravel_multi_index(tuple((places - vertex).T), cells)] for vertex in VERTICES]
+    some, number_of = distinct_rows(np.stack(around, axis=1))
+    coupling, mass = np.zeros((len(some), 27)), np.zeros(len(some))
+    cube, pairs = coupling.reshape(-1, 3, 3, 3), np.zeros((len(masses), 8, 8))
     pairs[:, PAIRS[:, 0], PAIRS[:, 1]] = pairs[:, PAIRS[:, 1], PAIRS[:, 0]] = of_pairs
-    for number, vertex in enumerate(VERTICES):
-        element = kind[np.ravel_multi_index(tuple((places - vertex).T), cells)]
+    for number, (vertex, kinds) in enumerate(zip(VERTICES, around, strict=True)):
         x, y, z = (slice(1 - end, 3 - end) for end in vertex)
-        cube[:, x, y, z] += pairs[element, number].reshape(-1, 2, 2, 2)
-        mass += masses[element, number]
-    return coupling, mass
+        cube[:, x, y, z] += pairs[kinds[some], number].reshape(-1, 2, 2, 2)
+        mass += masses[kinds[some], number]
+    return coupling[number_of], mass[number_of]
 
 
 def _transferred_mass(
@@ -307,7 +316,7 @@ def _needed_mass(
     is limited to 1: a uniform material needs no more than its mass next to a lighter one.
     """
     neighbour, size = _neighbours(touched, shape), np.abs(coupling)
-    place = np.searchsorted(touched, neighbour).clip(max=len(touched) - 1)
+    place = places_among(touched, neighbour, math.prod(shape))
     beside, row = touched[place] != neighbour, coupling.sum(axis=1)
     uniform = elements.materials.mass[_cell_material(elements)[neighbour]]
     need = size.sum(axis=1) / largest

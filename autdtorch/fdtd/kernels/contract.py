@@ -17,15 +17,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from autdtorch.utils.array_types import AnyArray, Index
+from autdtorch.utils.distinct import distinct_rows
 from autdtorch.utils.process import cached_property
-
-_MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)  # odd, of the golden ratio: digests of rows
-_SHARE_DISTINCT = 0.5  # Share of distinct rows from which a table of them does not save memory traffic
 
 
 class Layer(NamedTuple):
@@ -116,15 +113,10 @@ class Coefficients:
     def distinct_rows(self) -> tuple[Index, AnyArray]:
         """The number (n,) of each heterogeneous cell's row in a table, and the table (k, 27).
 
-        At flat faces few rows are distinct. All are, where two of them have the same digest.
+        At flat faces few rows are distinct.
         """
         rows = self.heterogeneous_weight.numpy()
-        digest = np.zeros(len(rows), np.uint64)
-        for column in rows.view(np.dtype(f"u{rows.itemsize}")).T:
-            digest = digest * _MULTIPLIER + column
-        _, first, kind = np.unique(digest, return_index=True, return_inverse=True)
-        if len(first) > _SHARE_DISTINCT * len(rows) or (rows[first][kind] != rows).any():
-            return np.arange(len(rows)), rows
+        first, kind = distinct_rows(rows)
         return kind, rows[first]
 
 
