@@ -101,7 +101,7 @@ class Costs:
         lasting = _CELL_BYTES * grouping.cells + _CELL_MEMORY * filled.cells + _COLUMN_BYTES * filled.columns
         assembled = min(_ELEMENTS * filled.cut / len(grouping.grids), _MOST_ELEMENTS * thread_count())
         assembled *= _ALIKE if grouping.aligned else 1
-        running = 24 * judged * cells + min(self.runs, self._at_once) * run
+        running = 12 * judged * cells + min(self.runs, self._at_once) * run
         return lasting + max(_ELEMENT_BYTES * assembled, running)
 
     @property

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from autdtorch.utils.array_types import AnyArray, Index
 
 _MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)  # odd, of the golden ratio: digests of rows
+_HALF = np.uint64(32)
 _TOGETHER = 4096  # Rows that stay in the cache while columns are added
 
 
@@ -21,7 +22,8 @@ def distinct_rows(rows: AnyArray) -> tuple[Index, Index]:
     for first_row in range(0, len(rows), _TOGETHER):
         some = slice(first_row, first_row + _TOGETHER)
         for column in bits[some].T:
-            digest[some] = digest[some] * _MULTIPLIER + column
+            mixed = (digest[some] ^ column) * _MULTIPLIER
+            digest[some] = mixed ^ (mixed >> _HALF)  # the upper bits, where those of numbers differ, count
     _, first, kind = np.unique(digest, return_index=True, return_inverse=True)
     if (rows[first][kind] != rows).any():
         return np.arange(len(rows)), np.arange(len(rows))

@@ -79,6 +79,31 @@ def test_chunks_of_planes_are_the_whole(chunks, lossy, monkeypatch):
         assert all(map(torch.equal, all_tensors(*again), all_tensors(*parts)))
 
 
+def test_no_cell_reads_those_inside_rigid_bodies(monkeypatch):
+    """The kernel skips them: what they hold at the beginning changes nothing."""
+    monkeypatch.setattr("autdtorch.fdtd.stepping._FEWEST_IDLE", 1)
+    monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._UNROLLED", 1)
+    body = Box(center=(12e-3, 11e-3, 13e-3), size=(10e-3, 9e-3, 11e-3), rigid=True)
+    parts = assembled_parts(small_scene((body,)), 1e-3, torch.float32)
+    assembly, sources, receivers = parts
+    c, signal = assembly.coefficients, drive_signal(assembly.steps_per_period, 0, 41).float()
+    assert len(c.idle) > 10
+
+    def stepped(coefficients, value):
+        state = assembly.silence(sources)
+        for first, last in c.idle:
+            for part in (state.now, state.before):
+                part.view(-1)[first:last] = value
+        state, recorded = CpuKernel().advance(state, coefficients, sources, receivers, signal)
+        for first, last in c.idle:
+            for part in (state.now, state.before):
+                part.view(-1)[first:last] = 0
+        return all_tensors(state, recorded)
+
+    whole = stepped(replace(c, idle=c.idle[:0]), 0)
+    assert all(map(torch.equal, stepped(c, math.nan), whole))
+
+
 def test_one_worker_steps_where_processors_are_busy(monkeypatch):
     kernel, used = CpuKernel(), []
     shares = iter([1.0, 0.5, 0.8, 0.95, 1.0])
