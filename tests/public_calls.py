@@ -327,6 +327,7 @@ OTHERS: dict[str, Any] = {
     "Calibration.predict.drives": DRIVE,
     "Calibration.predict.points": None,
     "calibrate.propagator_or_matrix": MATRIX,
+    "NearbyPoses.transfer_matrix.offset": (1e-4, 0.0, 0.0),
     "NearbyPoses.propagator": Made(lambda _: at.make_propagator(SCENE, "box", 1e-3, 0.5, max_periods=6)),
     "check_transducers.readings": 1,
     "differentiable_field.density": [50.0],

@@ -31,7 +31,8 @@ EXPECTED = {
     ),
     # whole metres, which move the obstacles out of the domain
     *(
-        ("Scene.moved", "offset", f"a tensor {kind}")
+        (call, "offset", f"a tensor {kind}")
+        for call in ("Scene.moved", "NearbyPoses.transfer_matrix")
         for kind in ("of 8 bits", "of unsigned integers", "with gradient")
     ),
 }
