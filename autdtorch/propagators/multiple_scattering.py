@@ -74,21 +74,30 @@ def solved(
     to a body; None stands for no waves.
     """
     pairs = zip(maps, incident, strict=True)
-    alone = torch.cat(
-        [waves.mT @ matrix.mT for matrix, waves in pairs], dim=-1
-    ).mT  # one product for all poses
+    answers = [(waves.mT @ matrix.mT).mT for matrix, waves in pairs]  # one product for all poses
+    alone = torch.cat(answers, dim=-2)
     if all(each is None for row in between for each in row):
         return alone
     rows = []
     for matrix, row in zip(maps, between, strict=True):
-        none = torch.zeros((len(matrix), max(map(len, maps))), **COMPLEX)
         blocks = [
-            none[:, : len(other)] if each is None else each for each, other in zip(row, maps, strict=True)
+            torch.zeros((len(matrix), len(other)), **COMPLEX) if each is None else matrix @ each
+            for each, other in zip(row, maps, strict=True)
         ]
-        rows.append(matrix @ torch.cat([each.expand(*alone.shape[:-2], -1, -1) for each in blocks], dim=-1))
+        rows.append(torch.cat([each.expand(*alone.shape[:-2], -1, -1) for each in blocks], dim=-1))
     coupled = torch.cat(rows, dim=-2)
-    outgoing: torch.Tensor = torch.linalg.solve(torch.eye(alone.shape[-2], **COMPLEX) - coupled, alone)
-    return outgoing
+    if between[-1][-1] is not None:
+        return _fixed(coupled, alone)
+    rest = coupled.shape[-1] - len(maps[-1])  # the last body's waves follow from those of the others
+    there, back = coupled[..., :rest, rest:], coupled[..., rest:, :rest]
+    others = _fixed(coupled[..., :rest, :rest] + there @ back, alone[..., :rest, :] + there @ answers[-1])
+    return torch.cat([others, answers[-1] + back @ others], dim=-2)
+
+
+def _fixed(matrix: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
+    """Return x = start + matrix x."""
+    solution: torch.Tensor = torch.linalg.solve(torch.eye(matrix.shape[-1], **COMPLEX) - matrix, start)
+    return solution
 
 
 def iterated(
