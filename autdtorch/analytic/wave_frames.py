@@ -1,12 +1,13 @@
 """Spherical waves in other frames: along turned axes, and around another centre.
 
-A turn maps the harmonics of each degree onto themselves; their values at a few directions decide how. A shift
-d along z, from the centre of outgoing waves to that of regular ones, keeps the order m:
+A turn maps the harmonics of each degree onto themselves; the map is fitted to their values at a few
+directions. Outgoing waves around a centre are regular waves of the same order m around another, which is
+higher along z by d:
 
-    h_n(kr) Y_nm = sum_l S_lnm j_l(kr') Y_lm,   S_lnm = 4 pi sum_q i^(l + q - n) h_q(kd) Y_q0(z) I_lnqm,
+    h_n(kr) Y_nm = sum_l S_lnm j_l(kr') Y_lm,   S_lnm = 4 pi sum_q i^(l + q - n) h_q(kd) Y_q0(z) I_lnqm.
 
-where I is the integral of Y_lm^* Y_nm Y_q0 over all directions (Martin, Multiple Scattering (2006), section
-3.7). Any other shift is one along z between two turns.
+I is the integral of Y_lm^* Y_nm Y_q0 over all directions (Martin, Multiple Scattering (2006), section 3.7).
+Any other shift is one along z between two turns.
 """
 
 from __future__ import annotations
@@ -78,9 +79,9 @@ def _frame(z: torch.Tensor) -> torch.Tensor:
 
 @functools.lru_cache(4)
 def _along_z(degree: int, other: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the terms (Q, C) of all S_lnm with m >= 0, and those (N, other + 1) of waves lm and n.
+    """Return the terms (Q, C) of all S_lnm with m >= 0, and the places (N, other + 1) of each there.
 
-    Place C is that of waves that a shift along z does not connect.
+    Pairs of waves with S = 0 have place C.
     """
     nodes, weights = np.polynomial.legendre.leggauss(degree + other + 1)
     across, most = np.sqrt(1 - nodes**2), degree + other

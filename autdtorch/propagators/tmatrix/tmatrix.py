@@ -337,7 +337,9 @@ class TMatrixCluster:
         every = np.broadcast_shapes(self.poses, grid[:-1])
         sets = targets.reshape(*grid, 3).expand(*every, -1, -1).reshape(-1, grid[-1], 3)
         bodies = [body._in_poses(every) for body in self.bodies]
-        count = 1 + _AT_ONCE // (len(array) * sum(len(body.matrix) for body in bodies))
+        waves = sum(len(body.matrix) for body in bodies)
+        coupled = together is None and (len(bodies) > 1 or len(images) > 1)
+        count = 1 + _AT_ONCE // (waves * max(len(array), waves if coupled else 1))
         gradients = torch.is_grad_enabled()
 
         def of_poses(first: int) -> torch.Tensor:
