@@ -127,7 +127,7 @@ class NearbyPoses:
 
     @cached_property
     def _start(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """The rest (P, M) after extrapolation, the difference of grids (P, M) and its factor, at the start."""
+        """The rest (P, M) after extrapolation, the difference of grids (P, M) and its factor."""
         coarse, difference = self._coarse(self.propagator.scene)
         error = self.propagator.transfer_matrix() - coarse
         size = difference.norm().square().clamp_min(_TINY)
