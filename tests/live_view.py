@@ -106,6 +106,13 @@ def pixels(page):
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(float)
 
 
+def drawn(explorer):
+    """The picture as the server has it (height, width, 3); its frames come to the page later."""
+    shots = []
+    in_session(explorer, lambda session: shots.append(session.display.picture.plotter.screenshot()))
+    return np.asarray(shots[0]).astype(float)
+
+
 def still(page):
     """The picture once two in a row are equal: a frame of lower quality comes first."""
     frames = [pixels(page)]

@@ -9,6 +9,7 @@ from live_view import (
     PATIENCE,
     center_of_box,
     drag,
+    drawn,
     enter,
     pixels,
     place_of,
@@ -17,7 +18,6 @@ from live_view import (
     settled,
     share_of_bound,
     simulated,
-    still,
     wait_for,
     wait_for_text,
 )
@@ -137,22 +137,17 @@ def test_mouse_and_buttons_move_the_camera_and_other_keys_do_not(live, scene):
     box = page.locator(".view").bounding_box()
     corner = (box["x"] + 30, box["y"] + box["height"] - 30)
 
-    page.click("#look_first")
-    first = still(page)
+    first = drawn(explorer)
 
     def change():
-        return np.abs(pixels(page) - first)[10:-10, 10:-10].mean()  # the rim shows what has the focus
+        return np.abs(drawn(explorer) - first).mean()
 
     def has_moved():
         return change() > 2
 
-    def is_back():
-        return change() < 0.5
-
     def goes_back():  # again, as a late event of the drag may come after the first click
         page.click("#look_first")
-        page.wait_for_timeout(200)
-        return is_back()
+        return change() < 0.5
 
     drag(page, corner, (80, 40), has_moved)
     wait_for(goes_back)
@@ -162,8 +157,7 @@ def test_mouse_and_buttons_move_the_camera_and_other_keys_do_not(live, scene):
     page.mouse.click(*corner)
     for key in "3pws":  # of VTK: stereo, a box, wireframe
         page.keyboard.press(key)
-    page.click("#look_first")
-    wait_for(is_back)
+    wait_for(goes_back)
     assert explorer.scene is scene
 
 
@@ -255,12 +249,12 @@ def test_undo_brings_back_the_colours_of_the_field(live):
 
 
 def test_plane_unit_and_volume_change_the_picture(live):
-    _, page = live
-    seen = [pixels(page)]
+    explorer, page = live
+    seen = [drawn(explorer)]
 
     def require_another_picture():
-        wait_for(lambda: np.abs(pixels(page) - seen[-1]).mean() > 0.5)
-        seen.append(pixels(page))
+        wait_for(lambda: np.abs(drawn(explorer) - seen[-1]).mean() > 0.5)
+        seen.append(drawn(explorer))
 
     with settled(page):
         page.select_option("#plane", "z")
