@@ -328,6 +328,8 @@ def _require_waves_inside(scene: Scene) -> None:
 
 def _require_in_front(scene: Scene) -> None:
     """Refuse what lies behind a reflector; obstacles that cross one are cut."""
+    if not scene.reflectors:
+        return
     contents = [*_contents(scene)[:2], ("Scene.array.nodes", scene.array.nodes.positions.reshape(-1, 3))]
     if scene.observation_plane is not None:
         contents.append(("Scene.observation_plane corner", scene.observation_plane.corners))
@@ -361,7 +363,10 @@ def _require_separate_points(scene: Scene) -> None:
     require_distinct("Scene.control_points", scene.control_points)
     array, points = scene.array, scene.control_points
     require_clear(array, "Scene.control_points", points)
-    groups = {"array.positions": array.positions, "control_points": points, "array.nodes": array.nodes[0]}
+    groups = {"array.positions": array.positions, "control_points": points}
+    radius = float(radii_of(array).max())
+    if any(obstacle.near(array.positions, radius).any() for obstacle in scene.obstacles):
+        groups["array.nodes"] = array.nodes[0]
     for name, group in groups.items():
         for index, obstacle in enumerate(scene.obstacles):
             if _is_of_medium(scene, obstacle):
