@@ -62,8 +62,7 @@ class Notices:
         """Log that a source is next to an obstacle, where runs began at the transducers."""
         if result.runs and not result.from_points and "source" not in self._logged:
             self._logged.add("source")
-            nodes = self._plan.scene.array.nodes.positions
-            if any(map(self._simulation.near_obstacle, nodes)):
+            if self._simulation.near_obstacle(self._plan.scene.array.nodes.positions.flatten(0, 1)):
                 logger.warning(
                     "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g"
                     " mm", 1e3 * self._plan.source_clearance, 1e3 * self._plan.spacing,
