@@ -9,16 +9,17 @@ import autdtorch as at
 
 
 def main(dtype: str) -> None:
-    """Simulate in a box and differentiate, and in float64 run holography."""
+    """Simulate in a box and in free space, differentiate, run holography."""
     scene = small_scene((CUBE,))
     matrix = at.make_propagator(scene, "box", 2e-3, dtype=dtype, cache=False).transfer_matrix()
     density = torch.tensor([CUBE.density], dtype=torch.float64, requires_grad=True)
     drive = torch.ones(4, dtype=torch.complex128)
     field = at.differentiable_field(scene, drive, density=density, spacing=2e-3, dtype=dtype)
     field.abs().sum().backward()
-    if dtype == "float64":
-        for algorithm in ("naive", "gs"):
-            at.holography(matrix, algorithm=algorithm)
+    points = torch.rand((10_000, 3), dtype=torch.float64) + 1
+    at.make_propagator(small_scene(()), "free_space", cache=False).transfer_matrix(points)
+    for algorithm in ("naive", "gs"):
+        at.holography(matrix.to(getattr(torch, dtype).to_complex()), algorithm=algorithm)
 
 
 if __name__ == "__main__":

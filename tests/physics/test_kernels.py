@@ -225,6 +225,7 @@ def test_compiled_sums_of_discs_are_those_of_their_waves(wavenumber, radii, seed
     one = torch.ones((1, 1), dtype=torch.complex128)
     received = torch.cat([superposition(discs, point[None], one, wavenumber) for point in points], dim=1)
     assert ((received.mT - exact).abs() / largest).max() < 2e-8  # reciprocity
-    twice = wave_matrix(points, discs, torch.arange(1.0, 1.0 + len(radii)) + 0j, 1, wavenumber)
-    summed = exact @ (torch.arange(1.0, 1.0 + len(radii)) + 0j).to(exact.dtype)[:, None]
+    numbers = torch.arange(1.0, 1.0 + len(radii), dtype=torch.float64) + 0j
+    twice = wave_matrix(points, discs, numbers, 1, wavenumber)
+    summed = exact @ numbers[:, None]
     assert (twice - summed).abs().max() < 2e-8 * len(radii) ** 2 * largest.max()

@@ -250,8 +250,8 @@ def _idle(runs: AnyArray, shape: torch.Size) -> tuple[AnyArray, AnyArray]:
 
 
 def _columns(c: Coefficients, columns: Columns) -> tuple[AnyArray, ...]:
-    count = len(columns.index)
-    return columns.index.numpy(), columns.offset.numpy(), columns.weight.numpy(), *rows_profile(c, count)
+    parts = columns.index, columns.offset, columns.weight
+    return *(part.contiguous().numpy() for part in parts), *rows_profile(c, len(columns.index))
 
 
 def _heterogeneous_cells(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, ...]:

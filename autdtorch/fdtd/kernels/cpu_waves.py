@@ -297,4 +297,5 @@ def _rows(places: Tensor | Discs) -> AnyArray:
 
 def _filled(rows: AnyArray, mode: Literal["edge", "constant"]) -> AnyArray:
     """Pad rows (..., N) to whole blocks by their last entry or by zeros."""
-    return np.pad(rows, (*((0, 0),) * (rows.ndim - 1), (0, -rows.shape[-1] % LANES)), mode)
+    ends = (*((0, 0),) * (rows.ndim - 1), (0, -rows.shape[-1] % LANES))
+    return np.ascontiguousarray(np.pad(rows, ends, mode))  # numba compiles again for another order
