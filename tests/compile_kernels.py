@@ -16,7 +16,7 @@ def main(dtype: str) -> None:
     drive = torch.ones(4, dtype=torch.complex128)
     field = at.differentiable_field(scene, drive, density=density, spacing=2e-3, dtype=dtype)
     field.abs().sum().backward()
-    points = torch.rand((10_000, 3), dtype=torch.float64) + 1
+    points = torch.rand((30_000, 3), dtype=torch.float64) + 1
     at.make_propagator(small_scene(()), "free_space", cache=False).transfer_matrix(points)
     for algorithm in ("naive", "gs"):
         at.holography(matrix.to(getattr(torch, dtype).to_complex()), algorithm=algorithm)

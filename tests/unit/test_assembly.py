@@ -297,8 +297,8 @@ def test_fields_at_a_thin_plate_grow_with_powers_of_a_half(thickness):
 
 def whole_element(elements):
     """Return the stiffness matrix (8, 8) of the first element of a section."""
-    coupling, _ = stacked(np.ones(1), [Prisms(*(part[0, 0] for part in elements))], 2, COARSE)
-    return stiffness_matrix(coupling[None])[0]
+    coupling, _ = stacked(np.ones((1, 1)), Prisms(*(part[:1, :1] for part in elements)), 2, COARSE)
+    return stiffness_matrix(coupling)[0]
 
 
 @pytest.mark.parametrize(

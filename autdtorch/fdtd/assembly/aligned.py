@@ -185,18 +185,15 @@ def _prismatic(
     axis: int, kinds: Index, blocks: Blocks, materials: Materials, stencil: Stencil
 ) -> tuple[Array, Array]:
     """Return coupling (n, 28) and mass (n, 8) of kinds of elements (n, 3) that do not vary along an axis."""
-    key = _key(materials)
-    coupling, mass = np.zeros((len(kinds), 28)), np.zeros((len(kinds), 8))
+    key, slices = _key(materials), []
     planes = blocks.planes[axis]
     levels = planes.centers[planes.begin[kinds[:, axis]]]
     across = [other for other in range(3) if other != axis]
-    for level in np.unique(levels):
-        sections = _Sections(blocks, axis, int(level))
-        for row in np.flatnonzero(levels == level):
-            section, place = sections.around(kinds[row, across])
-            prism = Prisms(*(part[place] for part in prisms(section, key, stencil)))
-            coupling[row], mass[row] = stacked(np.ones(1), [prism], axis, stencil)
-    return coupling, mass
+    sections = {level: _Sections(blocks, axis, level) for level in np.unique(levels).tolist()}
+    for level, kind in zip(levels.tolist(), kinds[:, across], strict=True):
+        section, place = sections[level].around(kind)
+        slices.append([Prisms(*(part[place] for part in prisms(section, key, stencil)))])
+    return _stacked([np.ones(1)] * len(kinds), slices, axis, stencil)
 
 
 def _densities(materials: Materials) -> Array:
@@ -224,18 +221,35 @@ def _cornered(kinds: Index, blocks: Blocks, materials: Materials, stencil: Stenc
     sections = {}
     for axis, planes in enumerate(blocks.planes):
         across = [other for other in range(3) if other != axis]
-        for row, kind in enumerate(kinds):
+        widths, stacks = [], []
+        for kind in kinds:
             slices = []
             for level in range(planes.first[kind[axis]], planes.last[kind[axis]] + 1):
                 if (axis, level) not in sections:
                     sections[axis, level] = _Sections(blocks, axis, level)
                 section, place = sections[axis, level].around(kind[across])
                 slices.append(Prisms(*(part[place] for part in prisms(section, key, stencil))))
-            width = np.diff(np.concatenate(([0.0], planes.cuts(kind[axis]), [1.0])))
-            for total, part in zip((coupling, mass), stacked(width, slices, axis, stencil), strict=True):
-                total[row] += part / 3
+            stacks.append(slices)
+            widths.append(np.diff(np.concatenate(([0.0], planes.cuts(kind[axis]), [1.0]))))
+        for total, part in zip((coupling, mass), _stacked(widths, stacks, axis, stencil), strict=True):
+            total += part / 3
     missing = 1 - coupling.sum(axis=1) / uniform_coupling(stencil).sum()
     return coupling * (1 + _STIFFER * np.maximum(missing, 0))[:, None], mass
+
+
+def _stacked(
+    widths: Sequence[Array], stacks: Sequence[Sequence[Prisms]], axis: int, stencil: Stencil
+) -> tuple[Array, Array]:
+    """Return coupling (n, 28) and mass (n, 8) of stacks of slices; see `stacked`."""
+    coupling, mass = np.zeros((len(stacks), 28)), np.zeros((len(stacks), 8))
+    layers = np.array([len(slices) for slices in stacks], np.int64)
+    for count in np.unique(layers):
+        rows = np.flatnonzero(layers == count).tolist()
+        parts = zip(*(zip(*stacks[row], strict=True) for row in rows), strict=True)
+        slices = Prisms(*(np.array(part) for part in parts))
+        width = np.array([widths[row] for row in rows])
+        coupling[rows], mass[rows] = stacked(width, slices, axis, stencil)
+    return coupling, mass
 
 
 class _Sections:

@@ -104,45 +104,50 @@ def _original(fit: Prisms, image: Image) -> Prisms:
     return Prisms(*map(turned, fit))
 
 
-def stacked(width: Array, slices: Sequence[Prisms], axis: int, stencil: Stencil) -> tuple[Array, Array]:
-    """Return the coupling (28,) and mass (8,) of an element, a stack of slices of prisms along an axis.
+def stacked(width: Array, slices: Prisms, axis: int, stencil: Stencil) -> tuple[Array, Array]:
+    """Return the coupling (n, 28) and mass (n, 8) of elements, stacks of L slices of prisms along an axis.
 
-    Each slice has a width (L,). A flow along a column passes all slices, which decides the pressure in each.
-    The energy across the columns is the sum over the slices, at their pressures. The energy along the columns
-    is made positive: the stencil would subtract some where couplings are strong.
+    Each slice has a width (n, L). A flow along a column passes all slices, which decides the pressure in
+    each. The energy across the columns is the sum over the slices, at their pressures. The energy along the
+    columns is made positive: the stencil would subtract some where couplings are strong.
     """
-    flat, mass, mobility = (np.stack(parts) for parts in zip(*slices, strict=True))
-    resistance = width[:, None, None] / np.maximum(mobility, _LEAST_MOBILITY)
-    end = np.cumsum(resistance, axis=0) / resistance.sum(axis=0)
-    drop = resistance / resistance.sum(axis=0)
+    flat, mass, mobility = slices
+    resistance = width[:, :, None, None] / np.maximum(mobility, _LEAST_MOBILITY)
+    total = resistance.sum(axis=1, keepdims=True)
+    end, drop = np.cumsum(resistance, axis=1) / total, resistance / total
     middle = end - drop / 2
     by_edges, sides = coupling_by_edges(stencil), _sides_between()
     straight, oblique = by_edges[sides], by_edges[np.minimum(sides + 1, 3)]
     number = np.moveaxis(np.arange(8).reshape(2, 2, 2), axis, 0).reshape(2, 4)  # vertices at both ends
-    matrix, masses = np.zeros((8, 8)), np.zeros(8)
+    matrix, masses = np.zeros((len(width), 8, 8)), np.zeros((len(width), 8))
     low, high = np.eye(8)[number]
-    slices_of = zip(flat, width, mass, resistance, middle, drop, strict=True)
-    for coupling, thick, part, passed, place, change in slices_of:
-        at_middle = (1 - place).reshape(4, 1) * low + place.reshape(4, 1) * high
-        along = change.reshape(4, 1) * (high - low)
+    for layer in range(width.shape[1]):
+        coupling, thick = flat[:, layer], width[:, layer, None, None]
+        part, place, change = (each[:, layer].reshape(-1, 4, 1) for each in (mass, middle, drop))
+        at_middle = (1 - place) * low + place * high
+        along = change * (high - low)
         across = _stiffness(2 * (straight + oblique) * coupling)
         # difference of the stencil from pressures that vary linearly along the columns
         beyond = _stiffness(((straight + oblique) / 3 - oblique) * coupling)
-        lengthwise = np.diag(1 / passed.ravel()) + thick / 12 * across + beyond / thick
-        matrix += thick * at_middle.T @ across @ at_middle + along.T @ _without_negative(lengthwise) @ along
-        masses[number] += thick * np.stack(((1 - place) * part, place * part)).reshape(2, 4)
-    return -matrix[PAIRS[:, 0], PAIRS[:, 1]], masses
+        conductance = np.eye(4) * (1 / resistance[:, layer].reshape(-1, 1, 4))
+        lengthwise = conductance + thick / 12 * across + beyond / thick
+        between = thick * at_middle.mT @ across @ at_middle
+        matrix += between + along.mT @ _without_negative(lengthwise) @ along
+        masses[:, number] += thick * np.stack(((1 - place) * part, place * part), axis=1)[..., 0]
+    return -matrix[:, PAIRS[:, 0], PAIRS[:, 1]], masses
 
 
-def _without_negative(matrix: Array) -> Array:
-    """Return a symmetric matrix without its negative eigenvalues."""
-    value, vector = np.linalg.eigh(matrix)
-    return np.asarray((vector * np.maximum(value, 0)) @ vector.T) if value[0] < 0 else matrix
+def _without_negative(matrices: Array) -> Array:
+    """Return symmetric matrices (n, m, m) without their negative eigenvalues."""
+    value, vector = np.linalg.eigh(matrices)
+    positive = (vector * np.maximum(value, 0)[:, None]) @ vector.mT
+    return np.where(value[:, :1, None] < 0, positive, matrices)
 
 
 def _stiffness(coupling: Array) -> Array:
-    """Return the stiffness matrix (4, 4) of coupling between columns (2, 2, 2, 2)."""
-    return stiffness_matrix(coupling.reshape(4, 4)[tuple(COLUMN_PAIRS.T)], COLUMN_PAIRS)
+    """Return the stiffness matrices (n, 4, 4) of coupling between columns (n, 2, 2, 2, 2)."""
+    pairs = coupling.reshape(-1, 4, 4)[:, COLUMN_PAIRS[:, 0], COLUMN_PAIRS[:, 1]]
+    return stiffness_matrix(pairs, COLUMN_PAIRS)
 
 
 def _sides_between() -> Index:
