@@ -194,7 +194,7 @@ class ScatteredField:
         """Cells where the incident field is needed, and the neighbours (n, 27) by their place among them."""
         around = self.assembly.heterogeneous.index[:, None] + flat_offsets(self.assembly.grid.shape)
         cells = distinct_cells(around, count := math.prod(self.assembly.grid.shape))
-        return cells, places_among(cells, around, count)
+        return cells, places_among(cells, count)[around]
 
     @cached_property
     def _radiating(self) -> Index:
@@ -216,7 +216,7 @@ class ScatteredField:
         step = chi.ravel()[around] - chi.ravel()[index, None]
         read = around[step != 0]
         cells = distinct_cells(read, chi.size)
-        place = places_among(cells, read, chi.size)
+        place = places_among(cells, chi.size)[read]
         row, column = np.nonzero(step)
         factor = assembly.coefficients.face / stencil.face * grid.spacing
         value = factor / assembly.stencil.source_factor(float(assembly.steps_per_period))

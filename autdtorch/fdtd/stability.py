@@ -34,6 +34,7 @@ MOST_CELLS = 1_000_000
 # whole block: nothing is gained.
 LONG_ENOUGH = 0.97
 _LANCZOS_STEPS = 60
+_TOGETHER = 50_000  # Cells whose neighbours are looked at together
 _ROUNDING = 1e-9  # Stencil rows within this of air's are those of air; most rows of maps are
 
 
@@ -50,14 +51,18 @@ def largest_eigenvalue(index: Index, weight: Array, stencil: Stencil, shape: tup
     if len(index) == 0:
         return air
     rows, place = _with_rim(index, shape)
-    neighbour = place[rows[:, None] + flat_offsets(shape)]
-    inside = neighbour >= 0
     forth = np.broadcast_to(stencil.weights, (len(rows), 27)).copy()
     forth[place[index]] = weight
-    back = np.where(inside, forth[neighbour, _REVERSED], stencil.weights)
+    parts = np.array_split(np.arange(len(rows), dtype=np.int32), 1 + len(rows) // _TOGETHER)
+
+    def pairs(part: NDArray[np.int32]) -> tuple[NDArray[np.int32], Array]:
+        """Return the places of neighbours, -1 outside, and their weights of the cells of a part."""
+        neighbour = place[rows[part, None] + flat_offsets(shape)]
+        return neighbour, np.where(neighbour >= 0, forth[neighbour, _REVERSED], stencil.weights)
+
     # Coupling K adds K (p_i - p_j)^2 <= max(K, 0) (1/m_i + 1/m_j) (m_i p_i^2 + m_j p_j^2) to the energy.
     # Summed over the neighbours of a cell, this bounds the largest eigenvalue at any contrast.
-    bound = float(np.maximum(forth + back, 0).sum(1).max())
+    bound = max(float(np.maximum(forth[part] + pairs(part)[1], 0).sum(1).max()) for part in parts)
     if bound <= CLOSE * air:
         return bound
     if len(index) > MOST_CELLS:
@@ -66,10 +71,14 @@ def largest_eigenvalue(index: Index, weight: Array, stencil: Stencil, shape: tup
             " is iterated for at most %d", len(index), MOST_CELLS,
         )  # fmt: skip
         return bound
-    product = np.where(inside, forth * back, 0).clip(min=0)  # zeros by rounding may differ in sign
-    matrix = -np.sign(forth) * np.sqrt(product)
+    matrix, column = np.empty(forth.shape), np.empty(forth.shape, np.int32)
+    for part in parts:
+        neighbour, back = pairs(part)
+        # zeros by rounding may differ in sign
+        product = np.where(neighbour >= 0, forth[part] * back, 0).clip(min=0)
+        matrix[part] = -np.sign(forth[part]) * np.sqrt(product)
+        column[part] = np.where(neighbour >= 0, neighbour, part[:, None])
     matrix[:, 13] = forth.sum(1)
-    column = np.where(inside, neighbour, np.arange(len(rows), dtype=np.int32)[:, None])
     first = np.arange(0, 27 * len(rows) + 1, 27)
     reached = _lanczos(csr_array((matrix.ravel(), column.ravel(), first)), _LANCZOS_STEPS)
     return min(bound, max(air, MARGIN * reached))

@@ -37,8 +37,8 @@ def distinct_cells(cells: Index, count: int) -> Index:
     return np.flatnonzero(mask)
 
 
-def places_among(distinct: Index, cells: Index, count: int) -> NDArray[np.int32]:
-    """Return the place (...) of flat indices below `count` among `distinct` ones (n,); 0 of others."""
+def places_among(distinct: Index, count: int) -> NDArray[np.int32]:
+    """Return the place of each of `count` flat indices among `distinct` ones (n,); 0 of others."""
     place = np.zeros(count, np.int32)
     place[distinct] = np.arange(len(distinct), dtype=np.int32)
-    return place[cells]
+    return place

@@ -30,12 +30,13 @@ from autdtorch.fdtd.assembly.elements import Elements
 from autdtorch.fdtd.assembly.losses import COUPLING, GROUND, MASS, condensed_loss
 from autdtorch.fdtd.region import Shape
 from autdtorch.fdtd.stencil import Stencil, flat_offsets, places_of
-from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.array_types import AnyArray, Array, Index
 from autdtorch.utils.distinct import distinct_cells, distinct_rows, places_among
 
 logger = logging.getLogger(__name__)
 
 GridShape = tuple[int, int, int]
+_TOGETHER = 50_000  # Cells whose neighbours are looked at together
 # Sum of coupling coefficients, relative to air, up to which a cell in a rigid body is excluded. Cells at a
 # surface have 0.3 or more, all others 0.03 or less. Vertices of finite elements inside a body remain
 # unknowns, except in slivers: the least sum is relative to the densest fluid, and above the body's 1e-5.
@@ -315,20 +316,26 @@ def _needed_mass(
     With the sum D_i of a row, the condition is D_i + sum_j |K_ij| sqrt(m_i / m_j) = 2 largest m_i. The root
     is limited to 1: a uniform material needs no more than its mass next to a lighter one.
     """
-    neighbour, size = _neighbours(touched, shape), np.abs(coupling)
-    place = places_among(touched, neighbour, math.prod(shape))
-    beside, row = touched[place] != neighbour, coupling.sum(axis=1)
-    uniform = elements.materials.mass[_cell_material(elements)[neighbour]]
-    need = size.sum(axis=1) / largest
+    material, place_of = _cell_material(elements), places_among(touched, math.prod(shape))
+    need = np.concatenate([np.abs(part).sum(axis=1) for part in _in_parts(coupling)]) / largest
     most = np.flatnonzero(need > mass)  # all others have more mass than they need
     everyone = np.arange(len(need))
     for some in (*[most] * (_NEED_ITERATIONS - 1), everyone):
         final = np.maximum(mass, need)
-        around = np.where(beside[some], uniform[some], final[place[some]])
-        ratio = np.divide(final[some, None], around, out=np.ones_like(around), where=around > 0)
-        lighter = np.sqrt(ratio).clip(max=1)
-        need[some] = (np.maximum(row[some], 0) + (size[some] * lighter).sum(axis=1)) / (2 * largest)
+        for part in _in_parts(some):
+            neighbour, pairs = _neighbours(touched[part], shape), coupling[part]
+            place, uniform = place_of[neighbour], elements.materials.mass[material[neighbour]]
+            around = np.where(touched[place] != neighbour, uniform, final[place])
+            ratio = np.divide(final[part, None], around, out=np.ones_like(around), where=around > 0)
+            lighter = np.sqrt(ratio).clip(max=1)
+            row = np.maximum(pairs.sum(axis=1), 0)
+            need[part] = (row + (np.abs(pairs) * lighter).sum(axis=1)) / (2 * largest)
     return np.asarray(need)
+
+
+def _in_parts(rows: AnyArray) -> list[AnyArray]:
+    """Return rows in parts, which take little memory each."""
+    return np.array_split(rows, 1 + len(rows) // _TOGETHER)
 
 
 def _uniform_cells(
