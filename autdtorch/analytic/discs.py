@@ -9,9 +9,18 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 
-from autdtorch.utils.apertures import RIM_DIGITS, RIM_LEAST, RIM_STRIP, RIM_TURNS, Discs, even_waves
+from autdtorch.utils.apertures import (
+    RIM_DIGITS,
+    RIM_LEAST,
+    RIM_STRIP,
+    RIM_TURNS,
+    Discs,
+    EvenWaves,
+    even_waves,
+)
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
@@ -26,16 +35,20 @@ def waves_of(points: torch.Tensor, sources: torch.Tensor | Discs, wavenumber: co
     """Return the waves (P, N) at points (P, 3) [m] of points (N, 3) or discs of strength 1 Pa m."""
     if not isinstance(sources, Discs):
         return _wave((points[:, None] - sources.to(points)).norm(dim=-1), wavenumber)
-    waves = torch.zeros((len(points), len(sources.radii)), **COMPLEX).to(points.device)
-    for index, some in sources.of_equal_radius():
-        radius = float(some.radii[0])
-        between, normals = points[:, None] - some.centers.to(points), some.normals.to(points)
-        if some.are_points(wavenumber):
-            part = _wave(between.norm(dim=-1), wavenumber)
-        else:
-            part = _disc_waves(between, normals.expand_as(between), radius, wavenumber)
-        waves = waves.index_copy(1, index.to(points.device), part)
-    return waves
+    radii, kind = sources.kinds()
+    series = even_waves(wavenumber, radii)
+    between, normals = points[:, None] - sources.centers.to(points), sources.normals.to(points)
+    normals, place = normals.expand_as(between), torch.from_numpy(kind)
+    apart = between.detach().norm(dim=-1)
+    near = apart < torch.from_numpy(series.reaches[:, 0]).to(points)[place]
+    if not near.any():
+        return _series(between, normals, place, series, wavenumber)
+    place, radius = place.expand(apart.shape), sources.radii.to(points).expand(apart.shape)
+    waves = torch.zeros(apart.shape, **COMPLEX).to(points.device)
+    if not near.all():
+        far = _series(between[~near], normals[~near], place[~near.cpu()], series, wavenumber)
+        waves = waves.index_put((~near,), far)
+    return waves.index_put((near,), _along_rim(between[near], normals[near], radius[near], wavenumber))
 
 
 def _wave(r: torch.Tensor, wavenumber: complex) -> torch.Tensor:
@@ -43,38 +56,29 @@ def _wave(r: torch.Tensor, wavenumber: complex) -> torch.Tensor:
     return torch.polar(torch.exp(-wavenumber.imag * r) / r, wavenumber.real * r)
 
 
-def _disc_waves(
-    between: torch.Tensor, normals: torch.Tensor, radius: float, wavenumber: complex
+def _series(
+    between: torch.Tensor, normals: torch.Tensor, kind: torch.Tensor, series: EvenWaves, wavenumber: complex
 ) -> torch.Tensor:
-    """Return the waves (P, N) of discs with normals (P, N, 3), from their centres to points (P, N, 3) [m]."""
-    apart = between.detach().norm(dim=-1)
-    near = apart < even_waves(wavenumber, radius).reaches[0]
-    if not near.any():
-        return _series(between, normals, radius, wavenumber)
-    waves = torch.zeros(apart.shape, **COMPLEX).to(apart.device)
-    if not near.all():
-        waves = waves.index_put((~near,), _series(between[~near], normals[~near], radius, wavenumber))
-    return waves.index_put((near,), _along_rim(between[near], normals[near], radius, wavenumber))
-
-
-def _series(between: torch.Tensor, normals: torch.Tensor, radius: float, wavenumber: complex) -> torch.Tensor:
-    """Return the sum of even waves (...) at places (..., 3) from the centre; see `EvenWaves`."""
-    series, r = even_waves(wavenumber, radius), between.norm(dim=-1)
+    """Return sums of even waves (...) of kinds (...) at places (..., 3) from centres; see `EvenWaves`."""
+    r = between.norm(dim=-1)
     nearness = 1 / r
     square, cosine = nearness**2, ((between * normals).sum(dim=-1) * nearness) ** 2
     before, wave = -1 - 1j / wavenumber * nearness, torch.ones_like(r).to(torch.complex128)
     lower, legendre = torch.zeros_like(r), torch.ones_like(r)
-    total = series.first * wave
-    place = int((series.reaches <= float(r.detach().min())).sum()) - 1
-    for re, im, beta, gamma, a, b, c, c_re, c_im in series.steps[: series.counts[place]].tolist():
-        before, wave = wave, (complex(re, im) * square - beta) * wave - gamma * before
+    total = torch.from_numpy(series.first).to(r.device)[kind] * wave
+    far = series.reaches <= float(r.detach().min())
+    count = int(np.take_along_axis(series.counts, np.maximum(far.sum(axis=1)[:, None] - 1, 0), axis=1).max())
+    steps = torch.from_numpy(series.steps.transpose(1, 2, 0).copy()).to(r.device)
+    for step in steps[:count]:
+        re, im, beta, gamma, a, b, c, c_re, c_im = step[:, kind] if len(series.first) > 1 else step
+        before, wave = wave, (torch.complex(re, im) * square - beta) * wave - gamma * before
         lower, legendre = legendre, (a * cosine - b) * legendre - c * lower
-        total = total + complex(c_re, c_im) * (legendre * wave)
+        total = total + torch.complex(c_re, c_im) * (legendre * wave)
     return total * _wave(r, wavenumber)
 
 
 def _along_rim(
-    between: torch.Tensor, normals: torch.Tensor, radius: float, wavenumber: complex
+    between: torch.Tensor, normals: torch.Tensor, radius: torch.Tensor, wavenumber: complex
 ) -> torch.Tensor:
     """Return the integral (Q,) along the rim at places (Q, 3) from the centre.
 
@@ -87,13 +91,13 @@ def _along_rim(
     offset = (place - height[:, None] * normals).norm(dim=-1)
     ratio = torch.hypot(height, offset - radius) / torch.hypot(height, offset + radius)
     squeeze = (RIM_STRIP * ratio.clamp(min=RIM_LEAST)).clamp(max=1).sqrt()
-    turns = RIM_DIGITS + RIM_TURNS * abs(wavenumber) * offset.clamp(max=radius)
+    turns = RIM_DIGITS + RIM_TURNS * abs(wavenumber) * torch.minimum(offset, radius)
     levels = torch.log2(turns / (2 * torch.atanh(squeeze / RIM_STRIP))).ceil().to(torch.int64)
     waves = torch.zeros(len(between), **COMPLEX).to(between.device)
     for level in torch.unique(levels).tolist():  # places with as many nodes
         for index in torch.split((levels == level).nonzero()[:, 0], max(1, _AT_ONCE >> level)):
-            part = between[index], normals[index], squeeze[index, None]
-            waves = waves.index_put((index,), _by_nodes(*part, 2**level, radius, wavenumber))
+            part = between[index], normals[index], squeeze[index, None], radius[index, None]
+            waves = waves.index_put((index,), _by_nodes(*part, 2**level, wavenumber))
     return waves
 
 
@@ -101,8 +105,8 @@ def _by_nodes(
     between: torch.Tensor,
     normals: torch.Tensor,
     squeeze: torch.Tensor,
+    radius: torch.Tensor,
     count: int,
-    radius: float,
     wavenumber: complex,
 ) -> torch.Tensor:
     """Return the integral of `_along_rim` by so many nodes, which stand still in derivatives."""

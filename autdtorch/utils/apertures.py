@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
 import torch
 
-from autdtorch.utils.array_types import COMPLEX, REAL, Array, Index
+from autdtorch.utils.array_types import COMPLEX, REAL, Array, ComplexArray, Index
 from autdtorch.utils.images import Image, distinct
 
 TOGETHER = 3
@@ -28,6 +28,9 @@ _POINT = 1e-4
 RIM_DIGITS, RIM_TURNS, RIM_STRIP, RIM_LEAST = 20.0, 1.2, 2.164, 1e-5
 """Rule for the integral along a rim: -log of its error, growth of a wave in the complex plane with k a
 [rad], coth(1 / 2), and the least ratio of the distances to the nearest and the farthest point of the rim."""
+
+_LEAST = 1e-290
+"""Least scale of a wave of a high degree; smaller ones of the smallest discs count as 0."""
 
 _RINGS, _RING_NODES = 5, 16
 """Rings of the monopoles that stand for a disc on a grid, and monopoles of each, up to k a = 6."""
@@ -93,15 +96,10 @@ class Discs(NamedTuple):
     normals: torch.Tensor  # (N, 3)
     radii: torch.Tensor  # (N,) [m]
 
-    def are_points(self, wavenumber: complex) -> bool:
-        """Return whether discs of equal radius are so small that they are points."""
-        return abs(wavenumber) * float(self.radii[0]) < _POINT
-
-    def of_equal_radius(self) -> Iterator[tuple[torch.Tensor, Self]]:
-        """Yield the indices (n,) of the discs of each radius, and these discs."""
-        for radius in torch.unique(self.radii).tolist():
-            index = torch.nonzero(self.radii == radius)[:, 0]
-            yield index, type(self)(*(part[index] for part in self))
+    def kinds(self) -> tuple[tuple[float, ...], Index]:
+        """Return the radii, each once, and the number of its radius among them for each disc (N,)."""
+        radii, kind = np.unique(self.radii.numpy(force=True), return_inverse=True)
+        return tuple(radii.tolist()), kind.reshape(-1)
 
 
 def image_of(places: torch.Tensor | Discs, image: Image) -> torch.Tensor | Discs:
@@ -119,49 +117,65 @@ class EvenWaves(NamedTuple):
     H_(-1) = -1 - i / kr and H_0 = P_0 = 1.
     """
 
-    first: complex  # c_0
-    steps: Array  # Re alpha, Im alpha, beta, gamma, A, B, C, Re c_(n+1), Im c_(n+1), by n (N, 9)
-    reaches: Array  # distances (K,) [m]; nearer than the first the series is slow
-    counts: Index  # numbers of steps that suffice from each distance on (K,)
+    first: ComplexArray  # c_0 of discs of several radii (R,)
+    steps: Array  # Re alpha, Im alpha, beta, gamma, A, B, C, Re c_(n+1), Im c_(n+1), by n (R, N, 9)
+    reaches: Array  # distances (R, K) [m]; nearer than the first the series is slow
+    counts: Index  # numbers of steps that suffice from each distance on (R, K)
 
 
 @functools.lru_cache(64)
-def even_waves(wavenumber: complex, radius: float) -> EvenWaves:
-    """Return the waves of a disc of radius a [m].
+def even_waves(wavenumber: complex, radii: tuple[float, ...]) -> EvenWaves:
+    """Return the waves of discs of radii a [m]; very small ones are points, of one wave.
 
     With spherical Bessel functions, c_n h_2n = (4n + 1) P_2n(0) 2 / a^2 int_0^a j_2n(ks) s ds h_2n(kr) up to
-    e^{ikr} / r (Stenzel 1935). High degrees fall as (a / r)^2n. H_n are h_2n of size 1 at the least distance.
+    e^{ikr} / r (Stenzel 1935). With x = ka and I_l = int_0^x j_l(t) t dt,
+    (l + 1) I_(l-1) = (2l + 1) x j_l(x) + l I_(l+1). High degrees fall as (a / r)^2n. H_n are h_2n of size 1
+    at the least distance.
     """
     from scipy.special import eval_legendre, spherical_jn
 
-    size = wavenumber * radius
-    count = TOGETHER * math.ceil((abs(size) / 2 + 24) / TOGETHER)
+    radius = np.array(radii)
+    is_point = abs(wavenumber) * radius < _POINT
+    size = wavenumber * np.where(is_point, 1 / abs(wavenumber), radius)
+    count = TOGETHER * math.ceil((float(abs(size).max()) / 2 + 24) / TOGETHER)
     degrees = 2 * np.arange(count + 1)
-    abscissa, weights = np.polynomial.legendre.leggauss(count + 30)
-    places = (abscissa + 1) / 2
-    means = spherical_jn(degrees[:, None], size * places) @ (weights * places)
+    means = np.zeros((count + 21, len(radii)), np.complex128)
+    for n in range(count + 19, -1, -1):
+        odd = 2 * n + 1
+        means[n] = ((2 * odd + 1) * size * spherical_jn(odd, size) + odd * means[n + 1]) / (odd + 1)
     l = 2.0 * np.arange(count)  # noqa: E741 - the degree in the formulas
     alpha, gamma = (2 * l + 1) * (2 * l + 3), (2 * l + 3) / (2 * l - 1)
     a = alpha / ((l + 1) * (l + 2))
     b = a * ((l + 1) ** 2 / alpha + l**2 / ((2 * l + 1) * (2 * l - 1)))
     c = a * l * (l - 1) / ((2 * l + 1) * (2 * l - 1))
-    reaches = _REACH * radius * 2 ** (np.arange(_REACHES) / 4)
-    nearness = 1 / (wavenumber * reaches)
-    scales, sizes = [1.0], [np.ones(_REACHES)]
+    stretch = _REACH * 2 ** (np.arange(_REACHES) / 4)
+    nearness = 1 / (size[:, None] * stretch)
+    scales, sizes = [np.ones((len(radii), 1))], [np.ones(nearness.shape)]
     before, wave = -1 - 1j * nearness, 1 + 0j * nearness
     for n in range(count):
         after = (alpha[n] * nearness**2 - 1 - gamma[n]) * wave - scales[-1] * gamma[n] * before
-        scales.append(1 / abs(after[0]))
+        scales.append(1 / abs(after[:, :1]))
         before, wave = wave, scales[-1] * after
         sizes.append(abs(wave))
-    scale = np.array(scales)
-    amplitude = (2 * degrees + 1) * eval_legendre(degrees, 0.0) * means / np.cumprod(scale)
-    left_out = np.cumsum((abs(amplitude)[:, None] * sizes)[:0:-1], axis=0)[::-1]
+    scale = np.concatenate(scales, axis=1)
+    means = (2 / size**2 * means[: count + 1]).T
+    total = np.cumprod(scale, axis=1)
+    means = means * np.divide(1, total, out=np.zeros_like(total), where=total > _LEAST)
+    amplitude = (2 * degrees + 1) * eval_legendre(degrees, 0.0) * means
+    terms = abs(amplitude).T[:, :, None] * np.array(sizes)
+    left_out = np.cumsum(terms[:0:-1], axis=0)[::-1]
     counts = TOGETHER * np.ceil((left_out > _ERROR).sum(axis=0) / TOGETHER)
-    alpha = scale[1:] * alpha / wavenumber**2
-    beta, gamma = scale[1:] * (1 + gamma), scale[1:] * scale[:-1] * gamma
-    parts = alpha.real, alpha.imag, beta, gamma, a, b, c, amplitude[1:].real, amplitude[1:].imag
-    return EvenWaves(complex(amplitude[0]), np.stack(parts, axis=1), reaches, counts.astype(np.int64))
+    alpha = scale[:, 1:] * alpha / wavenumber**2
+    beta, gamma = scale[:, 1:] * (1 + gamma), scale[:, 1:] * scale[:, :-1] * gamma
+    parts = alpha.real, alpha.imag, beta, gamma, a, b, c, amplitude[:, 1:].real, amplitude[:, 1:].imag
+    steps = np.stack(np.broadcast_arrays(*parts), axis=2)
+    radius = np.where(is_point, 0, radius)
+    return EvenWaves(
+        np.where(is_point, 1, amplitude[:, 0]),
+        np.where(is_point[:, None, None], 0, steps),
+        radius[:, None] * stretch,
+        np.where(is_point[:, None], 0, counts).astype(np.int64),
+    )
 
 
 @functools.lru_cache(64)

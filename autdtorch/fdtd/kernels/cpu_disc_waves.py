@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -19,6 +18,7 @@ from autdtorch.utils.apertures import (
     Discs,
     even_waves,
 )
+from autdtorch.utils.array_types import AnyArray
 
 LANES = 64
 """Places in a block; their waves stay in the first-level cache."""
@@ -39,35 +39,27 @@ _RE_NEW, _IM_OLD, _IM_NEW, _RE, _IM = np.arange(11, NUMBERS, dtype=np.uint64) * 
 _SMALL = 1e-5  # Phase up to which a difference of two waves is two terms of its series
 
 
-def disc_numbers(places: Tensor | Discs, wavenumber: complex, number: type) -> tuple[Any, ...]:
-    """Return the waves of discs of equal radius, for `turn_into_disc`; points have none."""
-    wavenumber = complex(wavenumber)
-    if not isinstance(places, Discs) or not len(places.radii) or places.are_points(wavenumber):
-        return np.zeros((0, 9), number), np.zeros((0, 2), number), 0.0, 0.0, 0.0
-    radius = float(places.radii[0])
-    first, steps, reaches, counts = even_waves(wavenumber, radius)
-    head = first.real, first.imag, (1 / wavenumber).real, (1 / wavenumber).imag, 1 / reaches[0], 0, 0, 0, 0
-    ends = np.stack((1 / reaches, counts), axis=1)
-    return (
-        np.vstack((head, steps)).astype(number),
-        ends.astype(number),
-        radius,
-        wavenumber.real,
-        wavenumber.imag,
-    )
+def disc_numbers(places: Tensor | Discs, wavenumber: complex, number: type) -> tuple[AnyArray, ...]:
+    """Return the waves of discs and the number (N,) of each disc's for `turn_into_disc`; points have none."""
+    if not isinstance(places, Discs):
+        return np.zeros((0, 0, 9), number), np.zeros((0, 0, 2), number), np.zeros(0, np.int64)
+    radii, kind = places.kinds()
+    k = complex(wavenumber)
+    first, steps, reaches, counts = even_waves(k, radii)
+    with np.errstate(divide="ignore"):
+        nearness = 1 / reaches
+    inverse, head = 1 / k, np.zeros((len(radii), 1, 9))
+    numbers = first.real, first.imag, inverse.real, inverse.imag, nearness[:, 0], radii, k.real, k.imag
+    for column, values in enumerate(numbers):
+        head[:, 0, column] = values
+    table = np.concatenate((head, steps), axis=1)
+    return table.astype(number), np.stack((nearness, counts), axis=2).astype(number), kind
 
 
 @njit(**INNER)
-def _coefficients(steps, n):  # type: ignore[no-untyped-def]
-    c = steps[n]
+def _row(table, kind, n):  # type: ignore[no-untyped-def]
+    c = table[kind, n]
     return c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8]
-
-
-@njit(**INNER)
-def _head(steps):  # type: ignore[no-untyped-def]
-    """Return the parts of c_0 and of 1 / k, and the inverse of the least distance; see `disc_numbers`."""
-    c = steps[0]
-    return c[0], c[1], c[2], c[3], c[4]
 
 
 @njit(**INNER)
@@ -81,9 +73,9 @@ def _next_wave(c, square, cosine, old, new, re_old, re_new, im_old, im_new, re, 
 
 
 @njit(**INNER)
-def _add_degrees(steps, n, lanes):  # type: ignore[no-untyped-def]
+def _add_degrees(table, kind, n, lanes):  # type: ignore[no-untyped-def]
     """Add the terms of three degrees, all of whose numbers stay in registers."""
-    first, second, third = _coefficients(steps, n), _coefficients(steps, n + 1), _coefficients(steps, n + 2)
+    first, second, third = _row(table, kind, n), _row(table, kind, n + 1), _row(table, kind, n + 2)
     for k in range(BLOCK):
         square, cosine, re, im = lanes[_SQUARE + k], lanes[_COSINE + k], lanes[_RE + k], lanes[_IM + k]
         p, q = lanes[_OLD + k], lanes[_NEW + k]
@@ -96,10 +88,9 @@ def _add_degrees(steps, n, lanes):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def turn_into_disc(place, others, first, disc, lanes):  # type: ignore[no-untyped-def]
+def turn_into_disc(place, others, first, table, ends, kind, lanes):  # type: ignore[no-untyped-def]
     """Turn the waves of a point into those of a disc at a place with a normal (6,)."""
-    steps, ends, radius, re_k, im_k = disc
-    start, also, re_inverse, im_inverse, least = _head(steps)
+    start, also, re_inverse, im_inverse, least, radius, re_k, im_k, _ = _row(table, kind, 0)
     x, y, z = place[0], place[1], place[2]
     along_x, along_y, along_z = place[3], place[4], place[5]
     for k in range(BLOCK):
@@ -116,10 +107,10 @@ def turn_into_disc(place, others, first, disc, lanes):  # type: ignore[no-untype
     for k in range(BLOCK):
         most = max(most, lanes[NEAR + k])
     number = 0
-    while number + 1 < len(ends) and most <= ends[number + 1, 0]:
+    while number + 1 < ends.shape[1] and most <= ends[kind, number + 1, 0]:
         number += 1
-    for n in range(0, int(ends[number, 1]), TOGETHER):
-        _add_degrees(steps, 1 + n, lanes)
+    for n in range(0, int(ends[kind, number, 1]), TOGETHER):
+        _add_degrees(table, kind, 1 + n, lanes)
     for k in range(BLOCK):
         re, im, a, b = lanes[WAVE + k], lanes[ALSO + k], lanes[_RE + k], lanes[_IM + k]
         lanes[WAVE + k], lanes[ALSO + k] = a * re - b * im, a * im + b * re

@@ -9,8 +9,8 @@ precision, the rest in the precision of the amplitudes. The order of all sums is
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
-from typing import Any, Literal
+from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 import torch
@@ -35,7 +35,7 @@ from autdtorch.fdtd.kernels.cpu_disc_waves import (
     turn_into_disc,
 )
 from autdtorch.utils.apertures import Discs
-from autdtorch.utils.array_types import COMPLEX, AnyArray
+from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.process import even_parts, spread
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
@@ -72,8 +72,8 @@ def _series(c, y):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _set_waves(place, others, block, wave, disc, room):  # type: ignore[no-untyped-def]
-    """Set the parts of the waves from a place (6,) to those of a block of `others` (3, N)."""
+def _set_waves(place, number, others, block, wave, disc, room):  # type: ignore[no-untyped-def]
+    """Set the parts of the waves from the place (6,) of a number to those of a block of `others` (3, N)."""
     series, lanes, bits = room
     turns_per_metre, halvings_per_metre, nearest = wave
     x, y, z = place[0], place[1], place[2]
@@ -106,8 +106,9 @@ def _set_waves(place, others, block, wave, disc, room):  # type: ignore[no-untyp
             size = lanes[SIDE + k] * _series(terms, lanes[WORK + k])
             lanes[WAVE + k] *= size
             lanes[ALSO + k] *= size
-    if len(disc[0]):
-        turn_into_disc(place, others, first, disc, lanes)
+    table, ends, kinds = disc
+    if len(table):
+        turn_into_disc(place, others, first, table, ends, kinds[number], lanes)
 
 
 @njit(**INNER)
@@ -138,7 +139,7 @@ def _sum_at_points(points, first, last, sources, amplitude, wave, disc, room, fi
     total = np.zeros((2, runs, LANES), amplitude.dtype)
     for block in range(first, last):
         for s in range(count):
-            _set_waves(sources[s], points, block, wave, disc, room)
+            _set_waves(sources[s], s, points, block, wave, disc, room)
             for r in range(runs):
                 _add_waves(total, r, amplitude[0, r, s], amplitude[1, r, s], room[1])
             if (s + 1) % LANES == 0 or s + 1 == count:  # limits rounding
@@ -165,7 +166,7 @@ def _sum_over_sources(points, first, last, sources, amplitude, wave, disc, room,
     total, less = np.empty(LANES, amplitude.dtype), np.empty(LANES, amplitude.dtype)
     for p in range(first, last):
         for block in range(blocks):
-            _set_waves(points[p], sources, block, wave, disc, room)
+            _set_waves(points[p], p, sources, block, wave, disc, room)
             for k in range(BLOCK):
                 real[block, k], imaginary[block, k] = room[1][WAVE + k], room[1][ALSO + k]
         for r in range(runs):
@@ -186,7 +187,7 @@ def _write_matrix(points, first, last, sources, columns, amplitude, wave, disc, 
     """Add the waves of sources (N, 6) to their columns (N,) of a matrix (M, P / LANES, LANES) of blocks."""
     for block in range(first, last):
         for s in range(len(sources)):
-            _set_waves(sources[s], points, block, wave, disc, room)
+            _set_waves(sources[s], s, points, block, wave, disc, room)
             row, lanes, a, b = matrix[columns[s], block], room[1], amplitude[s].real, amplitude[s].imag
             for k in range(BLOCK):
                 real, imaginary = lanes[WAVE + k], lanes[ALSO + k]
@@ -207,43 +208,6 @@ def superposition(
     the distance to points [m]. Either points or sources may be discs: the mean pressure over a disc, or the
     field of one. float32 takes half the time at an error of 3e-7 per wave. Threads do not change the result.
     """
-    fields = torch.zeros((len(_rows(points)), amplitude.shape[1]), **COMPLEX)
-    for place, some in _alike(points):
-        for index, origins in _alike(sources):
-            fields[place] += _superposed(some, origins, amplitude[index], wavenumber, nearest, dtype)
-    return fields
-
-
-def wave_matrix(
-    points: Tensor, sources: Tensor | Discs, amplitude: Tensor, columns: int, wavenumber: complex
-) -> Tensor:
-    """Return waves (P, columns) complex128 [Pa] at points (P, 3) [m] of N sources, amplitudes (N,) [Pa m].
-
-    Sources of one number, but for multiples of `columns`, add up; see `superposition`.
-    """
-    blocks = _filled(points.numpy().T, "edge")
-    matrix = np.zeros((columns, blocks.shape[1] // LANES, LANES), np.complex128)
-    column = np.arange(len(amplitude)) % columns
-    for index, some in _alike(sources):
-        rows = _rows(some), column[index], amplitude[index].numpy()
-        waves = _wave(wavenumber, 0.0), disc_numbers(some, wavenumber, np.float64)
-
-        def write(ends: tuple[int, int], work: Any = (*rows, *waves)) -> None:
-            _write_matrix(blocks, *ends, *work, _room(np.float64), matrix)
-
-        _spread(write, matrix.shape[1], len(points) * len(rows[0]))
-    return torch.from_numpy(matrix).flatten(1)[:, : len(points)].mT
-
-
-def _superposed(
-    points: Tensor | Discs,
-    sources: Tensor | Discs,
-    amplitude: Tensor,
-    wavenumber: complex,
-    nearest: float,
-    dtype: torch.dtype,
-) -> Tensor:
-    """Return the sum of `superposition` for discs of equal radius."""
     number = np.float32 if dtype == torch.float32 else np.float64
     wave = _wave(wavenumber, nearest)
     parts = (amplitude.real, amplitude.imag)
@@ -270,6 +234,28 @@ def _superposed(
     return torch.from_numpy((real + 1j * imaginary).T)
 
 
+def wave_matrix(
+    points: Tensor, sources: Tensor | Discs, amplitude: Tensor, columns: int, wavenumber: complex
+) -> Tensor:
+    """Return waves (P, columns) complex128 [Pa] at points (P, 3) [m] of N sources, amplitudes (N,) [Pa m].
+
+    Sources of one number, but for multiples of `columns`, add up; see `superposition`.
+    """
+    blocks = _filled(points.numpy().T, "edge")
+    matrix = np.zeros((columns, blocks.shape[1] // LANES, LANES), np.complex128)
+    column = np.arange(len(amplitude)) % columns
+    rows, strength = _rows(sources), amplitude.numpy()
+    wave, disc = _wave(wavenumber, 0.0), disc_numbers(sources, wavenumber, np.float64)
+    _spread(
+        lambda ends: _write_matrix(
+            blocks, *ends, rows, column, strength, wave, disc, _room(np.float64), matrix
+        ),
+        matrix.shape[1],
+        len(points) * len(rows),
+    )
+    return torch.from_numpy(matrix).flatten(1)[:, : len(points)].mT
+
+
 def _spread(function: Callable[[tuple[int, int]], None], units: int, pairs: int) -> None:
     """Call a function with the bounds of parts of the units, in threads."""
     spread(function, even_parts(units, max(1, min(units, 1 + pairs // _PAIRS))))
@@ -279,13 +265,6 @@ def _wave(wavenumber: complex, nearest: float) -> tuple[float, float, float]:
     """Return turns and halvings of a wave per metre, and the lower limit of the distance [m]."""
     wavenumber = complex(wavenumber)
     return wavenumber.real / (2 * math.pi), wavenumber.imag / math.log(2), max(nearest, LENGTH_TOLERANCE)
-
-
-def _alike(places: Tensor | Discs) -> Iterable[tuple[Any, Tensor | Discs]]:
-    """Return the index and the places of points, or of the discs of each radius."""
-    if isinstance(places, Discs):
-        return ((index.numpy(), some) for index, some in places.of_equal_radius())
-    return [(slice(None), places)]
 
 
 def _rows(places: Tensor | Discs) -> AnyArray:
