@@ -98,7 +98,7 @@ class Discs(NamedTuple):
 
     def kinds(self) -> tuple[tuple[float, ...], Index]:
         """Return the radii, each once, and the number of its radius among them for each disc (N,)."""
-        radii, kind = np.unique(self.radii.numpy(force=True), return_inverse=True)
+        radii, kind = np.unique(np.array(self.radii.tolist()), return_inverse=True)
         return tuple(radii.tolist()), kind.reshape(-1)
 
 

@@ -315,7 +315,8 @@ def test_joined_arrays_have_the_columns_of_both(first, second):
     joined = boards[0] + boards[1]
     points = [(0.05, 0.01, 0.0), (0.08, 0.0, 0.03)]
     both = torch.cat([free_space_matrix(points, board, WAVENUMBER) for board in boards], dim=1)
-    assert relative_error(free_space_matrix(points, joined, WAVENUMBER), both) < 1e-14
+    # the nearest point and disc decide how many waves are summed: up to 1e-8 is left out
+    assert relative_error(free_space_matrix(points, joined, WAVENUMBER), both) < 2e-8
     assert torch.equal(strengths_of(joined), torch.cat([strengths_of(board) for board in boards]))
     assert torch.equal(radii_of(joined), torch.cat([radii_of(board) for board in boards]))
 
