@@ -50,8 +50,7 @@ def disc_numbers(places: Tensor | Discs, wavenumber: complex, number: type) -> t
         nearness = 1 / reaches
     inverse, head = 1 / k, np.zeros((len(radii), 1, 9))
     numbers = first.real, first.imag, inverse.real, inverse.imag, nearness[:, 0], radii, k.real, k.imag
-    for column, values in enumerate(numbers):
-        head[:, 0, column] = values
+    head[:, 0, :8] = np.stack(np.broadcast_arrays(*numbers), axis=1)
     table = np.concatenate((head, steps), axis=1)
     return table.astype(number), np.stack((nearness, counts), axis=2).astype(number), kind
 
