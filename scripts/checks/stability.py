@@ -112,7 +112,8 @@ def run_trial(trial: Trial) -> Outcome:
         infinite = dict.fromkeys(LARGEST_RISE, math.inf)
         return Outcome(trial, infinite, infinite, False, math.inf, f"assembling: {error!r}")
     period = float(assembly.steps_per_period)
-    steps = {"driven": max(trial.steps, math.ceil(FEWEST_PERIODS * period)), "free": trial.steps}
+    driven = math.ceil(FEWEST_PERIODS * period)
+    steps = {"driven": max(trial.steps, driven), "free": max(trial.steps, assembly.steps_per_period.numerator)}
     mass = np.ones(math.prod(assembly.grid.shape))
     mass[assembly.heterogeneous.index] = assembly.heterogeneous.mass
     strength = torch.full(
