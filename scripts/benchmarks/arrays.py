@@ -1,0 +1,130 @@
+"""Real arrays: discs in free space, their accuracy, and large bodies by tolerance.
+
+A plane has 101 x 101 points, 150 mm in front of 256 transducers. Errors of discs are against Rayleigh's
+integral, at random points at least a wavelength from the rim, relative to the field at each point. Bodies
+are rigid, 0.15 m in front of a SonicSurface of discs with four foci behind, simulated to 2 % by
+`tolerance` in a process each; their true errors are against a grid with cells of 0.7 times the size or less.
+Takes about 10 minutes on 2 idle cores, most of it for the references.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import torch
+from shared.document import Page, percent, printed, table
+from shared.scenes import relative_error
+from shared.timing import in_new_process, peak_memory, shortest, timed
+
+import autdtorch as at
+from autdtorch.scene.arrays import TRANSDUCER_RADIUS
+
+DOCUMENT = "performance.md"
+
+AIR, FREQUENCY = at.Medium(1.2, 343.0), 40e3
+UP = (0.0, 0.0, 1.0)
+TILT = (0.2, 0.3, 0.1)
+THICKNESS = 3e-3
+SIDES = {"plate": (0.1, 0.2, 0.4), "cube": (0.1, 0.2, 0.3)}  # [m]
+TOLERANCE = 0.02
+FINER = 0.7
+"""Ratio of a reference's cells to those that are judged."""
+SIZES = (0.5, 1.0, 3.3, 6.0, 10.0, 20.0, 40.0)
+"""Products k a of the discs that are compared with Rayleigh's integral; 3.3 is a transducer's."""
+PLACES = 2000
+REPEATS = 3
+
+
+def main(page: Page) -> None:
+    """Measure, and write the block."""
+    page.write(
+        "Field of a drive on a plane of 101 x 101 points, 256 transducers:",
+        table(["transducers", "array and scene", "plane"], printed(planes())),
+        "Largest error of a disc's field from a wavelength off its rim on, by k a:",
+        table([f"{size:g}" for size in SIZES], [[f"{disc_error(size):.1e}" for size in SIZES]]),
+        "Rigid bodies to 2 % by `tolerance`, 256 discs, four foci:",
+        table(
+            ["body", "spacing", "time", "largest resident set", "claimed", "true error"],
+            printed(large_bodies()),
+        ),
+    )
+
+
+def planes() -> Iterator[list[str]]:
+    """Time a plane of points and of discs."""
+    for name, radius in (("points", None), ("discs", TRANSDUCER_RADIUS)):
+        scene, preparing = shortest(lambda radius=radius: _scene((), radius), REPEATS)
+        points = at.Plane((0.0, 0.0, 0.15), (1.0, 0.0, 0.0), (0.1, 0.1)).points(1e-3)
+        drive, propagator = torch.ones(len(scene.array), dtype=torch.complex128), at.make_propagator(scene)
+        propagator.field(drive, points[:2, :2])  # loads the kernels
+        _, seconds = shortest(lambda: propagator.field(drive, points), REPEATS)  # noqa: B023
+        yield [name, f"{1e3 * preparing:.1f} ms", f"{seconds:.3f} s"]
+
+
+def disc_error(size: float) -> float:
+    """Return the largest relative error of a disc of a size k a."""
+    scene = _scene((), None)
+    wavelength = 2 * math.pi / scene.wavenumber
+    radius = size / scene.wavenumber
+    rng = np.random.default_rng(0)
+    places = rng.uniform(-1, 1, (PLACES, 3)) * (radius + 3 * wavelength) + (0.0, 0.0, 2 * radius)
+    offset = np.hypot(np.hypot(places[:, 0], places[:, 1]) - radius, places[:, 2])
+    points = places[offset >= wavelength]
+    array = at.TransducerArray([(0.0, 0.0, 0.0)], UP, 1.0, radius)
+    field = at.make_propagator(at.Scene(array, AIR, FREQUENCY, points)).transfer_matrix()
+    exact = 4 * math.pi * at.analytic.piston_field(points, array.positions, scene.wavenumber, radius, UP)
+    return float(((field - exact).abs() / exact.abs()).max())
+
+
+def large_bodies() -> Iterator[list[str]]:
+    """Simulate all bodies, each beside its reference; then tell how time and memory grow."""
+    for kind, sides in SIDES.items():
+        costs = []
+        for side in sides:
+            matrix, spacing, seconds, memory, claimed = in_new_process(by_tolerance, (kind, side))
+            reference = in_new_process(on_a_grid, (kind, side, FINER * spacing))
+            costs.append((seconds, memory))
+            yield [
+                f"{kind} of {side:g} m",
+                f"{1e3 * spacing:.2f} mm",
+                f"{seconds:.1f} s",
+                f"{memory / 1e9:.2f} GB",
+                percent(claimed),
+                percent(relative_error(matrix, reference)),
+            ]
+        powers = [float(np.polyfit(np.log(sides), np.log(cost), 1)[0]) for cost in zip(*costs, strict=True)]
+        time, memory = (f"side^{power:.1f}" for power in powers)
+        yield [f"{kind}, growth", "", time, memory, "", ""]
+
+
+def by_tolerance(body: tuple[str, float]) -> tuple[torch.Tensor, float, float, int, float]:
+    """Return matrix, spacing [m], time [s], memory [byte] and claimed error of a body."""
+    at.make_propagator(_scene(_body("plate", 0.02)), "box").transfer_matrix()  # loads the kernels
+    scene = _scene(_body(*body))
+
+    def work() -> tuple[torch.Tensor, float, float]:
+        propagator = at.make_propagator(scene, spacing=None, tolerance=TOLERANCE, cache=False)
+        matrix, error = propagator.transfer_matrix(return_error=True)
+        return matrix, propagator.spacing, error
+
+    (matrix, spacing, error), seconds = timed(work)
+    return matrix, spacing, seconds, peak_memory(), error
+
+
+def on_a_grid(case: tuple[str, float, float]) -> torch.Tensor:
+    """Return the matrix of a body with cells of a size [m]."""
+    kind, side, spacing = case
+    return at.make_propagator(_scene(_body(kind, side)), "box", spacing, cache=False).transfer_matrix()
+
+
+def _body(kind: str, side: float) -> Sequence[at.Obstacle]:
+    thickness = THICKNESS if kind == "plate" else side
+    center = (0.0, 0.0, 0.15 + (0.0 if kind == "plate" else side / 2))
+    return [at.Box(center, (side, side, thickness), rigid=True, rotation=TILT)]
+
+
+def _scene(bodies: Sequence[at.Obstacle], radius: float | None = TRANSDUCER_RADIUS) -> at.Scene:
+    array = at.TransducerArray.sonicsurface((0.0, 0.0, 0.0), UP, radius=radius)
+    height = 0.3 if not bodies else bodies[0].center[2] + bodies[0].size[2] / 2 + 0.1
+    foci = at.circle_points((0.0, 0.0, height), 20e-3, 4, UP, angle=0.3)
+    return at.Scene(array, AIR, FREQUENCY, foci, bodies)
