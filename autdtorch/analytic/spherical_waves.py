@@ -151,6 +151,16 @@ class _Outgoing(torch.autograd.Function):
         parts = zip(tangent.unbind(dim=1), slopes, strict=True)
         return torch.stack([(part[:, None] * slope).mT for part, slope in parts]).sum(dim=0)
 
+    @staticmethod
+    def vmap(
+        _: Any, dims: tuple[int | None, ...], offsets: torch.Tensor, *settings: Any
+    ) -> tuple[torch.Tensor, int | None]:
+        if dims[0] is None:
+            return _Outgoing.apply(offsets, *settings), None  # type: ignore[no-untyped-call]
+        batch = offsets.movedim(dims[0], 0)
+        waves = _Outgoing.apply(batch.reshape(-1, 3), *settings)  # type: ignore[no-untyped-call]
+        return waves.reshape(len(waves), *batch.shape[:2]), 1
+
 
 def _outgoing(degree: int, wavenumber: complex, offsets: AnyArray, conjugate: bool) -> ComplexArray:
     """Return the waves (N, P) at offsets (P, 3); the recurrences are those of `harmonics`."""

@@ -213,7 +213,10 @@ def drawn_discs(radii, seed):
     seed=st.integers(0, 1000),
 )
 def test_compiled_sums_of_discs_are_those_of_their_waves(wavenumber, radii, seed):
-    """The rule along the rim is one, and the series end at most 1e-8 apart; single precision adds 1e-6."""
+    """The rule along the rim is one, and the series end at most 1e-8 apart.
+
+    Single precision adds its rounding, of 1e-7, for each of about k a waves of the size of their sum.
+    """
     discs, points = drawn_discs(radii, seed)
     exact = waves_of(points, discs, complex(wavenumber))
     amplitude = torch.eye(len(radii), dtype=torch.complex128)
@@ -221,7 +224,7 @@ def test_compiled_sums_of_discs_are_those_of_their_waves(wavenumber, radii, seed
     errors = (superposition(points, discs, amplitude, wavenumber) - exact).abs() / largest
     assert errors.max() < 2e-8
     single = superposition(points, discs, amplitude, wavenumber, dtype=torch.float32)
-    assert ((single - exact).abs() / largest).max() < 2e-5
+    assert ((single - exact).abs() / largest).max() < 2e-6 * (10 + abs(wavenumber) * max(radii))
     one = torch.ones((1, 1), dtype=torch.complex128)
     received = torch.cat([superposition(discs, point[None], one, wavenumber) for point in points], dim=1)
     assert ((received.mT - exact).abs() / largest).max() < 2e-8  # reciprocity
