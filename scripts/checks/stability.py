@@ -113,7 +113,10 @@ def run_trial(trial: Trial) -> Outcome:
         return Outcome(trial, infinite, infinite, False, math.inf, f"assembling: {error!r}")
     period = float(assembly.steps_per_period)
     driven = math.ceil(FEWEST_PERIODS * period)
-    steps = {"driven": max(trial.steps, driven), "free": max(trial.steps, assembly.steps_per_period.numerator)}
+    steps = {
+        "driven": max(trial.steps, driven),
+        "free": max(trial.steps, assembly.steps_per_period.numerator),
+    }
     mass = np.ones(math.prod(assembly.grid.shape))
     mass[assembly.heterogeneous.index] = assembly.heterogeneous.mass
     strength = torch.full(
