@@ -99,7 +99,8 @@ def images_of(
         wavenumber: k + i alpha of the medium [rad/m].
         size: diameter of the scene [m].
         held: mirrors, never two that face each other, in which the places are with their images already. Of
-            each pair of images that differ by these, there is one.
+            each pair of images that differ by these, there is one. The inverse of each is among them, so that
+            echoes are reciprocal although a grid along tilted faces is not its own image.
     """
     images, rest = [SPACE_ITSELF], list(mirrors)
     while rest:
@@ -165,13 +166,13 @@ def _between(
     if decay < 1:
         trips = min(trips, math.log(_NEGLIGIBLE) / math.log(max(decay, _NEGLIGIBLE)))
     count = min(max(math.ceil(trips), _FEWEST), _MOST)
-    images = [SPACE_ITSELF]
+    images, whole_trips = [SPACE_ITSELF], first in held or second in held
     for mirrors in ((first, second), (second, first)):
-        if mirrors[0] in held:  # these are images of what the held mirror has made
-            continue
         image = SPACE_ITSELF
         for number in range(1, 2 * count):
             image = mirrors[(number - 1) % 2].image.after(image)
+            if whole_trips and number % 2:  # the held mirror makes this one of a translation
+                continue
             fading = _fading(number / (2 * count)) if image.weight else 0.0
             if fading:
                 images.append(image._replace(weight=fading * image.weight))
