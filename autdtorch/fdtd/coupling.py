@@ -75,6 +75,8 @@ def coupling_of(target: ScatteredField, source: ScatteredField, images: Sequence
     """
     points, surface, k = target.driven, source.surface[0], source.wavenumber
     wavelength = 2 * math.pi / abs(k)
+    if not len(points):  # obstacles of air
+        return Coupling(0, (), ())
     here, there = _balls(points.numpy(), wavelength), _balls(surface.numpy(), wavelength)
     pairs: list[Pair] = []
     rest: list[Image] = []

@@ -159,6 +159,17 @@ class BoxSimulation(Simulation):
             self._couplings[key] = coupling_of(target, source, images)
         return self._couplings[key]
 
+    def images_towards(self, target: ScatteredField, source: ScatteredField) -> Sequence[Image]:
+        """Return the images of a box that drive another: as for receivers, both sides of mirrors count alike.
+
+        A mirror that both hold is left out: the other drives its own image. See `seen_twice`.
+        """
+        images = source.images
+        for mirror in self._mirrors(sorted(set(source.mirrors) - set(target.mirrors))):
+            half = [image._replace(weight=image.weight / 2) for image in images]
+            images = (*half, *(image.after(mirror.image) for image in half))
+        return images
+
     @cached_property
     def _couplings(self) -> dict[tuple[ScatteredField, ScatteredField], Coupling]:
         return {}
@@ -441,7 +452,8 @@ class _Scatterer:
         box, here = other.transform.box, self.transform.box
         if other is self and not self.comes_back_later:
             return None
-        coupling = self.simulation.coupling(here, box, box.echoes if other is self else box.images)
+        images = box.echoes if other is self else self.simulation.images_towards(here, box)
+        coupling = self.simulation.coupling(here, box, images)
         if not coupling.pairs:
             return box.radiated(outgoing, here.driven, coupling.rest)
         field = coupling.field(outgoing)

@@ -115,7 +115,7 @@ def iterated(
     seconds of each run, and whether the iteration has converged.
     """
     begin, runs, incoming = time.perf_counter(), incident[0].shape[1], list(incident)
-    largest = torch.stack([waves.norm(dim=0) for waves in incident]).amax(dim=0)
+    largest = torch.stack([waves.norm(dim=0) for waves in incident]).amax(dim=0).clamp_min(_TINY)
     periods, reached, unsettled = np.zeros(runs, np.int64), np.ones(runs, bool), torch.zeros(runs, **REAL)
     orders: list[torch.Tensor] = []
     settled = False

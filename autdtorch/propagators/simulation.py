@@ -33,7 +33,7 @@ from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.images import Mirror, images_of
+from autdtorch.utils.images import SPACE_ITSELF, Mirror
 from autdtorch.utils.process import cached_property
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.text import counted
@@ -209,7 +209,9 @@ class Simulation(ABC):
 
         A grid that follows tilted bodies is not its own image. The mean of both fields is reciprocal.
         """
-        images = images_of(self.held_mirrors, self.plan.scene.complex_wavenumber, 0.0)
+        images = [SPACE_ITSELF]
+        for mirror in self.held_mirrors:  # of two that face each other, this leaves out their series
+            images += [mirror.image.after(image) for image in images]
         if len(images) == 1:
             return receivers, None
         everywhere, weights = receivers.with_images(images)
