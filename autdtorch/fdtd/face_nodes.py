@@ -70,11 +70,11 @@ class FaceNodes:
         )
         return cls(everywhere, tuple(faces), (lower, upper), _CLEAR * 2 * math.pi / wavenumber)
 
-    def reach(self, points: Array) -> NDArray[np.bool_]:
-        """Return which points (P, 3) [m], along the axes of the grid, are far enough."""
+    def reach(self, points: Array, radii: Array | float = 0.0) -> NDArray[np.bool_]:
+        """Return which points (P, 3) [m], or discs about them, are far enough, along the axes of the grid."""
         lower, upper = self.bounds
         apart = np.maximum(np.maximum(lower - points, points - upper), 0)
-        return np.asarray(np.linalg.norm(apart, axis=1) >= self.clearance)
+        return np.asarray(np.linalg.norm(apart, axis=1) >= self.clearance + radii)
 
     def amplitudes(self, amplitude: Tensor) -> Tensor:
         """Return the amplitudes (m, R) of the nodes from those (n, R) of the cells."""

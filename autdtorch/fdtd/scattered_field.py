@@ -128,7 +128,7 @@ class ScatteredField:
         By default with all images of it. To points at a distance, few nodes radiate instead of the cells.
         """
         images = self.images if images is None else images
-        far = self._far(points.centers if isinstance(points, Discs) else points, images)
+        far = self._far(points, images)
         field = torch.zeros((len(far), amplitude.shape[1]), **COMPLEX)
         if not far.all():
             field[~far] = self.waves(_chosen(points, ~far), self.surface[0], amplitude, images=images)
@@ -146,12 +146,13 @@ class ScatteredField:
         """Return the positions (m, 3) [m] of nodes."""
         return torch.from_numpy(nodes.positions @ self.axes)
 
-    def _far(self, points: Tensor, images: Sequence[Image]) -> Tensor:
-        """Return the mask of points (P, 3) that the surface's nodes and their images reach."""
+    def _far(self, points: Tensor | Discs, images: Sequence[Image]) -> Tensor:
+        """Return the mask of points (P, 3) or discs that the surface's nodes and their images reach."""
+        points, radii = (points.centers, points.radii.numpy()) if isinstance(points, Discs) else (points, 0.0)
         if self._nodes is None:
             return torch.zeros(len(points), dtype=torch.bool, device="cpu")
         seen = [self._on_axes((points - image.offset) @ image.matrix).numpy() for image in images]
-        return torch.from_numpy(np.all([self._nodes.reach(each) for each in seen], axis=0))
+        return torch.from_numpy(np.all([self._nodes.reach(each, radii) for each in seen], axis=0))
 
     @cached_property
     def _nodes(self) -> FaceNodes | None:

@@ -20,7 +20,7 @@ from autdtorch.propagators.free_space import PAIR_BYTES
 from autdtorch.propagators.scene_region import region_of, with_rigid
 from autdtorch.propagators.store import key_of
 from autdtorch.propagators.tmatrix.bodies import waves_to_simulate
-from autdtorch.scene.arrays import radii_of
+from autdtorch.scene.arrays import apertures_of, radii_of
 from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.process import cached_property, require_memory
@@ -144,9 +144,10 @@ class Plan:
         if self.method == "full":
             region = whole_region(region)
         in_boxes = self.method != "full"
+        nodes = 1 if in_boxes else len(apertures_of(array, self.scene.wavenumber).weights)
         return Costs(
             region, self.grouping, self.spacing, self.kernel, self.runs, self.dtype.itemsize, in_boxes,
-            receivers=max(points, len(array) if in_boxes else array.nodes.positions[..., 0].numel()),
+            receivers=max(points, nodes * len(array)),
             terms=max(points, 2 * len(array)),  # a disc takes twice the time of a point
             meshes=tuple(isinstance(shape, Mesh) for shape in region.shapes),
         )  # fmt: skip

@@ -22,8 +22,8 @@ _ERROR = 1e-8
 _REACH, _REACHES = 1.5, 20
 """Least distance of these waves, in radii, and the number of distances by factors of 2^(1/4)."""
 
-_POINT = 1e-4
-"""k a of discs that are points: their factor differs by (k a)^2 / 8."""
+_POINT = 1e-8
+"""k a of discs that are points, of less than 1e-10 of a wavelength."""
 
 RIM_DIGITS, RIM_TURNS, RIM_STRIP, RIM_LEAST = 20.0, 1.2, 2.164, 1e-5
 """Rule for the integral along a rim: -log of its error, growth of a wave in the complex plane with k a

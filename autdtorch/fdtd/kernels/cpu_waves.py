@@ -213,6 +213,7 @@ def superposition(
     parts = (amplitude.real, amplitude.imag)
     strength = np.stack([np.ascontiguousarray(part.numpy().astype(number).T) for part in parts])
     discs = isinstance(points, Discs), isinstance(sources, Discs)
+    assert not all(discs)
     disc = disc_numbers(points if discs[0] else sources, wavenumber, number)
     places, origins = _rows(points), _rows(sources)
     runs, count = strength.shape[1], len(places)
