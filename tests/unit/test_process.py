@@ -125,10 +125,10 @@ def test_too_much_memory_is_refused_with_both_figures(what: str) -> None:
 
 @pytest.mark.parametrize("propagator", [FREE, BOX], ids=["free space", "box"])
 def test_many_points_are_refused(propagator: Propagator, monkeypatch: pytest.MonkeyPatch) -> None:
-    points = at.circle_points((0.1, 0, 0), 0.02, 5000, (1, 0, 0))
+    points = at.circle_points((0.1, 0, 0), 0.02, 8000, (1, 0, 0))
     monkeypatch.setattr(process, "available_memory", lambda: 1_000_000)
     for call in (propagator.transfer_matrix, functools.partial(propagator.field, DRIVE.expand(3, 4))):
-        with pytest.raises(ValueError, match=r"^points: \(5000, 3\); needs about"):
+        with pytest.raises(ValueError, match=r"^points: \(8000, 3\); needs about"):
             call(points)
 
 
