@@ -145,13 +145,15 @@ def _calibrate(config: DictConfig) -> None:
 
 @contextlib.contextmanager
 def _importing() -> Iterator[None]:
-    """Look for no garbage meanwhile: imports leave none, and the search takes a tenth of their time."""
+    """Pause garbage collection: imports leave none, and it takes a tenth of their time."""
+    enabled = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
         gc.freeze()
-        gc.enable()
+        if enabled:
+            gc.enable()
 
 
 @contextlib.contextmanager

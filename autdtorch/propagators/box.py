@@ -385,8 +385,7 @@ class BoxSimulation(Simulation):
             return contextlib.nullcontext()
         from autdtorch.fdtd.kernels.cpu import CpuKernel  # loads numba
 
-        assembly = self.assemblies[0]
-        return CpuKernel().compiled_ahead(assembly.grid.shape, assembly.coefficients)
+        return CpuKernel().compiled_ahead(self.assemblies[0].coefficients)
 
     @cached_property
     def _in_one_box(self) -> BoxSimulation:

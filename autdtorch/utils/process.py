@@ -194,6 +194,7 @@ class _Outside:
         """Set one thread in a forked process, also for the time after `leave`."""
         # PyTorch's threads do not survive a fork, and a forked process would wait for them forever.
         self._threads, self._blas = 1, contextlib.ExitStack()
+        _count.set(1)
         torch.set_num_threads(1)
 
 

@@ -19,6 +19,7 @@ from small_scenes import CUBE, small_scene
 
 import autdtorch as at
 from autdtorch.fdtd.kernels import compiled, cpu, cpu_waves
+from autdtorch.utils.process import one_library_thread, spread
 
 
 def test_any_change_of_the_kernels_changes_the_digest(tmp_path):
@@ -107,17 +108,28 @@ needs_fork = pytest.mark.skipif(sys.platform != "linux", reason="compiles in one
 
 
 @needs_fork
-def test_another_process_compiles_what_is_needed_next(kernel, monkeypatch):
+def test_another_process_compiles_what_is_needed_next(kernel):
     made, _ = kernel
-    monkeypatch.setattr(compiled, "thread_count", lambda: 2)
     ahead = made("tripled")
-    with compiled.meanwhile(lambda: ahead(3)):
+    # a second thread there would wait for numba's lock, which the first holds
+    with threads(2), one_library_thread(), compiled.meanwhile(lambda: spread(ahead, (3, 3))):
         assert made()(3) == 6
     assert ahead(3) == 9
     assert hits(ahead) == 1
-    with compiled.meanwhile(lambda: ahead(3)):
+    with threads(2), compiled.meanwhile(lambda: ahead(3)):
         made()(3)  # loaded from disk
     assert not compiled._children
+
+
+@needs_fork
+def test_what_no_other_process_can_compile_is_compiled_here(kernel, monkeypatch):
+    made, _ = kernel
+    forks = mock.Mock(side_effect=BlockingIOError("Resource temporarily unavailable"))
+    monkeypatch.setattr(os, "fork", forks)
+    with threads(2), compiled.meanwhile(lambda: None):
+        assert made()(3) == 6
+    forks.assert_called_once()
+    assert not compiled._calls
 
 
 def test_kernels_are_compiled_ahead_for_the_types_of_a_simulation(monkeypatch):
@@ -158,7 +170,9 @@ def test_without_a_folder_to_write_to_kernels_run_and_say_so_once(kernel, monkey
     made, folder = kernel
     compiled._log_once.cache_clear()
     monkeypatch.setattr(compiled, "njit", refusing)
-    assert made()(3) == made()(3) == 6
+    monkeypatch.setattr(compiled, "_fork", None)  # is not called: another process could save nothing
+    with threads(2), compiled.meanwhile(lambda: None):
+        assert made()(3) == made()(3) == 6
     assert caplog.text.count("compiled in every process") == 1
     assert not os.path.exists(folder)
 

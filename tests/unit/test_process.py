@@ -79,9 +79,10 @@ def test_threads_that_leave_in_the_order_they_entered_leave_nothing_behind() -> 
 def test_a_child_has_one_thread_also_after_leaving_what_its_parent_had_entered() -> None:
     with process.one_library_thread():
         child = os.fork()
+        inside = process.thread_count()
     if child == 0:
         libraries = [each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"]
-        os._exit(max(torch.get_num_threads(), *libraries))
+        os._exit(max(inside, torch.get_num_threads(), *libraries))
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
     assert torch.get_num_threads() == 4
 

@@ -19,7 +19,7 @@ from typing import Any
 
 from numba import njit
 from numba.core import event
-from numba.core.caching import IndexDataCacheFile
+from numba.core.caching import IndexDataCacheFile, NullCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_lock import global_compiler_lock
@@ -32,10 +32,11 @@ logger = logging.getLogger(__name__)
 
 _HERE = Path(__file__).parent
 _entries: set[Any] = set()
-_calls: list[Callable[[], object]] = []  # see `meanwhile`
+# See `meanwhile`; of all threads, because a thread of `spread` may be the first to compile
+_calls: list[Callable[[], object]] = []
 _children: list[int] = []  # processes that compile
-_PATIENCE = 100.0  # [s] after which a process that compiles is taken to hang
-_POLL = 0.01  # [s] between looks at such a process
+_PATIENCE = 30.0  # [s] after which processes that compile are taken to hang
+_POLL = 0.01  # [s] between looks at them
 
 
 class _InnerLibrary(JITCodeLibrary):
@@ -100,7 +101,7 @@ INNER: Any = {
 class _Compilation(event.Listener):
     """Logs that a kernel is compiled, which takes seconds; loading one from disk takes none.
 
-    Meanwhile Python does not look for garbage, an eighth of the time.
+    Garbage collection is paused, an eighth of the time.
     """
 
     def __init__(self) -> None:
@@ -112,8 +113,9 @@ class _Compilation(event.Listener):
             logger.info("compiling %s (once per machine)", function.__name__)
             self._paused = gc.isenabled()
             gc.disable()
-            while _calls:
-                _fork(_calls.pop())
+            with contextlib.suppress(IndexError):  # no more
+                while not isinstance(function._cache, NullCache):  # others could save nothing
+                    _fork(_calls.pop())
 
     def on_end(self, event: Any) -> None:
         if self._paused and event.data["dispatcher"] in _entries:
@@ -136,13 +138,19 @@ def meanwhile(*calls: Callable[[], object]) -> Iterator[None]:
     try:
         yield
     finally:
-        _calls.clear()
+        for call in calls:
+            with contextlib.suppress(ValueError):  # made
+                _calls.remove(call)
+        _forget_ended()
 
 
 def _fork(call: Callable[[], object]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of other threads: see utils/process.py
-        child = os.fork()
+        try:
+            child = os.fork()
+        except OSError:  # too many processes, or too little memory: this one compiles
+            return
     if child:
         _children.append(child)
         return
@@ -157,13 +165,26 @@ def _fork(call: Callable[[], object]) -> None:
 
 def _wait_for_children() -> None:
     """Wait until no other process compiles for this one."""
+    end = time.monotonic() + _PATIENCE
+    _forget_ended()
     while _children:
-        child, end = _children.pop(), time.monotonic() + _PATIENCE
-        with contextlib.suppress(ChildProcessError):  # another thread has waited for it
-            while os.waitpid(child, os.WNOHANG) == (0, 0):
-                time.sleep(_POLL)
-                if time.monotonic() > end:
+        time.sleep(_POLL)
+        if time.monotonic() > end:
+            for child in tuple(_children):
+                with contextlib.suppress(ProcessLookupError):
                     os.kill(child, signal.SIGKILL)
+        _forget_ended()
+
+
+def _forget_ended() -> None:
+    for child in tuple(_children):
+        try:
+            ended = os.waitpid(child, os.WNOHANG) != (0, 0)
+        except ChildProcessError:  # another thread has waited for it
+            ended = True
+        if ended:
+            with contextlib.suppress(ValueError):  # another thread has removed it
+                _children.remove(child)
 
 
 class _CheckedFiles(IndexDataCacheFile):
