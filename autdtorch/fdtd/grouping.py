@@ -23,7 +23,7 @@ from autdtorch.fdtd.grid import (
     domain_extent,
 )
 from autdtorch.fdtd.reflection import can_hold, near_mirrors, whole_region, with_images
-from autdtorch.fdtd.region import Region, bounds
+from autdtorch.fdtd.region import Body, Region, bounds
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil
@@ -203,25 +203,44 @@ class _Outline:
     def around(
         cls, region: Region, group: Sequence[int], surfaces: Sequence[FlatFaces], spacing: float
     ) -> _Outline:
-        """Return the outline of the box of a group, turned along its faces."""
+        """Return the outline of the box of a group, turned along its faces.
+
+        It is not turned where its corners would reach a mirror whose image no grid can hold.
+        """
+        turned = cls._along(region, group, surfaces, spacing, is_turned=True)
+        if can_hold(region, turned.mirrors):
+            return turned
+        straight = cls._along(region, group, surfaces, spacing, is_turned=False)
+        return straight if can_hold(region, straight.mirrors) else turned
+
+    @classmethod
+    def _along(
+        cls,
+        region: Region,
+        group: Sequence[int],
+        surfaces: Sequence[FlatFaces],
+        spacing: float,
+        is_turned: bool,
+    ) -> _Outline:
+        bodies: Sequence[Body] = [region.bodies[index] for index in group]
         faces = [surfaces[index] for index in group]
-        axes = axes_along(faces)
-        shapes = [turned_shape(region.bodies[index].shape, axes) for index in group]
-        near = near_mirrors(region, *bounds(shapes), axes, spacing)
-        if near:
-            bodies = with_images(
-                [region.bodies[index] for index in group], [region.mirrors[number] for number in near]
-            )
-            faces = [flat_faces(body.shape) for body in bodies]
-            axes = axes_along(faces)
-            shapes = [turned_shape(body.shape, axes) for body in bodies]
+        reached: tuple[int, ...] = ()
+        near: tuple[int, ...] | None = None
+        while reached != near:  # the box with images in these mirrors may reach others
+            near, held = reached, bodies
+            if near:
+                held = with_images(bodies, [region.mirrors[number] for number in near])
+                faces = [flat_faces(body.shape) for body in held]
+            axes = axes_along(faces) if is_turned else np.eye(3)
+            shapes = [turned_shape(body.shape, axes) for body in held]
+            reached = near_mirrors(region, *bounds(shapes), axes, spacing)
         aligned = all(each.all_aligned(axes) for each in faces)
         extent = bodies_extent(shapes, region.wavelength)
         if turns := _turns_to_flat(extent.interior(spacing)):
             axes = np.roll(axes, turns, axis=0)
             roll = functools.partial(np.roll, shift=turns)
             extent = replace(extent, lower=roll(extent.lower), upper=roll(extent.upper))
-        return cls(tuple(group), axes, extent, aligned, near)
+        return cls(tuple(group), axes, extent, aligned, reached)
 
     @classmethod
     def of_domain(cls, region: Region, spacing: float) -> _Outline:
