@@ -1,8 +1,11 @@
 """The field of points and discs, differentiable: the mean over each of e^{ikR} / R.
 
-From 1.5 radii on it is a sum of even outgoing waves, nearer an integral along the rim (see `piston_field`),
-1 / (pi a) oint (a - o cos u) / (R + z) sinc(k (R - z) / 2) e^{ik (R + z) / 2} du, at the height z and the
-distance o from the axis. `fdtd.kernels.cpu_waves` computes the same by compiled code.
+From 1.5 radii on it is a sum of even outgoing waves. Nearer it is an integral along the rim, at the height z
+and the distance o from the axis (see `piston_field`):
+
+    1 / (pi a) oint (a - o cos u) / (R + z) sinc(k (R - z) / 2) e^{ik (R + z) / 2} du.
+
+`fdtd.kernels.cpu_waves` has the compiled form.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 _AT_ONCE = 1 << 18
-"""Pairs of a place and a node on a rim that are in memory at once, but for gradients."""
+"""Pairs of a place and a node on a rim in memory at a time; gradients need all."""
 
 _SMALL = 1e-3
 """Argument up to which a sine is the first two terms of its series: the next one is below 1e-14."""

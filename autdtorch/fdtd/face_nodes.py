@@ -92,7 +92,7 @@ class FaceNodes:
 def _nodes(cells: Index, phase: float) -> tuple[Array, Array]:
     """Return nodes (a,) along cells (A,), in cells, and the values (a, A) of their polynomials at the cells.
 
-    `phase` is that of a wave over a cell.
+    A wave advances by `phase` [rad] over a cell.
     """
     half = (len(cells) - 1) / 2
     count = math.ceil(_PER_PHASE * phase * half) + _MORE

@@ -1,12 +1,12 @@
 """Transfer matrices of obstacles that move a little as one body, by runs on coarser grids alone.
 
 Seen from the obstacles, the array and the points move, and the grids stay. So errors of a grid change little
-from pose to pose. With the matrices G of the pose at the start, C and D on two coarser grids, and those of
-another pose (primed),
+from pose to pose. G is the matrix of the pose at the start, C and D are its matrices on two coarser grids, and
+primes mark another pose:
 
-    G' = C' + a (C' - D') + (G - C - a (C - D)),
+    G' = C' + a (C' - D') + (G - C - a (C - D)).
 
-where a fits G - C by C - D. The last term is what extrapolation leaves at the start. It stays right as long
+The factor a fits G - C by C - D. The last term is what extrapolation leaves at the start. It stays right as long
 as C - D does, whose change tells the error.
 """
 

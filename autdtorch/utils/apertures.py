@@ -26,8 +26,9 @@ _POINT = 1e-8
 """k a of discs that are points, of less than 1e-10 of a wavelength."""
 
 RIM_DIGITS, RIM_TURNS, RIM_STRIP, RIM_LEAST = 20.0, 1.2, 2.164, 1e-5
-"""Rule for the integral along a rim: -log of its error, growth of a wave in the complex plane with k a
-[rad], coth(1 / 2), and the least ratio of the distances to the nearest and the farthest point of the rim."""
+"""Rule for the integral along a rim. The first number is -log of its error, the second the growth of a wave
+in the complex plane with k a [rad], the third coth(1 / 2). The last one is the least ratio of the distances
+to the nearest and the farthest point of the rim."""
 
 _LEAST = 1e-290
 """Least scale of a wave of a high degree; smaller ones of the smallest discs count as 0."""

@@ -28,8 +28,8 @@ _NEGLIGIBLE = 1e-6
 """Weight of an image, relative to the first, that ends the series of two planes that absorb."""
 
 _REACH = 1.5
-"""Distance up to which the images of two parallel planes have their full weights, relative to that of those
-that send the steepest wave guided between the planes across the scene."""
+"""Distance up to which the images of two parallel planes have their full weights. The unit is the distance of
+the images that send the steepest guided wave across the scene."""
 
 _PLATEAU = 0.3
 """Share of the images of two parallel planes before the tail begins to fade out."""

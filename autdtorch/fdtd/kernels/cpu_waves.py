@@ -1,9 +1,9 @@
 """The fields of many sources in free space: sum_s amplitude_s e^{i k r} / r for several fields.
 
 Waves between one place and a block of others are vectorised. The others are the points or the sources,
-whichever are more. Discs are always the places. Their waves are those of points with a factor, a sum of even
-waves, but for the others next to them, one by one. Distances and whole turns of the phase are in double
-precision, the rest in the precision of the amplitudes. The order of all sums is fixed.
+whichever are more. Discs are always the places. Their waves are waves of points times a sum of even waves;
+next to a disc an integral along its rim is computed for each of the others. Distances and whole turns of the
+phase are in double precision, the rest in the precision of the amplitudes. The order of all sums is fixed.
 """
 
 from __future__ import annotations
@@ -240,7 +240,7 @@ def wave_matrix(
 ) -> Tensor:
     """Return waves (P, columns) complex128 [Pa] at points (P, 3) [m] of N sources, amplitudes (N,) [Pa m].
 
-    Sources of one number, but for multiples of `columns`, add up; see `superposition`.
+    Source s adds to column s modulo `columns`; see `superposition`.
     """
     blocks = _filled(points.numpy().T, "edge")
     matrix = np.zeros((columns, blocks.shape[1] // LANES, LANES), np.complex128)
