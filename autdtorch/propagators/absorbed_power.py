@@ -94,7 +94,7 @@ def _power_behind(
 def _far_waves(
     directions: torch.Tensor, places: torch.Tensor | Discs, middle: torch.Tensor, wavenumber: float
 ) -> torch.Tensor:
-    """Return the far field (n, N) in directions (n, 3) of points or discs, relative to a wave from the middle."""
+    """Return the far field (n, N) of points or discs in directions (n, 3); at the middle the phase is 0."""
     centers = places.centers if isinstance(places, Discs) else places
     waves = torch.polar(torch.ones((), **REAL), -wavenumber * directions @ (centers - middle).mT)
     if not isinstance(places, Discs):

@@ -1,13 +1,13 @@
 """Transfer matrices of obstacles that move a little as one body, by runs on coarser grids alone.
 
 Seen from the obstacles, the array and the points move, and the grids stay. So errors of a grid change little
-from pose to pose. G is the matrix of the pose at the start, C and D are its matrices on two coarser grids, and
-primes mark another pose:
+from pose to pose. G is the matrix of the pose at the start, C and D are its matrices on two coarser grids.
+Primes mark another pose:
 
     G' = C' + a (C' - D') + (G - C - a (C - D)).
 
-The factor a fits G - C by C - D. The last term is what extrapolation leaves at the start. It stays right as long
-as C - D does, whose change tells the error.
+The factor a fits G - C by C - D. The last term is what extrapolation leaves at the start. It stays right as
+long as C - D does, whose change tells the error.
 """
 
 from __future__ import annotations
