@@ -23,7 +23,7 @@ from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.process import cached_property, one_library_thread
 from autdtorch.utils.units import angles
-from autdtorch.utils.validation import ArrayLike, boolean, finite_vector, invalid, require_kind
+from autdtorch.utils.validation import ArrayLike, boolean, finite_vector, invalid, require_kind, within
 
 _COARSER, _COARSEST = 1.6, 2.5
 """Cells of the coarser grids, relative to the propagator's. For a hand at 1 mm, moved by 1 mm and 2 degrees,
@@ -106,7 +106,7 @@ class NearbyPoses:
             offset: (3,) [m], from the propagator's scene, as in `Scene.moved`.
             rotation: angles (3,) [rad] about the fixed axes x, y, z, in this order.
             return_error: also return the estimated relative error (L2 of the whole matrix), against a
-                simulation of the pose at the propagator's spacing.
+                simulation at the propagator's spacing on a grid that turns with the obstacles.
             rotation_degrees: these angles (3,) in degrees, in place of `rotation`.
 
         Raises:
@@ -115,7 +115,9 @@ class NearbyPoses:
         with_error = boolean("return_error", return_error)
         shift, turn = finite_vector("offset", offset), angles("rotation", rotation, rotation_degrees)
         start = self.propagator.scene
-        moved = start.moved(shift, turn)
+        place, angle = (", ".join(f"{entry:.4g}" for entry in entries) for entries in (shift, turn))
+        with within(f"offset ({place}) m, rotation ({angle}) rad"):
+            moved = start.moved(shift, turn)
         scene, _ = seen_from_obstacles(moved, start.obstacles, torch.tensor(shift, **REAL), turn)
         coarse, difference = self._coarse(scene)
         before, change, factor = self._start

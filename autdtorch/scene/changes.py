@@ -170,6 +170,7 @@ def seen_from_obstacles(
 ) -> tuple[Scene, Image]:
     """Return a scene, whose obstacles have moved as one body, seen from these; see `changed_and_seen`.
 
+    The domain grows with all that leaves it: in boxes, obstacles end where they do.
     `obstacles` are those before, offset (3,) [m] and rotation [rad] as in `Scene.moved`.
     """
     (center, _), turn = circumscribed(obstacles), rotation_matrix(rotation)
@@ -189,7 +190,7 @@ def seen_from_obstacles(
             control_points=points,
             obstacles=obstacles,
             reflectors=tuple(planes),
-            domain=_domain_with(scene, array, points),
+            domain=_grown(torch.tensor(scene.domain, **REAL), array, points),
             observation_plane=None,
         )
     return seen, view
@@ -273,6 +274,11 @@ def _domain_with(scene: Scene, array: TransducerArray, points: torch.Tensor) -> 
     for one in scene.obstacles:
         if (lower.new_tensor(one.lower) <= lower).any() or (upper.new_tensor(one.upper) >= upper).any():
             return scene.domain
+    return _grown(domain, array, points)
+
+
+def _grown(domain: torch.Tensor, array: TransducerArray, points: torch.Tensor) -> tuple[Vector, Vector]:
+    """Return a domain (2, 3) [m] grown to hold an array and points."""
     reach = array.half_extents
     everything = torch.cat([domain, points, array.positions - reach, array.positions + reach])
     return finite_vector("domain", everything.amin(dim=0)), finite_vector("domain", everything.amax(dim=0))

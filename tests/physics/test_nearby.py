@@ -9,7 +9,7 @@ from small_scenes import relative_error, small_scene
 from autdtorch.propagators import make_propagator
 from autdtorch.propagators.nearby import NearbyPoses
 from autdtorch.scene.changes import seen_from_obstacles
-from autdtorch.scene.obstacles import Cylinder, Sphere
+from autdtorch.scene.obstacles import Box, Cylinder, Sphere
 from autdtorch.scene.reflectors import Reflector
 
 BALL = Sphere((12e-3, 14e-3, 14e-3), 2.5e-3, rigid=True)
@@ -46,6 +46,18 @@ def test_poses_are_those_simulated_afresh_to_the_error_told():
     assert error < 0.3 * relative_error(coarse, fresh)
     assert told / 3 < error < 3 * told
     assert torch.equal(NearbyPoses(propagator).transfer_matrix(SHIFT, TURN), matrix)
+
+
+def test_poses_at_the_edge_of_the_domain_are_those_of_any_domain():
+    block = Box((12e-3, 12e-3, 16e-3), (4e-3, 5e-3, 6e-3), rigid=True)
+    domains = ((0, 0, 0), (24e-3, 20e-3, 19e-3)), ((-9e-3,) * 3, (40e-3,) * 3)
+    scenes = (replace(SCENE, obstacles=(block,), domain=domain) for domain in domains)
+    tight, wide = (NearbyPoses(make_propagator(each, "box", 1e-3, 0.02, cache=False)) for each in scenes)
+    pose = (0, 0, -4e-3), TURN
+    assert torch.equal(tight.transfer_matrix(*pose), wide.transfer_matrix(*pose))
+    message = r"offset \(0.01, -0.0045, 0\) m, rotation \(0, 0, 0.03\) rad: Scene.control_points.*obstacle 0"
+    with pytest.raises(ValueError, match=message):
+        tight.transfer_matrix((10e-3, -4.5e-3, 0), (0, 0, 0.03))
 
 
 def test_propagators_without_coarser_grids_are_refused():

@@ -125,6 +125,18 @@ def test_grids_turn_with_obstacles_that_turn_as_one_body():
 SIMULATED = replace(DISCS, obstacles=(TILTED,))
 
 
+def test_obstacles_at_the_edge_of_the_domain_turn():
+    cube = Box((14e-3, 12e-3, 20e-3), (4e-3, 6e-3, 8e-3), rigid=True)
+    tight, wide = (
+        replace(DISCS, obstacles=(cube,), domain=((-beyond, -beyond, -beyond), (24e-3 + beyond,) * 3))
+        for beyond in (0.0, 9e-3)
+    )
+    one, other = (changes_of(each, "obstacles.turn_x", method="box").matrix([0.6]) for each in (tight, wide))
+    assert torch.equal(one, other)  # boxes hold obstacles as they are, whatever the domain
+    plain = (make_propagator(each, "box", **COARSE).transfer_matrix() for each in (tight, wide))
+    assert torch.equal(*plain)
+
+
 def test_derivatives_on_grids_are_those_of_t_matrices():
     names, levers = ["obstacles.x", "obstacles[0].turn_z"], [1.0, 3.5e-3]
     changes = [changes_of(SIMULATED, *names, method=method) for method in ("box", "tmatrix")]

@@ -265,6 +265,15 @@ def test_bad_input_is_named(cube):
         cube.moved((-28e-3, 0, 0)).transfer_matrix(ARRAY, POINTS)
     with pytest.raises(ValueError, match=r"offset: shape \(2,\)"):
         cube.moved((0.0, 0.0))
+    with pytest.raises(ValueError, match=r"offset: shape \(0, 3\); must be \(3,\), or \(..., 3\)"):
+        cube.moved(torch.zeros(0, 3))
+    poses = cube.moved(torch.zeros(5, 3))
+    with pytest.raises(ValueError, match=r"points: shape \(3, 4, 3\) beside poses \(5,\); leading"):
+        poses.transfer_matrix(ARRAY, torch.zeros(3, 4, 3))
+    with pytest.raises(ValueError, match=r"offset: shape \(3, 3\) beside a .* and poses \(5,\)"):
+        poses.moved(torch.zeros(3, 3))
+    with pytest.raises(ValueError, match=r"bodies\[1\].center: shape \(3, 3\) beside \(5, 3\)"):
+        at.TMatrixCluster([poses, cube.moved(torch.zeros(3, 3))])
     with pytest.raises(ValueError, match="obstacles"):
         at.TMatrix.of([], AIR, FREQUENCY)
     with pytest.raises(ValueError, match=r"error: 0; must be in 1e-08 to 0\.1"):

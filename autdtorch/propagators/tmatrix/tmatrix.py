@@ -153,16 +153,13 @@ class TMatrix:
         Gradients of all pass. Transfer matrices of many poses have their leading dimensions.
         """
         shift, angles = real_tensor("offset", offset, "m"), turn_tensor(rotation, rotation_degrees)
-        if shift.ndim == 0 or shift.shape[-1] != 3:
+        if shift.ndim == 0 or shift.shape[-1] != 3 or not shift.numel():
             raise ValueError(f"offset: shape {tuple(shift.shape)}; must be (3,), or (..., 3) for many poses")
+        before = np.broadcast_shapes(self.center.shape[:-1], self.axes.shape[:-2])
+        beside = f" beside a rotation of {tuple(angles.shape)}" + (f" and poses {before}" if before else "")
+        poses = _broadcast("offset", shift, beside, shift.shape[:-1], angles.shape[:-1], before)
         axes = composed_rotation(angles.cos(), angles.sin()) @ self.axes
-        center = self.center + shift
-        try:
-            poses = np.broadcast_shapes(center.shape[:-1], axes.shape[:-2])
-        except ValueError:
-            shapes = f"{tuple(shift.shape)} beside a rotation of {tuple(angles.shape)}"
-            raise ValueError(f"offset: shape {shapes}; leading dimensions must broadcast") from None
-        return replace(self, center=center, axes=axes)._in_poses(poses)
+        return replace(self, center=self.center + shift, axes=axes)._in_poses(poses)
 
     def _in_poses(self, poses: Sequence[int]) -> TMatrix:
         """Return the body with poses of these leading dimensions."""
@@ -210,6 +207,15 @@ class TMatrix:
             return cls(matrix, complex(arrays["wavenumber"]), radius, center, axes)
 
 
+def _broadcast(name: str, value: torch.Tensor, beside: str, *shapes: Sequence[int]) -> tuple[int, ...]:
+    """Return what leading dimensions broadcast to; the message names a value and what is beside it."""
+    try:
+        return np.broadcast_shapes(*map(tuple, shapes))
+    except ValueError:
+        shape = f"{tuple(value.shape)}{beside}"
+        raise ValueError(f"{name}: shape {shape}; leading dimensions must broadcast") from None
+
+
 def _varies(body: TMatrix) -> bool:
     """Return whether gradients by a body are asked for."""
     return any(part.requires_grad for part in (body.matrix, body.center, body.axes))
@@ -244,6 +250,9 @@ class TMatrixCluster:
             if abs(body.wavenumber - bodies[0].wavenumber) > 1e-9 * abs(bodies[0].wavenumber):
                 raise invalid(f"bodies[{number}].wavenumber", body.wavenumber, "must be that of the first")
             for other in bodies[:number]:
+                others = f" beside {tuple(other.center.shape)}"
+                poses = body.center.shape[:-1], other.center.shape[:-1]
+                _broadcast(f"bodies[{number}].center", body.center, others, *poses)
                 least = body.radius + other.radius
                 apart = float((body.center - other.center).detach().norm(dim=-1).min())
                 if apart < least - LENGTH_TOLERANCE:
@@ -320,7 +329,8 @@ class TMatrixCluster:
         """
         require_kind("array", array, TransducerArray)
         places, grid = points_grid("points", points)
-        targets = places.cpu()
+        targets, of_points = places.cpu(), places.reshape(*grid, 3)
+        every = _broadcast("points", of_points, f" beside poses {self.poses}", self.poses, grid[:-1])
         for name, places in (("points", targets.detach()), ("array.positions", array.positions)):
             require_in_front(self.reflectors, name, places.reshape(-1, 3))
         everything = torch.cat(
@@ -334,7 +344,6 @@ class TMatrixCluster:
         if not self.poses:
             scattered = scattered_field(self.bodies, array, targets, images, together)
             return direct + scattered.reshape(direct.shape)
-        every = np.broadcast_shapes(self.poses, grid[:-1])
         sets = targets.reshape(*grid, 3).expand(*every, -1, -1).reshape(-1, grid[-1], 3)
         bodies = [body._in_poses(every) for body in self.bodies]
         waves = sum(len(body.matrix) for body in bodies)
