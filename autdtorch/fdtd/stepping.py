@@ -34,6 +34,10 @@ from autdtorch.utils.validation import invalid
 
 logger = logging.getLogger(__name__)
 
+_MOST_SINGLE = 1000
+"""Steps in a period up to which single precision serves. Rounding of the coefficients (1e-7) makes slow waves
+grow by up to its square root in a step; from 3000 steps on that is more than they lose by leaving."""
+
 # Periods over which the drive is switched on. A short ramp excites the shortest waves of the grid, whose
 # group velocity is almost zero: at 2 mm, 3 periods left changes of 1e-3 per period after 60 periods. Free
 # space at 1 mm has errors of 0.056, 0.120, 0.074 and 0.050 % with 5 to 8 periods.
@@ -152,6 +156,9 @@ def assembly_of(
     fewest = fewest_stable_steps(cells, stencil, grid.shape)
     steps_per_period = whole_steps(_wanted_steps(fewest, time_step, frequency))
     steps = float(steps_per_period)
+    if dtype == torch.float32 and steps > _MOST_SINGLE:
+        logger.info("%d steps in a period: in double precision, as rounding would grow in single", steps)
+        dtype = torch.float64
     losses = cells.losses
     cells, loss, ground = at_time_step(cells, stencil, steps)
     damping = stencil.damping(steps)
