@@ -6,9 +6,7 @@ import math
 
 import numpy as np
 import torch
-from scipy.special import j1
 
-from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.spatial import distances
 from autdtorch.utils.units import real_wavenumber
 from autdtorch.utils.validation import (
@@ -118,11 +116,14 @@ def piston_directivity(angle: ArrayLike, wavenumber: float, radius: float) -> to
     """
     angles = real_tensor("angle", angle, "rad").detach()
     reach = real_wavenumber(wavenumber) * positive("radius", radius, "m")
-    argument = reach * np.sin(angles.cpu().numpy())
-    small = np.abs(argument) < _SMALL
-    safe = np.where(small, 1, argument)
-    ratio = np.where(small, 1, 2 * j1(safe) / safe)
-    return torch.as_tensor(ratio, **COMPLEX).to(angles.device)
+    return directivity(reach * torch.sin(angles)).to(torch.complex128)
+
+
+def directivity(argument: torch.Tensor) -> torch.Tensor:
+    """Return 2 J_1(v) / v of arguments v, float64; it is 1 at 0."""
+    safe = torch.where(argument.abs() < _SMALL, _SMALL, argument)
+    ratio: torch.Tensor = 2 * torch.special.bessel_j1(safe) / safe
+    return ratio
 
 
 def piston_on_axis(distance: ArrayLike, wavenumber: float, radius: float) -> torch.Tensor:

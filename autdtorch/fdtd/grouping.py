@@ -27,7 +27,7 @@ from autdtorch.fdtd.region import Body, Region, bounds
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil
-from autdtorch.fdtd.turning import FlatFaces, axes_along, flat_faces, turned_shape
+from autdtorch.fdtd.turning import FlatFaces, axes_along, flat_faces, is_tilted, turned_shape
 from autdtorch.utils.array_types import Array
 
 logger = logging.getLogger(__name__)
@@ -142,7 +142,7 @@ def choose_grids(
     gain = runs * domain.grids[0].work / boxes.box_cost(runs)
     first, last = region.domain
     outside = any((np.less(one.lower, first) | np.greater(one.upper, last)).any() for one in region.shapes)
-    tilted = any((np.abs(axes).max(axis=1) < 1).any() for axes in boxes.axes)
+    tilted = any(map(is_tilted, boxes.axes))
     method, grouping = ("full", domain) if walls or not (outside or tilted or gain > 1) else ("box", boxes)
     logger.debug(
         "method auto: %s; full would take %.2g times as long as box (walls through the boundary layer: %s,"
@@ -207,10 +207,10 @@ class _Outline:
 
         It is not turned where its corners would reach a mirror whose image no grid can hold.
         """
-        turned = cls._along(region, group, surfaces, spacing, is_turned=True)
+        turned = cls._along(region, group, surfaces, spacing, along_faces=True)
         if can_hold(region, turned.mirrors):
             return turned
-        straight = cls._along(region, group, surfaces, spacing, is_turned=False)
+        straight = cls._along(region, group, surfaces, spacing, along_faces=False)
         return straight if can_hold(region, straight.mirrors) else turned
 
     @classmethod
@@ -220,7 +220,7 @@ class _Outline:
         group: Sequence[int],
         surfaces: Sequence[FlatFaces],
         spacing: float,
-        is_turned: bool,
+        along_faces: bool,
     ) -> _Outline:
         bodies: Sequence[Body] = [region.bodies[index] for index in group]
         faces = [surfaces[index] for index in group]
@@ -231,7 +231,7 @@ class _Outline:
             if near:
                 held = with_images(bodies, [region.mirrors[number] for number in near])
                 faces = [flat_faces(body.shape) for body in held]
-            axes = axes_along(faces) if is_turned else np.eye(3)
+            axes = axes_along(faces) if along_faces else np.eye(3)
             shapes = [turned_shape(body.shape, axes) for body in held]
             reached = near_mirrors(region, *bounds(shapes), axes, spacing)
         aligned = all(each.all_aligned(axes) for each in faces)

@@ -163,8 +163,7 @@ def _on(index: Index, cells: HeterogeneousCells, stencil: Stencil) -> tuple[Arra
 
 def domain_cells(region: Region, grid: Grid) -> tuple[slice, ...]:
     """Return the cells of the domain along each axis, the shape of maps."""
-    margin = domain_extent(region, grid.spacing).margin
-    return tuple(slice(a + margin, b - margin) for a, b in zip(grid.first, grid.last, strict=True))
+    return grid.deeper(domain_extent(region, grid.spacing).margin)
 
 
 def cells_of_maps(

@@ -205,7 +205,7 @@ def _idle(grid: Grid, cells: HeterogeneousCells) -> Index:
         return np.zeros((0, 2), np.int64)
     mask, behind = np.zeros((2, math.prod(grid.shape)), bool)
     mask[cells.rigid], mask[cells.shell] = True, False
-    inner = tuple(map(slice, grid.first, grid.last))
+    inner = grid.deeper(0)
     behind.reshape(grid.shape)[inner] = mask.reshape(grid.shape)[inner]
     runs = np.flatnonzero(np.diff(behind, prepend=False, append=False)).reshape(-1, 2)
     return runs[np.diff(runs, axis=1)[:, 0] >= _FEWEST_IDLE]

@@ -91,6 +91,11 @@ def is_turned(axes: Array) -> bool:
     return bool((axes != np.eye(3)).any())
 
 
+def is_tilted(axes: Array) -> bool:
+    """Return whether axes, one a row (3, 3), are not those of the scene in any order."""
+    return bool((np.abs(axes).max(axis=1) < 1).any())
+
+
 def turned_shape(shape: Shape, axes: Array) -> Shape:
     """Return a shape in the coordinates of other axes, one a row (3, 3)."""
     return Turned(shape, axes) if is_turned(axes) else shape

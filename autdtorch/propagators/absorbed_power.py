@@ -9,18 +9,16 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from autdtorch.analytic.green import directivity
 from autdtorch.scene.arrays import apertures_of, complex_strengths_of
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.apertures import Discs, image_of
+from autdtorch.utils.apertures import Discs, centers_of, image_of
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.images import Mirror, images_of
 from autdtorch.utils.validation import invalid
 
 _MORE = 20
 """Degrees of a far field beyond wavenumber times radius: those that are left out are below 1e-6."""
-
-_SMALL = 1e-8
-"""Argument v up to which the directivity 2 J_1(v) / v of a disc is 1."""
 
 _AT_ONCE = 4_000_000
 """Pairs of a direction and a source whose waves are in memory at once."""
@@ -78,7 +76,7 @@ def _power_behind(
         missing = [other for number, other in others.items() if number not in part.mirrors]
         for image in images_of(missing, scene.complex_wavenumber, 1.0):
             everything.append((image_of(part.places, image), image.weight * part.amplitude.to(**COMPLEX)))
-    centers = torch.cat([each.centers if isinstance(each, Discs) else each for each, _ in everything])
+    centers = torch.cat([centers_of(each) for each, _ in everything])
     middle = (centers.amax(dim=0) + centers.amin(dim=0)) / 2
     radii = [float(each.radii.max()) for each, _ in everything if isinstance(each, Discs)]
     reach = float((centers - middle).norm(dim=1).max()) + max(radii, default=0.0)
@@ -95,14 +93,12 @@ def _far_waves(
     directions: torch.Tensor, places: torch.Tensor | Discs, middle: torch.Tensor, wavenumber: float
 ) -> torch.Tensor:
     """Return the far field (n, N) of points or discs in directions (n, 3); at the middle the phase is 0."""
-    centers = places.centers if isinstance(places, Discs) else places
-    waves = torch.polar(torch.ones((), **REAL), -wavenumber * directions @ (centers - middle).mT)
+    turn = -wavenumber * directions @ (centers_of(places) - middle).mT
+    waves = torch.polar(torch.ones((), **REAL), turn)
     if not isinstance(places, Discs):
         return waves
     sine = (1 - (directions @ places.normals.mT) ** 2).clamp(min=0).sqrt()
-    argument = (wavenumber * places.radii * sine).clamp(min=_SMALL)
-    directivity: torch.Tensor = 2 * torch.special.bessel_j1(argument) / argument
-    return waves * directivity
+    return waves * directivity(wavenumber * places.radii * sine)
 
 
 def _half_sphere(degree: int, mirror: Mirror, count: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:

@@ -32,7 +32,7 @@ from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
 from autdtorch.fdtd.steady_state import MOST_JUDGED, SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_array, orbits_of_transducers
-from autdtorch.fdtd.turning import is_turned
+from autdtorch.fdtd.turning import is_tilted
 from autdtorch.propagators.absorbed_power import Radiators
 from autdtorch.propagators.assembled_box import assembled_box
 from autdtorch.propagators.multiple_scattering import Observe, iterated
@@ -137,7 +137,7 @@ class BoxSimulation(Simulation):
         boxes, grouping = [], plan.grouping
         for group, axes, near in zip(grouping.groups, grouping.axes, grouping.mirrors, strict=True):
             part = self._part(group, near)
-            if is_turned(axes):
+            if is_tilted(axes):
                 logger.debug("the grid around obstacles %s is turned along their faces", list(group))
             assembly = assembled_box(part, axes, plan.spacing, plan.dtype, plan.time_step)
             images = other_images(plan.region, near, plan.scene.images)

@@ -103,6 +103,11 @@ class Discs(NamedTuple):
         return tuple(radii.tolist()), kind.reshape(-1)
 
 
+def centers_of(places: torch.Tensor | Discs) -> torch.Tensor:
+    """Return points (N, 3) [m], or the centres of discs."""
+    return places.centers if isinstance(places, Discs) else places
+
+
 def image_of(places: torch.Tensor | Discs, image: Image) -> torch.Tensor | Discs:
     """Return the image of points (N, 3) or discs."""
     if not isinstance(places, Discs):

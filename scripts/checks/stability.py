@@ -153,7 +153,7 @@ class _Course:
 def _random_state(assembly: Assembly, sources: Sources, seed: int) -> WaveState:
     """Return random pressure at rest in the interior; none in rigid cells, where it would stay."""
     grid, state = assembly.grid, assembly.silence(sources)
-    inside = tuple(slice(low, high) for low, high in zip(grid.first, grid.last, strict=True))
+    inside = grid.deeper(0)
     state.now[inside] = torch.from_numpy(np.random.default_rng(seed).standard_normal(grid.interior)).to(
         assembly.dtype
     )

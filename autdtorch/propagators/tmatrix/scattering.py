@@ -83,11 +83,9 @@ def _weights(bodies: Sequence[TMatrix], waves: torch.Tensor, images: Sequence[Im
 
 def joined(bodies: Sequence[TMatrix], images: Sequence[Image]) -> torch.Tensor:
     """Return the map (N, N) from the regular waves on all bodies to the outgoing waves of all."""
-    maps, one = (
-        [body.matrix for body in bodies],
-        torch.eye(sum(len(body.matrix) for body in bodies), **COMPLEX),
-    )
-    return solved(maps, _between(bodies, images), torch.split(one, [len(matrix) for matrix in maps]))
+    maps = [body.matrix for body in bodies]
+    sizes = [len(matrix) for matrix in maps]
+    return solved(maps, _between(bodies, images), torch.split(torch.eye(sum(sizes), **COMPLEX), sizes))
 
 
 def waves_at(bodies: Sequence[TMatrix], points: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:
