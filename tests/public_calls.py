@@ -71,6 +71,19 @@ class Made(NamedTuple):
     make: Callable[[Path], Any]
 
 
+class Louder:
+    """A sensor of pulses, each louder than all before."""
+
+    def __init__(self):
+        self.pulses = 0
+
+    def read_pulse(self, on, off):
+        on()
+        off()
+        self.pulses += 1
+        return torch.full((3,), 10.0**self.pulses, dtype=torch.float64)
+
+
 class Silent(hardware.Port):
     """A port that nothing hangs on, and a sensor that always reads the same."""
 
@@ -329,6 +342,8 @@ OTHERS: dict[str, Any] = {
     "calibrate.propagator_or_matrix": MATRIX,
     "NearbyPoses.transfer_matrix.offset": (1e-4, 0.0, 0.0),
     "NearbyPoses.propagator": Made(lambda _: at.make_propagator(SCENE, "box", 1e-3, 0.5, max_periods=6)),
+    "check_picture.readings": 1,
+    "check_picture.sensor": Made(lambda _: Louder()),
     "check_transducers.readings": 1,
     "differentiable_field.density": [50.0],
     "differentiable_field.sound_speed": [340.0],

@@ -28,7 +28,7 @@ from autdtorch.cli.settings import (
     solver_of,
 )
 from autdtorch.hardware.sensors.by_hand import typed
-from autdtorch.hardware.sensors.sensor import SensorConfig, Setup
+from autdtorch.hardware.sensors.sensor import AnySensor, SensorConfig, Setup
 from autdtorch.io.drive_file import save_drive
 from autdtorch.io.goal_section import goal_section, load_goal, score_label
 from autdtorch.io.readings_file import load_readings
@@ -110,7 +110,7 @@ class Bench:
         port = BenchPort(bench, print) if self.is_dry else device.emulated_port(bench)
         return hardware.Link(device, port, self.transducers, settle, bench.bus.sleep)
 
-    def sensor(self) -> AbstractContextManager[hardware.Sensor]:
+    def sensor(self) -> AbstractContextManager[AnySensor]:
         """Return a context in which the sensor is open."""
         scene = self._scene
         return self._sensor.open(Setup(scene.control_points, scene.frequency, _ask, self._bench, self._seed))
@@ -328,13 +328,11 @@ class _Trial:
             at_the_end.callback(limited.off)
             if objective.evaluations:
                 logger.info("going on after %d evaluations", objective.evaluations)
-            progress.begin("checking the transducers, one by one")
             preflight = self._preflight(limited, sensor, readings, progress)
             progress.begin(f"running {name_of(self._method)} on {bench.device.name}")
             solution = solve(self._method, objective, [0], self._seed, self._goal, readings=self._readings)
             progress.begin("the drive of the method, once more")
-            limited.play(solution.drive[0])
-            again = torch.stack([limited.reading(sensor, points) for _ in range(readings)])
+            again = limited.measure(solution.drive[0], sensor, points, readings)
             limited.off()
             progress.begin("silence, outputs off, once more")
             with _silence_expected():
@@ -356,15 +354,20 @@ class _Trial:
             return str(error)
 
     def _preflight(
-        self, limited: hardware.LimitedLink, sensor: hardware.Sensor, readings: int, progress: Progress
+        self, limited: hardware.LimitedLink, sensor: AnySensor, readings: int, progress: Progress
     ) -> hardware.Preflight:
-        count = len(self._scene.array)
+        count, points = len(self._scene.array), len(self._scene.control_points)
+        if isinstance(sensor, hardware.PulsedSensor):
+            logger.info("the sensor sees no single transducer: no check of each, but of silence and a picture")
+            progress.begin("a first picture, of the simulated drive")
+            return hardware.check_picture(limited, sensor, points, self._expected.drive[0], readings)
+        progress.begin("checking the transducers, one by one")
         show = progress.begin if self._bench.by_hand else progress.describe
         with _silence_expected():
             check = hardware.check_transducers(
                 limited,
                 sensor,
-                len(self._scene.control_points),
+                points,
                 readings,
                 1 if self._bench.by_hand else 32,
                 watch=lambda what: show(f"pre-flight check: {what}"),

@@ -23,6 +23,7 @@ from .safety import LimitError as LimitError
 from .safety import Limits as Limits
 from .safety import Preflight as Preflight
 from .safety import Signalled as Signalled
+from .safety import check_picture as check_picture
 from .safety import check_transducers as check_transducers
 from .safety import ended_by_signals as ended_by_signals
 from .safety import hears_silence as hears_silence
@@ -39,6 +40,7 @@ from .sensors.scpi_scope import Oscilloscope as Oscilloscope
 from .sensors.scpi_scope import Waveform as Waveform
 from .sensors.scpi_scope import open_scope as open_scope
 from .sensors.sensor import EmulatedSensor as EmulatedSensor
+from .sensors.sensor import PulsedSensor as PulsedSensor
 from .sensors.sensor import Sensor as Sensor
 from .sensors.sensor import SensorError as SensorError
 from .transport.port import LinkError as LinkError

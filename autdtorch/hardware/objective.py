@@ -13,7 +13,7 @@ from autdtorch.hardware.devices.device import Device
 from autdtorch.hardware.link import AmplitudeScale, Wiring
 from autdtorch.hardware.log import Evaluation, EvaluationLog
 from autdtorch.hardware.safety import LimitedLink, LimitError
-from autdtorch.hardware.sensors.sensor import Sensor
+from autdtorch.hardware.sensors.sensor import AnySensor, require_sensor
 from autdtorch.objectives.objective import Objective, observe_drives, validate_matrix
 from autdtorch.objectives.perturbations import Perturbation
 from autdtorch.scene.scene import Scene
@@ -40,7 +40,7 @@ class HardwareObjective:
         self,
         scene: Scene,
         link: LimitedLink,
-        sensor: Sensor,
+        sensor: AnySensor,
         log: str | Path,
         settings: Mapping[str, Any] | None = None,
         watch: Callable[[Evaluation], None] | None = None,
@@ -66,7 +66,7 @@ class HardwareObjective:
             OSError: the log cannot be read or written.
         """
         require_kind("scene", scene, Scene)
-        require_kind("sensor", sensor, Sensor)
+        require_sensor(sensor)
         watch = (lambda _: None) if watch is None else watch
         require_callable("watch", watch)
         if not isinstance(link, LimitedLink):
@@ -141,8 +141,7 @@ class HardwareObjective:
         most = self._link.limits.evaluations
         if self.evaluations >= most:
             raise LimitError(f"{most} evaluations are made, the limit")
-        self._link.play(drive)
-        pressure = self._link.reading(self._sensor, len(self.scene.control_points))
+        pressure = self._link.measure(drive, self._sensor, len(self.scene.control_points))[0]
         evaluation = self.log.append(drive, pressure, self._link.seconds_on)
         self._watch(evaluation)
         return pressure

@@ -20,7 +20,15 @@ from types import FrameType
 import torch
 
 from autdtorch.hardware.link import AmplitudeScale, Link
-from autdtorch.hardware.sensors.sensor import Sensor, SensorError, checked_reading
+from autdtorch.hardware.sensors.sensor import (
+    AnySensor,
+    Pulse,
+    PulsedSensor,
+    Sensor,
+    SensorError,
+    checked_reading,
+    require_sensor,
+)
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.process import send_again
 from autdtorch.utils.validation import (
@@ -200,7 +208,7 @@ class LimitedLink:
         if self._stretch() > self.limits.seconds_in_a_row / 2:  # leave the other half to the sensor
             self.off()
         if self._on_since is None:
-            time.sleep(max(0.0, self._rested_at - time.monotonic()))
+            self._rest_now()
         left = self._seconds_left()
         with self._lock:
             self._raise_failure()
@@ -237,6 +245,37 @@ class LimitedLink:
         self.require_on()
         return reading
 
+    def measure(
+        self, drive: torch.Tensor, sensor: AnySensor, points: int, readings: int = 1
+    ) -> torch.Tensor:
+        """Play a drive (M,), |q| <= 1, and return readings (R, P) [Pa] of it.
+
+        A `PulsedSensor` gets a pulse for each reading, after the rest of the duty cycle, and the outputs are
+        off afterwards; with another sensor the drive plays on. Errors are those of `play` and `reading`.
+        """
+        require_sensor(sensor)
+        points, readings = integer_at_least("points", points, 1), _count("readings", readings)
+        if isinstance(sensor, PulsedSensor):
+            return torch.stack([self._read_pulse(drive, sensor, points) for _ in range(readings)])
+        self.play(drive)
+        return torch.stack([self.reading(sensor, points) for _ in range(readings)])
+
+    def _read_pulse(self, drive: torch.Tensor, sensor: PulsedSensor, points: int) -> torch.Tensor:
+        """Return the reading (P,) [Pa] of a pulse; `LimitError` if the outputs go off before its end."""
+
+        def end() -> None:
+            self.require_on()
+            self.off()
+
+        self._scale.asked(drive)  # an invalid one must not wait
+        self.off()
+        self._rest_now()
+        self._seconds_left()
+        try:
+            return checked_reading(Pulse(sensor, partial(self.play, drive), end), points)
+        finally:
+            self.off()
+
     def require_on(self) -> None:
         """Raise `LimitError` if the outputs went off since `play`, and the readings meanwhile are void."""
         with self._lock:  # against the timer, which may be switching off
@@ -258,6 +297,9 @@ class LimitedLink:
             self._seconds_before += stretch
             self._rested_at = time.monotonic() + self._rest(stretch)
             self._on_since = None
+
+    def _rest_now(self) -> None:
+        time.sleep(max(0.0, self._rested_at - time.monotonic()))
 
     def _rest(self, stretch: float) -> float:
         return stretch * (1 / self.limits.duty_cycle - 1)
@@ -301,7 +343,8 @@ class Preflight:
     """The pressure of each transducer alone, and of silence.
 
     Attributes:
-        pressure: of each transducer (M,) [Pa], rms over readings and control points.
+        pressure: of each transducer (M,) [Pa], rms over readings and control points; (0,) where a sensor does
+            not see a transducer alone.
         silence: with the outputs off [Pa].
         threshold: pressure that a working transducer exceeds [Pa].
     """
@@ -372,16 +415,46 @@ def check_transducers(
     return Preflight(pressure, math.sqrt(silence), max(above_noise, _WEAK * float(pressure.median())))
 
 
-def hears_silence(sensor: Sensor, check: Preflight, points: int, readings: int = 4) -> bool:
+def check_picture(
+    link: LimitedLink, sensor: PulsedSensor, points: int, drive: torch.Tensor, readings: int = 4
+) -> Preflight:
+    """Read silence and one drive (M,), in place of single transducers, which a camera does not see.
+
+    The threshold is as of `check_transducers`, with the drive's loudest control point for all transducers.
+    `SensorError` if the drive is not above it anywhere; other errors are those of `check_transducers`.
+    """
+    require_kind("link", link, LimitedLink)
+    require_kind("sensor", sensor, PulsedSensor)
+    points = integer_at_least("points", points, 1)
+    readings = _count("readings", readings)
+    silence = _power(_silent(sensor, points), readings)
+    loudest = float(link.measure(drive, sensor, points).max())
+    threshold = math.sqrt(silence * (1 + _DEVIATIONS / math.sqrt(readings * points)))
+    if loudest <= threshold:
+        accepted = f"must be above {threshold:.3g} Pa, the noise; check the device's power, and the sensor"
+        raise SensorError(f"the first picture shows {loudest:.3g} Pa at the loudest control point; {accepted}")
+    return Preflight(torch.empty(0, **REAL), math.sqrt(silence), max(threshold, _WEAK * loudest))
+
+
+def hears_silence(sensor: AnySensor, check: Preflight, points: int, readings: int = 4) -> bool:
     """Return True if a sensor of P points reads no more than at the `check` before, with the outputs off.
 
     `ValueError` if the sensor does not give P finite magnitudes, or for another number of readings.
     """
-    require_kind("sensor", sensor, Sensor)
+    require_sensor(sensor)
     require_kind("check", check, Preflight)
     points = integer_at_least("points", points, 1)
     readings = _count("readings", readings)
-    return math.sqrt(_power(partial(checked_reading, sensor, points), readings)) <= check.threshold
+    return math.sqrt(_power(_silent(sensor, points), readings)) <= check.threshold
+
+
+def _silent(sensor: AnySensor, points: int) -> Callable[[], torch.Tensor]:
+    """Return a function that reads (P,) [Pa] and leaves the outputs off."""
+    silent = Pulse(sensor, _nothing, _nothing) if isinstance(sensor, PulsedSensor) else sensor
+    return partial(checked_reading, silent, points)
+
+
+def _nothing() -> None: ...
 
 
 def _count(name: str, value: object) -> int:

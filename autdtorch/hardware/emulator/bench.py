@@ -71,10 +71,13 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         super().__init__()
         self.chips = list(chips)  # plugged in or not
         self.slept = 0.0  # [s]
+        self.watchers: list[Callable[[float], object]] = []  # called with the seconds that have passed
 
     def sleep(self, seconds: float) -> None:
         """Let time pass on the bench, without waiting."""
         self.slept += seconds
+        for watcher in self.watchers:
+            watcher(seconds)
 
     def enumerate_devices(self) -> list[int]:
         return [address for address, chip in enumerate(self.chips) if chip.present]

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from types import FrameType
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import torch
@@ -49,6 +49,39 @@ class Sensor(Protocol):
 
     def read(self) -> torch.Tensor:
         """Return magnitudes (P,) [Pa] at the control points, once the field is steady."""
+
+
+@runtime_checkable
+class PulsedSensor(Protocol):
+    """A sensor that switches the sound on and off itself, as a camera of what the sound heats."""
+
+    def read_pulse(self, on: Callable[[], None], off: Callable[[], None]) -> torch.Tensor:
+        """Return magnitudes (P,) [Pa] at the control points.
+
+        The outputs are off before. `on` plays the drive and returns once the sound is steady; `off` ends it.
+        """
+
+
+AnySensor: TypeAlias = Sensor | PulsedSensor
+
+
+def require_sensor(sensor: object) -> None:
+    """Check that `sensor` reads a steady sound, or pulses."""
+    if not isinstance(sensor, PulsedSensor):
+        require_kind("sensor", sensor, Sensor)
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """A pulse of sound that a sensor reads."""
+
+    sensor: PulsedSensor
+    on: Callable[[], None]
+    off: Callable[[], None]
+
+    def read(self) -> torch.Tensor:
+        """Return magnitudes (P,) [Pa]."""
+        return self.sensor.read_pulse(self.on, self.off)
 
 
 def checked_reading(sensor: Sensor, points: int, seconds: float = LONGEST) -> torch.Tensor:
@@ -152,7 +185,7 @@ class SensorConfig(ABC):
         finite_number("hardware.sensor.snr", snr)
 
     @abstractmethod
-    def open(self, setup: Setup) -> AbstractContextManager[Sensor]:
+    def open(self, setup: Setup) -> AbstractContextManager[AnySensor]:
         """Return a context with the sensor."""
 
 

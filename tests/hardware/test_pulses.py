@@ -1,0 +1,111 @@
+"""Sensors that switch the sound on and off themselves, within the limits of a trial."""
+
+import time
+
+import pytest
+import torch
+
+from autdtorch import hardware as hw
+from autdtorch.hardware import safety
+
+FULL = torch.ones(16, dtype=torch.complex128)
+
+
+class Heat:
+    """A sensor that sees the energy of a pulse: the rms over its length, with the outputs off at both ends."""
+
+    def __init__(self, bench: hw.EmulatedBench, during=lambda: None):
+        self._bench, self._during, self.pulses = bench, during, 0
+
+    def read_pulse(self, on, off):
+        assert not self._bench.drive().any()
+        on()
+        pressure = self._bench.pressure().abs()
+        self._during()
+        off()
+        assert not self._bench.drive().any()
+        self.pulses += 1
+        return pressure
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """The clock of limits, which goes on in sleeps alone."""
+    clock = type("Clock", (), {"now": 0.0, "monotonic": lambda: clock.now})
+    clock.sleep = lambda seconds: setattr(clock, "now", clock.now + seconds)
+    monkeypatch.setattr(safety, "time", clock)
+    return clock
+
+
+def test_a_pulse_is_read_for_each_evaluation_as_a_steady_sound_is(trial):
+    drives = torch.stack([FULL, 1j * FULL, 0.5 * FULL])
+    with trial.limited() as (bench, link):
+        sensor = Heat(bench)
+        measured = trial.objective(link, sensor)(drives)
+        assert sensor.pulses == 3
+        assert torch.equal(link.measure(FULL, sensor, 2, readings=2), measured[[0, 0]])
+    with trial.limited() as (bench, link):
+        trial.log.unlink()
+        assert torch.equal(trial.objective(link, hw.EmulatedSensor(bench))(drives), measured)
+        assert torch.equal(link.measure(FULL, hw.EmulatedSensor(bench), 2)[0], measured[0])
+        assert bench.drive().any()  # and plays on
+
+
+def test_pulses_count_against_the_limits_and_rest_for_the_duty_cycle(trial, clock):
+    with trial.limited(seconds_in_a_row=10, duty_cycle=0.2, seconds=3) as (bench, link):
+        sensor = Heat(bench, lambda: clock.sleep(0.5))
+        starts = []
+        with pytest.raises(hw.LimitError, match="on for 3 s, the limit"):
+            for _ in range(10):
+                link.measure(FULL, sensor, 2)
+                starts.append(clock.now)
+        assert link.seconds_on == pytest.approx(3)
+        assert sensor.pulses == 6
+        # The rest comes before the frames of the background, not between these and the pulse.
+        assert starts == pytest.approx([0.5 + 2.5 * n for n in range(6)])
+
+
+def test_a_pulse_that_lasts_too_long_is_void(trial):
+    with trial.limited(seconds_in_a_row=0.05) as (bench, link):
+        sensor = Heat(bench, lambda: time.sleep(0.2))
+        with pytest.raises(hw.LimitError, match=r"longer than .* 0\.05 s in a row"):
+            trial.objective(link, sensor)(FULL)
+        assert not bench.drive().any()
+        assert not sensor.pulses
+
+
+@pytest.mark.parametrize("error", [hw.SensorError, KeyboardInterrupt])
+def test_the_outputs_are_off_after_a_pulse_that_failed(trial, error):
+    def fail():
+        raise error
+
+    with trial.limited() as (bench, link):
+        with pytest.raises(error):
+            link.measure(FULL, Heat(bench, fail), 2)
+        assert not bench.firmware.drive().any()
+        with pytest.raises(ValueError, match="amplitude 2"):
+            link.measure(2 * FULL, Heat(bench), 2)
+        with pytest.raises(ValueError, match="sensor"):
+            link.measure(FULL, object(), 2)
+
+
+def test_a_first_picture_takes_the_place_of_the_check_by_single_transducers(trial):
+    class Noisy(Heat):
+        noise = 1.0
+
+        def read_pulse(self, on, off):
+            return super().read_pulse(on, off) + self.noise
+
+    with trial.limited() as (bench, link):
+        sensor = Noisy(bench)
+        strongest = float(trial.simulated(FULL).max())
+        sensor.noise = 0.01 * strongest
+        check = hw.check_picture(link, sensor, 2, FULL)
+        assert check.failed == []
+        assert check.silence == pytest.approx(sensor.noise)
+        assert hw.hears_silence(sensor, check, 2)
+        sensor.noise = 0.2 * strongest  # of outputs that are on, or of a leak
+        assert not hw.hears_silence(sensor, check, 2)
+        sensor.noise = 2 * strongest
+        with pytest.raises(hw.SensorError, match="the first picture shows"):
+            hw.check_picture(link, sensor, 2, FULL)
