@@ -336,7 +336,7 @@ class DeafConfig(SensorConfig):
 
     @contextlib.contextmanager
     def open(self, setup):
-        yield mock.Mock(read=lambda: self.fraction * setup.bench.pressure().abs())
+        yield mock.Mock(["read"], read=lambda: self.fraction * setup.bench.pressure().abs())
 
 
 def test_a_device_and_a_sensor_are_one_entry_each(trial, write, tmp_path, monkeypatch):
