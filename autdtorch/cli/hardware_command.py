@@ -358,7 +358,9 @@ class _Trial:
     ) -> hardware.Preflight:
         count, points = len(self._scene.array), len(self._scene.control_points)
         if isinstance(sensor, hardware.PulsedSensor):
-            logger.info("the sensor sees no single transducer: no check of each, but of silence and a picture")
+            logger.info(
+                "the sensor sees no single transducer: no check of each, but of silence and a picture"
+            )
             progress.begin("a first picture, of the simulated drive")
             return hardware.check_picture(limited, sensor, points, self._expected.drive[0], readings)
         progress.begin("checking the transducers, one by one")

@@ -245,9 +245,7 @@ class LimitedLink:
         self.require_on()
         return reading
 
-    def measure(
-        self, drive: torch.Tensor, sensor: AnySensor, points: int, readings: int = 1
-    ) -> torch.Tensor:
+    def measure(self, drive: torch.Tensor, sensor: AnySensor, points: int, readings: int = 1) -> torch.Tensor:
         """Play a drive (M,), |q| <= 1, and return readings (R, P) [Pa] of it.
 
         A `PulsedSensor` gets a pulse for each reading, after the rest of the duty cycle, and the outputs are
@@ -432,7 +430,9 @@ def check_picture(
     threshold = math.sqrt(silence * (1 + _DEVIATIONS / math.sqrt(readings * points)))
     if loudest <= threshold:
         accepted = f"must be above {threshold:.3g} Pa, the noise; check the device's power, and the sensor"
-        raise SensorError(f"the first picture shows {loudest:.3g} Pa at the loudest control point; {accepted}")
+        raise SensorError(
+            f"the first picture shows {loudest:.3g} Pa at the loudest control point; {accepted}"
+        )
     return Preflight(torch.empty(0, **REAL), math.sqrt(silence), max(threshold, _WEAK * loudest))
 
 
