@@ -12,7 +12,7 @@ FULL = torch.ones(16, dtype=torch.complex128)
 
 
 class Heat:
-    """A sensor that sees the energy of a pulse: the rms over its length, with the outputs off at both ends."""
+    """A sensor of pulses, with the outputs off before and after each."""
 
     def __init__(self, bench: hw.EmulatedBench, during=lambda: None):
         self._bench, self._during, self.pulses = bench, during, 0
