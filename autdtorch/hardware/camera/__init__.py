@@ -1,0 +1,1 @@
+"""A thermal camera that sees the heat of the sound in a thin screen."""

@@ -1,0 +1,129 @@
+"""A picture of the pressure in a plane, as a thermal camera saw it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.ndimage import map_coordinates, spline_filter
+
+from autdtorch.objectives.readings import Readings
+from autdtorch.scene.geometry import Plane, cell_centers_of
+from autdtorch.utils.array_types import REAL, Array
+from autdtorch.utils.validation import ArrayLike, invalid, points_tensor
+
+_OFF_PLANE = 0.02  # largest distance of a point from its plane, by the plane's longer edge
+_STEPS = 30  # to a maximum
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Picture:
+    """The pressure magnitudes in the cells of a plane, with their standard deviations.
+
+    Attributes:
+        plane: the plane.
+        pressure: peak amplitudes (Nu, Nv) [Pa] at `cell_centers(plane)`.
+        deviation: standard deviations (Nu, Nv) [Pa].
+        relative: True if all pressures have an unknown factor, common to all pictures of the screen.
+        frames: number of frames used.
+        latency: time from the start of the sound until the frames show it [s].
+        doubts: what is wrong with the frames, a sentence each.
+    """
+
+    plane: Plane
+    pressure: torch.Tensor
+    deviation: torch.Tensor
+    relative: bool = False
+    frames: int = 0
+    latency: float = 0.0
+    doubts: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        """Return the size and the largest pressure."""
+        counts = " x ".join(map(str, self.pressure.shape))
+        unit = "of an unknown unit" if self.relative else "Pa"
+        return f"Picture({counts} cells, up to {self.pressure.max():.4g} {unit}, {self.frames} frames)"
+
+    @property
+    def cell_area(self) -> float:
+        """Area of a cell [m^2], for `focus_metrics`."""
+        return self.plane.size[0] * self.plane.size[1] / self.pressure.numel()
+
+    @property
+    def points(self) -> torch.Tensor:
+        """The centres of the cells (Nu Nv, 3) [m]."""
+        return cell_centers_of(self.plane, self._counts).reshape(-1, 3)
+
+    def at(self, points: ArrayLike) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return magnitudes and standard deviations (P,) [Pa] at points of the plane (P, 3) [m].
+
+        |p|^2 is interpolated by a spline, because it is band-limited, and |p| is not.
+
+        Raises:
+            ValueError: a point is not in the plane.
+        """
+        cells = self._cells(plane_coordinates(self.plane, points))
+        square = map_coordinates(self._spline, cells.T, order=5, mode="reflect", prefilter=False)
+        deviation = map_coordinates(self.deviation.numpy(), cells.T, order=1, mode="nearest")
+        pressure = torch.from_numpy(np.maximum(square, 0.0)).sqrt()
+        return pressure, torch.from_numpy(deviation)
+
+    def foci(self, near: ArrayLike, radius: float = 5e-3) -> torch.Tensor:
+        """Return the places (P, 3) [m] of the largest |p| within a radius [m] of points (P, 3) [m]."""
+        starts = plane_coordinates(self.plane, near)
+        u, v = (basis.numpy() for basis in self.plane.basis)
+        places = np.stack([self._climb(start, radius) for start in starts])
+        return torch.from_numpy(np.asarray(self.plane.center) + places[:, :1] * u + places[:, 1:] * v)
+
+    def readings(self, drive: ArrayLike) -> Readings:
+        """Return the picture as readings of a drive (M,) at all cells of the plane."""
+        return Readings(torch.as_tensor(drive), self.pressure.reshape(1, -1), self.points)
+
+    def _climb(self, start: Array, radius: float) -> Array:
+        """Return the maximum (2,) of |p|^2 near a start (2,), by ever finer patches of 5 x 5 places."""
+        place, step = start, radius / 2
+        offsets = np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3), indexing="ij"), -1).reshape(-1, 2)
+        bound = np.asarray(self.plane.size) / 2
+        for _ in range(_STEPS):
+            around = np.clip(place + step * offsets, -bound, bound)
+            around = around[np.linalg.norm(around - start, axis=1) <= radius * (1 + 1e-9)]
+            square = map_coordinates(
+                self._spline, self._cells(around).T, order=5, mode="reflect", prefilter=False
+            )
+            best = around[square.argmax()]
+            step *= 0.5 if np.linalg.norm(best - place) < 1.5 * step else 1.0
+            place = best
+        return place
+
+    @property
+    def _counts(self) -> tuple[int, int]:
+        return self.pressure.shape[0], self.pressure.shape[1]
+
+    @property
+    def _spline(self) -> Array:
+        return np.asarray(spline_filter(self.pressure.square().numpy(), order=5, mode="reflect"))
+
+    def _cells(self, coordinates: Array) -> Array:
+        """Return the indices (P, 2), in parts of a cell, of coordinates (P, 2) [m]."""
+        return np.asarray((coordinates / np.asarray(self.plane.size) + 0.5) * self._counts - 0.5)
+
+
+def plane_coordinates(plane: Plane, points: ArrayLike, name: str = "points") -> Array:
+    """Return the coordinates (P, 2) [m] along the axes (u, v) of a plane, from its centre.
+
+    Raises:
+        ValueError: a point is not in the plane.
+    """
+    offset = points_tensor(name, points).cpu() - torch.tensor(plane.center, **REAL)
+    u, v = plane.basis
+    coordinates = torch.stack((offset @ u, offset @ v), dim=1)
+    half = torch.tensor(plane.size, **REAL) / 2
+    tolerance = _OFF_PLANE * 2 * half.max()
+    height = (offset @ torch.tensor(plane.normal, **REAL)).abs()
+    outside = (height > tolerance) | (coordinates.abs() > half + tolerance).any(dim=1)
+    if outside.any():
+        index = int(outside.nonzero()[0])
+        point = (offset + torch.tensor(plane.center, **REAL))[index].tolist()
+        raise invalid(f"{name}[{index}]", point, "must be in the plane of the picture", "m")
+    return np.asarray(coordinates.numpy(), dtype=np.float64)

@@ -1,0 +1,198 @@
+"""The registration of a camera: where each place of a plane is in its images."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, label, map_coordinates
+from scipy.optimize import least_squares
+
+from autdtorch.hardware.camera.picture import plane_coordinates
+from autdtorch.scene.geometry import Plane
+from autdtorch.utils.array_types import Array
+from autdtorch.utils.validation import ArrayLike, invalid, real_tensor
+
+_LARGE_RESIDUAL = 0.5e-3  # [m]; 6 % of a wavelength at 40 kHz
+_LEAST_SPREAD = 1e-4  # of the equations of four marks in line, by those of a square: about 0
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """A homography between the coordinates (u, v) [m] of a plane, from its centre, and pixels (column, row).
+
+    Pixel (0, 0) is the centre of the first pixel of the first row. A camera whose lens distorts needs
+    undistorted images.
+
+    Attributes:
+        plane: the plane.
+        matrix: (3, 3), from (u, v, 1) [m] to the pixel, up to a factor.
+        residuals: distance (K,) [m] of each mark from where the homography puts it; 0 for four marks.
+    """
+
+    plane: Plane
+    matrix: Array
+    residuals: Array = field(default_factory=lambda: np.zeros(4))
+
+    @classmethod
+    def of(cls, plane: Plane, pixels: ArrayLike, places: ArrayLike) -> Registration:
+        """Return the registration by marks whose places are known.
+
+        Args:
+            plane: the plane.
+            pixels: (K, 2), K >= 4, as (column, row), with fractions.
+            places: (K, 3) [m], in the plane; no three of four in a line.
+
+        Raises:
+            ValueError: shapes that do not fit, places off the plane, or too near to a line.
+        """
+        seen = _pixels("pixels", pixels)
+        coordinates = plane_coordinates(plane, places, "places")
+        if len(seen) < 4 or len(coordinates) != len(seen):
+            accepted = "must be K, and one place for each, K >= 4"
+            raise invalid("pixels", f"{len(seen)} pixels and {len(coordinates)} places", accepted)
+        matrix = _refined(_homography(coordinates, seen), coordinates, seen)
+        registration = cls(plane, matrix)
+        residuals = np.linalg.norm(registration.to_plane(seen) - coordinates, axis=1)
+        registration = cls(plane, matrix, residuals)
+        if registration.residual > _LARGE_RESIDUAL:
+            warnings.warn(
+                f"registration: the marks are {1e3 * registration.residual:.2g} mm (rms) off the image of "
+                f"a plane, the worst is mark {residuals.argmax()} with {1e3 * residuals.max():.2g} mm",
+                stacklevel=2,
+            )
+        return registration
+
+    @property
+    def residual(self) -> float:
+        """Root mean square error of a mark [m], by the residuals; 0 for four marks, which fit any camera."""
+        free = len(self.residuals) - 4
+        return math.sqrt(float((self.residuals**2).sum()) / free) if free > 0 else 0.0
+
+    def to_pixels(self, coordinates: Array) -> Array:
+        """Return the pixels (..., 2), as (column, row), of coordinates (..., 2) [m]."""
+        return _projected(self.matrix, coordinates)
+
+    def to_plane(self, pixels: Array) -> Array:
+        """Return the coordinates (..., 2) [m] of pixels (..., 2), as (column, row)."""
+        return _projected(np.asarray(np.linalg.inv(self.matrix), dtype=np.float64), pixels)
+
+    def on_grid(self, image: Array, counts: tuple[int, int]) -> Array:
+        """Return an image (H, W) at the centres (Nu, Nv) of equal cells of the plane, NaN where unseen.
+
+        Places next to a pixel that is NaN, or outside the image, are NaN.
+        """
+        along = [
+            size * ((np.arange(n) + 0.5) / n - 0.5) for size, n in zip(self.plane.size, counts, strict=True)
+        ]
+        pixels = self.to_pixels(np.stack(np.meshgrid(*along, indexing="ij"), axis=-1))
+        return np.asarray(
+            map_coordinates(image, [pixels[..., 1], pixels[..., 0]], order=1, cval=np.nan), dtype=np.float64
+        )
+
+
+def registered_by_foci(plane: Plane, rises: Sequence[Array], places: ArrayLike) -> Registration:
+    """Return the registration by foci that the array played, one for each image.
+
+    Args:
+        plane: the plane.
+        rises: K images (H, W) of the rise of temperature, each while one focus is played; NaN where a pixel
+            is dead.
+        places: (K, 3) [m], where |p| is largest in the plane for each of the foci; K >= 4.
+
+    Raises:
+        ValueError: an image without a hot spot, or as for `Registration.of`.
+    """
+    return Registration.of(plane, np.stack([hot_spot(rise) for rise in rises]), places)
+
+
+def hot_spot(rise: Array) -> Array:
+    """Return the pixel (2,), as (column, row) with fractions, around which an image (H, W) is hottest.
+
+    A Gaussian with free widths and tilt is fitted to the pixels above half the maximum.
+
+    Raises:
+        ValueError: nothing in the image stands out of its noise.
+    """
+    valid = np.isfinite(rise)
+    smooth = gaussian_filter(np.where(valid, rise, 0.0), 1.5)
+    share = gaussian_filter(valid.astype(np.float64), 1.5)
+    smooth = np.where(share > 0.3, smooth / np.maximum(share, 0.3), -np.inf)
+    row, column = divmod(int(smooth.argmax()), rise.shape[1])
+    level = np.nanmedian(rise)
+    spread = 1.5 * np.nanmedian(np.abs(rise - level))
+    height = smooth[row, column] - level
+    if not height > 4 * spread / 3:  # smoothing leaves about a fifth of the noise
+        raise invalid("rises", float(height), f"must have a spot above their noise of {spread:.2g}", "K")
+    rows, columns = np.nonzero(_connected(smooth > level + height / 2, row, column) & valid)
+    offset = np.stack([columns - column, rows - row])
+
+    def misfit(unknowns: Array) -> Array:
+        x, y, xx, xy, yy, top, base = unknowns
+        du, dv = offset[0] - x, offset[1] - y
+        model = base + top * np.exp(-0.5 * (xx * du**2 + 2 * xy * du * dv + yy * dv**2))
+        return np.asarray(model - rise[rows, columns], dtype=np.float64)
+
+    width = 2.4 * np.pi / max(len(rows), 1)
+    start = np.array([0.0, 0.0, width, 0.0, width, height, level])
+    fitted = least_squares(misfit, start, x_scale=[1.0, 1.0, width, width, width, height, height]).x
+    return np.array([column + fitted[0], row + fitted[1]])
+
+
+def _connected(mask: Array, row: int, column: int) -> Array:
+    """Return the part of a mask (H, W) that is connected to a pixel."""
+    labels, _ = label(mask)
+    return np.asarray(labels == labels[row, column])
+
+
+def _pixels(name: str, value: object) -> Array:
+    pixels = real_tensor(name, value)
+    if pixels.ndim != 2 or pixels.shape[1] != 2:
+        raise ValueError(f"{name}: shape {tuple(pixels.shape)}; must be (K, 2), as (column, row)")
+    return pixels.detach().cpu().numpy()
+
+
+def _projected(matrix: Array, places: Array) -> Array:
+    x, y = places[..., 0], places[..., 1]
+    a, b, w = (row[0] * x + row[1] * y + row[2] for row in matrix)
+    return np.stack([a / w, b / w], axis=-1)
+
+
+def _normalised(places: Array) -> tuple[Array, Array]:
+    """Return places (K, 2) around 0 with mean distance 1, and the matrix (3, 3) that makes them so."""
+    center = places.mean(axis=0)
+    scale = 1 / max(float(np.linalg.norm(places - center, axis=1).mean()), 1e-12)
+    matrix = np.array([[scale, 0, -scale * center[0]], [0, scale, -scale * center[1]], [0, 0, 1.0]])
+    return scale * (places - center), matrix
+
+
+def _homography(coordinates: Array, pixels: Array) -> Array:
+    """Return the homography (3, 3) by the direct linear transform (Hartley & Zisserman 2004, 4.1)."""
+    (source, to_source), (image, to_image) = _normalised(coordinates), _normalised(pixels)
+    ones, zeros = np.ones((len(source), 1)), np.zeros((len(source), 3))
+    known = np.hstack([source, ones])
+    equations = np.vstack(
+        [
+            np.hstack([known, zeros, -image[:, :1] * known]),
+            np.hstack([zeros, known, -image[:, 1:] * known]),
+        ]
+    )
+    _, values, rows = np.linalg.svd(equations)
+    if values[7] < _LEAST_SPREAD * values[0]:
+        raise invalid("places", "marks nearly in a line", "four of them must have no three in a line")
+    matrix = np.linalg.inv(to_image) @ rows[-1].reshape(3, 3) @ to_source
+    return np.asarray(matrix / matrix[2, 2])
+
+
+def _refined(matrix: Array, coordinates: Array, pixels: Array) -> Array:
+    """Return the homography (3, 3) with the least squared distance of pixels."""
+    scale = np.abs(matrix).ravel()[:8] + 1e-9
+
+    def misfit(entries: Array) -> Array:
+        return (_projected(np.append(entries * scale, 1.0).reshape(3, 3), coordinates) - pixels).ravel()
+
+    fitted = least_squares(misfit, matrix.ravel()[:8] / scale, xtol=1e-14, ftol=1e-14).x
+    return np.append(fitted * scale, 1.0).reshape(3, 3)

@@ -1,0 +1,89 @@
+"""Registration of a camera by marks and by foci."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from autdtorch.hardware.camera.registration import Registration, hot_spot
+from autdtorch.scene.geometry import Plane
+
+PLANE = Plane((0.01, 0.0, 0.15), (0.0, 0.0, 1.0), (0.1, 0.08))
+
+
+def camera(plane: Plane = PLANE, tilt: float = 0.0, pitch: float = 0.8e-3) -> Registration:
+    """Return the registration of a pinhole camera, 1000 pixels of focal length, tilted about its row axis."""
+    cos, sin, turn = math.cos(tilt), math.sin(tilt), 0.1
+    tilted = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
+    turned = np.array([[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]])
+    lens = np.array([[1000.0, 0, 79.8], [0, 1000.0, 74.3], [0, 0, 1]])
+    pose = np.column_stack([(tilted @ turned)[:, :2], [0, 0, 1000.0 * pitch]])
+    return Registration(plane, lens @ pose)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.6])
+def test_four_corners_register_a_camera(tilt: float) -> None:
+    truth = camera(tilt=tilt)
+    half = np.array(PLANE.size) / 2
+    corners = truth.to_pixels(half * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]))
+    registration = Registration.of(PLANE, corners, PLANE.corners)
+    inside = np.random.default_rng(0).uniform(-1, 1, (20, 2)) * half
+    np.testing.assert_allclose(registration.to_pixels(inside), truth.to_pixels(inside), atol=1e-8)
+    np.testing.assert_allclose(registration.to_plane(truth.to_pixels(inside)), inside, atol=1e-11)
+    assert registration.residual == 0
+
+
+def test_the_residual_tells_the_error_of_the_marks() -> None:
+    generator, truth = np.random.default_rng(1), camera(tilt=0.5)
+    places = np.stack(np.meshgrid([-0.04, -0.01, 0.02, 0.05], [-0.03, 0.0, 0.03]), -1).reshape(-1, 2) * 0.9
+    marks = torch.tensor(np.column_stack([places + np.array(PLANE.center[:2]), np.full(12, 0.15)]))
+    pixels = truth.to_pixels(places) + generator.normal(0, 0.1, (12, 2))
+    registration = Registration.of(PLANE, pixels, marks)
+    # 0.1 pixels of 0.8 mm in each of two axes; 16 degrees of freedom scatter by a fifth.
+    assert registration.residual == pytest.approx(0.08e-3 * 2**0.5, rel=0.6)
+    pixels[3] += 10
+    with pytest.warns(UserWarning, match="mark 3"):
+        Registration.of(PLANE, pixels, marks)
+
+
+def test_marks_in_a_line_are_refused() -> None:
+    places = [[0.01, 0.0, 0.15], [0.02, 0.0, 0.15], [0.03, 0.0, 0.15], [0.04, 0.02, 0.15]]
+    with pytest.raises(ValueError, match="line"):
+        Registration.of(PLANE, [[0, 0], [10, 0], [20, 0], [30, 20]], places)
+    with pytest.raises(ValueError, match="K >= 4"):
+        Registration.of(PLANE, [[0, 0], [10, 0], [20, 10]], places[1:])
+    with pytest.raises(ValueError, match="plane"):
+        Registration.of(PLANE, [[0, 0], [10, 0], [20, 0], [30, 20]], [*places[:3], [0, 0, 0.2]])
+
+
+def test_an_image_is_sampled_on_the_plane() -> None:
+    truth = camera(tilt=0.4)
+    rows, columns = np.mgrid[:150, :160]
+    places = truth.to_plane(np.stack([columns, rows], -1).astype(float))
+    image = 20 + 100 * places[..., 0] - 50 * places[..., 1]
+    image[60:62, 80] = np.nan
+    grid = truth.on_grid(image, (50, 40))
+    u, v = np.meshgrid(
+        PLANE.size[0] * ((np.arange(50) + 0.5) / 50 - 0.5),
+        PLANE.size[1] * ((np.arange(40) + 0.5) / 40 - 0.5),
+        indexing="ij",
+    )
+    seen = np.isfinite(grid)
+    assert 0.95 < seen.mean() < 1
+    np.testing.assert_allclose(grid[seen], (20 + 100 * u - 50 * v)[seen], atol=0.01)
+
+
+def test_a_hot_spot_is_found_to_a_part_of_a_pixel() -> None:
+    generator = np.random.default_rng(2)
+    rows, columns = np.mgrid[:60, :80]
+    for _ in range(5):
+        x, y = generator.uniform(15, 45, 2)
+        rise = np.exp(-0.5 * (((columns - x) / 4.5) ** 2 + ((rows - y) / 3) ** 2)) + generator.normal(
+            0, 0.02, (60, 80)
+        )
+        rise[generator.integers(60, size=40), generator.integers(80, size=40)] = np.nan
+        # Noise of 2 % over about 40 pixels allows 0.02 pixels.
+        np.testing.assert_allclose(hot_spot(rise), [x, y], atol=0.1)
+    with pytest.raises(ValueError, match="noise"):
+        hot_spot(generator.normal(0, 0.02, (60, 80)))
