@@ -76,9 +76,9 @@ class Picture:
         places = np.stack([self._climb(start, radius) for start in starts])
         return torch.from_numpy(np.asarray(self.plane.center) + places[:, :1] * u + places[:, 1:] * v)
 
-    def readings(self, drive: ArrayLike) -> Readings:
+    def readings(self, drive: torch.Tensor) -> Readings:
         """Return the picture as readings of a drive (M,) at all cells of the plane."""
-        return Readings(torch.as_tensor(drive), self.pressure.reshape(1, -1), self.points)
+        return Readings(drive, self.pressure.reshape(-1), self.points)
 
     def _climb(self, start: Array, radius: float) -> Array:
         """Return the maximum (2,) of |p|^2 near a start (2,), by ever finer patches of 5 x 5 places."""
