@@ -5,6 +5,7 @@ from .io.array_file import load_array
 from .io.calibration_file import load_calibration, save_calibration
 from .io.drive_file import load_drive, save_drive
 from .io.field_file import save_field
+from .io.picture_file import load_picture, save_picture
 from .io.readings_file import load_readings, save_readings
 from .io.scene_file import load_scene, save_scene
 from .methods.base import Method, State
@@ -142,6 +143,7 @@ __all__ = [
     "load_array",
     "load_calibration",
     "load_drive",
+    "load_picture",
     "load_readings",
     "load_results",
     "load_scene",
@@ -165,6 +167,7 @@ __all__ = [
     "save_calibration",
     "save_drive",
     "save_field",
+    "save_picture",
     "save_readings",
     "save_scene",
     "save_state",

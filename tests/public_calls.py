@@ -41,7 +41,7 @@ METHODS = ("BayesOpt", "GABS", "GradientAscent", "Holography", "Identify", "LSS"
 NOT_CALLED_BY_USERS = {
     *("Estimate", "Evaluation", "EvaluationLog", "FocusMetrics", "Preflight", "Run", "Solution", "Sweep"),
     *("Adapter", "Device", "Dialect", "Obstacle", "OpenMPDBoard"),
-    *("Calibration", "TMatrixPropagator", "TMatrix", "SimulatedPropagator"),
+    *("Calibration", "Picture", "TMatrixPropagator", "TMatrix", "SimulatedPropagator"),
     "UsbtmcPort",
     *("EmulatedBench.receive", "EmulatedScope.execute", "Goal", "Method", "State", "Waveform"),
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
@@ -126,6 +126,15 @@ def calibration() -> at.Calibration:
 def calibration_file(folder: Path) -> Path:
     at.save_calibration(folder / "calibration.npz", calibration())
     return folder / "calibration.npz"
+
+
+def picture() -> hardware.Picture:
+    return hardware.Picture(PLANE, torch.ones(4, 4, dtype=torch.float64), torch.ones(4, 4, dtype=torch.float64))
+
+
+def picture_file(folder: Path) -> Path:
+    at.save_picture(folder / "picture.npz", picture())
+    return folder / "picture.npz"
 
 
 def mesh_file(folder: Path) -> Path:
@@ -260,6 +269,7 @@ ARGUMENTS: dict[str, Any] = {
     "off_screen": True,
     "path": Made(lambda folder: folder / "file.npz"),
     "phases": [0.0, 1.0, 2.0, 3.0],
+    "picture": Made(lambda _: picture()),
     "plane_pressure": [[1.0, 2.0], [1.0, 2.0]],
     "planes": {"scene": PLANE},
     "X": torch.full((2, 3), 0.5, dtype=torch.float64),
@@ -325,6 +335,7 @@ OTHERS: dict[str, Any] = {
     "PhasorKernel.mean.x": torch.ones(3, 2, dtype=torch.float64),
     "Problem.transducers": 4,
     "Oscilloscope.port": Made(lambda _: scope()._port),
+    "Picture.foci.near": [PLANE.center],
     "Plane.size": (0.1, 0.1),
     "Scene.equals.other": AIR_ALONE,
     "porous.flow_resistivity": 1e5,
@@ -353,6 +364,7 @@ OTHERS: dict[str, Any] = {
     "run.method": Made(lambda _: made("GABS")),
     "save_state.method": Made(lambda _: made("GABS")),
     "save_state.state": Made(lambda _: state("GABS")),
+    "load_picture.path": Made(picture_file),
     "load_readings.source": Made(readings_file),
     "load_readings.columns": None,
     "load_readings.phases": "deg",
@@ -403,6 +415,7 @@ INSTANCES = {
     "Medium": Made(lambda _: AIR),
     "TMatrix": Made(lambda _: operator()),
     "TMatrixCluster": Made(lambda _: at.TMatrixCluster([operator()])),
+    "Picture": Made(lambda _: picture()),
     "OpenMPDBoard": Made(lambda folder: at.OpenMPDBoard.load(board_file(folder))),
 }
 

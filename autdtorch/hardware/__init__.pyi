@@ -1,3 +1,4 @@
+from .camera.picture import Picture as Picture
 from .devices import AUTD3 as AUTD3
 from .devices import DEVICES as DEVICES
 from .devices import OPENMPD as OPENMPD

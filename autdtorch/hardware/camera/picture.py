@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates, spline_filter
 from autdtorch.objectives.readings import Readings
 from autdtorch.scene.geometry import Plane, cell_centers_of
 from autdtorch.utils.array_types import REAL, Array
-from autdtorch.utils.validation import ArrayLike, invalid, points_tensor
+from autdtorch.utils.validation import ArrayLike, invalid, points_tensor, positive
 
 _OFF_PLANE = 0.02  # largest distance of a point from its plane, by the plane's longer edge
 _STEPS = 30  # to a maximum
@@ -52,7 +52,7 @@ class Picture:
 
     @property
     def points(self) -> torch.Tensor:
-        """The centres of the cells (Nu Nv, 3) [m]."""
+        """The centres (P, 3) of the P = Nu Nv cells [m]."""
         return cell_centers_of(self.plane, self._counts).reshape(-1, 3)
 
     def at(self, points: ArrayLike) -> tuple[torch.Tensor, torch.Tensor]:
@@ -70,8 +70,13 @@ class Picture:
         return pressure, torch.from_numpy(deviation)
 
     def foci(self, near: ArrayLike, radius: float = 5e-3) -> torch.Tensor:
-        """Return the places (P, 3) [m] of the largest |p| within a radius [m] of points (P, 3) [m]."""
-        starts = plane_coordinates(self.plane, near)
+        """Return the places (P, 3) [m] of the largest |p| within a radius [m] of points (P, 3) [m].
+
+        Raises:
+            ValueError: a point is not in the plane, or `radius` is not a finite number > 0.
+        """
+        radius = positive("radius", radius, "m")
+        starts = plane_coordinates(self.plane, near, "near")
         u, v = (basis.numpy() for basis in self.plane.basis)
         places = np.stack([self._climb(start, radius) for start in starts])
         return torch.from_numpy(np.asarray(self.plane.center) + places[:, :1] * u + places[:, 1:] * v)

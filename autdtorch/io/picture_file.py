@@ -1,0 +1,97 @@
+"""Pictures of a thermal camera in files: plain NumPy arrays, single precision."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from autdtorch.hardware.camera.picture import Picture
+from autdtorch.scene.geometry import Plane
+from autdtorch.utils.array_types import AnyArray
+from autdtorch.utils.files import read_arrays, write_arrays
+from autdtorch.utils.validation import invalid, path_of, require_kind, within
+
+#: Folder of a trial for its pictures: `evaluation_00012.npz` of evaluation 12 (from 0), and `again_0.npz`,
+#: `again_1.npz`, ... of the drive that the search found, when it was played again.
+PICTURES = "pictures"
+AGAIN = "again"  # begins the names of these
+
+_MAPS = ("pressure", "deviation")
+_PLANE = {"center": 3, "normal": 3, "size": 2}
+
+
+def save_picture(path: str | os.PathLike[str], picture: Picture) -> None:
+    """Write a picture of a thermal camera to a .npz file, its maps in single precision.
+
+    Args:
+        path: of the file, which is replaced.
+        picture: the picture.
+
+    Raises:
+        ValueError: another suffix, or no picture.
+        OSError: the file cannot be written.
+    """
+    path = path_of("path", path, suffixes=(".npz",))
+    require_kind("picture", picture, Picture)
+    maps = {name: getattr(picture, name).numpy().astype(np.float32) for name in _MAPS}
+    plane = {name: np.asarray(getattr(picture.plane, name)) for name in _PLANE}
+    rest = {name: getattr(picture, name) for name in ("relative", "frames", "latency")}
+    write_arrays(path, maps | plane | rest | {"doubts": np.asarray(picture.doubts, dtype=np.str_)})
+
+
+def load_picture(path: str | os.PathLike[str]) -> Picture:
+    """Read a picture that `save_picture` wrote; reading runs no code.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: another suffix, or a file without a picture.
+    """
+    path = path_of("path", path, suffixes=(".npz",))
+    arrays = read_arrays(path)
+    with within(path):
+        wanted = {*_MAPS, *_PLANE, "relative", "frames", "latency", "doubts"}
+        if missing := sorted(wanted - set(arrays)):
+            raise ValueError(f"no array {missing[0]!r}; must be written by save_picture")
+        pressure, deviation = (_map(name, arrays[name]) for name in _MAPS)
+        if pressure.shape != deviation.shape:
+            raise invalid("deviation", tuple(deviation.shape), f"must be {tuple(pressure.shape)}, as pressure")
+        center, normal, size = (_numbers(name, arrays[name], count) for name, count in _PLANE.items())
+        relative, frames, latency = (
+            _numbers(name, arrays[name], 1)[0] for name in ("relative", "frames", "latency")
+        )
+        plane = Plane((center[0], center[1], center[2]), (normal[0], normal[1], normal[2]), (size[0], size[1]))
+        doubts = tuple(map(str, arrays["doubts"].ravel()))
+        return Picture(plane, pressure, deviation, bool(relative), int(frames), latency, doubts)
+
+
+def newest_picture(folder: Path) -> Path | None:
+    """Return the picture of a folder that was written last; None if there is none yet."""
+    times = {}
+    for path in folder.glob("*.npz"):
+        try:
+            times[path] = path.stat().st_mtime_ns
+        except OSError:  # removed meanwhile
+            continue
+    return max(times, key=lambda path: (times[path], path.name), default=None)
+
+
+def _map(name: str, values: AnyArray) -> torch.Tensor:
+    """Return a map (Nu, Nv) in double precision, after checking it."""
+    if values.ndim != 2 or values.size == 0 or values.dtype.kind != "f":
+        raise ValueError(f"{name}: shape {values.shape}, type {values.dtype}; must be real, (Nu, Nv)")
+    if not (np.isfinite(values) & (values >= 0)).all():
+        raise ValueError(f"{name}: must be finite and >= 0 in every cell")
+    return torch.from_numpy(values.astype(np.float64))
+
+
+def _numbers(name: str, values: AnyArray, count: int) -> list[float]:
+    """Return `count` finite numbers of a file, after checking them."""
+    if values.size != count or values.dtype.kind not in "biuf" or not np.isfinite(values).all():
+        raise ValueError(f"{name}: {values.tolist()!r:.80}; must be {count} finite numbers")
+    return [float(value) for value in values.ravel()]
