@@ -129,7 +129,9 @@ def calibration_file(folder: Path) -> Path:
 
 
 def picture() -> hardware.Picture:
-    return hardware.Picture(PLANE, torch.ones(4, 4, dtype=torch.float64), torch.ones(4, 4, dtype=torch.float64))
+    return hardware.Picture(
+        PLANE, torch.ones(4, 4, dtype=torch.float64), torch.ones(4, 4, dtype=torch.float64)
+    )
 
 
 def picture_file(folder: Path) -> Path:

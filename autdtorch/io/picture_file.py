@@ -60,12 +60,16 @@ def load_picture(path: str | os.PathLike[str]) -> Picture:
             raise ValueError(f"no array {missing[0]!r}; must be written by save_picture")
         pressure, deviation = (_map(name, arrays[name]) for name in _MAPS)
         if pressure.shape != deviation.shape:
-            raise invalid("deviation", tuple(deviation.shape), f"must be {tuple(pressure.shape)}, as pressure")
+            raise invalid(
+                "deviation", tuple(deviation.shape), f"must be {tuple(pressure.shape)}, as pressure"
+            )
         center, normal, size = (_numbers(name, arrays[name], count) for name, count in _PLANE.items())
         relative, frames, latency = (
             _numbers(name, arrays[name], 1)[0] for name in ("relative", "frames", "latency")
         )
-        plane = Plane((center[0], center[1], center[2]), (normal[0], normal[1], normal[2]), (size[0], size[1]))
+        plane = Plane(
+            (center[0], center[1], center[2]), (normal[0], normal[1], normal[2]), (size[0], size[1])
+        )
         doubts = tuple(map(str, arrays["doubts"].ravel()))
         return Picture(plane, pressure, deviation, bool(relative), int(frames), latency, doubts)
 
