@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.ndimage import map_coordinates, spline_filter
+from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
 from autdtorch.objectives.readings import Readings
 from autdtorch.scene.geometry import Plane, cell_centers_of
@@ -14,7 +14,7 @@ from autdtorch.utils.array_types import REAL, Array
 from autdtorch.utils.validation import ArrayLike, invalid, points_tensor, positive
 
 _OFF_PLANE = 0.02  # largest distance of a point from its plane, by the plane's longer edge
-_STEPS = 30  # to a maximum
+_SMOOTHING, _FINEST = 0.2, 1e-4  # for the place of a focus, by the radius
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -64,7 +64,8 @@ class Picture:
             ValueError: a point is not in the plane.
         """
         cells = self._cells(plane_coordinates(self.plane, points))
-        square = map_coordinates(self._spline, cells.T, order=5, mode="reflect", prefilter=False)
+        spline = spline_filter(self.pressure.square().numpy(), order=5, mode="reflect")
+        square = _interpolated(spline, cells)
         deviation = map_coordinates(self.deviation.numpy(), cells.T, order=1, mode="nearest")
         pressure = torch.from_numpy(np.maximum(square, 0.0)).sqrt()
         return pressure, torch.from_numpy(deviation)
@@ -72,46 +73,49 @@ class Picture:
     def foci(self, near: ArrayLike, radius: float = 5e-3) -> torch.Tensor:
         """Return the places (P, 3) [m] of the largest |p| within a radius [m] of points (P, 3) [m].
 
+        |p|^2 is smoothed over a fifth of the radius, because noise moves the top of a focus.
+
         Raises:
             ValueError: a point is not in the plane, or `radius` is not a finite number > 0.
         """
-        radius = positive("radius", radius, "m")
+        length = _SMOOTHING * positive("radius", radius, "m")
         starts = plane_coordinates(self.plane, near, "near")
-        u, v = (basis.numpy() for basis in self.plane.basis)
-        places = np.stack([self._climb(start, radius) for start in starts])
+        cells = length * np.asarray(self._counts) / np.asarray(self.plane.size)
+        smooth = gaussian_filter(self.pressure.square().numpy(), cells)
+        spline = spline_filter(smooth, order=5, mode="reflect")
+        places = np.stack([self._climb(spline, start, radius) for start in starts])
+        u, v = (axis.numpy() for axis in self.plane.basis)
         return torch.from_numpy(np.asarray(self.plane.center) + places[:, :1] * u + places[:, 1:] * v)
 
     def readings(self, drive: torch.Tensor) -> Readings:
         """Return the picture as readings of a drive (M,) at all cells of the plane."""
         return Readings(drive, self.pressure.reshape(-1), self.points)
 
-    def _climb(self, start: Array, radius: float) -> Array:
-        """Return the maximum (2,) of |p|^2 near a start (2,), by ever finer patches of 5 x 5 places."""
-        place, step = start, radius / 2
-        offsets = np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3), indexing="ij"), -1).reshape(-1, 2)
-        bound = np.asarray(self.plane.size) / 2
-        for _ in range(_STEPS):
+    def _climb(self, spline: Array, start: Array, radius: float) -> Array:
+        """Return the largest place (2,) of a spline near a start (2,), by ever finer patches of 5 x 5."""
+        offsets = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+        place, step, bound = start, radius / 2, np.asarray(self.plane.size) / 2
+        while step > _FINEST * radius:
             around = np.clip(place + step * offsets, -bound, bound)
-            around = around[np.linalg.norm(around - start, axis=1) <= radius * (1 + 1e-9)]
-            square = map_coordinates(
-                self._spline, self._cells(around).T, order=5, mode="reflect", prefilter=False
-            )
-            best = around[square.argmax()]
-            step *= 0.5 if np.linalg.norm(best - place) < 1.5 * step else 1.0
+            around = around[np.linalg.norm(around - start, axis=1) <= 1.01 * radius]
+            best = around[_interpolated(spline, self._cells(around)).argmax()]
+            if np.linalg.norm(best - place) < 1.5 * step:
+                step /= 2
             place = best
-        return place
+        return np.asarray(place)
 
     @property
     def _counts(self) -> tuple[int, int]:
         return self.pressure.shape[0], self.pressure.shape[1]
 
-    @property
-    def _spline(self) -> Array:
-        return np.asarray(spline_filter(self.pressure.square().numpy(), order=5, mode="reflect"))
-
     def _cells(self, coordinates: Array) -> Array:
         """Return the indices (P, 2), in parts of a cell, of coordinates (P, 2) [m]."""
         return np.asarray((coordinates / np.asarray(self.plane.size) + 0.5) * self._counts - 0.5)
+
+
+def _interpolated(spline: Array, cells: Array) -> Array:
+    """Return the values (P,) of a spline of fifth order at indices (P, 2), in parts of a cell."""
+    return np.asarray(map_coordinates(spline, cells.T, order=5, mode="reflect", prefilter=False))
 
 
 def plane_coordinates(plane: Plane, points: ArrayLike, name: str = "points") -> Array:

@@ -1,0 +1,243 @@
+"""The least squares of the frames of one pulse of sound."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from autdtorch.hardware.camera.cosines import Cosines
+from autdtorch.hardware.camera.screen import Screen
+from autdtorch.utils.array_types import AnyArray, Array
+from autdtorch.utils.text import counted
+from autdtorch.utils.validation import invalid
+
+_RATES = 48  # of decay, that stand for those of all cosines
+_RANK = 1e-3  # smallest singular value of the combinations of frames, by the largest
+_CONVERGED, _ITERATIONS = 1e-4, 300  # of conjugate gradients: residual norm by that of the right side
+_ROUGH = 1e-2  # of the coefficients by which the latency is found
+_LATENCIES = np.linspace(-0.1, 0.4, 251)  # that are tried [s]
+_CERTAIN = 0.02  # largest standard deviation of a latency [s]
+_LEAST_NOISE = 1e-6  # [K]
+
+
+class PulseFit:
+    """The frames of one pulse, reduced to a few combinations, and the cosines of |p|^2 that fit them.
+
+    Every pixel has a constant of its own, and every frame an offset common to its pixels: white, and with a
+    drift. The combinations span what cosines of any rate of decay do over time, without constants. They are
+    orthonormal, so that their noise is white; pixels that miss frames have a weight matrix.
+
+    Attributes:
+        noise: standard deviation of a pixel in a frame [K], by the frames alone.
+        frames: number of frames.
+    """
+
+    def __init__(
+        self,
+        cosines: Cosines,
+        screen: Screen,
+        times: Array,
+        values: Array,
+        duration: float,
+        drift: float,
+        remaining: float,
+    ) -> None:
+        """Reduce the values (T, N) [K] of pixels, NaN for none, at times (T,) [s].
+
+        The sound begins at time 0 and lasts for a duration [s]. The drift [K/s] of all pixels, and the heat
+        that remains of earlier pulses at time 0 [K], are standard deviations.
+        """
+        self._cosines, self._screen, self._times, self._duration = cosines, screen, times, duration
+        self.frames = len(times)
+        decay = screen.decay(cosines.wavenumber)
+        rates = np.geomspace(decay.min(), decay.max(), _RATES)[:, None]
+        courses = [screen.rise(rates, times, duration), (times - times.mean())[None]]
+        courses += [np.exp(-rates * times)] if remaining else []
+        self._basis = _orthonormal(np.concatenate(courses).T)  # (T, R)
+        valid = np.isfinite(values)
+        self._full = valid.all(axis=0)
+        if not self._full.any():
+            raise invalid("images", "no pixel in all frames", "some must be finite and below saturation")
+        self._reduce(np.where(valid, values, 0.0), valid)
+        self._measure_noise(drift)
+        self._courses = [np.moveaxis(screen.rise(decay[..., None], times, duration) @ self._basis, -1, 0)]
+        self._prior = [self._strongest() ** 2 * cosines.spectrum]
+        if remaining:
+            self._courses.append(np.moveaxis(np.exp(-decay[..., None] * times) @ self._basis, -1, 0))
+            self._prior.append(remaining**2 * cosines.spectrum)
+
+    def _reduce(self, values: Array, valid: AnyArray) -> None:
+        """Form the combinations (N, R) of frames, and their weights (N, R, R), without constants."""
+        count = np.maximum(valid.sum(axis=0), 1)
+        self._values = np.where(valid, values - values.sum(axis=0) / count, 0.0)
+        self._data = self._values.T @ self._basis
+        self._weights = np.broadcast_to(
+            np.eye(self._basis.shape[1]), (len(count), *[self._basis.shape[1]] * 2)
+        )
+        if self._full.all():
+            return
+        self._weights = self._weights.copy()
+        for pixel in np.flatnonzero(~self._full):
+            seen = self._basis[valid[:, pixel]]
+            self._weights[pixel] = seen.T @ (seen - (seen.mean(axis=0) if len(seen) else 0.0))
+
+    def _measure_noise(self, drift: float) -> None:
+        """Measure the noise of pixels, and of the offsets of frames, by what no combination holds."""
+        values, freedom = self._values[:, self._full], self.frames - 1 - self._basis.shape[1]
+        left = values - self._basis @ (self._basis.T @ values)
+        common = left.mean(axis=1)
+        squares = ((left - common[:, None]) ** 2).sum(axis=0)
+        median = freedom * (1 - 2 / (9 * freedom)) ** 3  # of chi^2 (Wilson & Hilferty 1931)
+        self.noise = max(math.sqrt(np.median(squares) / median), _LEAST_NOISE)
+        jitter = max(float(common @ common) / freedom, self.noise**2 / len(squares))
+        slope = self._basis.T @ (self._times - self._times.mean())
+        self._offsets = jitter * np.eye(len(slope)) + drift**2 * np.outer(slope, slope)
+
+    def _strongest(self) -> float:
+        """Return the largest |p|^2 [Pa^2], roughly: twice the largest of pixels that do not conduct."""
+        course = self._courses[0][:, 0, 0]
+        weight = self._weights @ course @ course
+        seen = weight > 0.1 * weight.max()
+        return max(2 * float(np.max(self._data[seen] @ course / weight[seen])), 1e-9)
+
+    def solve(self, tolerance: float = _CONVERGED) -> Array:
+        """Return the coefficients (Ku, Kv) of the cosines of |p|^2 [Pa^2]."""
+        variance, shape = self.noise**2, self._cosines.wavenumber.shape
+        mask = self._cosines.spectrum > 0
+        courses, prior = np.stack(self._courses), np.stack(self._prior)
+        share = len(self._data) * self._cosines.blur**2 * float(np.mean(self._seen()))
+        precision = variance / np.where(mask, prior, 1.0)
+        scale = mask / np.sqrt(share * (courses**2).sum(axis=1) + precision)
+        offset_precision = variance * np.linalg.inv(self._offsets)
+        offset_scale = 1 / np.sqrt(len(self._data) + np.diag(offset_precision))
+
+        def parts(unknowns: Array) -> tuple[Array, Array]:
+            fields, offsets = np.split(unknowns, [scale.size])
+            return fields.reshape(-1, *shape) * scale, offsets * offset_scale
+
+        def weighted(fields: Array, offsets: Array) -> Array:
+            images = self._cosines.forward((courses * fields[:, None]).sum(axis=0)) + offsets
+            return np.asarray(np.einsum("nrs,ns->nr", self._weights, images))
+
+        def adjoint(residual: Array, fields: Array, offsets: Array) -> Array:
+            """Return the gradient, in scaled unknowns, of the data and the priors."""
+            images = (courses * self._cosines.adjoint(residual)).sum(axis=1) + precision * fields
+            total = residual.sum(axis=0) + offset_precision @ offsets
+            return np.concatenate([(scale * images).ravel(), offset_scale * total])
+
+        def normal(unknowns: Array) -> Array:
+            fields, offsets = parts(unknowns)
+            return adjoint(weighted(fields, offsets), fields, offsets)
+
+        nothing = np.zeros_like(scale), np.zeros_like(offset_scale)
+        solution = _conjugate_gradients(normal, adjoint(self._data, *nothing), tolerance)
+        fields, offsets = parts(solution)
+        self._left = self._data - weighted(fields, offsets)
+        return np.asarray(fields[0])
+
+    def misfit(self) -> float:
+        """Return the root mean square of what the solution leaves, by that of the noise."""
+        information = self._information(1.0)
+        unknowns = float((information / (1 + information)).sum())
+        freedom = max(int(self._full.sum()) * self._basis.shape[1] - unknowns, 1.0)
+        return math.sqrt(float((self._left[self._full] ** 2).sum()) / freedom) / self.noise
+
+    def variance(self, counts: tuple[int, ...], length: float) -> tuple[Array, Array]:
+        """Return the posterior variance (Nu, Nv) of |p|^2 [Pa^4] in cells of the plane, and their density.
+
+        The density of valid pixels, by its mean, is smoothed over a length [m]. The variance at a place
+        is that of a plane with its density everywhere.
+        """
+        density = np.maximum(self._cosines.density(self._seen(), counts, length), 1e-6)
+        steps = np.geomspace(density.min() * 0.99, density.max() * 1.01, 40)
+        variances = [float((self._prior[0] / (1 + self._information(step))).sum()) for step in steps]
+        course = self._courses[0][:, 0, 0]
+        common = 1 / float(course @ np.linalg.solve(self._offsets, course))
+        return common + np.exp(np.interp(np.log(density), np.log(steps), np.log(variances))), density
+
+    def _information(self, density: float) -> Array:
+        """Return the weight (Ku, Kv) of the data on each cosine, by that of its prior."""
+        gram = density * len(self._data) * self._cosines.blur**2 / self.noise**2
+        weight = (self._courses[0] ** 2).sum(axis=0)
+        if len(self._courses) > 1:  # what could also be heat that remains is no information
+            both = (self._courses[0] * self._courses[1]).sum(axis=0)
+            fades = (self._courses[1] ** 2).sum(axis=0)
+            weight -= gram * self._prior[1] * both**2 / (gram * self._prior[1] * fades + 1)
+        return np.asarray(gram * weight * self._prior[0])
+
+    def _seen(self) -> Array:
+        """Return the weight (N,) of each pixel: 1 with all frames, 0 without."""
+        course = self._courses[0][:, 0, 0]
+        return np.asarray(self._weights @ course @ course / (course @ course))
+
+    def latency(self) -> tuple[float, float] | None:
+        """Return the latency [s], and its part of the relative deviation of |p|^2; None if it is not seen.
+
+        The pixels, weighted by their heat, are summed for one curve over time. Its scale and its latency are
+        fitted together.
+        """
+        coefficients = self.solve(_ROUGH)
+        heat = np.maximum(self._cosines.forward(coefficients), 0.0) * self._full
+        weights = (coefficients * self._cosines.adjoint(heat)).ravel()
+        decay = self._screen.decay(self._cosines.wavenumber).ravel()
+        rates = np.geomspace(0.999 * decay.min(), 1.001 * decay.max(), 4 * _RATES)
+        parts = np.bincount(np.searchsorted(rates, decay), weights, len(rates))
+        curve, ones = self._values @ heat, np.ones_like(self._times)
+
+        def course(latency: float) -> Array:
+            return np.asarray(
+                parts @ self._screen.rise(rates[:, None], self._times - latency, self._duration)
+            )
+
+        def misfit(latency: float) -> float:
+            columns = np.stack([course(latency), ones], axis=1)
+            left = curve - columns @ np.linalg.lstsq(columns, curve, rcond=None)[0]
+            return float(left @ left)
+
+        misfits = [misfit(latency) for latency in _LATENCIES]
+        best, step = int(np.argmin(misfits)), float(_LATENCIES[1] - _LATENCIES[0])
+        if best in (0, len(misfits) - 1):
+            return None
+        below, at, above = misfits[best - 1 : best + 2]
+        latency = float(_LATENCIES[best]) + 0.5 * step * (below - above) / (below + above - 2 * at)
+        rise, change = course(latency), (course(latency + step) - course(latency - step)) / (2 * step)
+        noise = self.noise**2 * float(heat @ heat)
+        free = noise * _inverse_gram(rise, change, ones)
+        fixed = noise * _inverse_gram(rise, ones)
+        if free[1, 1] > _CERTAIN**2:
+            return None
+        return latency, math.sqrt(max(free[0, 0] - fixed[0, 0], 0.0))
+
+
+def _orthonormal(courses: Array) -> Array:
+    """Return an orthonormal basis (T, R) of courses over time (T, C), less their means."""
+    centred = courses - courses.mean(axis=0)
+    basis, sizes, _ = np.linalg.svd(centred / np.linalg.norm(centred, axis=0), full_matrices=False)
+    rank = int((sizes > _RANK * sizes[0]).sum())
+    if len(courses) < rank + 3:
+        raise invalid("times", counted(len(courses), "frame"), f"must be at least {rank + 3} frames")
+    return np.asarray(basis[:, :rank])
+
+
+def _inverse_gram(*columns: Array) -> Array:
+    table = np.stack(columns, axis=1)
+    return np.asarray(np.linalg.inv(table.T @ table))
+
+
+def _conjugate_gradients(normal: Callable[[Array], Array], right: Array, tolerance: float) -> Array:
+    """Return the solution of normal(x) = right."""
+    solution, residual = np.zeros_like(right), right.copy()
+    direction, square = right.copy(), float(right @ right)
+    goal = tolerance**2 * square
+    for _ in range(_ITERATIONS):
+        if square <= goal:
+            break
+        image = normal(direction)
+        step = square / float(direction @ image)
+        solution += step * direction
+        residual -= step * image
+        square, before = float(residual @ residual), square
+        direction = residual + (square / before) * direction
+    return solution
