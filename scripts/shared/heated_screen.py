@@ -97,7 +97,7 @@ def laplacian(values: np.ndarray) -> np.ndarray:
 
 def point_spread(blur: float) -> tuple[np.ndarray, np.ndarray]:
     """Return offsets [pixels] and weights of a Gaussian convolved with a pixel, along an axis."""
-    offsets = np.linspace(-3 * blur - 0.5, 3 * blur + 0.5, 13)
+    offsets = np.linspace(-3 * blur - 0.5, 3 * blur + 0.5, 9)
     weights = erf((offsets + 0.5) / (2**0.5 * blur)) - erf((offsets - 0.5) / (2**0.5 * blur))
     return offsets, weights / weights.sum()
 

@@ -12,13 +12,12 @@ it shrinks |p|^2 by no more than about the square of its relative standard devia
 from __future__ import annotations
 
 import math
-from functools import cache
 
 import numpy as np
 import torch
 
 from autdtorch.hardware.camera.cosines import Cosines
-from autdtorch.hardware.camera.picture import Picture
+from autdtorch.hardware.camera.picture import Picture, deviation_of
 from autdtorch.hardware.camera.pulse_fit import PulseFit
 from autdtorch.hardware.camera.registration import Registration
 from autdtorch.hardware.camera.screen import Screen
@@ -105,10 +104,17 @@ class HeatInversion:
         variance, density = fit.variance(self.counts, _SMOOTH * self._wavelength)
         if unseen := float(np.mean(density < _UNSEEN * np.median(density))):
             doubts.append(f"{100 * unseen:.2g} % of the plane is not seen")
-        deviation = np.hypot(max(1.0, misfit) * np.sqrt(variance), uncertainty * square)
-        pressure, spread = map(torch.from_numpy, magnitudes(square, deviation))
-        relative = self.screen.heating is None
-        return Picture(self.registration.plane, pressure, spread, relative, fit.frames, shift, tuple(doubts))
+        of_square = np.hypot(max(1.0, misfit) * np.sqrt(variance), uncertainty * square)
+        pressure = np.sqrt(np.maximum(square, 0.0))
+        return Picture(
+            self.registration.plane,
+            torch.from_numpy(pressure),
+            torch.from_numpy(deviation_of(pressure, of_square)),
+            self.screen.heating is None,
+            fit.frames,
+            shift,
+            tuple(doubts),
+        )
 
     def _checked(self, times: Array, images: Array, saturation: float) -> tuple[Array, Array]:
         """Return times (T,) and the values (T, N) of the pixels around the plane, NaN without one."""
@@ -120,29 +126,3 @@ class HeatInversion:
             raise invalid("times", times, "must have frames before and after 0, when the sound begins", "s")
         values = images.reshape(len(times), -1)[:, self._cosines.pixels]
         return times, np.where(values < saturation, values, np.nan)
-
-
-def magnitudes(square: Array, deviation: Array) -> tuple[Array, Array]:
-    """Return magnitudes and their deviations from squares, which noise may make negative.
-
-    They are mean and standard deviation of the posterior of |p| >= 0, all values as likely a priori. Far
-    above the noise they are those of the root of the square.
-    """
-    deviation = np.maximum(deviation, 1e-100)
-    ratio = square / deviation
-    ratios, means, deviations = _posterior_table()
-    far, root = ratio > ratios[-1], np.sqrt(np.maximum(ratio, 1.0))
-    mean = np.where(far, root, np.interp(ratio, ratios, means))
-    spread = np.where(far, 0.5 / root, np.interp(ratio, ratios, deviations))
-    return np.sqrt(deviation) * mean, np.sqrt(deviation) * spread
-
-
-@cache
-def _posterior_table() -> tuple[Array, Array, Array]:
-    """Return ratios of a square to its deviation; mean and deviation of its root for a deviation of 1."""
-    ratios, roots = np.linspace(-10, 30, 401), np.linspace(0, 7, 1401)
-    exponents = -0.5 * (roots**2 - ratios[:, None]) ** 2
-    weights = np.exp(exponents - exponents.max(axis=1, keepdims=True))
-    weights /= weights.sum(axis=1, keepdims=True)
-    means = weights @ roots
-    return ratios, means, np.sqrt(np.maximum(weights @ roots**2 - means**2, 0.0))

@@ -21,6 +21,9 @@ _SMOOTHING, _FINEST = 0.2, 1e-4  # for the place of a focus, by the radius
 class Picture:
     """The pressure magnitudes in the cells of a plane, with their standard deviations.
 
+    The frames show |p|^2, whose noise is equal in loud and in dark places. Deviations are those towards
+    higher pressures: |p|^2 deviates by (pressure + deviation)^2 - pressure^2.
+
     Attributes:
         plane: the plane.
         pressure: peak amplitudes (Nu, Nv) [Pa] at `cell_centers(plane)`.
@@ -65,10 +68,10 @@ class Picture:
         """
         cells = self._cells(plane_coordinates(self.plane, points))
         spline = spline_filter(self.pressure.square().numpy(), order=5, mode="reflect")
-        square = _interpolated(spline, cells)
-        deviation = map_coordinates(self.deviation.numpy(), cells.T, order=1, mode="nearest")
-        pressure = torch.from_numpy(np.maximum(square, 0.0)).sqrt()
-        return pressure, torch.from_numpy(deviation)
+        pressure = np.sqrt(np.maximum(_interpolated(spline, cells), 0.0))
+        of_square = (self.pressure + self.deviation).square() - self.pressure.square()
+        spread = map_coordinates(of_square.numpy(), cells.T, order=1, mode="nearest")
+        return torch.from_numpy(pressure), torch.from_numpy(deviation_of(pressure, spread))
 
     def foci(self, near: ArrayLike, radius: float = 5e-3) -> torch.Tensor:
         """Return the places (P, 3) [m] of the largest |p| within a radius [m] of points (P, 3) [m].
@@ -111,6 +114,11 @@ class Picture:
     def _cells(self, coordinates: Array) -> Array:
         """Return the indices (P, 2), in parts of a cell, of coordinates (P, 2) [m]."""
         return np.asarray((coordinates / np.asarray(self.plane.size) + 0.5) * self._counts - 0.5)
+
+
+def deviation_of(pressure: Array, of_square: Array) -> Array:
+    """Return the deviation [Pa] of magnitudes [Pa] by that of their squares [Pa^2]."""
+    return np.asarray(of_square / np.maximum(np.sqrt(pressure**2 + of_square) + pressure, 1e-300))
 
 
 def _interpolated(spline: Array, cells: Array) -> Array:
