@@ -292,6 +292,7 @@ class _Trial:
             log,
             solution,
             again,
+            self._propagator,
             self._simulated,
             self._expected,
             preflight,

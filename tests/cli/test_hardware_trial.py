@@ -27,15 +27,18 @@ from autdtorch.hardware import (
     MovedMicrophone,
     OffError,
     Oscilloscope,
+    Picture,
     ScopeSensor,
 )
 from autdtorch.hardware.sensors.sensor import SensorConfig
 from autdtorch.io.drive_file import load_drive
+from autdtorch.io.picture_file import PICTURES, save_picture
 from autdtorch.io.scene_file import load_scene
 from autdtorch.objectives.goals import TargetPressures, WeakestFocus
 from autdtorch.objectives.quiet import QuietPoints
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import PhaseLevels
+from autdtorch.scene.geometry import Plane
 from autdtorch.study.report.hardware_report import compare
 from autdtorch.utils.validation import integer_at_least
 
@@ -89,6 +92,19 @@ def test_a_trial_leaves_log_drive_and_report_and_is_not_repeated(trial, tmp_path
     status, _, log = trial(*GABS)
     assert status == 2
     assert "of another trial, whose failed is [4], not []" in log
+
+
+def test_the_pictures_of_a_trial_are_in_its_report(trial, tmp_path):
+    plane = Plane((80e-3, 0, 0), (1, 0, 0), (0.06, 0.06))
+    pressure = torch.full((12, 12), 1.0, dtype=torch.float64)
+    picture = Picture(plane, pressure, 0.02 * pressure, relative=True, doubts=("3 frames are missing",))
+    save_picture(tmp_path / "out" / PICTURES / "again_0.npz", picture)
+    assert trial(*GABS)[0] == 0
+    report = (tmp_path / "out" / "report.md").read_text()
+    assert re.search(r"## The plane\n\n!\[.*\]\(plane\.png\)\n\nThe mean of 1 picture of", report)
+    assert "a deviation of 2 %.\nThe screen is not calibrated" in report
+    assert "\n\n- 3 frames are missing\n\n" in report
+    assert (tmp_path / "out" / "plane.png").exists()
 
 
 def test_a_calibration_that_fails_does_not_spoil_a_trial(trial, tmp_path, monkeypatch):

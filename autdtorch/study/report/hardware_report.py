@@ -21,8 +21,10 @@ from autdtorch.objectives.goals import Goal
 from autdtorch.objectives.objective import Objective
 from autdtorch.plot.calibration_figure import plot_calibration
 from autdtorch.plot.trials import plot_convergence
+from autdtorch.propagators import Propagator
 from autdtorch.study.report import alt_texts
 from autdtorch.study.report.document import code, picture, rendered
+from autdtorch.study.report.measured_plane import measured_plane
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.files import naming, replace_file
 from autdtorch.utils.text import in_digits
@@ -50,6 +52,7 @@ def write_hardware_report(
     log: EvaluationLog,
     solution: Solution,
     again: torch.Tensor,
+    propagator: Propagator,
     simulated: Objective,
     expected: Solution,
     preflight: Preflight,
@@ -60,8 +63,8 @@ def write_hardware_report(
     """Write `report.md` and its figures into a folder; return its path.
 
     The drive of the `solution` on the bench was read `again` (R, P) [Pa]. `expected` is the solution of
-    the same method on the `simulated` objective, without noise and with the phase levels of the device. Both
-    maximised the `goal`. The `calibration` is of the evaluations, or a text says why there is none.
+    the same method on the `simulated` objective of the `propagator`, without noise and with the phase levels
+    of the device. Both maximised the `goal`. The `calibration` is of the evaluations, or a text says why there is none.
     """
     evaluations, scene = log.evaluations, simulated.scene
     working = torch.ones(len(scene.array), **REAL)
@@ -78,6 +81,7 @@ def write_hardware_report(
     if isinstance(calibration, Calibration):
         with naming(folder / _CALIBRATION_FIGURE):
             plot_calibration(calibration).savefig(folder / _CALIBRATION_FIGURE)
+    names = _names(scene.control_points)
     again_mean = again.mean(dim=0)
     pressures = solution.pressure[0], again_mean, fit.scale * simulated(working * solution.drive)[0]
     times = [datetime.fromisoformat(one.time) for one in evaluations]
@@ -98,10 +102,11 @@ def write_hardware_report(
         score_again=float(goal(again_mean)),
         readings=len(again),
         same=int(torch.isclose(solution.drive, expected.drive, rtol=0, atol=1e-9).sum()),
-        points=_points(scene.control_points, *pressures),
-        fits=_fits(scene.control_points, measured, predicted),
+        points=_points(names, *pressures),
+        fits=_fits(names, measured, predicted),
         scale=fit.scale,
         misfit=_percent(fit.misfit),
+        **measured_plane(folder, propagator, working * solution.drive[0], fit.scale, names),
         **_calibrated(calibration),
         alone=preflight.pressure[preflight.pressure > preflight.threshold],
         preflight=preflight,
@@ -140,18 +145,18 @@ def _as_text(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _points(places: torch.Tensor, *pressures: torch.Tensor) -> list[list[str]]:
+def _points(names: list[str], *pressures: torch.Tensor) -> list[list[str]]:
     rows = [["control point [mm]", "when found [Pa]", "again [Pa]", "simulated [Pa]", "again / simulated"]]
     columns = [[*pressure.tolist(), float(pressure.min())] for pressure in pressures]
-    for name, when_found, again, simulated in zip([*_names(places), "weakest"], *columns, strict=True):
+    for name, when_found, again, simulated in zip([*names, "weakest"], *columns, strict=True):
         values = (f"{value:#.4g}" for value in (when_found, again, simulated))
         rows.append([name, *values, f"{again / simulated:.3f}"])
     return rows
 
 
-def _fits(places: torch.Tensor, measured: torch.Tensor, simulated: torch.Tensor) -> list[list[str]]:
+def _fits(names: list[str], measured: torch.Tensor, simulated: torch.Tensor) -> list[list[str]]:
     rows = [["control point [mm]", "factor", "differs by [%]"]]
-    for name, *pressures in zip(_names(places), measured.T, simulated.T, strict=True):
+    for name, *pressures in zip(names, measured.T, simulated.T, strict=True):
         fit = compare(*pressures)
         rows.append([name, f"{fit.scale:#.4g}", _percent(fit.misfit)])
     return rows
