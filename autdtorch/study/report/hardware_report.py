@@ -64,7 +64,8 @@ def write_hardware_report(
 
     The drive of the `solution` on the bench was read `again` (R, P) [Pa]. `expected` is the solution of
     the same method on the `simulated` objective of the `propagator`, without noise and with the phase levels
-    of the device. Both maximised the `goal`. The `calibration` is of the evaluations, or a text says why there is none.
+    of the device. Both maximised the `goal`. The `calibration` is of the evaluations, or a text says why
+    there is none.
     """
     evaluations, scene = log.evaluations, simulated.scene
     working = torch.ones(len(scene.array), **REAL)

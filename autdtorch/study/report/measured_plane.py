@@ -1,4 +1,4 @@
-"""The plane of a camera in the report of a trial: pressures and foci as measured, beside the simulated ones."""
+"""The plane of a camera in the report of a trial: as measured, beside the simulated one."""
 
 from __future__ import annotations
 
