@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -170,8 +170,7 @@ def make_grid(region: Region, spacing: float) -> Grid:
 
 def make_box(region: Region, spacing: float) -> Grid:
     """Return a grid over the region's bodies and `AROUND` cells of air around them, whatever its domain."""
-    everywhere = replace(region, domain=((-math.inf,) * 3, (math.inf,) * 3))
-    return _covering(everywhere, spacing, bodies_extent(region.shapes, region.wavelength))
+    return _covering(region.unbounded, spacing, bodies_extent(region.shapes, region.wavelength))
 
 
 def require_spacing(region: Region, spacing: float) -> None:

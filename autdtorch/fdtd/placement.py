@@ -35,6 +35,8 @@ _ALLOWANCE = 0.1
 _NARROWER = 0.2  # Distance of the faces that represent a slender cylinder from its surface [cells]
 _BEST = 0.45  # Best distance of a face behind the last centre [cells]
 _CLOSED = 1.0  # Square error of the faces of a slit without a centre in it
+_ROOM = 0.08  # Most by which a spacing is changed for the faces, relative to it
+_TRIED, _MOST_TRIED = 8, 256  # Spacings tried for each cell by which the longest body changes; most in all
 
 
 def grid_offset(
@@ -47,6 +49,29 @@ def grid_offset(
         for axis, (low, high) in enumerate(zip(lower, upper, strict=True))
     )
     return x, y, z
+
+
+def fitting_spacing(regions: Sequence[Region], spacing: float, coarsest: float = math.inf) -> float:
+    """Return the spacing [m] near one, not above a limit, with which the faces of regions fall best.
+
+    Each region has a grid. Without flat faces it is the spacing itself. Behind large bodies, where little
+    arrives past their edges, errors at equal spacings differ up to tenfold with the place of the faces.
+    """
+    faces = []
+    for region in regions:
+        surfaces = [_flat_surface(shape, spacing) for shape in region.shapes]
+        faces += [_faces(region, surfaces, axis, 0.0) for axis in range(3)]
+    faces = [each for each in faces if each.shape[1]]
+    if not faces:
+        return spacing
+    longest = max(float(np.ptp(place)) for place, _, _ in faces)
+    count = min(_TRIED * (1 + math.ceil(2 * _ROOM * longest / spacing)), _MOST_TRIED)
+    tried = np.linspace((1 + _ROOM) * spacing, (1 - _ROOM) * spacing, count).clip(max=coarsest)
+    missed = [
+        sum(_placements(place / one, first, area, 0.0)[1].min() for place, first, area in faces)
+        for one in tried
+    ]
+    return float(tried[int(np.argmin(missed))])
 
 
 def _flat_surface(shape: Shape, spacing: float) -> tuple[Array, Array]:
@@ -96,6 +121,17 @@ def _axis_offset(faces: Array, transducers: Array, length: float, spacing: float
     middle = (math.ceil(whole - _ROUNDING) - whole) / 2
     if len(place) == 0:
         return middle
+    offsets, missed = _placements(cells, first, area, middle)
+    best, symmetric = int(missed.argmin()), min(_SYMMETRIC, key=lambda number: missed[number])
+    allowed = missed[best] / _WORTHWHILE
+    pointlike = np.stack((transducers, np.zeros_like(transducers), np.zeros_like(transducers)))
+    if _mirrored(np.concatenate((faces, pointlike), axis=1), length):
+        allowed = max(allowed, (math.sqrt(missed[best]) + _ALLOWANCE) ** 2)
+    return float(offsets[symmetric if missed[symmetric] <= allowed else best])
+
+
+def _placements(cells: Array, first: Array, area: Array, middle: float) -> tuple[Array, Array]:
+    """Return offsets [cells], those around `middle` first, and the mean square errors of the faces."""
     slits = _slits(cells, first)
     between = np.unique(np.round(-cells % 1, 9))[:_STEPS]
     opened = np.unique(np.round((0.5 - cells[slits].mean(axis=1)) % 1, 9))[:_STEPS]
@@ -105,13 +141,7 @@ def _axis_offset(faces: Array, transducers: Array, length: float, spacing: float
     distance = (first * place - _TOUCHING) % 1 + _TOUCHING
     closed = np.diff(np.floor(place[:, slits]), axis=2)[:, :, 0] == 0
     missed = (distance - _BEST) ** 2 @ area + _CLOSED * closed @ area[slits].sum(axis=1)
-    missed /= area.sum()
-    best, symmetric = int(missed.argmin()), min(_SYMMETRIC, key=lambda number: missed[number])
-    allowed = missed[best] / _WORTHWHILE
-    pointlike = np.stack((transducers, np.zeros_like(transducers), np.zeros_like(transducers)))
-    if _mirrored(np.concatenate((faces, pointlike), axis=1), length):
-        allowed = max(allowed, (math.sqrt(missed[best]) + _ALLOWANCE) ** 2)
-    return float(offsets[symmetric if missed[symmetric] <= allowed else best])
+    return offsets, missed / area.sum()
 
 
 def _slits(cells: Array, first: Array) -> Index:

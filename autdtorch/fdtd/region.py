@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 from torch import Tensor
@@ -105,6 +105,11 @@ class Region:
     def shortest_wavelength(self) -> float:
         """Wavelength [m] where sound is slowest."""
         return min(self.sound_speeds.values()) / self.frequency
+
+    @property
+    def unbounded(self) -> Self:
+        """The region with an infinite domain."""
+        return replace(self, domain=((-math.inf,) * 3, (math.inf,) * 3))
 
     @property
     def shapes(self) -> list[Shape]:

@@ -106,8 +106,7 @@ def turned(region: Region, axes: Array) -> Region:
     if not is_turned(axes):
         return region
     bodies = tuple(replace(body, shape=turned_shape(body.shape, axes)) for body in region.bodies)
-    everywhere = (-np.inf,) * 3, (np.inf,) * 3
-    return replace(region, bodies=bodies, domain=everywhere, sources=region.sources @ axes.T)
+    return replace(region.unbounded, bodies=bodies, sources=region.sources @ axes.T)
 
 
 class FlatFaces(NamedTuple):

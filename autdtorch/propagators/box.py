@@ -26,8 +26,7 @@ from autdtorch.fdtd.absorption import absorption
 from autdtorch.fdtd.coupling import Coupling, coupling_of
 from autdtorch.fdtd.grouping import one_box
 from autdtorch.fdtd.kernels.contract import Sources
-from autdtorch.fdtd.reflection import other_images, with_images
-from autdtorch.fdtd.region import Region
+from autdtorch.fdtd.reflection import other_images
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
 from autdtorch.fdtd.steady_state import MOST_JUDGED, SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly
@@ -136,18 +135,13 @@ class BoxSimulation(Simulation):
         plan.require_feasible()
         boxes, grouping = [], plan.grouping
         for group, axes, near in zip(grouping.groups, grouping.axes, grouping.mirrors, strict=True):
-            part = self._part(group, near)
+            part = self.plan.part(group, near)
             if is_tilted(axes):
                 logger.debug("the grid around obstacles %s is turned along their faces", list(group))
             assembly = assembled_box(part, axes, plan.spacing, plan.dtype, plan.time_step)
             images = other_images(plan.region, near, plan.scene.images)
             boxes.append(ScatteredField(assembly, plan.scene.complex_wavenumber, axes, images, near))
         return boxes
-
-    def _part(self, group: Sequence[int], near: Sequence[int]) -> Region:
-        """Return the region with a group of its bodies alone, and their images in mirrors near them."""
-        bodies = [self.plan.region.bodies[index] for index in group]
-        return replace(self.plan.region, bodies=with_images(bodies, self._mirrors(near)))
 
     def _mirrors(self, numbers: Iterable[int]) -> list[Mirror]:
         return [self.plan.region.mirrors[number] for number in numbers]
@@ -189,7 +183,7 @@ class BoxSimulation(Simulation):
         """The cells of each box that absorb."""
         result = []
         for box, group in zip(self.boxes, self.plan.grouping.groups, strict=True):
-            form = absorption(box.assembly, self._part(group, box.mirrors), box.axes)
+            form = absorption(box.assembly, self.plan.part(group, box.mirrors), box.axes)
             places, mirrors = box.positions(form.cells), self._mirrors(box.mirrors)
             result.append(AbsorbingCells.of(form, places, self.plan.region, group, mirrors))
         return result

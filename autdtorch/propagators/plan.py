@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Self
 
@@ -14,8 +16,10 @@ from autdtorch.fdtd.grid_errors import Law
 from autdtorch.fdtd.grouping import Grouping, choose_grids
 from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels.choice import available_kernel, precision_of
-from autdtorch.fdtd.reflection import require_domain, require_sharp, whole_region
+from autdtorch.fdtd.placement import fitting_spacing
+from autdtorch.fdtd.reflection import require_domain, require_sharp, whole_region, with_images
 from autdtorch.fdtd.region import Region
+from autdtorch.fdtd.turning import turned
 from autdtorch.propagators.free_space import PAIR_BYTES
 from autdtorch.propagators.scene_region import region_of, with_rigid
 from autdtorch.propagators.store import key_of
@@ -73,6 +77,18 @@ class Plan:
         """Return a plan of the same method with another spacing [m], tolerance and time step [s]."""
         _, grouping = choose_grids(self.region, self.method, spacing, tolerance, self.runs)
         return replace(self, spacing=spacing, tolerance=tolerance, time_step=time_step, grouping=grouping)
+
+    def fitting(self, spacing: float, coarsest: float = math.inf) -> float:
+        """Return the spacing [m] near one, not above a limit, with which flat faces fall best."""
+        grouping = self.grouping
+        grids = zip(grouping.groups, grouping.mirrors, grouping.axes, strict=True)
+        regions = [turned(self.part(group, near).unbounded, axes) for group, near, axes in grids]
+        return fitting_spacing(regions, spacing, coarsest)
+
+    def part(self, group: Sequence[int], near: Sequence[int]) -> Region:
+        """Return the region with a group of its bodies alone, and their images in mirrors near them."""
+        mirrors = [self.region.mirrors[number] for number in near]
+        return replace(self.region, bodies=with_images([self.region.bodies[one] for one in group], mirrors))
 
     def of(self, scene: Scene) -> Self:
         """Return a plan of a changed scene with these settings, which takes the same bodies as rigid."""

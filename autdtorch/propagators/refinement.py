@@ -81,7 +81,7 @@ def refined(plan: Plan, budget: Budget | None, store: Store) -> SimulatedPropaga
     if budget.is_unlimited:
         spacing /= min(region.wavelength / region.shortest_wavelength, _FINER_IF_SLOW)
         spacing = min(spacing, law.spacing_of(plan.tolerance / _FIRST_ERROR))
-    first = plan.at(spacing, _SETTLED * plan.tolerance, plan.time_step)
+    first = plan.at(plan.fitting(spacing, spacing), _SETTLED * plan.tolerance, plan.time_step)
     propagator = _chosen(plan, first, budget, store)
     propagator.warn_of_ringing()
     return propagator
@@ -119,7 +119,7 @@ def _chosen(pilot: Plan, plan: Plan, budget: Budget | None, store: Store) -> Sim
             wanted = aim / (error - known) * law.growth(plan.spacing)
             step = min(max(plan.spacing / law.spacing_of(wanted), _SMALLEST_STEP), _LARGEST_STEP)
         for ratio in (step, _SMALLEST_STEP):
-            finer = plan.at(plan.spacing / ratio, plan.tolerance, pilot.time_step)
+            finer = plan.at(plan.fitting(plan.spacing / ratio), plan.tolerance, pilot.time_step)
             if budget.fits(finer, plan, taken):
                 break
         else:

@@ -18,7 +18,7 @@ from autdtorch.fdtd.interpolation import (
     interpolate_points,
     interpolation_width,
 )
-from autdtorch.fdtd.placement import grid_offset
+from autdtorch.fdtd.placement import fitting_spacing, grid_offset
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
@@ -208,6 +208,19 @@ def test_only_axis_aligned_faces_move_the_grid_which_covers_the_domain():
     for centers, first, last in zip(grid.centers, grid.first, grid.last, strict=True):
         assert centers[first + margin] <= 0.5 * SPACING + 1e-9
         assert centers[last - 1 - margin] >= 30e-3 - 0.5 * SPACING - 1e-9
+
+
+@given(st.floats(8, 40), st.floats(0.6, 2.0))
+def test_a_spacing_is_moved_until_opposite_faces_fall_alike(side, spacing):
+    """Faces of a cube of whole cells and a tenth are both 0.45 cells behind a centre."""
+    region = region_of(scene(box((20, 20, 20), (side,) * 3)))
+    fitting = fitting_spacing([region.unbounded], spacing * 1e-3) * 1e3
+    assert 0.92 * spacing - 1e-9 <= fitting <= 1.08 * spacing + 1e-9
+    reached = any(abs(side / (cells + 0.1) / spacing - 1) < 0.08 for cells in range(100))
+    assert not reached or abs((side / fitting - 0.1 + 0.5) % 1 - 0.5) < 0.13  # of spacings an eighth apart
+    assert fitting_spacing([region.unbounded], spacing * 1e-3, spacing * 1e-3) <= spacing * 1e-3
+    sphere = Sphere((20e-3, 20e-3, 20e-3), 5e-3, rigid=True)
+    assert fitting_spacing([region_of(scene(sphere))], SPACING) == SPACING
 
 
 SHAPE = (24, 22, 20)
