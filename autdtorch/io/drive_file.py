@@ -83,7 +83,7 @@ def save_drive(
 def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
     """Read a drive (M,) or frames (T, M), complex128, levels as the device plays them.
 
-    - `.csv` and `.npz` of `save_drive`.
+    - `.csv` and `.npz` of `save_drive`, and `.npz` of `save_picture`.
     - `.csv` with the columns `phase [rad]` (or `[deg]`) and `amplitude`, by default 1; phases are phi. Names
       and units may be in a comment. Without names, one column is phases, and two are phases and amplitudes if
       only one of them can be amplitudes and not all numbers are whole. A unit that is not stated is taken as

@@ -9,29 +9,32 @@ import numpy as np
 import torch
 
 from autdtorch.hardware.camera.picture import Picture
+from autdtorch.scene.drive import validate_single_drive
 from autdtorch.scene.geometry import Plane
 from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.files import read_arrays, write_arrays
-from autdtorch.utils.validation import invalid, path_of, require_kind, within
+from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid, path_of, require_kind, within
 
 #: Folder of a trial for its pictures: `evaluation_00012.npz` of evaluation 12 (from 0), and `again_0.npz`,
 #: `again_1.npz`, ... of the drive that the search found, when it was played again.
 PICTURES = "pictures"
 AGAIN = "again"  # begins the names of these
 
+_MOST_CELLS = 2**22  # of a picture; a camera has 2**20 pixels at most
 _MAPS = ("pressure", "deviation")
 _PLANE = {"center": 3, "normal": 3, "size": 2}
 
 
-def save_picture(path: str | os.PathLike[str], picture: Picture) -> None:
+def save_picture(path: str | os.PathLike[str], picture: Picture, drive: ArrayLike | None = None) -> None:
     """Write a picture of a thermal camera to a .npz file, its maps in single precision.
 
     Args:
         path: of the file, which is replaced.
         picture: the picture.
+        drive: complex (M,), |q| <= 1, of the sound in the picture, which `load_drive` reads from the file.
 
     Raises:
-        ValueError: another suffix, or no picture.
+        ValueError: another suffix, no picture, or no drive.
         OSError: the file cannot be written.
     """
     path = path_of("path", path, suffixes=(".npz",))
@@ -39,7 +42,11 @@ def save_picture(path: str | os.PathLike[str], picture: Picture) -> None:
     maps = {name: getattr(picture, name).numpy().astype(np.float32) for name in _MAPS}
     plane = {name: np.asarray(getattr(picture.plane, name)) for name in _PLANE}
     rest = {name: getattr(picture, name) for name in ("relative", "frames", "latency")}
-    write_arrays(path, maps | plane | rest | {"doubts": np.asarray(picture.doubts, dtype=np.str_)})
+    rest["doubts"] = np.asarray(picture.doubts, dtype=np.str_)
+    if drive is not None:
+        checked = complex_tensor("drive", drive)
+        rest["drive"] = validate_single_drive(checked, checked.numel()).detach().cpu().numpy()
+    write_arrays(path, maps | plane | rest)
 
 
 def load_picture(path: str | os.PathLike[str]) -> Picture:
@@ -89,6 +96,8 @@ def _map(name: str, values: AnyArray) -> torch.Tensor:
     """Return a map (Nu, Nv) in double precision, after checking it."""
     if values.ndim != 2 or values.size == 0 or values.dtype.kind != "f":
         raise ValueError(f"{name}: shape {values.shape}, type {values.dtype}; must be real, (Nu, Nv)")
+    if values.size > _MOST_CELLS:
+        raise ValueError(f"{name}: {values.size} cells; must be at most {_MOST_CELLS}")
     if not (np.isfinite(values) & (values >= 0)).all():
         raise ValueError(f"{name}: must be finite and >= 0 in every cell")
     return torch.from_numpy(values.astype(np.float64))

@@ -29,6 +29,15 @@ def test_a_picture_is_loaded_as_it_was(tmp_path: Path) -> None:
         assert getattr(loaded, name) == getattr(picture, name)
 
 
+def test_the_drive_of_a_picture_is_beside_it(tmp_path: Path) -> None:
+    drive = torch.polar(torch.ones(5, dtype=torch.float64), torch.arange(5, dtype=torch.float64))
+    at.save_picture(tmp_path / "a.npz", picture_of(), drive)
+    assert torch.equal(at.load_drive(tmp_path / "a.npz"), drive)
+    assert at.load_picture(tmp_path / "a.npz").frames == 40
+    with pytest.raises(ValueError, match="drive"):
+        at.save_picture(tmp_path / "b.npz", picture_of(), [2.0 + 0j])
+
+
 def test_a_picture_without_doubts_is_loaded(tmp_path: Path) -> None:
     picture = Picture(PLANE, torch.ones(2, 3, dtype=torch.float64), torch.ones(2, 3, dtype=torch.float64))
     at.save_picture(tmp_path / "a.npz", picture)
