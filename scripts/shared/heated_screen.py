@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import torch
+from scipy.ndimage import zoom
 from scipy.sparse import csr_array
 from scipy.special import erf
 
@@ -13,6 +14,7 @@ from autdtorch.hardware.camera.screen import Screen
 
 FREQUENCY, WAVELENGTH = 40e3, 343.0 / 40e3
 _SPACING, _STEP = 0.5e-3, 2.5e-3  # of the finite differences [m], [s]
+_FINER = 2  # cells of the camera in one of these: its bilinear weights blur
 _MARGIN = 15e-3  # of the screen around the plane [m]
 
 
@@ -53,27 +55,38 @@ class HeatedScreen:
         large = at.Plane(plane.center, plane.normal, (self.counts[0] * _SPACING, self.counts[1] * _SPACING))
         self.points = large.points(_SPACING).reshape(-1, 3)
         rows, columns = np.divmod(np.arange(math.prod(shape)), shape[1])
+        cells, spacing = _FINER * np.array(self.counts), _SPACING / _FINER
         offsets, weights = point_spread(blur)
         entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for dx, wx in zip(offsets, weights, strict=True):
             for dy, wy in zip(offsets, weights, strict=True):
                 places = registration.to_plane(np.stack([columns + dx, rows + dy], axis=-1))
-                position = places / _SPACING + np.array(self.counts) / 2 - 0.5
+                position = places / spacing + cells / 2 - 0.5
                 start = np.floor(position).astype(int)
                 part = position - start
-                inside = ((start >= 0) & (start < np.array(self.counts) - 1)).all(axis=1)
+                inside = ((start >= 0) & (start < cells - 1)).all(axis=1)
                 for du, dv in ((0, 0), (0, 1), (1, 0), (1, 1)):
                     share = wx * wy * (part[:, 0] if du else 1 - part[:, 0])
                     share = share * (part[:, 1] if dv else 1 - part[:, 1])
-                    cell = (start[:, 0] + du) * self.counts[1] + start[:, 1] + dv
+                    cell = (start[:, 0] + du) * cells[1] + start[:, 1] + dv
                     entries.append((share[inside], np.flatnonzero(inside), cell[inside]))
         share, pixel, cell = (np.concatenate(part) for part in zip(*entries, strict=True))
-        self._sampling = csr_array((share, (pixel, cell)), shape=(len(rows), len(self.points)))
+        self._sampling = csr_array((share, (pixel, cell)), shape=(len(rows), int(cells.prod())))
 
     def rises(self, pressure: torch.Tensor, times: np.ndarray, duration: float) -> np.ndarray:
         """Return the rise (T, H, W) [K] for magnitudes at `points` [Pa], that sound from time 0 [s]."""
+        return self.images(self.temperatures(pressure, times, duration))
+
+    def images(self, temperatures: np.ndarray) -> np.ndarray:
+        """Return images (T, H, W) of temperatures (T, P) at `points`."""
+        maps = temperatures.reshape(-1, *self.counts)
+        fine = [zoom(one, _FINER, order=3, mode="nearest", grid_mode=True).ravel() for one in maps]
+        return (self._sampling @ np.stack(fine, axis=1)).T.reshape(-1, *self.shape)
+
+    def temperatures(self, pressure: torch.Tensor, times: np.ndarray, duration: float) -> np.ndarray:
+        """Return the rise (T, P) [K] of the screen at `points`, as `rises` does for images."""
         source = self.screen.rate * pressure.abs().square().numpy().reshape(self.counts)
-        temperature, images, now = np.zeros(self.counts), [], 0.0
+        temperature, rises, now = np.zeros(self.counts), [], 0.0
         for time in times:
             while now < time - 1e-12:
                 end = duration if now < duration - 1e-12 else math.inf
@@ -82,8 +95,8 @@ class HeatedScreen:
                 change = self.screen.diffusivity * laplacian(temperature) - loss
                 temperature = temperature + step * (change + (source if end < math.inf else 0.0))
                 now += step
-            images.append(self._sampling @ temperature.ravel())
-        return np.stack(images).reshape(len(times), *self.shape)
+            rises.append(temperature.ravel())
+        return np.stack(rises)
 
 
 def laplacian(values: np.ndarray) -> np.ndarray:

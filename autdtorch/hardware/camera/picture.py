@@ -14,6 +14,7 @@ from autdtorch.utils.array_types import REAL, Array
 from autdtorch.utils.validation import ArrayLike, invalid, points_tensor, positive
 
 _OFF_PLANE = 0.02  # largest distance of a point from its plane, by the plane's longer edge
+_WIDER = 3  # cells around a picture, for its splines
 _SMOOTHING, _FINEST = 0.2, 1e-4  # for the place of a focus, by the radius
 
 
@@ -67,7 +68,7 @@ class Picture:
             ValueError: a point is not in the plane.
         """
         cells = self._cells(plane_coordinates(self.plane, points))
-        spline = spline_filter(self.pressure.square().numpy(), order=5, mode="reflect")
+        spline = _spline(self.pressure.square().numpy())
         pressure = np.sqrt(np.maximum(_interpolated(spline, cells), 0.0))
         of_square = (self.pressure + self.deviation).square() - self.pressure.square()
         spread = map_coordinates(of_square.numpy(), cells.T, order=1, mode="nearest")
@@ -84,8 +85,7 @@ class Picture:
         length = _SMOOTHING * positive("radius", radius, "m")
         starts = plane_coordinates(self.plane, near, "near")
         cells = length * np.asarray(self._counts) / np.asarray(self.plane.size)
-        smooth = gaussian_filter(self.pressure.square().numpy(), cells)
-        spline = spline_filter(smooth, order=5, mode="reflect")
+        spline = _spline(gaussian_filter(self.pressure.square().numpy(), cells))
         places = np.stack([self._climb(spline, start, radius) for start in starts])
         u, v = (axis.numpy() for axis in self.plane.basis)
         return torch.from_numpy(np.asarray(self.plane.center) + places[:, :1] * u + places[:, 1:] * v)
@@ -121,9 +121,15 @@ def deviation_of(pressure: Array, of_square: Array) -> Array:
     return np.asarray(of_square / np.maximum(np.sqrt(pressure**2 + of_square) + pressure, 1e-300))
 
 
+def _spline(values: Array) -> Array:
+    """Return the coefficients of a spline of fifth order through cells (Nu, Nv) and beyond their edges."""
+    wide = np.pad(values, _WIDER, mode="reflect", reflect_type="odd")
+    return np.asarray(spline_filter(wide, order=5, mode="reflect"))
+
+
 def _interpolated(spline: Array, cells: Array) -> Array:
     """Return the values (P,) of a spline of fifth order at indices (P, 2), in parts of a cell."""
-    return np.asarray(map_coordinates(spline, cells.T, order=5, mode="reflect", prefilter=False))
+    return np.asarray(map_coordinates(spline, cells.T + _WIDER, order=5, mode="reflect", prefilter=False))
 
 
 def plane_coordinates(plane: Plane, points: ArrayLike, name: str = "points") -> Array:
