@@ -40,7 +40,7 @@ from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.objectives.perturbations import simulated_matrix
 from autdtorch.objectives.readings import Readings
-from autdtorch.propagators import make_propagator
+from autdtorch.propagators import Propagator, make_propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.study.report.hardware_report import write_hardware_report
 from autdtorch.study.run_study import check_goal, name_of, solve
@@ -81,6 +81,7 @@ class Bench:
         self._failed = indices_of("hardware.failed", failed, len(scene.array)) if failed else []
         self.by_hand = self._sensor.by_hand
         self._bench: hardware.EmulatedBench | None = None
+        self._matrix_of: Callable[[torch.Tensor], torch.Tensor] = _no_matrix
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -91,12 +92,13 @@ class Bench:
             settings |= {"emulated": True, "snr [dB]": snr, "failed": self._failed}
         return settings | self.device.settings
 
-    def emulate(self, simulated: SimulatedObjective) -> None:
+    def emulate(self, simulated: SimulatedObjective, propagator: Propagator) -> None:
         """Make the emulated bench, if there is one, with the transfer matrix of a simulated objective."""
         if self._emulated and simulated.transfer_matrix is not None:
-            wired = torch.tensor(self.transducers, dtype=torch.int64, device="cpu")
-            matrix, wired = self.device.as_built(simulated.transfer_matrix, wired)
+            chosen = torch.tensor(self.transducers, dtype=torch.int64, device="cpu")
+            matrix, wired = self.device.as_built(simulated.transfer_matrix, chosen)
             self._bench = hardware.EmulatedBench(self.device, matrix, wired, self._failed)
+            self._matrix_of = lambda points: self.device.as_built(propagator.transfer_matrix(points), chosen)[0]
 
     def link(self) -> hardware.Link:
         """Open the link to the device or its emulator."""
@@ -112,8 +114,7 @@ class Bench:
 
     def sensor(self) -> AbstractContextManager[AnySensor]:
         """Return a context in which the sensor is open."""
-        scene = self._scene
-        return self._sensor.open(Setup(scene.control_points, scene.frequency, _ask, self._bench, self._seed))
+        return self._sensor.open(Setup(self._scene, _ask, self._bench, self._seed, self._matrix_of))
 
     def _wired(self, count: int) -> list[int]:
         """Return the device's transducers for the scene's `count`."""
@@ -130,6 +131,10 @@ class Bench:
         if len(wired) != count:
             raise invalid(field, f"{len(wired)} transducers", f"must be {count}, as many as the scene has")
         return wired
+
+
+def _no_matrix(points: torch.Tensor) -> torch.Tensor:
+    raise NotImplementedError("a real bench has no transfer matrix")
 
 
 def indices_of(field: str, value: object, count: int) -> list[int]:
@@ -257,7 +262,7 @@ class _Trial:
         self.begun = False
         self._propagator = make_propagator(self._scene, **solver_of(settings))
         simulated = SimulatedObjective(self._scene, self._propagator)
-        bench.emulate(simulated)
+        bench.emulate(simulated, self._propagator)
         self._simulated = hardware.Played(simulated, bench.device, bench.transducers, bench.limits.amplitude)
         self._settings["largest amplitude"] = round(self._simulated.largest, 4)
         simulated_readings = self._with_readings(readings)

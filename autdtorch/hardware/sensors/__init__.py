@@ -1,8 +1,9 @@
-"""Sensors of the pressure at the control points: an oscilloscope, a person, a file.
+"""Sensors of the pressure at the control points: an oscilloscope, a person, a file, a thermal camera.
 
 A sensor is a class and the class of its config, in a module, and a line in `SENSORS`.
 """
 
+from autdtorch.hardware.camera.config import CameraConfig
 from autdtorch.hardware.sensors.by_hand import ManualConfig
 from autdtorch.hardware.sensors.reading_file import FileConfig
 from autdtorch.hardware.sensors.scope_microphones import ScopeConfig
@@ -16,4 +17,5 @@ SENSORS: dict[str, type[SensorConfig]] = {
     "scope": ScopeConfig,
     "file": FileConfig,
     "manual": ManualConfig,
+    "camera": CameraConfig,
 }

@@ -16,6 +16,7 @@ import torch
 
 from autdtorch.objectives.objective import validate_magnitudes
 from autdtorch.objectives.perturbations import SNRS, random_rms
+from autdtorch.scene.scene import Scene
 from autdtorch.utils.process import send
 from autdtorch.utils.validation import (
     finite_number,
@@ -141,18 +142,28 @@ class Setup:
     """The bench that a configured sensor is opened on.
 
     Attributes:
-        control_points: (P, 3) [m].
-        frequency: of the drive [Hz].
+        scene: the scene on the bench.
         ask: shows a person a question, and returns the answer.
         bench: the emulated bench; None for a real one.
         seed: of emulated noise.
+        matrix_of: returns the transfer matrix (N, M) [Pa] of points (N, 3) [m] on an emulated bench.
     """
 
-    control_points: torch.Tensor
-    frequency: float
+    scene: Scene
     ask: Callable[[str], str]
     bench: EmulatedBench | None
     seed: int
+    matrix_of: Callable[[torch.Tensor], torch.Tensor]
+
+    @property
+    def control_points(self) -> torch.Tensor:
+        """The control points (P, 3) [m]."""
+        return self.scene.control_points
+
+    @property
+    def frequency(self) -> float:
+        """The frequency of the drive [Hz]."""
+        return self.scene.frequency
 
 
 class SensorConfig(ABC):
