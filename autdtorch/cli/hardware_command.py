@@ -98,7 +98,9 @@ class Bench:
             chosen = torch.tensor(self.transducers, dtype=torch.int64, device="cpu")
             matrix, wired = self.device.as_built(simulated.transfer_matrix, chosen)
             self._bench = hardware.EmulatedBench(self.device, matrix, wired, self._failed)
-            self._matrix_of = lambda points: self.device.as_built(propagator.transfer_matrix(points), chosen)[0]
+            self._matrix_of = lambda points: self.device.as_built(propagator.transfer_matrix(points), chosen)[
+                0
+            ]
 
     def link(self) -> hardware.Link:
         """Open the link to the device or its emulator."""

@@ -1,4 +1,13 @@
+from .camera.frames import CallableFrames as CallableFrames
+from .camera.frames import FolderFrames as FolderFrames
+from .camera.frames import Frame as Frame
+from .camera.frames import FrameSource as FrameSource
+from .camera.frames import uvc_frames as uvc_frames
 from .camera.picture import Picture as Picture
+from .camera.registration import Registration as Registration
+from .camera.registration import registered_by_foci as registered_by_foci
+from .camera.screen import Screen as Screen
+from .camera.thermal_camera import ThermalCamera as ThermalCamera
 from .devices import AUTD3 as AUTD3
 from .devices import DEVICES as DEVICES
 from .devices import OPENMPD as OPENMPD
@@ -8,6 +17,7 @@ from .devices.device import Device as Device
 from .devices.openmpd import openmpd_boards as openmpd_boards
 from .devices.ultraino import ultraino_boards as ultraino_boards
 from .emulator.bench import EmulatedBench as EmulatedBench
+from .emulator.emulated_camera import EmulatedCamera as EmulatedCamera
 from .emulator.emulated_scope import EmulatedScope as EmulatedScope
 from .link import Link as Link
 from .link import OffError as OffError

@@ -111,6 +111,10 @@ class EmulatedCamera:
         self.present = True
         bench.bus.watchers.append(self._pass)
 
+    def close(self) -> None:
+        """Take no more frames."""
+        self._bench.bus.watchers.remove(self._pass)
+
     def clock(self) -> float:
         """Return the time now on the bench [s], which the files bear."""
         return self._bench.bus.slept
@@ -136,7 +140,7 @@ class EmulatedCamera:
             self._heating = 0.0
             return
         power = (self._matrix @ drive.to(torch.complex64)).abs().square().numpy()
-        self._heating = self._screen.heating * power.reshape(self._excess.shape)
+        self._heating = self._screen.rate * power.reshape(self._excess.shape)
 
     def _heat(self, seconds: float) -> None:
         """Step the screen by Heun's method."""
@@ -189,7 +193,7 @@ class _View:
         """Return pixels (..., 2) of places (..., 2); the centre of the image is that of the plane."""
         seen = np.concatenate([places, np.zeros_like(places[..., :1])], axis=-1) @ self._axes.T
         middle = (np.array(self._shape[::-1]) - 1) / 2
-        return middle + self._scale * seen[..., :2] / (_DISTANCE - seen[..., 2:])
+        return np.asarray(middle + self._scale * seen[..., :2] / (_DISTANCE - seen[..., 2:]))
 
     def _places(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the places (..., 2) of pixels, where their rays meet the plane."""
@@ -198,7 +202,7 @@ class _View:
         rays = np.concatenate([slopes, -np.ones_like(slopes[..., :1])], axis=-1) @ self._axes
         pinhole = _DISTANCE * self._axes[2]
         length = -pinhole[2] / rays[..., 2:]
-        return (pinhole + length * rays)[..., :2]
+        return np.asarray((pinhole + length * rays)[..., :2])
 
     def samples(self, counts: tuple[int, ...], spacing: float) -> sparse.csr_matrix:
         """Return the matrix from a grid of `counts` cells to the pixels, each the mean over its area."""
