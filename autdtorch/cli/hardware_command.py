@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import math
 import shlex
@@ -31,6 +32,7 @@ from autdtorch.hardware.sensors.by_hand import typed
 from autdtorch.hardware.sensors.sensor import AnySensor, SensorConfig, Setup
 from autdtorch.io.drive_file import save_drive
 from autdtorch.io.goal_section import goal_section, load_goal, score_label
+from autdtorch.io.picture_file import AGAIN, PICTURES, save_picture
 from autdtorch.io.readings_file import load_readings
 from autdtorch.methods.calibration.calibrate import calibrate
 from autdtorch.methods.calibration.calibration import Calibration
@@ -322,13 +324,14 @@ class _Trial:
             contextlib.ExitStack() as at_the_end,
         ):
             limited = hardware.LimitedLink(link, bench.limits)
+            pictures = _Pictures(log.parent / PICTURES, sensor)
             objective = hardware.HardwareObjective(
                 self._scene,
                 limited,
                 sensor,
                 log,
                 self._settings,
-                _watcher(progress, self._goal),
+                _watcher(progress, self._goal, pictures),
                 simulated_matrix(self._simulated),
             )
             self.begun = not bench.is_dry
@@ -337,10 +340,15 @@ class _Trial:
             if objective.evaluations:
                 logger.info("going on after %d evaluations", objective.evaluations)
             preflight = self._preflight(limited, sensor, readings, progress)
+            pictures.skip()
             progress.begin(f"running {name_of(self._method)} on {bench.device.name}")
             solution = solve(self._method, objective, [0], self._seed, self._goal, readings=self._readings)
             progress.begin("the drive of the method, once more")
-            again = limited.measure(solution.drive[0], sensor, points, readings)
+            rows = []
+            for number in range(readings):
+                rows.append(limited.measure(solution.drive[0], sensor, points)[0])
+                pictures.keep(f"{AGAIN}_{number}")
+            again = torch.stack(rows)
             limited.off()
             progress.begin("silence, outputs off, once more")
             with _silence_expected():
@@ -409,12 +417,33 @@ def _shown(goal: Goal, pressure: torch.Tensor) -> str:
     return f"{score_label(goal.name)} {float(goal(pressure)):.4g} {goal.unit}".rstrip()
 
 
-def _watcher(progress: Progress, goal: Goal) -> Callable[[hardware.Evaluation], None]:
-    """Return a function that shows every evaluation, and the best so far."""
-    best = -math.inf
+class _Pictures:
+    """A folder for the pictures of a sensor that takes any."""
+
+    def __init__(self, folder: Path, sensor: AnySensor) -> None:
+        self._folder, self._sensor = folder, sensor
+        self._last: object = None
+
+    def keep(self, name: str) -> None:
+        """Write the sensor's picture, unless it is the last one that was written or skipped."""
+        picture = getattr(self._sensor, "picture", None)
+        if isinstance(picture, hardware.Picture) and picture is not self._last:
+            self._folder.mkdir(exist_ok=True)
+            save_picture(self._folder / f"{name}.npz", picture)
+        self._last = picture
+
+    def skip(self) -> None:
+        """Leave the sensor's picture out."""
+        self._last = getattr(self._sensor, "picture", None)
+
+
+def _watcher(progress: Progress, goal: Goal, pictures: _Pictures) -> Callable[[hardware.Evaluation], None]:
+    """Return a function that shows every evaluation, and the best so far, and keeps its picture."""
+    best, numbers = -math.inf, itertools.count()
 
     def watch(evaluation: hardware.Evaluation) -> None:
         nonlocal best
+        pictures.keep(f"evaluation_{next(numbers):05d}")
         progress.advance(1)
         score = float(goal(evaluation.pressure))
         if score > best:

@@ -4,9 +4,6 @@ from .camera.frames import Frame as Frame
 from .camera.frames import FrameSource as FrameSource
 from .camera.frames import uvc_frames as uvc_frames
 from .camera.picture import Picture as Picture
-from .camera.registration import Registration as Registration
-from .camera.registration import registered_by_foci as registered_by_foci
-from .camera.screen import Screen as Screen
 from .camera.thermal_camera import ThermalCamera as ThermalCamera
 from .devices import AUTD3 as AUTD3
 from .devices import DEVICES as DEVICES
@@ -38,9 +35,9 @@ from .safety import check_picture as check_picture
 from .safety import check_transducers as check_transducers
 from .safety import ended_by_signals as ended_by_signals
 from .safety import hears_silence as hears_silence
-from .sensors import SENSORS as SENSORS
 from .sensors.by_hand import ManualSensor as ManualSensor
 from .sensors.by_hand import MovedMicrophone as MovedMicrophone
+from .sensors.kinds import SENSORS as SENSORS
 from .sensors.reading_file import FileSensor as FileSensor
 from .sensors.scope_microphones import Microphone as Microphone
 from .sensors.scope_microphones import ScopeSensor as ScopeSensor

@@ -23,6 +23,7 @@ CALLS = public_calls()
 EXPECTED = {
     ("load_scene", "source", "a dict"),  # a scene without the keys that it needs
     ("view3d", "volume", "itself, with nan"),  # unknown values of a volume
+    ("Frame", "image", "itself, with nan"),  # saturated pixels
     ("plot_poses", "bounds", "itself, with inf"),  # no bound is known
     *(
         (call, name, "itself, with nan")  # gaps

@@ -6,6 +6,7 @@ import contextlib
 import logging
 import re
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from autdtorch.hardware.sensors.sensor import SensorError
 from autdtorch.utils.validation import (
     boolean,
     finite_number,
+    gappy_tensor,
     integer_at_least,
     invalid,
     number_between,
@@ -46,10 +48,20 @@ class Frame:
     Attributes:
         time: moment of the exposure [s], on the clock of its source.
         image: (H, W) [degrees C], NaN where a pixel is saturated.
+
+    `ValueError` for other shapes or kinds.
     """
 
     time: float
     image: Degrees
+
+    def __post_init__(self) -> None:
+        """Check the attributes."""
+        object.__setattr__(self, "time", finite_number("time", self.time, "s"))
+        image = gappy_tensor("image", self.image, "degrees C").detach().cpu().numpy()
+        if image.ndim != 2 or image.size == 0:
+            raise ValueError(f"image: shape {image.shape}; must be (H, W)")
+        object.__setattr__(self, "image", image)
 
 
 @runtime_checkable
@@ -111,11 +123,10 @@ class FolderFrames:
         for name, function in (("clock", clock), ("sleep", sleep)):
             require_callable(name, function)
         self.clock, self._sleep = clock, sleep
-        self._seen: set[str] = set()
+        self._seen = set(self._names())
         self._incomplete: dict[str, float] = {}  # when each was first tried
         self._first: tuple[int, float] | None = None  # number and time, for the rate
         self._shape: tuple[int, ...] | None = None
-        self._names()
 
     def begin(self) -> None:
         """Drop the files that are there."""
@@ -197,7 +208,7 @@ def _read_image(path: Path, scale: float, offset: float) -> Degrees:
     if path.suffix.lower() == ".npy":
         values = np.load(path, allow_pickle=False)
     else:
-        with Image.open(path) as opened:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as opened:
             values = np.asarray(opened)
     return _matrix(values, scale, offset)
 

@@ -25,10 +25,12 @@ from autdtorch.scene.geometry import Plane
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import (
     ArrayLike,
+    finite_number,
     invalid,
     number_between,
     points_tensor,
     positive,
+    real_tensor,
     require_kind,
     require_known,
     require_one_of,
@@ -71,7 +73,7 @@ class ThermalCamera:
         before: float = 0.4,
         after: float = 0.3,
         blur: float = 0.5,
-        saturation: float = math.inf,
+        saturation: float | None = None,
     ) -> None:
         """Set the camera up; it takes no frame yet.
 
@@ -87,7 +89,8 @@ class ThermalCamera:
             before: time that they are taken for before [s], up to 60.
             after: time that they are taken for after [s], up to 60.
             blur: standard deviation of the camera's blur [pixels].
-            saturation: temperature from which on a pixel does not count [degrees C].
+            saturation: temperature from which on a pixel does not count [degrees C]; None where the frames
+                have NaN there, as integers at their largest value get.
 
         `ValueError` for an argument out of range.
         """
@@ -96,7 +99,10 @@ class ThermalCamera:
         if isinstance(corners, Registration):
             self.registration = corners
         else:
-            self.registration = Registration.of(plane, corners, plane.corners)
+            pixels = real_tensor("corners", corners)
+            if pixels.shape != (4, 2):
+                raise ValueError(f"corners: shape {tuple(pixels.shape)}; must be (4, 2), as (column, row)")
+            self.registration = Registration.of(plane, pixels, plane.corners)
         self._source, self._plane = frames, plane
         grid = plane.points(spacing)
         self._counts = grid.shape[0], grid.shape[1]
@@ -108,7 +114,8 @@ class ThermalCamera:
         self._pulse = number_between("pulse", positive("pulse", pulse, "s"), 0.0, _LONGEST_PULSE, "s")
         self._before = number_between("before", positive("before", before, "s"), 0.0, _LONGEST_WAIT, "s")
         self._after = number_between("after", after, 0.0, _LONGEST_WAIT, "s")
-        self._blur, self._saturation = number_between("blur", blur, 0.0, 100.0, "pixels"), saturation
+        self._blur = number_between("blur", blur, 0.0, 100.0, "pixels")
+        self._saturation = math.inf if saturation is None else finite_number("saturation", saturation)
         self._heat: HeatInversion | None = None
         self._latency: float | None = None
         self._warmth = _Warmth()

@@ -98,10 +98,10 @@ class EmulatedCamera:
         size = (counts[0] * _SPACING, counts[1] * _SPACING)
         points = Plane(plane.center, plane.normal, size).points(_SPACING)
         self._matrix = matrix_of(points.reshape(-1, 3)).to(torch.complex64)
-        self._excess = np.zeros(points.shape[:2], np.float32)  # [K]
+        self._excess: NDArray[np.floating] = np.zeros(points.shape[:2], np.float32)  # [K]
         self._slope = np.zeros_like(self._excess)  # [K/s]
         self._drive: torch.Tensor | None = None
-        self._heating: NDArray[np.float32] | float = 0.0  # [K/s]
+        self._heating: NDArray[np.floating] | float = 0.0  # [K/s]
         self._view = _View(plane, (rows, columns), angle)
         self._samples = self._view.samples(self._excess.shape, _SPACING)
         self.corners = self._view.pixels(_corners(plane))
@@ -153,7 +153,7 @@ class EmulatedCamera:
             self._excess = self._excess + step * self._slope
         self._time += seconds
 
-    def _rate_of_change(self, excess: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _rate_of_change(self, excess: NDArray[np.floating]) -> NDArray[np.floating]:
         curvature = ndimage.laplace(excess, mode="nearest") / _SPACING**2
         change = self._screen.diffusivity * curvature - excess / self._screen.loss_time + self._heating
         return np.asarray(change, np.float32)

@@ -1,0 +1,21 @@
+"""The kinds of sensor that a config may name.
+
+A sensor is a class and the class of its config, in a module, and a line in `SENSORS`.
+"""
+
+from autdtorch.hardware.camera.thermal_camera import CameraConfig
+from autdtorch.hardware.sensors.by_hand import ManualConfig
+from autdtorch.hardware.sensors.reading_file import FileConfig
+from autdtorch.hardware.sensors.scope_microphones import ScopeConfig
+from autdtorch.hardware.sensors.sensor import EmulatedConfig, SensorConfig
+
+__all__ = ["SENSORS"]
+
+#: The config of every kind of sensor, by the kind.
+SENSORS: dict[str, type[SensorConfig]] = {
+    "emulated": EmulatedConfig,
+    "scope": ScopeConfig,
+    "file": FileConfig,
+    "manual": ManualConfig,
+    "camera": CameraConfig,
+}
