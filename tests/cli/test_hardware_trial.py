@@ -196,7 +196,10 @@ OPENMPD = ("hardware=openmpd", "hardware.limits.amplitude=1", "hardware.transduc
         ((*GABS, "hardware.limits.amplitude=0.5"), "amplitude: 0.5; must be >= 1"),
         ((*GABS, "+hardware.limits.loudness=3"), "loudness"),
         ((*GABS, "+hardware.colour=red"), "hardware: unknown key 'colour'"),
-        ((*OPENMPD, "hardware/sensor=emulated"), "hardware.sensor: 'emulated'; must be scope, file or"),
+        (
+            (*OPENMPD, "hardware/sensor=emulated"),
+            "hardware.sensor: 'emulated'; must be scope, file, manual or",
+        ),
         ((*OPENMPD, "hardware/sensor=file"), "hardware.sensor.path: none; must be given"),
         (OPENMPD, "hardware.sensor.chip: None; must be the oscilloscope's VID:PID"),
         ((*OPENMPD, "hardware.sensor.chip=1:2:3"), "hardware.sensor.chip: '1:2:3'; must be VID:PID"),
