@@ -37,7 +37,7 @@ from autdtorch.cli.errors import AGAIN, FULL_ERROR, FailedJob, in_one_line, stop
 logger = logging.getLogger(__name__)
 
 _LONGEST_NAME = 150  # of a job's folder; file systems allow 255 bytes
-_EXPLORE_KEYS = ("port", "browser", "drive")
+_EXPLORE_KEYS = ("port", "browser", "drive", "trial")
 _EXPLORE_SETTINGS = re.compile(r"\+*(scene|modules|explore|hydra)\b|\+*solver\.spacing=")
 
 
@@ -184,11 +184,12 @@ def explore_scene(settings: dict[str, Any], modules: list[Any]) -> None:
     if (file := given_file("explore.drive", section.get("drive"))) is not None:
         with within("explore.drive"):
             drive = load_drive(file)
+    trial = given_file("explore.trial", section.get("trial"))
     scene = scene_of("scene", section_of(settings, "scene"), modules)
     spacing, port, browser = solver_of(settings)["spacing"], section["port"], section["browser"]
     with signals_restored():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        explorer = explore(scene, drive, spacing=spacing, port=port, open_browser=browser)
+        explorer = explore(scene, drive, spacing=spacing, port=port, open_browser=browser, trial=trial)
         try:
             print(f"The live view is at {explorer.address}\nCtrl+C ends it.", flush=True)
             explorer.wait()

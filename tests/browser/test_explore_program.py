@@ -1,6 +1,7 @@
 """The live view as a program uses it: scene and drive are read and set, and results waited for."""
 
 import gc
+import re
 import signal
 import threading
 import weakref
@@ -10,11 +11,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from live_view import PATIENCE, SPACING, in_session, share_of_bound
+from live_view import PATIENCE, SPACING, in_session, share_of_bound, wait_for
 
 import autdtorch as at
+from autdtorch.hardware import Picture
+from autdtorch.io.picture_file import PICTURES
 from autdtorch.plot.explore import calculation
 from autdtorch.plot.explore.picture import Grip
+from autdtorch.plot.explore.trial_pictures import TrialPictures
 
 
 def test_a_notebook_that_runs_all_cells_has_the_drive(view, scene):
@@ -36,6 +40,33 @@ def test_a_drive_that_is_set_ends_the_search(view):
     view.drive = mine
     view.ready()
     assert torch.equal(view.drive, mine)
+
+
+def test_the_pictures_of_a_trial_are_shown_beside_the_simulation_of_their_drives(view, scene, tmp_path):
+    plane, drive = scene.observation_plane, torch.exp(1j * torch.linspace(0, 3, 16, dtype=torch.float64))
+    pictures, state = TrialPictures(tmp_path), []
+
+    def follow(session):
+        session._pictures = pictures
+        session._look_for_pictures(pictures)
+        state.append(session._state)
+
+    in_session(view, follow)
+    field = at.make_propagator(scene, spacing=SPACING).field(drive, plane.points(2e-3)).abs()
+    picture = Picture(plane, 1.2 * field, 0.01 * field, doubts=("a frame is missing",))
+    at.save_picture(tmp_path / PICTURES / "evaluation_00000.npz", picture, drive)
+    try:
+        wait_for(lambda: state[0].camera)
+        view.ready()
+        assert torch.equal(view.drive, drive)
+        assert state[0].camera.startswith("data:image/png;base64,")
+        # cells of 2 mm are compared by splines with others of about 1 mm
+        assert re.search(r"times 1\.(2|19|21) differs by 0?\.?\d+ %", state[0].camera_text)
+        assert state[0].camera_text.endswith(" a frame is missing.")
+        (tmp_path / PICTURES / "evaluation_00001.npz").write_bytes(b"broken")
+        wait_for(lambda: "evaluation_00001.npz" in state[0].message)
+    finally:
+        in_session(view, lambda session: setattr(session, "_pictures", None))
 
 
 def test_what_cannot_be_set_changes_nothing(view, scene):

@@ -177,6 +177,7 @@ WRONG = {
     "explore  scene=homogeneous  explore.port=-1": "port: -1; must be an integer >= 0",
     "explore  scene=homogeneous  +explore.other=1": "explore: unknown key 'other'",
     "explore  scene=homogeneous  explore.drive=missing.npz": ".*missing.npz: there is no such file",
+    "explore  scene=homogeneous  explore.trial=missing": "trial: 'missing'; must be the folder of a trial",
     "explore  scene=homogeneous  method=lssg": "method=lssg: has no effect on explore",
     "explore  scene=homogeneous  solver.tolerance=0.1": "solver.tolerance=0.1: has no effect on explore",
 }

@@ -82,7 +82,8 @@ class Picture:
         Raises:
             ValueError: a point is not in the plane, or `radius` is not a finite number > 0.
         """
-        length = _SMOOTHING * positive("radius", radius, "m")
+        radius = positive("radius", radius, "m")
+        length = _SMOOTHING * radius
         starts = plane_coordinates(self.plane, near, "near")
         cells = length * np.asarray(self._counts) / np.asarray(self.plane.size)
         spline = _spline(gaussian_filter(self.pressure.square().numpy(), cells))

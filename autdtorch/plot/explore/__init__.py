@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import threading
 import webbrowser
 from typing import TYPE_CHECKING
@@ -11,7 +12,15 @@ from autdtorch.plot.explore.situation import checked_drive
 from autdtorch.plot.view3d import require_rendering
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.hints import with_extra
-from autdtorch.utils.validation import ArrayLike, boolean, integer_at_least, invalid, positive, require_kind
+from autdtorch.utils.validation import (
+    ArrayLike,
+    boolean,
+    integer_at_least,
+    invalid,
+    path_of,
+    positive,
+    require_kind,
+)
 
 if TYPE_CHECKING:
     from autdtorch.plot.explore.explorer import Explorer
@@ -27,6 +36,7 @@ def explore(
     spacing: float = 1e-3,
     port: int = 0,
     open_browser: bool = False,
+    trial: str | os.PathLike[str] | None = None,
 ) -> Explorer:
     """Show a scene in a live view: in a notebook, or in a browser at the view's address.
 
@@ -41,13 +51,15 @@ def explore(
         spacing: edge of a cell [m] when nothing is dragged; see `make_propagator`.
         port: port of the server, 0 to 65535; 0 for any free one.
         open_browser: True to open the page in this machine's browser.
+        trial: folder of a hardware trial with a camera, whose newest picture is shown beside the simulated
+            plane, for its drive, also while the trial runs; by default none.
 
     Returns:
         The live view. Its `scene` and `drive` are the present ones, and can be set; `ready` waits for the
         calculation, and `close` ends the view.
 
     Raises:
-        ValueError: an argument is out of range, or `drive` does not fit the array.
+        ValueError: an argument is out of range, `drive` does not fit the array, or `trial` is no folder.
         RuntimeError: this machine cannot render in 3D, or the extra ``explore`` is not installed; the message
             names the cause.
         OSError: the port is taken.
@@ -58,6 +70,9 @@ def explore(
     spacing, browses = positive("spacing", spacing, "m"), boolean("open_browser", open_browser)
     if not 0 <= (port := integer_at_least("port", port, 0)) <= _LAST_PORT:
         raise invalid("port", port, f"must be at most {_LAST_PORT}")
+    folder = None if trial is None else path_of("trial", trial, "the folder of a trial")
+    if folder is not None and not folder.is_dir():
+        raise invalid("trial", str(trial), "must be the folder of a trial, which exists")
     if importlib.util.find_spec("trame_rca") is None:
         raise RuntimeError(f"explore: needs trame: {with_extra('explore')}")
     with _OPENING:
@@ -66,7 +81,7 @@ def explore(
         from autdtorch.propagators.plan import plan
 
         plan(scene, spacing=spacing)  # refuses a spacing too large for the scene, before there is a page
-        explorer = Explorer(scene, drive, spacing, port)
+        explorer = Explorer(scene, drive, spacing, port, folder)
     if browses:
         webbrowser.open(explorer.address)
     return explorer

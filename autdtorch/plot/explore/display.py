@@ -134,7 +134,7 @@ def first_state(situation: Situation, methods: dict[str, Method]) -> dict[str, A
         "units": [("dB", "dB"), ("Pa", "Pa")], "unit": "dB", "reference": 1.0,
         "volume": False, "surface": _FIRST_SURFACE, "dark": False, "scale_low": "", "scale_high": "",
         "scale_style": _gradient(colours.PRESSURE_MAP), "phase_style": _gradient(colours.PHASE_MAP),
-        "folder": free_folder(), "shown": -1, "wanted": 0, "settled": 0,
+        "folder": free_folder(), "camera": "", "camera_text": "", "shown": -1, "wanted": 0, "settled": 0,
     }  # fmt: skip
 
 

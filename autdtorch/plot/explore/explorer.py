@@ -6,6 +6,7 @@ import weakref
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from html import escape
+from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
@@ -18,6 +19,7 @@ from autdtorch.plot.explore.page import page
 from autdtorch.plot.explore.server import Defer, End, Server
 from autdtorch.plot.explore.session import FIRST_METHOD, Session
 from autdtorch.plot.explore.situation import Situation, checked_drive, in_phase
+from autdtorch.plot.explore.trial_pictures import TrialPictures
 from autdtorch.propagators.plan import plan
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import ArrayLike, require_kind
@@ -39,10 +41,12 @@ class Explorer:
         address: address of the page, with the token that opens it; for browsers on this machine.
     """
 
-    def __init__(self, scene: Scene, drive: torch.Tensor | None, spacing: float, port: int) -> None:
+    def __init__(
+        self, scene: Scene, drive: torch.Tensor | None, spacing: float, port: int, trial: Path | None
+    ) -> None:
         """Use `explore`, which checks its arguments."""
         self._spacing = spacing
-        self._application = application = _Application(scene, drive, spacing)
+        self._application = application = _Application(scene, drive, spacing, trial)
         self._server = Server(application.build, port)
         self.address = self._server.address
         # On garbage collection or at exit: OpenGL must end in its thread, before the interpreter does
@@ -123,15 +127,16 @@ class _Application:
 
     session: Session
 
-    def __init__(self, scene: Scene, drive: torch.Tensor | None, spacing: float) -> None:
+    def __init__(self, scene: Scene, drive: torch.Tensor | None, spacing: float, trial: Path | None) -> None:
         """Prepare the application; without a drive, a search begins."""
         self._situation = Situation.of(scene, in_phase(scene) if drive is None else drive)
         self._method = FIRST_METHOD if drive is None else None
         self._spacing = spacing
+        self._pictures = None if trial is None else TrialPictures(trial)
 
     def build(self, trame: Any, defer: Defer) -> End:
         """Make the application; return the function that ends it."""
-        self.session = session = Session(trame, self._situation, self._spacing, defer)
+        self.session = session = Session(trame, self._situation, self._spacing, defer, self._pictures)
         Controls(trame, session)
         Mouse(session)
         session.begin(self._method)

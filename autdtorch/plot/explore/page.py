@@ -136,6 +136,9 @@ def page(view: str) -> str:
         </tbody>
       </table>
     </div>
+    <figure v-if="camera">
+      <img id="camera" :src="camera" :alt="camera_text"><figcaption>{{{{ camera_text }}}}</figcaption>
+    </figure>
     <details>
       <summary id="write_python" @click="trigger('write_python')">Python</summary>
       <button type="button" data-copy="python">Copy</button>

@@ -26,6 +26,7 @@ from autdtorch.plot.explore.situation import (
     same_array,
     save_situation,
 )
+from autdtorch.plot.explore.trial_pictures import TrialPictures
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.moving import angles_of
 from autdtorch.scene.scene import Scene
@@ -35,6 +36,7 @@ DIGITS = 7
 """Decimals of lengths [m] from the page, whose steps are 0.1 mm."""
 
 _PATIENCE = 0.25  # s; a picture before the field would slow its calculation down
+_LOOK = 0.5  # s between looks for a new picture of a trial
 _NEW_FOCUS = 1.5  # wavelengths beside the last focus
 _FOLLOWING = "follow"
 FIRST_METHOD = "gradient_ascent"
@@ -55,10 +57,17 @@ class Session:
         failure: the error that ended the last calculation, if any.
     """
 
-    def __init__(self, trame: Any, situation: Situation, spacing: float, defer: Callable[..., None]) -> None:
+    def __init__(
+        self,
+        trame: Any,
+        situation: Situation,
+        spacing: float,
+        defer: Callable[..., None],
+        pictures: TrialPictures | None,
+    ) -> None:
         """Begin with a situation; cells have a `spacing` [m] when nothing is dragged.
 
-        `defer` queues a call of a function in this thread.
+        `defer` queues a call of a function in this thread. The `pictures` of a trial, if any, are followed.
         """
         self._state = trame.state
         self._history = History(situation)
@@ -78,6 +87,7 @@ class Session:
         self.ready = threading.Event()
         self.failure: Exception | None = None
         self._waiting = asyncio.get_running_loop().call_later(_PATIENCE, self.display.update)
+        self._pictures = pictures
 
     @property
     def now(self) -> Situation:
@@ -89,6 +99,8 @@ class Session:
         self._search = method
         self.place()
         self._ask()
+        if self._pictures is not None:
+            self._look_for_pictures(self._pictures)
 
     def place(self) -> None:
         """Show the situation in the page and the picture, as yet without its field."""
@@ -168,6 +180,22 @@ class Session:
         self._end_search()
         self._history.step(self.now.with_drive(drive))
         self._show()
+
+    def _look_for_pictures(self, pictures: TrialPictures) -> None:
+        """Show the field of the newest picture's drive, without a step, unless something is dragged."""
+        if self._closed or pictures is not self._pictures:
+            return
+        try:
+            drive = None if self.grip is not None else pictures.look()
+            if drive is not None:
+                situation = self.now.with_drive(drive)
+                self._end_search()
+                self._history.amend(situation)
+                self._show()
+        except (ValueError, OSError) as error:
+            with self._state:
+                self._state.message = f"Picture of the trial: {refusal(error)}"
+        asyncio.get_running_loop().call_later(_LOOK, self._look_for_pictures, pictures)
 
     # Actions of the page
 
@@ -284,6 +312,9 @@ class Session:
             reference = self.now.reference or largest(np.abs(result.field)) or 1.0
             self._history.amend(self.now.with_reference(reference))  # first, as the page sends it back
             self.display.redraw(result, reference)
+            if self._pictures is not None and result.request.fine:
+                with self._state:
+                    self._state.update(self._pictures.state(result))
 
     def _ask(self, fine: bool = True) -> None:
         """Ask for the field of the situation, and show the picture with it or, if it takes long, without."""

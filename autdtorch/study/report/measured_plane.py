@@ -11,8 +11,8 @@ import torch
 from autdtorch.hardware.camera.picture import Picture
 from autdtorch.io.picture_file import AGAIN, PICTURES, load_picture
 from autdtorch.objectives.metrics import focus_metrics
+from autdtorch.plot.camera_figure import camera_figure
 from autdtorch.plot.data import outside_on_plane
-from autdtorch.plot.pressure_maps import plot_planes
 from autdtorch.propagators import Propagator
 from autdtorch.scene.geometry import cell_centers_of
 from autdtorch.scene.scene import Scene
@@ -43,23 +43,19 @@ def measured_plane(
     plane, counts = measured.plane, (measured.pressure.shape[0], measured.pressure.shape[1])
     field = scale * propagator.field(drive, cell_centers_of(plane, counts)).abs()
     simulated = Picture(plane, field, torch.zeros_like(field))
-    maps = {"camera": measured.pressure, "simulation": simulated.pressure}
     with naming(folder / _FIGURE):
-        figure = plot_planes(
-            maps, plane, scene.control_points, scene.obstacles, reflectors=scene.reflectors or None
-        )
-        figure.savefig(folder / _FIGURE)
+        camera_figure(measured, field.numpy(), plane, scene).savefig(folder / _FIGURE)
     air = torch.from_numpy(
         outside_on_plane(field.numpy(), plane, scene.obstacles, scene.reflectors)
     ).isfinite()
     size = measured.pressure[air].square().mean().sqrt()
     return {
-        "plane": picture(_FIGURE, alt_texts.of_measured(*maps.values())),
+        "plane": picture(_FIGURE, alt_texts.of_measured(measured.pressure, field)),
         "off": float((measured.pressure - field)[air].square().mean().sqrt() / size),
         "noise": float(measured.deviation[air].square().mean().sqrt() / size),
         "pictures": len(files),
         "relative": measured.relative,
-        "areas": {name: _area(one, scene) for name, one in zip(maps, (measured, simulated), strict=True)},
+        "areas": [_area(one, scene) for one in (measured, simulated)],
         "foci": _foci(scene, names, measured, simulated),
         "doubts": measured.doubts,
     }
