@@ -1,7 +1,8 @@
 """The error of a grid, estimated from other grids and from the uncertain surfaces of bodies.
 
 Chance decides which of two grids is nearer the truth. The estimate is the geometric mean of the errors that
-up to two other grids show and of the usual error of such a grid.
+up to two other grids show and of the usual error of such a grid. Faces parallel to the
+grid are placed alike on all, and three grids show the order of their errors.
 """
 
 from __future__ import annotations
@@ -15,11 +16,13 @@ from torch import Tensor
 
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import SILENCE
+from autdtorch.utils.array_types import REAL
 
 _WEIGHT = 0.2  # of the logarithm of the usual error: grids may agree by chance
 _MOST_APART = 10.0  # Largest ratio of the two errors: a usual error farther away is moved to this ratio
 _LEAST = 0.37  # Least error that is claimed, relative to the usual one
 _COMPARED = 2  # Last other grids that count: earlier ones may be too coarse for the scene
+_ORDERS = 2.0, 4.0  # Least and largest order that three grids may show: those of the scheme's parts
 _TINY = torch.finfo(torch.float64).tiny
 
 
@@ -81,12 +84,23 @@ def errors_by_grids(
     matrix: Tensor, free: Tensor, spacing: float, others: Sequence[tuple[Tensor, float]], law: Law
 ) -> Tensor:
     """Return the errors (P,) from other grids alone; see `grid_errors`."""
-    size, logarithms = sizes(matrix, free), []
-    for other, coarser in others[-_COMPARED:]:
-        difference = (matrix - other).norm(dim=1) / size
-        ratio = abs(law.growth(coarser) / law.growth(spacing) - 1)
-        logarithms.append((difference / ratio).clamp(min=_TINY).log())
-    return torch.stack(logarithms).mean(dim=0).exp()
+    size, compared = sizes(matrix, free), others[-_COMPARED:]
+    spacings = [spacing, *(each for _, each in compared)]
+    changes = [(one - matrix).norm(dim=1) / size for one, _ in compared]
+    growth = torch.tensor([law.growth(each) for each in spacings], **REAL).expand(len(size), -1)
+    if law.aligned and len(compared) > 1:
+        change = (compared[0][0] - compared[1][0]).norm(dim=1) / size
+        growth = torch.tensor(spacings, **REAL) ** _order(change, changes[1], *spacings)[:, None]
+    grown = (growth[:, 1:] / growth[:, :1] - 1).abs()
+    return (torch.stack(changes, dim=1) / grown).clamp(min=_TINY).log().mean(dim=1).exp()
+
+
+def _order(change: Tensor, later: Tensor, finest: float, coarsest: float, middle: float) -> Tensor:
+    """Return the order (P,) of errors that two successive changes (P,) on three grids show."""
+    orders = torch.linspace(*_ORDERS, 41, **REAL)
+    fine, coarse, between = (spacing**orders for spacing in (finest, coarsest, middle))
+    place = torch.searchsorted((coarse - between) / (between - fine), change / later.clamp(min=_TINY))
+    return orders[place.clamp(max=len(orders) - 1)]
 
 
 def shape_errors(matrix: Tensor, free: Tensor, region: Region) -> Tensor:

@@ -40,7 +40,7 @@ _SHAPE = 3.0
 _RIGID_SHARE = 0.3
 """Error of bodies taken as rigid, relative to the tolerance, from which their materials count."""
 
-_SETTLED = 0.03
+_SETTLED = 0.05
 """Distance to the steady state at which runs end, relative to the tolerance."""
 
 

@@ -129,6 +129,15 @@ def test_errors_are_known_from_either_grid(ratio, error, spacing):
     assert (known * (1 + other) / other).numpy() == pytest.approx(1)
 
 
+@given(st.floats(2, 4), st.floats(1.15, 1.7), st.floats(1.15, 1.7), st.floats(1e-6, 1e-3))
+def test_three_grids_show_the_order_of_errors(order, first, second, error):
+    one, law = torch.ones(2, 3, dtype=torch.complex128), Law(8.5, aligned=True)
+    coarsest, coarser, fine = (one * (1 + error * ratio**order) for ratio in (first * second, second, 1.0))
+    others = [(coarsest, first * second), (coarser, second)]
+    claim = errors_by_grids(fine, one, 1.0, others, law)
+    assert (claim * (1 + error) / error).numpy() == pytest.approx(1, rel=0.15)  # of orders 0.05 apart
+
+
 @given(st.floats(0.05, 0.25), st.floats(0.01, 1.0), st.floats(-7, 0))
 def test_estimates_lean_towards_the_usual_error(spacing, scattered, logarithm):
     """The logarithm moves by a fifth towards it, by 0.2 at most, and no claim is below 0.37 of it."""
