@@ -40,8 +40,8 @@ from .objectives.bound import focus_bound
 from .objectives.goals import Goal, MeanPressure, TargetPressures, WeakestFocus
 from .objectives.metrics import FocusMetrics, focus_metrics
 from .objectives.objective import Objective, SimulatedObjective, weakest_focus
-from .objectives.perturbations import Drift, FailedTransducers, Noise, Quantised, true_pressure
-from .objectives.quiet import Contrast, QuietPoints
+from .objectives.perturbations import CameraNoise, Drift, FailedTransducers, Noise, Quantised, true_pressure
+from .objectives.quiet import Contrast, QuietPoints, SeenPoints
 from .objectives.readings import Readings
 from .plot.calibration_figure import plot_calibration
 from .plot.costs import plot_pareto, plot_scaling
@@ -73,6 +73,7 @@ __all__ = [
     "BayesOpt",
     "Box",
     "Calibration",
+    "CameraNoise",
     "Contrast",
     "Cylinder",
     "Drift",
@@ -105,6 +106,7 @@ __all__ = [
     "Reflector",
     "ScaleWarning",
     "Scene",
+    "SeenPoints",
     "SimulatedObjective",
     "Solution",
     "Sphere",

@@ -338,6 +338,7 @@ OTHERS: dict[str, Any] = {
     "Mesh.path": Made(mesh_file),
     "OpenMPDBoard.load.path": Made(board_file),
     "QuietPoints.points": [1],
+    "SeenPoints.points": [1],
     "Readings.drives": torch.stack([DRIVE, DRIVE]),
     "Readings.pressure": [[1.0, 2.0], [3.0, 4.0]],
     "Readings.phase": [[0.1, 0.2], [0.3, 0.4]],

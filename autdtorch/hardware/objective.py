@@ -131,6 +131,11 @@ class HardwareObjective:
         """
         return self._link.quantised(drive)
 
+    @property
+    def deviation(self) -> Callable[[torch.Tensor], torch.Tensor] | None:
+        """The sensor's function of readings (..., P) [Pa] that gives their deviations, if it has one."""
+        return getattr(self._sensor, "deviation", None)
+
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
         try:
             return torch.stack([self._measure(row) for row in drive])

@@ -39,10 +39,10 @@ _VERSION = 1
 _HEADER, _SCENE = "header", "scene/"
 _SCENE_FILE = "scene.yaml"
 _SETTINGS = ("method", "spacing", "tolerance", "max_periods", "time_step")  # of a plan, with its dtype
-_OF_READINGS = ("drives", "pressure", "points", "phase")
+_OF_READINGS = ("drives", "pressure", "points", "phase", "deviation")
 _OF_PRIOR = ("rows", "spread", "widths", "changes")
 _OF_POSTERIOR = ("factors", "entries", "variance")
-_OF_MAGNITUDES = ("value", "limit", "phase")
+_OF_MAGNITUDES = ("value", "limit", "phase", "deviation")
 _OF_PREDICTIONS = ("predicted", "simulated")
 _NUMBERS = ("gain", "phase", "rest")  # of a prior
 

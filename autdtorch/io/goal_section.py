@@ -14,11 +14,12 @@ from autdtorch.objectives.goals import (
     TargetPressures,
     WeakestFocus,
 )
-from autdtorch.objectives.quiet import Contrast, QuietPoints
+from autdtorch.objectives.quiet import Contrast, QuietPoints, SeenPoints
 from autdtorch.utils.validation import invalid, require_known, require_name, require_one_of
 
 GOALS: dict[str, type[Goal]] = {
-    goal.name: goal for goal in (WeakestFocus, MeanPressure, TargetPressures, QuietPoints, Contrast)
+    goal.name: goal
+    for goal in (WeakestFocus, MeanPressure, TargetPressures, QuietPoints, SeenPoints, Contrast)
 }
 """The goals by name."""
 

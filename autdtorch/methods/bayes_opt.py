@@ -13,12 +13,20 @@ import torch
 from autdtorch.methods.base import Method, State, Step, choice, setting, whole
 from autdtorch.methods.gradient import climbed
 from autdtorch.methods.matrix_fit import posteriors, tensors_of
-from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, prior_mean, prior_of
+from autdtorch.methods.prior import (
+    Prior,
+    best_simulated_drives,
+    matrix_prior,
+    numbers_of_factors,
+    prior_mean,
+    prior_of,
+)
 from autdtorch.methods.problem import Problem, starts_of
 from autdtorch.methods.seeds import generators_of, restored, states_of, uniform
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import scores_of
 from autdtorch.objectives.objective import GoalFunction
+from autdtorch.objectives.quiet import SeenPoints
 from autdtorch.objectives.readings import Readings
 from autdtorch.scene.drive import AMPLITUDE_TOLERANCE, drive_from_phases, phases_of
 from autdtorch.utils.array_types import REAL
@@ -93,9 +101,9 @@ class BayesOpt(Method):
             et al. 2023), which has a slope also where the improvement itself rounds to 0.
         initial_points: a scrambled "sobol" sequence, or independent "random" points.
         noise: variance of the noise, from 1e-6 to 1: of scores in variances of the process, or of a reading
-            in mean intensities of its focus (model "foci"). "inferred" fits it. The model "foci"
-            spends the last evaluation at the maximum of the posterior mean, and returns the observed drive
-            where the posterior mean is highest.
+            in mean intensities of its focus (model "foci"). "inferred" fits it, as do readings
+            of known deviations. The model "foci" spends the last evaluation at the maximum of the posterior
+            mean, and returns the observed drive where the posterior mean is highest.
         prior: simulated transfer matrix, and how far to trust it, for the model "foci".
 
     Raises:
@@ -140,10 +148,9 @@ class BayesOpt(Method):
 
     def numbers_kept(self, problem: Problem) -> float:
         """Return the numbers of the processes: a few matrices of all pairs of evaluations."""
-        outputs = self._outputs(problem)
-        coupled = outputs if self.prior is not None else 1  # a fit from a prior couples the foci
         earlier = 0 if problem.readings is None else len(problem.readings)
-        return 4.0 * outputs * coupled * (self.evaluations + earlier) ** 2
+        kept = 4.0 * self._outputs(problem) * (self.evaluations + earlier) ** 2
+        return kept if self.prior is None else kept + numbers_of_factors(self.prior, problem)
 
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Observe the initial points that earlier readings do not stand for, or what these show."""
@@ -201,7 +208,12 @@ class BayesOpt(Method):
         values = search["values"]
         if rows is not None:  # outliers are as the matrix fits them
             values = torch.where(search["outliers"], search["fitted_values"], values)
-        acquisition = self._acquisition(problem.goal, values, points, fit, rows)
+        goal = problem.goal
+        if isinstance(goal, SeenPoints):  # the foci alone have processes
+            foci, goal = goal.foci(problem.foci), goal.goal
+            values, fit = values[..., foci], fit.of(foci)
+            rows = None if rows is None else rows.of(foci)
+        acquisition = self._acquisition(goal, values, points, fit, rows)
         if left == 0:
             return Step(self._drives(points[:, :0]), {**search, "answer": acquisition.best})
         point = acquisition.next_points(generators, last=left == 1)[:, None]
@@ -306,9 +318,11 @@ class BayesOpt(Method):
         observed = search["values"]
         drives = problem.quantise(self._drives(search["points"]))
         power = mean_intensity(_believed(search))
-        variance = None if isinstance(self.noise, str) else 0.5 * self.noise / (1 + self.noise) * power
+        deviation = None if problem.deviation is None else problem.deviation(observed)
+        is_known = deviation is None and not isinstance(self.noise, str)
+        variance = 0.5 * float(self.noise) / (1 + float(self.noise)) * power if is_known else None
         prior = None if self.prior is None else matrix_prior(self.prior, problem)
-        fits = posteriors(prior, search, drives, observed, generators, variance)
+        fits = posteriors(prior, search, drives, observed, generators, variance, deviation)
         search |= tensors_of(fits)
         mean = torch.stack([fit.posterior.matrix for fit in fits])
         search["fitted_values"] = (drives @ mean.mT).abs()

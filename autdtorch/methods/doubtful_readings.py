@@ -41,11 +41,13 @@ class Magnitudes:
         value: (N, P) [Pa].
         limit: True for lower limits (N, P), bool.
         phase: of the pressures (N, P) [rad], NaN where it was not read; None if nowhere.
+        deviation: of the readings (N, P) [Pa], as `Readings.deviation`; None if unknown.
     """
 
     value: torch.Tensor
     limit: torch.Tensor
     phase: torch.Tensor | None = None
+    deviation: torch.Tensor | None = None
 
     @classmethod
     def of(
@@ -54,10 +56,19 @@ class Magnitudes:
         outliers: torch.Tensor,
         highest: torch.Tensor,
         phase: torch.Tensor | None = None,
+        deviation: torch.Tensor | None = None,
     ) -> Magnitudes:
         """Return readings (N, P) [Pa] without `outliers` (N, P), of sensors that end at `highest` (P,)."""
         limit = outliers | (observed >= (1 - _EQUAL) * highest)
-        return cls(observed.masked_fill(outliers, 0), limit, phase)
+        if deviation is not None:
+            deviation = torch.where(deviation.isnan(), deviation.nanmedian(), deviation)  # of gaps
+        return cls(observed.masked_fill(outliers, 0), limit, phase, deviation)
+
+    @property
+    def stated(self) -> torch.Tensor:
+        """The usual deviation of the readings, where they state theirs: the median [Pa]."""
+        assert self.deviation is not None
+        return self.deviation.median()
 
     @property
     def outliers(self) -> torch.Tensor:

@@ -61,7 +61,7 @@ def _in_order(readings: Readings, points: torch.Tensor, scene: Scene | None) -> 
     if len(set(column.tolist())) < len(column):
         raise invalid("readings.points", column.tolist(), "must be another control point each")
     shape = len(readings), len(control_points)
-    parts = {"pressure": readings.pressure, "phase": readings.phase}
+    parts = {"pressure": readings.pressure, "phase": readings.phase, "deviation": readings.deviation}
     columns = {
         name: None if part is None else torch.full(shape, torch.nan, **REAL).index_copy(1, column, part)
         for name, part in parts.items()

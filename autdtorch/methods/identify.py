@@ -17,7 +17,14 @@ from autdtorch.methods.doubtful_readings import Magnitudes, reading_doubts, sens
 from autdtorch.methods.further_readings import independent_readings
 from autdtorch.methods.gradient import climb, climbed, random_drives
 from autdtorch.methods.matrix_fit import Fit, posteriors, tensors_of
-from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, prior_mean, prior_of
+from autdtorch.methods.prior import (
+    Prior,
+    best_simulated_drives,
+    matrix_prior,
+    numbers_of_factors,
+    prior_mean,
+    prior_of,
+)
 from autdtorch.methods.problem import Problem
 from autdtorch.methods.seeds import generators_of, restored, states_of
 from autdtorch.methods.solution import Solution
@@ -85,11 +92,14 @@ class Identify(Method):
         return _LEAST if self.prior is not None else max(_LEAST, 4 * problem.transducers)
 
     def numbers_kept(self, problem: Problem) -> float:
-        """Add the numbers of the fit: derivatives, and with a prior all pairs of readings."""
+        """Add the numbers of the fit: derivatives, or pairs of the readings of each point with a prior."""
         earlier = 0 if problem.readings is None else len(problem.readings)
-        readings = float((self.most_evaluations(problem) + earlier) * problem.foci)
-        pairs = 3 * readings**2 if self.prior is not None else 0.0
-        return super().numbers_kept(problem) + 6 * readings * problem.transducers + pairs
+        drives = self.most_evaluations(problem) + earlier
+        each = 6.0 * problem.transducers
+        if self.prior is not None and drives <= 2 * problem.transducers:
+            each = 6.0 + 3 * drives
+        factors = 0.0 if self.prior is None else numbers_of_factors(self.prior, problem)
+        return super().numbers_kept(problem) + each * drives * problem.foci + factors
 
     @one_library_thread()
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
@@ -134,7 +144,8 @@ class Identify(Method):
         """Fit the matrix to all readings, and observe the best drives of samples of it, or of the fit."""
         drives, observed = search["drives"], search["observed"]
         prior = None if self.prior is None else matrix_prior(self.prior, problem)
-        fits = posteriors(prior, search, drives, observed, generators)
+        deviation = None if problem.deviation is None else problem.deviation(observed)
+        fits = posteriors(prior, search, drives, observed, generators, deviation=deviation)
         copies = [played.clone() for played in drives]  # products must not round by the place in memory
         trials = list(zip(fits, copies, generators, strict=True))
         best = torch.stack([_highest(problem.goal, *trial) for trial in trials])

@@ -10,6 +10,7 @@ import torch
 
 from autdtorch.methods.doubtful_readings import Magnitudes, gross_outliers, range_ends, reads_finely
 from autdtorch.methods.matrix_posterior import MatrixPosterior, MatrixPrior
+from autdtorch.objectives.readings import Readings
 from autdtorch.utils.process import one_library_thread
 
 _OF_POSTERIOR = ("factors", "entries", "variance")  # its tensors, from which the next fit goes on
@@ -48,6 +49,7 @@ def posteriors(
     observed: torch.Tensor,
     generators: Sequence[torch.Generator],
     variance: torch.Tensor | None = None,
+    deviation: torch.Tensor | None = None,
 ) -> list[Fit]:
     """Return the posteriors of T trials by all their readings but outliers.
 
@@ -58,6 +60,7 @@ def posteriors(
         observed: magnitudes (T, N, P); NaN is a gap, which is taken like an outlier.
         generators: of the trials, for the first search without a prior.
         variance: of the magnitudes' noise (T, P) [Pa^2]; None to infer it.
+        deviation: of the magnitudes (T, N, P) [Pa], as `Readings.deviation`; None if unknown.
     """
     fits = []
     for trial, generator in enumerate(generators):
@@ -67,7 +70,8 @@ def posteriors(
         before = {name: search[name][trial].clone() for name in names}
         scaled = None if prior is None else prior.in_units_of(played, seen)
         noise = None if variance is None else variance[trial]
-        fits.append(Trial(scaled, before, played, seen, generator, noise).fit())
+        errors = None if deviation is None else deviation[trial].clone()
+        fits.append(Trial(scaled, before, played, seen, generator, noise, deviation=errors).fit())
     return fits
 
 
@@ -87,7 +91,7 @@ class Trial:
     """The data of a trial's fit; see `posteriors`.
 
     The generator is for the first search without a prior. The phases of the pressures (N, P) [rad] are
-    fitted, too, where they are read.
+    fitted, too, where they are read. Readings count by their deviations (N, P) [Pa], where these are known.
     """
 
     prior: MatrixPrior | None
@@ -97,6 +101,13 @@ class Trial:
     generator: torch.Generator = field(default_factory=torch.Generator)
     variance: torch.Tensor | None = None
     phase: torch.Tensor | None = None
+    deviation: torch.Tensor | None = None
+
+    @classmethod
+    def of(cls, prior: MatrixPrior, before: Mapping[str, torch.Tensor], readings: Readings) -> Trial:
+        """Return the trial of readings, with all that they state."""
+        parts = readings.drives, readings.pressure
+        return cls(prior, before, *parts, phase=readings.phase, deviation=readings.deviation)
 
     def fit(self) -> Fit:
         """Return the fit without outliers, where readings at the end of a sensor's range are limits.
@@ -126,7 +137,7 @@ class Trial:
         elif self.prior is None:
             outliers = gaps | gross_outliers(self.observed)
         for _ in range(_SCREENINGS):
-            read = Magnitudes.of(self.observed, outliers, ends, self.phase)
+            read = Magnitudes.of(self.observed, outliers, ends, self.phase, self.deviation)
             start = self._start(read, matrix)
             if self.variance is not None:
                 start = replace(start, variance=self.variance)
@@ -146,7 +157,7 @@ class Trial:
         if before := self.before:
             known = replace(prior, spread=before["spread"])
             return MatrixPosterior(known, *(before[name] for name in _OF_POSTERIOR))
-        start = MatrixPosterior.start(prior)
+        start = MatrixPosterior.start(prior, read)
         if self.prior is not None:
             return start
         rows = retrieve(self.drives, read, self.generator).T if matrix is None else matrix

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,6 +14,7 @@ from autdtorch.utils.process import one_library_thread
 
 _STEPS = 10  # of the Gauss-Newton search
 _HALVINGS = 6  # of a step that raises the misfit
+_DAMPINGS = (1.0, 10.0, 100.0, 1e3, 1e4)  # of such a step where readings state their deviations
 _ENOUGH = 1e-3  # relative gain of a step below which the fit ends
 _NOISE_ROUNDS = 4  # estimates of the noise
 _NOISE_FACTOR = 1.5  # change of the variance above which the maximum is sought again
@@ -48,9 +50,13 @@ class MatrixPrior:
 
     @property
     def usual_variance(self) -> torch.Tensor:
-        """Variance of the noise that is assumed before readings [Pa^2]."""
+        """Variance of the noise that is assumed before readings which state none [Pa^2]."""
         power = (self.rows.abs().square() + self.spread[:, None].square()).sum(dim=1).mean()
         return 0.5 * _USUAL_NOISE**2 * power
+
+    def variance_of(self, read: Magnitudes) -> torch.Tensor:
+        """Return the usual variance of the readings' noise [Pa^2], as stated or else assumed."""
+        return self.usual_variance if read.deviation is None else read.stated.square()
 
     def in_units_of(self, drives: torch.Tensor, observed: torch.Tensor) -> MatrixPrior:
         """Return the prior in units of the first of magnitudes (N, P) by drives (N, M), or of their median.
@@ -100,7 +106,8 @@ class MatrixPosterior:
         prior: of the matrix.
         factors: a_m, b_m, s, c and t_k at the maximum, as `MatrixPrior.widths`.
         entries: e_pm at the maximum (P, M).
-        variance: of the magnitudes' noise, for each focus (P,) [Pa^2].
+        variance: of the magnitudes' noise, for each focus (P,) [Pa^2]; of the median reading where these
+            state their deviations.
     """
 
     prior: MatrixPrior
@@ -109,9 +116,9 @@ class MatrixPosterior:
     variance: torch.Tensor
 
     @classmethod
-    def start(cls, prior: MatrixPrior) -> MatrixPosterior:
-        """Return the maximum of the prior."""
-        variance = prior.usual_variance.expand_as(prior.spread)
+    def start(cls, prior: MatrixPrior, read: Magnitudes) -> MatrixPosterior:
+        """Return the maximum of the prior, with the usual noise of readings."""
+        variance = prior.variance_of(read).expand_as(prior.spread)
         return cls(prior, torch.zeros_like(prior.widths), torch.zeros_like(prior.rows), variance)
 
     @property
@@ -128,7 +135,7 @@ class MatrixPosterior:
         """
         now, line = self._maximum(self.linearised(drives, read), drives, read)
         for _ in range(_NOISE_ROUNDS if infer_noise else 0):
-            before, now = now.variance[0], now._with_noise(line)
+            before, now = now.variance[0], now._with_noise(line, self.prior.variance_of(read))
             if not 1 / _NOISE_FACTOR < now.variance[0] / before < _NOISE_FACTOR:
                 now, line = now._maximum(line, drives, read)
         return now
@@ -139,9 +146,8 @@ class MatrixPosterior:
         """Return the maximum by damped Gauss-Newton steps, and its linearisation."""
         now = self
         for _ in range(_STEPS):
-            target, misfit = now._solved(line), now._misfit(line)
-            for halving in range(_HALVINGS):
-                there = now._towards(target, 0.5**halving)
+            misfit = now._misfit(line)
+            for there in now._steps(line, read):
                 new_line = there.linearised(drives, read)
                 better = there._misfit(new_line)
                 if better < misfit:
@@ -153,8 +159,8 @@ class MatrixPosterior:
                 break
         return now, line
 
-    def _with_noise(self, line: LinearisedReadings) -> MatrixPosterior:
-        left = line.left.square().sum() + _WEIGHT * self.prior.usual_variance
+    def _with_noise(self, line: LinearisedReadings, usual: torch.Tensor) -> MatrixPosterior:
+        left = line.left.square().sum() + _WEIGHT * usual
         variance = left / (line.unexplained + _WEIGHT)
         return replace(self, variance=variance.expand_as(self.variance))
 
@@ -188,7 +194,8 @@ class MatrixPosterior:
             believed = replace(read, value=observed.where(doubted, read.value), limit=read.limit & ~doubted)
             left = self.linearised(drives, believed).left
         left = left.abs()
-        far = left > _HARMLESS * self.matrix.norm(dim=1)
+        pressure = left if read.deviation is None else self._in_pascals(left, read)
+        far = pressure > _HARMLESS * self.matrix.norm(dim=1)
         if not far.any():
             return torch.zeros_like(read.limit)
         share = line.shares.masked_fill(~line.decided, 1)
@@ -198,6 +205,12 @@ class MatrixPosterior:
         deviation = torch.maximum(usual.nanmedian(), usual.nanmedian(dim=0).values.nan_to_num()) / _MEDIAN
         doubtful: torch.Tensor = far & (ratio > _OUTLIER * deviation)
         return doubtful.reshape(-1, *observed.shape).any(dim=0)
+
+    def _in_pascals(self, left: torch.Tensor, read: Magnitudes) -> torch.Tensor:
+        """Return differences (R, P) that count in the readings' deviations as those of magnitudes [Pa]."""
+        assert read.deviation is not None
+        by_drive = left.reshape(-1, *read.deviation.shape) * (read.deviation / read.stated)
+        return by_drive.reshape(left.shape)
 
     def deviations(self, drives: torch.Tensor, read: Magnitudes) -> torch.Tensor:
         """Return how far the readings of each control point (P,) are from this fit, rms [Pa].
@@ -231,10 +244,25 @@ class MatrixPosterior:
         widths, spread = self.prior.widths, self.prior.spread
         return LinearisedReadings.at(matrix, rows, changes, widths, spread, drives, read, self.variance)
 
-    def _solved(self, line: LinearisedReadings) -> MatrixPosterior:
-        left = line.left + line.change(self.factors / self.prior.widths, self.entries)
-        factors, entries = line.explained(left)
-        return replace(self, factors=self.prior.widths * factors, entries=entries)
+    def _steps(self, line: LinearisedReadings, read: Magnitudes) -> Iterator[MatrixPosterior]:
+        """Yield the maximum where the readings were linear, and then nearer ones."""
+        target = self._solved(line)
+        yield target
+        if read.deviation is None:
+            for halving in range(1, _HALVINGS):
+                yield self._towards(target, 0.5**halving)
+            return
+        # Pictures determine many factors at once; shares of their steps would have to be too small.
+        for damping in _DAMPINGS:
+            yield self._solved(line, damping)
+
+    def _solved(self, line: LinearisedReadings, damping: float = 0.0) -> MatrixPosterior:
+        """Return the maximum where the readings were linear; damping holds the factors near these."""
+        here = self.factors / self.prior.widths
+        held = damping / (1 + damping) * here
+        left = line.left + line.change(here - held, self.entries)
+        factors, entries = line.explained(left, damping)
+        return replace(self, factors=self.prior.widths * (held + factors), entries=entries)
 
     def _towards(self, other: MatrixPosterior, share: float) -> MatrixPosterior:
         return replace(

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, fields
 import torch
 
 from autdtorch.methods.gradient import climb, random_drives
+from autdtorch.methods.linearised_readings import NUMBERS_AT_ONCE
 from autdtorch.methods.matrix_posterior import MatrixPrior
 from autdtorch.methods.problem import Problem
 from autdtorch.objectives.objective import validate_matrix
@@ -119,6 +120,13 @@ def matrix_prior(prior: Prior, problem: Problem) -> MatrixPrior:
     if isinstance(prior.variants, torch.Tensor):
         changes = prior.variants - matrix
     return gaussian_prior(prior, matrix, changes, torch.ones(len(changes), **REAL))
+
+
+def numbers_of_factors(prior: Prior, problem: Problem) -> float:
+    """Return how many numbers a fit from a prior holds for the factors that all points share."""
+    variants = 0 if prior.variants is None else len(prior.variants)
+    factors = 2 * problem.transducers + 2 + variants
+    return 3.0 * factors**2 + 3 * NUMBERS_AT_ONCE
 
 
 def gaussian_prior(

@@ -17,7 +17,7 @@ from autdtorch.objectives.objective import (
     validate_drives,
     validate_matrix,
 )
-from autdtorch.objectives.perturbations import quantised, simulated_matrix
+from autdtorch.objectives.perturbations import deviation_of, quantised, simulated_matrix
 from autdtorch.objectives.readings import Readings
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import (
@@ -48,6 +48,8 @@ class Problem:
             (T, M); `BayesOpt`, `GABS` and `GradientAscent` begin there.
         readings: earlier ones of the same array and control points. `Identify` and `BayesOpt` go on from
             them; for all methods, their best drive counts. They are no evaluations.
+        deviation: function of readings (..., P) [Pa], earlier ones included, that gives their standard
+            deviations, as `Readings.deviation`; None if they are unknown, and alike.
     """
 
     transducers: int
@@ -58,6 +60,7 @@ class Problem:
     quantise: Callable[[torch.Tensor], torch.Tensor] = field(default=lambda drive: drive)
     start: torch.Tensor | None = None
     readings: Readings | None = None
+    deviation: Callable[[torch.Tensor], torch.Tensor] | None = None
 
     def __post_init__(self) -> None:
         """Check the fields."""
@@ -68,6 +71,8 @@ class Problem:
         if isinstance(self.goal, Goal):
             self.goal.check(self.foci)
         require_callable("quantise", self.quantise)
+        if self.deviation is not None:
+            require_callable("deviation", self.deviation)
         if self.scene is not None:
             require_kind("scene", self.scene, Scene)
         if self.transfer_matrix is not None:
@@ -83,6 +88,9 @@ class Problem:
             object.__setattr__(self, "start", start)
         if self.readings is not None:
             readings = fitting(self.readings, self.scene, self.transducers, self.foci)
+            if readings.deviation is not None and self.deviation is None:
+                accepted = "must be None, as the objective has no `deviation` of the readings to come"
+                raise invalid("readings.deviation", "given", accepted)
             object.__setattr__(self, "readings", readings)
 
     @classmethod
@@ -105,7 +113,7 @@ class Problem:
         scene, matrix = objective.scene, simulated_matrix(objective)
         counts = len(scene.array), len(scene.control_points)
         quantise = partial(quantised, objective)
-        return cls(*counts, goal, scene, matrix, quantise, start, readings)
+        return cls(*counts, goal, scene, matrix, quantise, start, readings, deviation_of(objective))
 
 
 def starts_of(problem: Problem, trials: int) -> torch.Tensor | None:

@@ -29,7 +29,7 @@ from autdtorch.utils.files import read_arrays, replace_file
 from autdtorch.utils.validation import invalid, path_of, require_kind, within
 
 _BEST, _SEARCH, _READINGS, _HEADER = "best.", "search.", "readings.", "header"
-_OF_READINGS = ("drives", "pressure", "phase")
+_OF_READINGS = ("drives", "pressure", "phase", "deviation")
 _VERSION = 4  # of the format; a new one where `State`, or the `search` of a method, changes
 _SHOWN = 16  # digits of a digest
 _COLUMNS = tuple(field.name for field in dataclasses.fields(Solution))

@@ -9,7 +9,7 @@ divided among calls. A trial that must not depend on others therefore needs a se
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -201,6 +201,44 @@ class Noise(Perturbation):
         return (pressure + noise).abs().reshape(len(drive), self.reads, -1).mean(dim=1)
 
 
+class CameraNoise(Perturbation):
+    """Noise of a thermal camera, which sees |p|^2: a relative part, and a floor where it is dark.
+
+    A reading is sqrt(max(0, |p|^2 + n)) with Gaussian n.
+    """
+
+    def __init__(
+        self, objective: Objective, relative: float = 0.025, floor: float = 0.0, seed: int = 0
+    ) -> None:
+        """Wrap an objective.
+
+        Args:
+            objective: is wrapped.
+            relative: standard deviation of a high pressure, relative to it, 1e-6 to 1.
+            floor: [Pa], >= 0; its square is the standard deviation of |p|^2 in the dark.
+            seed: of the noise, >= 0.
+        """
+        super().__init__(objective)
+        self.relative = number_between("relative", relative, 1e-6, 1.0)
+        self.floor = not_negative("floor", floor, "Pa")
+        self._generator = _generator(seed, "CameraNoise")
+
+    def deviation(self, pressure: torch.Tensor) -> torch.Tensor:
+        """Return the deviations (..., P) [Pa] of readings (..., P) [Pa], as `Readings.deviation`."""
+        square = pressure.square()
+        deviation = (square + self._of_square(square)).sqrt() - pressure
+        return deviation.clamp_min(torch.finfo(deviation.dtype).tiny)
+
+    def _observe(self, drive: torch.Tensor) -> torch.Tensor:
+        square = self.inner(drive).square()
+        noise = torch.from_numpy(self._generator.standard_normal(square.shape))
+        return (square + self._of_square(square) * noise).clamp_min(0).sqrt()
+
+    def _of_square(self, square: torch.Tensor) -> torch.Tensor:
+        """Return the deviations [Pa^2] of squares of pressures."""
+        return torch.hypot(2 * self.relative * square, torch.full_like(square, self.floor**2))
+
+
 def true_pressure(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
     """Return the pressures (..., P) [Pa] that the array at present makes for drives (..., M).
 
@@ -222,6 +260,15 @@ def quantised(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
         objective = objective.inner
     known = getattr(objective, "quantised", None)  # of a `HardwareObjective`
     return drive if known is None else known(drive)
+
+
+def deviation_of(objective: Objective) -> Callable[[torch.Tensor], torch.Tensor] | None:
+    """Return the function of an objective that gives the deviations of its readings (..., P) [Pa], if any."""
+    known = getattr(objective, "deviation", None)
+    while known is None and isinstance(objective, Perturbation):
+        objective = objective.inner
+        known = getattr(objective, "deviation", None)
+    return known
 
 
 def simulated_matrix(objective: Objective) -> torch.Tensor | None:

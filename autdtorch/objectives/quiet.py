@@ -1,4 +1,4 @@
-"""Goals for foci beside points that stay quiet; a quiet region is points of a plane or a sphere."""
+"""Goals for foci beside points that stay quiet, or that are only seen; a region is points of it."""
 
 from __future__ import annotations
 
@@ -46,36 +46,103 @@ class _BesideOthers(Goal):
     def wanted(self, points: int) -> Array:
         """Return 0 for the other points, and the pressures wanted at the foci."""
         wanted = np.zeros(points)
-        wanted[self._foci(points)] = self._wanted_at_foci(points - len(self.points))
+        wanted[self.foci(points)] = self._wanted_at_foci(points - len(self.points))
         return wanted
 
     def _wanted_at_foci(self, foci: int) -> Array:
         return np.ones(foci)
 
-    def _foci(self, points: int) -> list[int]:
+    def foci(self, points: int) -> list[int]:
         """Return the indices of the foci among so many control points."""
         return sorted(set(range(points)).difference(self.points))
 
     def _parts(self, pressure: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the pressures [Pa] of the foci (..., P - K) and of the other points (..., K)."""
-        return pressure[..., self._foci(pressure.shape[-1])], pressure[..., list(self.points)]
+        return pressure[..., self.foci(pressure.shape[-1])], pressure[..., list(self.points)]
 
     def _rows(self, G: ArrayLike) -> tuple[ComplexArray, ComplexArray]:
         """Return the checked rows of the foci (P - K, M) and of the other points (K, M)."""
         matrix = checked_matrix(G)
         self.check(len(matrix))
-        return matrix[self._foci(len(matrix))], matrix[list(self.points)]
+        return matrix[self.foci(len(matrix))], matrix[list(self.points)]
 
     def _whole(self, at_foci: torch.Tensor, at_others: torch.Tensor) -> torch.Tensor:
         """Return the values (..., P) of all control points."""
         whole = at_foci.new_zeros(*at_foci.shape[:-1], at_foci.shape[-1] + len(self.points))
-        whole[..., self._foci(whole.shape[-1])] = at_foci
+        whole[..., self.foci(whole.shape[-1])] = at_foci
         whole[..., list(self.points)] = at_others
         return whole
 
 
+class _GoalBesideOthers(_BesideOthers):
+    """Base of a `goal` for the foci, in their order, beside other points."""
+
+    goal: Goal
+
+    def __post_init__(self) -> None:
+        """Check goal and indices."""
+        require_kind("goal", self.goal, Goal)
+        if isinstance(self.goal, _BesideOthers) and not self._takes(self.goal):
+            raise invalid("goal", self.goal, "must be a goal without quiet points")
+        super().__post_init__()
+
+    def _takes(self, goal: _BesideOthers) -> bool:
+        return False
+
+    @property
+    def unit(self) -> str:  # type: ignore[override]
+        """The unit of the goal."""
+        return self.goal.unit
+
+    @property
+    def absolute(self) -> bool:  # type: ignore[override]
+        """True if the goal wants pressures in Pa."""
+        return self.goal.absolute
+
+    def check(self, points: int) -> None:
+        """Check the indices, and the goal for the other points."""
+        super().check(points)
+        self.goal.check(points - len(self.points))
+
+    def _wanted_at_foci(self, foci: int) -> Array:
+        return self.goal.wanted(foci)
+
+
 @dataclass(frozen=True)
-class QuietPoints(_BesideOthers):
+class SeenPoints(_GoalBesideOthers):
+    """A goal for some control points, while others are seen and not scored, as by a camera.
+
+    Methods that fit the transfer matrix, `Identify` and `BayesOpt`, learn from all points.
+
+    Attributes:
+        goal: of the points that count, in their order.
+        points: indices of the control points that are only seen.
+    """
+
+    name: ClassVar[str] = "seen_points"
+
+    goal: Goal
+    points: Sequence[int]
+
+    def __call__(self, pressure: ArrayLike) -> torch.Tensor:
+        """Return the score of the points that count (...)."""
+        return self.goal(self._parts(self.checked(pressure))[0])
+
+    def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
+        """Return the derivatives of the goal, 0 at points that are only seen."""
+        foci, others = self._parts(pressure)
+        return self._whole(self.goal.slope(foci, smoothing), torch.zeros_like(others))
+
+    def bound(self, G: ArrayLike) -> float:
+        """Return the bound of the goal; see `Goal.bound`."""
+        return self.goal.bound(self._rows(G)[0])
+
+    def _takes(self, goal: _BesideOthers) -> bool:
+        return not isinstance(goal, SeenPoints)
+
+
+@dataclass(frozen=True)
+class QuietPoints(_GoalBesideOthers):
     """A goal for some control points, while others stay quiet: below a ratio of the weakest of the former.
 
     The other points are scored by `goal`. If the loudest quiet point exceeds its limit by a factor, a score
@@ -97,21 +164,8 @@ class QuietPoints(_BesideOthers):
 
     def __post_init__(self) -> None:
         """Check the fields."""
-        require_kind("goal", self.goal, Goal)
-        if isinstance(self.goal, QuietPoints | Contrast):
-            raise invalid("goal", self.goal, "must be a goal without quiet points")
         super().__post_init__()
         object.__setattr__(self, "ratio", positive("ratio", self.ratio))
-
-    @property
-    def unit(self) -> str:  # type: ignore[override]
-        """The unit of the goal."""
-        return self.goal.unit
-
-    @property
-    def absolute(self) -> bool:  # type: ignore[override]
-        """True if the goal wants pressures in Pa."""
-        return self.goal.absolute
 
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:
         """Return the score of the other points (...), lowered for the excess of quiet points."""
@@ -161,14 +215,6 @@ class QuietPoints(_BesideOthers):
             if scores.max() > (1 - _GAIN) * before:
                 break
         return float(scores.max())
-
-    def _wanted_at_foci(self, foci: int) -> Array:
-        return self.goal.wanted(foci)
-
-    def check(self, points: int) -> None:
-        """Check the indices, and the goal for the other points."""
-        super().check(points)
-        self.goal.check(points - len(self.points))
 
 
 @dataclass(frozen=True)

@@ -27,12 +27,15 @@ class Readings:
         points: (P, 3) [m]; None for the control points of the scene.
         phase: of the pressure phasors (N, P) [rad], with the time factor e^{-i w t}; NaN is unknown, as it is
             at gaps of the pressure. None for magnitudes alone.
+        deviation: standard deviations (N, P) [Pa], > 0, towards higher pressures: pressure^2 deviates by
+            (pressure + deviation)^2 - pressure^2, which holds near 0, too. None if unknown, and alike.
     """
 
     drives: torch.Tensor
     pressure: torch.Tensor
     points: torch.Tensor | None = None
     phase: torch.Tensor | None = None
+    deviation: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
         """Check the arrays, and copy them to the CPU as float64 and complex128."""
@@ -49,15 +52,19 @@ class Readings:
         if points is not None and len(points) != pressure.shape[1]:
             accepted = f"must be ({pressure.shape[1]}, 3), a point for each column of pressure"
             raise ValueError(f"points: shape {tuple(points.shape)}; {accepted}")
-        phase = None
-        if self.phase is not None:
-            phase = self._per_drive("phase", self.phase, len(drives), single, "rad")
-            if phase.shape != pressure.shape:
-                raise ValueError(f"phase: shape {tuple(phase.shape)}; must be {tuple(pressure.shape)}")
-            phase[pressure.isnan()] = torch.nan
-        copies = (drives.detach().cpu().clone(), pressure, points, phase)
-        for name, copy in zip(("drives", "pressure", "points", "phase"), copies, strict=True):
-            object.__setattr__(self, name, copy)
+        copies = {"drives": drives.detach().cpu().clone(), "pressure": pressure, "points": points}
+        for name, unit in (("phase", "rad"), ("deviation", "Pa")):
+            if getattr(self, name) is not None:
+                copy = copies[name] = self._per_drive(name, getattr(self, name), len(drives), single, unit)
+                if copy.shape != pressure.shape:
+                    raise ValueError(f"{name}: shape {tuple(copy.shape)}; must be {tuple(pressure.shape)}")
+                copy[pressure.isnan()] = torch.nan
+        deviation = copies.get("deviation")
+        if deviation is not None and len(wrong := (~(deviation > 0) & ~pressure.isnan()).nonzero()):
+            place = wrong[0].tolist()
+            raise invalid(f"deviation{place}", deviation[tuple(place)].item(), "must be > 0", "Pa")
+        for name, each in copies.items():
+            object.__setattr__(self, name, each)
 
     @staticmethod
     def _per_drive(name: str, value: object, drives: int, single: bool, unit: str) -> torch.Tensor:
@@ -123,8 +130,8 @@ class Readings:
     def __getitem__(self, rows: Any) -> Readings:
         """Return the readings of drives, by a slice, a mask, indices or one index."""
         chosen = torch.arange(len(self), dtype=torch.int64, device="cpu")[rows].reshape(-1)
-        phase = None if self.phase is None else self.phase[chosen]
-        return Readings(self.drives[chosen], self.pressure[chosen], self.points, phase)
+        phase, deviation = (None if part is None else part[chosen] for part in (self.phase, self.deviation))
+        return Readings(self.drives[chosen], self.pressure[chosen], self.points, phase, deviation)
 
     def __repr__(self) -> str:
         """Return the sizes."""

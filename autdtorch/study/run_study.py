@@ -24,7 +24,7 @@ from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.objectives.metrics import focus_metrics
 from autdtorch.objectives.objective import Objective, SimulatedObjective
-from autdtorch.objectives.quiet import QuietPoints
+from autdtorch.objectives.quiet import QuietPoints, SeenPoints
 from autdtorch.objectives.readings import Readings
 from autdtorch.propagators import Propagator, SimulatedPropagator, TMatrixPropagator, make_propagator
 from autdtorch.propagators.plan import plan
@@ -225,7 +225,7 @@ def goal_keyword(method: Callable[..., Solution]) -> str | None:
 
 def _goals_of(goal: Goal) -> list[Goal]:
     """Return a goal, and the goals that it is made of."""
-    return [goal, *_goals_of(goal.goal)] if isinstance(goal, QuietPoints) else [goal]
+    return [goal, *_goals_of(goal.goal)] if isinstance(goal, QuietPoints | SeenPoints) else [goal]
 
 
 def _is_random(method: StudyMethod) -> bool:

@@ -36,6 +36,8 @@ def goals_for(points: int, unit: float) -> list[at.Goal]:
         at.QuietPoints(at.WeakestFocus(weights[1:]), [0], DB30),
         at.QuietPoints(at.MeanPressure(), [0], 0.3),
         at.QuietPoints(at.TargetPressures([unit] * (points - 1)), [1], 0.1),
+        at.SeenPoints(at.WeakestFocus(weights[1:]), [0]),
+        at.SeenPoints(at.TargetPressures([unit] * (points - 1)), [points - 1]),
         at.Contrast([0]),
         at.Contrast(range(1, points)),
     ]
@@ -55,6 +57,8 @@ def test_scores_are_those_of_the_definitions():
             at.QuietPoints(at.TargetPressures([2, 1, 1]), [0], 4 / 0.3),
             [-0.7 / math.sqrt(3), -math.sqrt((9 + 0.81 + 9) / 3)],
         ),
+        (at.SeenPoints(at.WeakestFocus(), [2, 3]), [2.0, 1.0]),
+        (at.SeenPoints(at.QuietPoints(at.WeakestFocus(), [1], 1.0), [2, 3]), [4.0, 1 / 64]),
         (at.Contrast([0, 2]), [1 / math.sqrt((4**2 + 0.3**2) / 2), 4 / math.sqrt((1 + 0.1**2) / 2)]),
         (at.Contrast([0, 1, 3]), [0.3 / math.sqrt(7), 0.1 / math.sqrt(27)]),
     ):
@@ -162,7 +166,7 @@ def test_a_failed_transducer_changes_no_bound(random_matrix):
         assert goal.bound(silent) == pytest.approx(goal.bound(matrix), rel=1e-3)
 
 
-@pytest.mark.parametrize("number", range(10))
+@pytest.mark.parametrize("number", range(12))
 def test_slopes_are_derivatives(number):
     goal = goals_for(4, unit=2.0)[number]
     pressure = torch.tensor([1.3, 1.9, 2.4, 3.1], dtype=torch.float64)

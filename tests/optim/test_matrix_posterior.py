@@ -60,19 +60,18 @@ def test_derivatives_are_those_of_the_magnitudes(prior, with_factors):
         )
         place = tuple(divmod(index, 2))
         if with_factors:
-            torch.testing.assert_close(line.by_factors[place], by[0] * prior.widths)
-        # PyTorch's gradient of a real function is the conjugate of the derivative by the entry.
-        torch.testing.assert_close(line.by_entries[place], by[1][place[1]].conj())
+            torch.testing.assert_close(line.by_factors()[place[::-1]], by[0] * prior.widths)
+        by_parts = torch.view_as_real(by[1][place[1]]).T.flatten()
+        torch.testing.assert_close(2**0.5 * line.by_entries[place[::-1]], by_parts)
 
 
 def slopes(posterior, drives):
     """Derivatives (N P, K) of magnitudes by factors, and by real and imaginary parts of all entries."""
     line = posterior.linearised(drives, exact((drives @ posterior.matrix.T).abs()))
-    by_parts = torch.zeros(*line.magnitudes.shape, *posterior.entries.shape, 2, dtype=torch.float64)
-    for focus in range(len(posterior.entries)):
-        entry = line.by_entries[:, focus]
-        by_parts[:, focus, focus] = torch.stack([entry.real, -entry.imag], dim=-1)
-    by_factors = line.by_factors / posterior.prior.widths
+    by_parts = torch.zeros(*line.left.shape, *posterior.entries.shape, 2, dtype=torch.float64)
+    for focus, entries in enumerate(2**0.5 * line.by_entries):
+        by_parts[:, focus, focus] = entries.reshape(len(drives), 2, -1).mT
+    by_factors = line.by_factors().transpose(0, 1) / posterior.prior.widths
     return torch.cat([by_factors, by_parts.flatten(2)], dim=-1).flatten(0, 1)
 
 

@@ -164,6 +164,10 @@ class Fit(NamedTuple):
     length_scale: torch.Tensor
     noise: torch.Tensor
 
+    def of(self, outputs: list[int]) -> Fit:
+        """Return the hyperparameters of some outputs."""
+        return Fit(*(part[:, outputs] for part in self))
+
 
 class Rows(NamedTuple):
     """The rows of the transfer matrix as they are known before the observations.
@@ -177,6 +181,10 @@ class Rows(NamedTuple):
     mean: torch.Tensor
     variance: torch.Tensor
     best: torch.Tensor
+
+    def of(self, outputs: list[int]) -> Rows:
+        """Return the rows of some outputs."""
+        return Rows(self.mean[:, outputs], self.variance[:, outputs], self.best)
 
 
 class Posterior(NamedTuple):

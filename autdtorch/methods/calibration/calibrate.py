@@ -32,6 +32,7 @@ _LEAST_DRIVES = 2  # for each fold, to hold back drives; else readings are held 
 _SHIFTS = (-3, -2, -1, 1, 2, 3)  # rows by which readings and drives may be shifted
 _COMPARED = 24  # least number of drives to look for a shift or a failed sensor
 _VARIES = 0.1  # least relative deviation of the expected readings, to see whether a sensor follows them
+_CLEAR = 2.0  # least deviation of the expected readings, in those that a sensor states, likewise
 _FOLLOWS = 0.3  # least rank correlation with the drives of a sensor that follows them
 
 
@@ -121,10 +122,14 @@ def _held_back(calibration: Calibration, folds: int, seed: int) -> HeldBack:
         fit = fitted(here, rest, calibration.settings)
         part = replace(calibration, simulation=here, readings=rest, fit=fit)
         prediction = part.predict(readings.drives)
-        predicted[taken], deviation[taken] = prediction.pressure[taken], prediction.of_reading[taken]
+        predicted[taken] = prediction.pressure[taken]
+        noise = prediction.of_reading
+        if readings.deviation is not None:
+            noise = torch.hypot(prediction.deviation, part.noise / part.fit.read.stated * readings.deviation)
+        deviation[taken] = noise[taken]
         scaled[taken] = gain_to(observed[seen], simulated[seen]) * simulated[taken]
     inside = ((predicted - observed).abs() < _INTERVAL * deviation)[scored]
-    error, before = relative_error(predicted, observed), relative_error(scaled, observed)
+    error, before = (relative_error(each, observed, readings.deviation) for each in (predicted, scaled))
     return HeldBack(error, before, float(inside.double().mean()), len(inside), predicted, scaled)
 
 
@@ -192,25 +197,30 @@ def _fit_without_failed(
 ) -> tuple[CalibrationFit, torch.Tensor]:
     """Return the fit, and the points (P,), bool, that neither simulation nor other readings explain."""
     observed = readings.pressure
-    suspects = _failed(expected, observed)
+    suspects = _failed(expected, readings)
     if not suspects.any() or suspects.all():
         return fitted(simulation, readings, prior), torch.zeros_like(suspects)
     fit = fitted(simulation, _without(readings, suspects.expand_as(observed)), prior)
-    failed = suspects & _failed((readings.drives @ fit.posterior.matrix.T).abs(), observed)
+    failed = suspects & _failed((readings.drives @ fit.posterior.matrix.T).abs(), readings)
     if not torch.equal(failed, suspects):
         fit = fitted(simulation, _without(readings, failed.expand_as(observed)), prior)
     return fit, failed
 
 
-def _failed(expected: torch.Tensor, observed: torch.Tensor) -> torch.Tensor:
-    """Return the points (P,), bool, whose readings (N, P) do not follow the expected ones.
+def _failed(expected: torch.Tensor, readings: Readings) -> torch.Tensor:
+    """Return the points (P,), bool, whose readings do not follow the expected ones (N, P).
 
-    Few readings, and drives that are expected to give nearly the same, show nothing of a sensor.
+    Few readings, and drives that are expected to give nearly the same, show nothing of a sensor, nor does a
+    point that is dark beside the deviations of its readings.
     """
     failed = []
-    for one, other in zip(expected.T, observed.T, strict=True):
+    least = torch.zeros_like(expected[0])
+    if readings.deviation is not None:
+        least = _CLEAR * readings.deviation.nanmedian(dim=0).values
+    for one, other, dark in zip(expected.T, readings.pressure.T, least, strict=True):
         known = ~other.isnan()
-        judged = int(known.sum()) >= _COMPARED and one[known].std() > _VARIES * one[known].mean()
+        varies = torch.maximum(_VARIES * one[known].mean(), dark)
+        judged = int(known.sum()) >= _COMPARED and bool(one[known].std() > varies)
         failed.append(judged and _correlation(one[:, None], other[:, None]) < _FOLLOWS)
     return torch.tensor(failed, dtype=torch.bool, device="cpu")
 

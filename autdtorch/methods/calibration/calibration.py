@@ -40,7 +40,7 @@ class Prediction(NamedTuple):
     Attributes:
         pressure: the likeliest magnitudes.
         deviation: their standard deviations.
-        of_reading: standard deviations of readings, with the noise.
+        of_reading: standard deviations of readings, with `Calibration.noise`.
     """
 
     pressure: torch.Tensor
@@ -74,10 +74,13 @@ def gain_to(observed: torch.Tensor, simulated: torch.Tensor) -> torch.Tensor:
     return (simulated * observed)[known].sum() / simulated[known].square().sum()
 
 
-def relative_error(predicted: torch.Tensor, observed: torch.Tensor) -> float:
-    """Return the rms difference over the rms of observed magnitudes, where both are known."""
+def relative_error(
+    predicted: torch.Tensor, observed: torch.Tensor, deviation: torch.Tensor | None = None
+) -> float:
+    """Return the rms difference over the rms of observed magnitudes, where both are known, by deviation."""
     known = ~(observed + predicted).isnan()
-    return float((predicted - observed)[known].norm() / observed[known].norm())
+    weight = torch.ones_like(observed) if deviation is None else 1 / deviation
+    return float((weight * (predicted - observed))[known].norm() / (weight * observed)[known].norm())
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -141,7 +144,7 @@ class Calibration:
 
     @property
     def noise(self) -> float:
-        """Standard deviation of the readings' noise [Pa]."""
+        """Standard deviation of the readings' noise [Pa]; of the median one where they state theirs."""
         return float(self.fit.posterior.variance.mean().sqrt())
 
     @property
@@ -160,7 +163,7 @@ class Calibration:
     @cached_property
     def together(self) -> list[list[int]]:
         """Groups of transducers that the readings show only together, such as rings of symmetric drives."""
-        by_gain = self.fit.line.by_factors.flatten(0, 1)[:, : len(self.gain)]
+        by_gain = self.fit.line.by_factors().flatten(0, 1)[:, : len(self.gain)]
         unit = by_gain / by_gain.norm(dim=0).clamp_min(torch.finfo(by_gain.dtype).tiny)
         alike, seen, groups = unit.mT @ unit > _ALIKE, set[int](), []
         for transducer, row in enumerate(alike):
@@ -191,6 +194,14 @@ class Calibration:
             phase=float(self.phase_deviation.square().mean().sqrt()),
             rest=self.settings.rest,
         )
+
+    @property
+    def prior_with_readings(self) -> Prior:
+        """The prior of a method that takes the readings, too: with the widths before, at the fitted amounts."""
+        matrix, changes = self.fit.changes
+        steps = self.simulation.widths[:, None, None] * changes
+        variants = matrix + steps if len(steps) else None
+        return replace(self.settings, transfer_matrix=matrix, variants=variants)
 
     @one_library_thread()
     def predict(self, drives: ArrayLike, points: ArrayLike | None = None) -> Prediction:

@@ -96,7 +96,7 @@ def fitted(simulation: Simulation, readings: Readings, prior: Prior) -> Calibrat
     enough = _ENOUGH_ON_GRIDS if simulation.changes.simulates else _ENOUGH
     for left in reversed(range(_ROUNDS)):
         before, around = fit, prior_around(tangent, simulation.widths, prior).times(unit)
-        trial = Trial(around, fit.before, readings.drives, readings.pressure, phase=readings.phase).fit()
+        trial = Trial.of(around, fit.before, readings).fit()
         fit = replace(fit, posterior=trial.posterior, read=trial.read)
         step = fit.amounts - tangent.amounts
         if not len(step) or (step.abs() < enough * fit.deviations[-len(step) :]).all():
@@ -116,13 +116,18 @@ def _first(prior: MatrixPrior, readings: Readings, unit: float) -> CalibrationFi
     """Return the maximum of the prior, with the common phase of the readings and without outliers far off."""
     drives, observed = readings.drives, readings.pressure
     expected = drives @ prior.rows.T
-    start = MatrixPosterior.start(prior)
+    shift = torch.zeros_like(prior.widths)
     if readings.phase is not None:
         parts = torch.polar(observed, readings.phase) * expected.conj()
-        start.factors[2 * drives.shape[1] + 1] = parts[parts.abs().isfinite()].sum().angle()
-    far = (observed - expected.abs()).abs() > _FAR * prior.errors(drives)
+        shift[2 * drives.shape[1] + 1] = parts[parts.abs().isfinite()].sum().angle()
+    errors = prior.errors(drives)
+    if readings.deviation is not None:
+        errors = torch.hypot(errors, readings.deviation)
+    far = (observed - expected.abs()).abs() > _FAR * errors
     outliers = far | observed.isnan()
-    read = Magnitudes.of(observed, outliers, torch.full_like(observed[0], torch.inf), readings.phase)
+    ends = torch.full_like(observed[0], torch.inf)
+    read = Magnitudes.of(observed, outliers, ends, readings.phase, readings.deviation)
+    start = replace(MatrixPosterior.start(prior, read), factors=shift)
     usual = start.variance
     for factor in _TEMPERED:
         start = replace(start, variance=factor * usual).fitted(drives, read, infer_noise=False)
