@@ -210,7 +210,7 @@ class BayesOpt(Method):
             values = torch.where(search["outliers"], search["fitted_values"], values)
         goal = problem.goal
         if isinstance(goal, SeenPoints):  # the foci alone have processes
-            foci, goal = goal.foci(problem.foci), goal.goal
+            foci, goal = sorted({*range(problem.foci)}.difference(goal.points)), goal.goal
             values, fit = values[..., foci], fit.of(foci)
             rows = None if rows is None else rows.of(foci)
         acquisition = self._acquisition(goal, values, points, fit, rows)

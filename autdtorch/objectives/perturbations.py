@@ -26,6 +26,7 @@ from autdtorch.utils.validation import (
     not_negative,
     number_between,
     positive,
+    real_tensor,
 )
 
 SNRS = (-1000.0, 1000.0)
@@ -225,6 +226,7 @@ class CameraNoise(Perturbation):
 
     def deviation(self, pressure: torch.Tensor) -> torch.Tensor:
         """Return the deviations (..., P) [Pa] of readings (..., P) [Pa], as `Readings.deviation`."""
+        pressure = real_tensor("pressure", pressure, "Pa")
         square = pressure.square()
         deviation = (square + self._of_square(square)).sqrt() - pressure
         return deviation.clamp_min(torch.finfo(deviation.dtype).tiny)

@@ -46,30 +46,30 @@ class _BesideOthers(Goal):
     def wanted(self, points: int) -> Array:
         """Return 0 for the other points, and the pressures wanted at the foci."""
         wanted = np.zeros(points)
-        wanted[self.foci(points)] = self._wanted_at_foci(points - len(self.points))
+        wanted[self._foci(points)] = self._wanted_at_foci(points - len(self.points))
         return wanted
 
     def _wanted_at_foci(self, foci: int) -> Array:
         return np.ones(foci)
 
-    def foci(self, points: int) -> list[int]:
+    def _foci(self, points: int) -> list[int]:
         """Return the indices of the foci among so many control points."""
         return sorted(set(range(points)).difference(self.points))
 
     def _parts(self, pressure: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the pressures [Pa] of the foci (..., P - K) and of the other points (..., K)."""
-        return pressure[..., self.foci(pressure.shape[-1])], pressure[..., list(self.points)]
+        return pressure[..., self._foci(pressure.shape[-1])], pressure[..., list(self.points)]
 
     def _rows(self, G: ArrayLike) -> tuple[ComplexArray, ComplexArray]:
         """Return the checked rows of the foci (P - K, M) and of the other points (K, M)."""
         matrix = checked_matrix(G)
         self.check(len(matrix))
-        return matrix[self.foci(len(matrix))], matrix[list(self.points)]
+        return matrix[self._foci(len(matrix))], matrix[list(self.points)]
 
     def _whole(self, at_foci: torch.Tensor, at_others: torch.Tensor) -> torch.Tensor:
         """Return the values (..., P) of all control points."""
         whole = at_foci.new_zeros(*at_foci.shape[:-1], at_foci.shape[-1] + len(self.points))
-        whole[..., self.foci(whole.shape[-1])] = at_foci
+        whole[..., self._foci(whole.shape[-1])] = at_foci
         whole[..., list(self.points)] = at_others
         return whole
 

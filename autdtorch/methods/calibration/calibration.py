@@ -197,7 +197,7 @@ class Calibration:
 
     @property
     def prior_with_readings(self) -> Prior:
-        """The prior of a method that takes the readings, too: with the widths before, at the fitted amounts."""
+        """The prior of a method that takes the readings, too: the widths before, at the fitted amounts."""
         matrix, changes = self.fit.changes
         steps = self.simulation.widths[:, None, None] * changes
         variants = matrix + steps if len(steps) else None
