@@ -12,9 +12,11 @@ it shrinks |p|^2 by no more than about the square of its relative standard devia
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
+from scipy.optimize import least_squares
 
 from autdtorch.hardware.camera.cosines import Cosines
 from autdtorch.hardware.camera.picture import Picture, deviation_of
@@ -24,6 +26,8 @@ from autdtorch.hardware.camera.screen import Screen
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import finite_number, invalid, not_negative, positive, positive_integers
 
+_DRIFT = 0.02  # of all pixels [K/s], standard deviation
+_LATE = 0.1  # unit of a latency that is fitted with a screen [s]
 _SMOOTH = 0.2  # length over which the density of pixels is smoothed, in wavelengths
 _UNSEEN = 0.1  # of the median density of pixels
 _MISFIT = 1.3  # of the frames, by their noise, from which on it is a doubt
@@ -69,7 +73,7 @@ class HeatInversion:
         *,
         latency: float | None = None,
         saturation: float = math.inf,
-        drift: float = 0.02,
+        drift: float = _DRIFT,
         remaining: float = 0.0,
     ) -> Picture:
         """Return the picture of a sound that begins at time 0.
@@ -115,6 +119,39 @@ class HeatInversion:
             shift,
             tuple(doubts),
         )
+
+    def fitted_screen(
+        self, times: Array, images: Array, duration: float, saturation: float = math.inf
+    ) -> Screen:
+        """Return the screen with the diffusivity and the loss time that fit the frames; takes seconds.
+
+        Args:
+            times: of the frames (T,) [s]; the last ones a loss time or more after the sound.
+            images: of strong foci (T, H, W) [degC or K]; NaN where a pixel says nothing.
+            duration: of the sound [s], > 0.
+            saturation: temperature from which on a pixel says nothing.
+
+        Raises:
+            ValueError: as for `picture`.
+        """
+        times, values = self._checked(times, images, saturation)
+        duration = positive("duration", duration, "s")
+
+        def screen_of(unknowns: Array) -> Screen:
+            diffusivity, loss_time = np.exp(unknowns[:2])
+            return replace(self.screen, diffusivity=float(diffusivity), loss_time=float(loss_time))
+
+        def residuals(unknowns: Array) -> Array:
+            late = times - _LATE * unknowns[2]
+            fit = PulseFit(self._cosines, screen_of(unknowns), late, values, duration, _DRIFT, 0.0)
+            fit.solve()
+            return fit.residuals().ravel() / first.noise
+
+        first = PulseFit(self._cosines, self.screen, times, values, duration, _DRIFT, 0.0)
+        latency, _ = first.latency() or (0.0, 0.0)
+        start = [math.log(self.screen.diffusivity), math.log(self.screen.loss_time), latency / _LATE]
+        steps = {"diff_step": 0.01, "x_scale": 0.1, "xtol": 1e-2, "ftol": 1e-5}
+        return screen_of(least_squares(residuals, start, **steps).x)
 
     def _checked(self, times: Array, images: Array, saturation: float) -> tuple[Array, Array]:
         """Return times (T,) and the values (T, N) of the pixels around the plane, NaN without one."""

@@ -144,6 +144,11 @@ class PulseFit:
         freedom = max(int(self._full.sum()) * self._basis.shape[1] - unknowns, 1.0)
         return math.sqrt(float((self._left[self._full] ** 2).sum()) / freedom) / self.noise
 
+    def residuals(self) -> Array:
+        """Return what the solution leaves (T, N) of pixels in all frames [K]."""
+        model = (self._data - self._left)[self._full] @ self._basis.T
+        return np.asarray(self._values[:, self._full] - model.T)
+
     def variance(self, counts: tuple[int, ...], length: float) -> tuple[Array, Array]:
         """Return the posterior variance (Nu, Nv) of |p|^2 [Pa^4] in cells of the plane, and their density.
 

@@ -22,9 +22,10 @@ class Screen:
     """A mesh or film whose temperature T follows dT/dt = D lap T - (T - T0) / tau + a |p|^2.
 
     Thermal images of a mesh show airborne ultrasound from about 1 kPa (Onishi et al., Phys. Rev. Applied 18,
-    2022), and peaks to 2.5 % up to 4.25 kPa (Morgan, Cho & Subramanian, Commun. Eng. 4, 101, 2025). Neither
-    constant of the default is taken from them: they are derived, for a polyester mesh of 77 threads of
-    48 um per cm, as follows, and should be fitted to the screen on the bench.
+    2022), and peaks to 2.5 % up to 4.25 kPa (Morgan, Cho & Subramanian, Commun. Eng. 4, 101, 2025). No
+    constant of the default is taken from them: they are derived for a polyester mesh of 77 threads of 48 um
+    per cm, as follows. `HeatInversion.fitted_screen` fits the first two to frames. A loss time that is wrong
+    by a third changes |p| by 4 %, nearly the same in all pictures, a diffusivity by 0.5 %.
 
     - Heat capacity: 28 um of polyester on average, 47 J/(m^2 K).
     - Loss time: free convection and radiation on both sides, 24 W/(m^2 K), make 2 s.
