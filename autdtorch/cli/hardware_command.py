@@ -315,7 +315,7 @@ class _Trial:
     def _measure(self, log: Path) -> _Measured:
         """Check the transducers, run the method on the device, and read its drive again (R, P) [Pa]."""
         bench, points = self._bench, len(self._scene.control_points)
-        readings = 1 if bench.by_hand else 4
+        usual = 1 if bench.by_hand else 4
         with (
             hardware.lock_log(log),  # before a device is touched that plays for another trial
             bench.sensor() as sensor,
@@ -324,6 +324,7 @@ class _Trial:
             contextlib.ExitStack() as at_the_end,
         ):
             limited = hardware.LimitedLink(link, bench.limits)
+            readings = 2 if isinstance(sensor, hardware.PulsedSensor) else usual  # a pulse takes seconds
             pictures = _Pictures(log.parent / PICTURES, sensor)
             objective = hardware.HardwareObjective(
                 self._scene,
@@ -347,7 +348,7 @@ class _Trial:
             rows = []
             for number in range(readings):
                 rows.append(limited.measure(solution.drive[0], sensor, points)[0])
-                pictures.keep(f"{AGAIN}_{number}")
+                pictures.keep(f"{AGAIN}_{number}", solution.drive[0])
             again = torch.stack(rows)
             limited.off()
             progress.begin("silence, outputs off, once more")
@@ -424,12 +425,12 @@ class _Pictures:
         self._folder, self._sensor = folder, sensor
         self._last: object = None
 
-    def keep(self, name: str) -> None:
-        """Write the sensor's picture, unless it is the last one that was written or skipped."""
+    def keep(self, name: str, drive: torch.Tensor) -> None:
+        """Write the sensor's picture of a drive, unless it is the last one that was written or skipped."""
         picture = getattr(self._sensor, "picture", None)
         if isinstance(picture, hardware.Picture) and picture is not self._last:
             self._folder.mkdir(exist_ok=True)
-            save_picture(self._folder / f"{name}.npz", picture)
+            save_picture(self._folder / f"{name}.npz", picture, drive)
         self._last = picture
 
     def skip(self) -> None:
@@ -443,7 +444,7 @@ def _watcher(progress: Progress, goal: Goal, pictures: _Pictures) -> Callable[[h
 
     def watch(evaluation: hardware.Evaluation) -> None:
         nonlocal best
-        pictures.keep(f"evaluation_{next(numbers):05d}")
+        pictures.keep(f"evaluation_{next(numbers):05d}", evaluation.drive)
         progress.advance(1)
         score = float(goal(evaluation.pressure))
         if score > best:

@@ -32,7 +32,7 @@ from autdtorch.hardware import (
 )
 from autdtorch.hardware.sensors.sensor import SensorConfig
 from autdtorch.io.drive_file import load_drive
-from autdtorch.io.picture_file import PICTURES, save_picture
+from autdtorch.io.picture_file import PICTURES, load_picture, save_picture
 from autdtorch.io.scene_file import load_scene
 from autdtorch.objectives.goals import TargetPressures, WeakestFocus
 from autdtorch.objectives.quiet import QuietPoints
@@ -527,3 +527,34 @@ def test_the_documented_scene_lies_in_the_middle_of_a_sonicsurface(tmp_path):
     places = device.positions[indices_of("transducers", chosen[1], 256)]
     # Rounding, of a pitch of 1e-2 m.
     assert torch.allclose(load_scene(path).array.positions, places, rtol=0, atol=1e-9)
+
+
+CAMERA = """
+name: bright
+frequency: 40e3
+medium: {density: 1.2, sound_speed: 340.0}
+array:
+  {type: grid, shape: [2, 2], pitch: 10.5e-3, center: [0, 0, 0], normal: [1, 0, 0], source_strength: 30}
+control_points: {type: points, positions: [[40e-3, 6e-3, 0.0], [40e-3, -6e-3, 3e-3]]}
+observation_plane: {center: [40e-3, 0, 0], normal: [1, 0, 0], size: [30e-3, 30e-3]}
+"""
+
+
+def test_a_trial_by_camera_keeps_its_pictures(run, write, tmp_path):
+    write("ours/scene/bright.yaml", CAMERA)
+    folder = tmp_path / "out"
+    words = (*EMULATED, "hardware/sensor=camera", "method=gs", "scene=bright", f"output={folder}")
+    assert run(*words, f"--config-dir={tmp_path / 'ours'}") == 0
+    report = (folder / "report.md").read_text()
+    assert "does not see a transducer alone" in report
+    factor = re.search(r"fitted by one factor, differ by ([0-9.]+) %", report)
+    assert float(factor[1]) < 1.5  # of 50 mK and foci above 1 kPa
+    evaluations = (folder / "trial.jsonl").read_text().count("pressure")
+    pictures = {path.stem: path for path in (folder / PICTURES).iterdir()}
+    names = [f"evaluation_{number:05d}" for number in range(evaluations)]
+    assert set(pictures) == {*names, *(f"again_{number}" for number in range(2))}
+    last = load_drive(pictures["again_0"])
+    assert torch.equal(last, load_drive(folder / "drive.npz"))
+    points = load_scene(tmp_path / "ours/scene/bright.yaml").control_points
+    again = torch.stack([load_picture(pictures[f"again_{n}"]).at(points)[0] for n in range(2)])
+    assert f"**{float(again.mean(dim=0).min()):#.4g} Pa**" in report

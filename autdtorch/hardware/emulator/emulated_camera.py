@@ -30,8 +30,9 @@ from autdtorch.utils.validation import (
     require_kind,
 )
 
-_SPACING = 0.5e-3  # of the screen's grid [m]: 17 cells a wavelength at 40 kHz
+_SPACING = 0.6e-3  # of the screen's grid [m]: 7 cells in the finest pattern of |p|^2 at 40 kHz
 _MARGIN = 15e-3  # of the screen around the plane [m]
+_PIXEL = 0.9e-3  # about [m]
 _FRACTION = 0.9  # of the image that the plane fills
 _DISTANCE = 0.5  # of the camera from the plane [m]
 _ROLL = math.radians(2.0)
@@ -59,7 +60,7 @@ class EmulatedCamera:
         folder: str | Path,
         screen: Screen | None = None,
         rate: float = 30.0,
-        shape: tuple[int, int] = (120, 160),
+        shape: tuple[int, int] | None = None,
         noise: float = 0.05,
         drift: float = 0.01,
         tilt: float = 15.0,
@@ -74,7 +75,7 @@ class EmulatedCamera:
             folder: where the files appear.
             screen: true properties of the screen; by default the usual one.
             rate: of the frames [1/s].
-            shape: rows and columns of the image.
+            shape: rows and columns of the image; by default pixels of 0.9 mm, and a third more columns.
             noise: standard deviation of a pixel in a frame [K].
             drift: of the temperature that all pixels show [K/s].
             tilt: angle between the line of sight and the plane's normal [degrees].
@@ -89,7 +90,7 @@ class EmulatedCamera:
         self._screen = Screen() if screen is None else screen
         require_kind("screen", self._screen, Screen)
         self._period = 1 / number_between("rate", rate, 1.0, 1000.0, "1/s")
-        rows, columns = positive_integers("shape", shape, 2)
+        rows, columns = _shape(plane) if shape is None else positive_integers("shape", shape, 2)
         self._noise = number_between("noise", noise, 0.0, 10.0, "K")
         self.drift = number_between("drift", drift, -10.0, 10.0, "K/s")
         angle = math.radians(number_between("tilt", tilt, -60.0, 60.0, "degrees"))
@@ -154,9 +155,11 @@ class EmulatedCamera:
         self._time += seconds
 
     def _rate_of_change(self, excess: NDArray[np.floating]) -> NDArray[np.floating]:
-        curvature = ndimage.laplace(excess, mode="nearest") / _SPACING**2
-        change = self._screen.diffusivity * curvature - excess / self._screen.loss_time + self._heating
-        return np.asarray(change, np.float32)
+        edged = np.pad(excess, 1, mode="edge")
+        around = edged[2:, 1:-1] + edged[:-2, 1:-1] + edged[1:-1, 2:] + edged[1:-1, :-2]
+        conduction = self._screen.diffusivity / _SPACING**2
+        loss = 4 * conduction + 1 / self._screen.loss_time
+        return np.asarray(conduction * around - loss * excess + self._heating, np.float32)
 
     def _take(self) -> None:
         """Write the file of a frame: under another name first, as a camera's program should."""
@@ -228,6 +231,11 @@ def _linear(places: NDArray[np.float64], counts: tuple[int, ...], spacing: float
             weights.append(np.abs(1 - i - share[:, 0]) * np.abs(1 - j - share[:, 1]))
     entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
     return sparse.csr_matrix(entries, shape=(len(places), counts[0] * counts[1]))
+
+
+def _shape(plane: Plane) -> tuple[int, int]:
+    rows = math.ceil(max(plane.size) / (_FRACTION * _PIXEL))
+    return rows, math.ceil(4 * rows / 3)
 
 
 def _corners(plane: Plane) -> NDArray[np.float64]:
