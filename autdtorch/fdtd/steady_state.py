@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,7 +36,7 @@ _FEWEST_PERIODS = 3
 _PARTS = 4  # Windows per block
 # Range of the number of stored phasors, limited by `_MOST_NUMBERS`; more extrapolate better
 _FEWEST_PHASORS, _MOST_PHASORS = 12, 64
-_MOST_NUMBERS = 20_000_000  # Most complex numbers of the stored phasors: 320 MB
+_MOST_NUMBERS = 20_000_000  # Most complex numbers of the stored phasors: 160 MB of single precision
 _MOST_FITTED = 2048  # Most cells whose phasors decide the means
 _ROUNDING = 1e-13  # Regularisation of the normal equations, relative to the mean square of the differences
 # Pressure relative to that in free space, -80 dB, below which errors are relative to this floor: behind a
@@ -80,7 +81,7 @@ def run_to_steady_state(
     earliest, block = fewest_periods(assembly.grid.arrival), block_of(assembly.steps_per_period)[1]
     if echo:
         earliest += block  # the first answer to an echo is a block late
-    sequence = Extrapolation(phasors_kept(len(cells)))
+    sequence = Extrapolation(phasors_kept(len(cells)), single=assembly.dtype == torch.float32)
     values: deque[Sequence[Tensor]] = deque(maxlen=_JUDGED)
     first_judged = min(earliest, max_periods) - (_JUDGED - 1) * block
     ramp = math.ceil(RAMP_PERIODS * assembly.steps_per_period)
@@ -119,9 +120,11 @@ def phasors_kept(cells: int) -> int:
 class Extrapolation:
     """Reduced rank extrapolation of a sequence, from its last `most` values."""
 
-    def __init__(self, most: int) -> None:
-        """Start an empty sequence."""
-        self._values: deque[Phasors] = deque(maxlen=most)
+    def __init__(self, most: int, single: bool = False) -> None:
+        """Start an empty sequence, whose values are stored in double or in `single` precision."""
+        self._precision = np.complex64 if single else np.complex128
+        self._values: deque[NDArray[Any]] = deque(maxlen=most)
+        self._last = np.zeros(0, np.complex128)
         self._steps: deque[Phasors] = deque(maxlen=most - 1)
         self._product = np.zeros((0, 0), np.complex128)
 
@@ -131,26 +134,26 @@ class Extrapolation:
 
     def append(self, value: Phasors) -> None:
         """Append the next value (k,)."""
+        before, self._last = self._last, value[:: -(-len(value) // _MOST_FITTED)].copy()
         if self._values:
-            every = -(-len(value) // _MOST_FITTED)
-            step = value[::every] - self._values[-1][::every]
+            step = self._last - before
             self._steps.append(step)
             old = self._product[-len(self._steps) + 1 :, -len(self._steps) + 1 :]
             self._product = np.empty((len(self._steps),) * 2, np.complex128)
             self._product[:-1, :-1] = old if len(self._steps) > 1 else 0
             self._product[:, -1] = [np.vdot(other, step) for other in self._steps]
             self._product[-1] = self._product[:, -1].conj()
-        self._values.append(value)
+        self._values.append(value.astype(self._precision))
 
     def limit(self) -> Phasors:
         """Return the estimated limit (k,), or the last value while there are too few."""
         count = len(self._steps)
         size = float(np.trace(self._product).real) / max(count, 1)
         if count < 2 or not (math.isfinite(size) and size > 0):
-            return self._values[-1]
+            return self._values[-1].astype(np.complex128)
         mean = np.linalg.solve(self._product + _ROUNDING * size * np.eye(count), np.ones(count))
         mean /= mean.sum()
-        total = np.zeros_like(self._values[-1])
+        total = np.zeros(len(self._values[-1]), np.complex128)
         for share, value in zip(mean, itertools.islice(self._values, 1, None), strict=True):
             total += share * value
         return total
