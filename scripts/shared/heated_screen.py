@@ -13,8 +13,8 @@ from autdtorch.hardware.camera.registration import Registration
 from autdtorch.hardware.camera.screen import Screen
 
 FREQUENCY, WAVELENGTH = 40e3, 343.0 / 40e3
-_SPACING, _STEP = 0.5e-3, 2.5e-3  # of the finite differences [m], [s]
-_FINER = 2  # cells of the camera in one of these: its bilinear weights blur
+_SPACING, _STEP = 0.8e-3, 2.5e-3  # of the finite differences [m], [s]
+_FINER = 3  # cells of the camera in one of these: its bilinear weights blur
 _MARGIN = 15e-3  # of the screen around the plane [m]
 
 
