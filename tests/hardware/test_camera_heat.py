@@ -100,19 +100,22 @@ def test_foci_are_measured_to_a_few_percent_with_their_errors() -> None:
             assert 1 / 1.5 < deviations(picture, truth.plane, dark) * 2**0.5 < 1.5 * 2**0.5
         assert not picture.relative
         assert picture.doubts == ()
+        readings = picture.readings(torch.ones(144, dtype=torch.complex128))
+        assert readings.deviation is not None
+        torch.testing.assert_close(readings.deviation[0], picture.deviation.flatten())
     assert float(torch.cat(errors).abs().max()) < 3.5
 
 
 def test_a_focus_is_not_shrunk_in_noise() -> None:
-    # Ten times the noise makes 10 % of |p| uncertain; the mean of 6 squares is uncertain by 8 %.
+    # Ten times the noise makes 10 % of |p| uncertain; the mean of 4 squares is uncertain by 10 %.
     truth = pulse()
     squares = []
-    for seed in range(6):
+    for seed in range(4):
         picture = inversion().picture(TIMES, truth.frames(seed, 10 * NOISE), DURATION, latency=LATENCY)
         pressure, deviation = picture.at(truth.foci[:1])
         squares.append(float(pressure / truth.pressure[0]) ** 2)
     assert float(deviation / truth.pressure[0]) > 0.07
-    assert np.mean(squares) == pytest.approx(1, abs=0.2)
+    assert np.mean(squares) == pytest.approx(1, abs=0.3)
 
 
 def test_pixels_and_frames_may_be_missing() -> None:

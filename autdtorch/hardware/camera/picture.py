@@ -92,8 +92,9 @@ class Picture:
         return torch.from_numpy(np.asarray(self.plane.center) + places[:, :1] * u + places[:, 1:] * v)
 
     def readings(self, drive: torch.Tensor) -> Readings:
-        """Return the picture as readings of a drive (M,) at all cells of the plane."""
-        return Readings(drive, self.pressure.reshape(-1), self.points)
+        """Return the picture as readings of a drive (M,) at all cells of the plane, with their deviations."""
+        deviation = self.deviation.reshape(-1)
+        return Readings(drive, self.pressure.reshape(-1), self.points, deviation=deviation)
 
     def _climb(self, spline: Array, start: Array, radius: float) -> Array:
         """Return the largest place (2,) of a spline near a start (2,), by ever finer patches of 5 x 5."""
