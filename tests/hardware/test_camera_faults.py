@@ -51,9 +51,12 @@ class Disturbed:
         self.source.begin()
         self.calls = 0
 
-    def frames(self, seconds: float) -> list[hw.Frame]:
+    def wait(self, seconds: float) -> None:
+        self.source.wait(seconds)
+
+    def frames(self) -> list[hw.Frame]:
         self.calls += 1
-        frames = self.source.frames(seconds)
+        frames = self.source.frames()
         return self.change(self, frames) if self.armed else frames
 
 
@@ -113,21 +116,23 @@ def frozen(source: Disturbed, frames: list[hw.Frame]) -> list[hw.Frame]:
 
 
 def late(source: Disturbed, frames: list[hw.Frame]) -> list[hw.Frame]:
-    """All frames come with the next call."""
-    frames, source.held = source.held, frames
-    return frames if source.calls > 1 else []
+    """Most frames come a second later."""
+    if source.calls == 1:
+        source.held = frames[5:]
+        return frames[:5]
+    return source.held + frames
 
 
 def gone(source: Disturbed, frames: list[hw.Frame]) -> list[hw.Frame]:
     shutil.rmtree(source.folder)
-    return source.source.frames(0.1)
+    return source.source.frames()
 
 
 def broken_files(content: bytes) -> Callable:
     def leave(source: Disturbed, frames: list[hw.Frame]) -> list[hw.Frame]:
         for number in range(3):
             (source.folder / f"broken{number}.tif").write_bytes(content)
-        return frames + source.source.frames(0.0)
+        return frames + source.source.frames()
 
     return leave
 

@@ -31,6 +31,11 @@ def folder_frames(folder, clock, **settings):
     return hw.FolderFrames(folder, clock=lambda: clock.now, sleep=clock.sleep, **settings)
 
 
+def frames_of(source, seconds):
+    source.wait(seconds)
+    return source.frames()
+
+
 def write(path, degrees=DEGREES, time=1000.0):
     """Write a file by its suffix; integers are hundredths of a kelvin."""
     counts = np.round(100 * (degrees + 273.15)).astype(np.uint16)
@@ -48,10 +53,10 @@ def test_files_of_every_kind_are_degrees(tmp_path, clock, name):
     source = folder_frames(tmp_path, clock, scale=0.01, offset=-273.15)
     write(tmp_path / name, time=1000.5)
     write(tmp_path / f".hidden{name}")
-    (frame,) = source.frames(0.1)
+    (frame,) = frames_of(source, 0.1)
     assert frame.time == 1000.5
     np.testing.assert_allclose(frame.image, DEGREES, atol=5.1e-3)  # half a count
-    assert source.frames(0.1) == []
+    assert frames_of(source, 0.1) == []
 
 
 @pytest.mark.parametrize(
@@ -66,7 +71,7 @@ def test_files_of_every_kind_are_degrees(tmp_path, clock, name):
 def test_csv_of_many_programs_is_read(tmp_path, clock, text):
     source = folder_frames(tmp_path, clock)
     (tmp_path / "1.csv").write_bytes(text.encode())
-    assert source.frames(0.1)[0].image.tolist() == [[21.5, 22.25], [23.0, 24.0]]
+    assert frames_of(source, 0.1)[0].image.tolist() == [[21.5, 22.25], [23.0, 24.0]]
 
 
 def test_frames_come_in_the_order_of_their_numbers_and_old_ones_are_dropped(tmp_path, clock):
@@ -76,20 +81,20 @@ def test_frames_come_in_the_order_of_their_numbers_and_old_ones_are_dropped(tmp_
     for number in (10, 9, 12):
         write(tmp_path / f"frame{number}.npy", DEGREES + number, time=1000 + 0.1 * number)
     clock.events[1000.2] = lambda: write(tmp_path / "frame13.npy", DEGREES + 13)
-    frames = source.frames(0.5)
+    frames = frames_of(source, 0.5)
     assert [float(frame.image[0, 0] - 21.5) for frame in frames] == [9, 10, 12, 13]
     assert [frame.time for frame in frames] == pytest.approx([1000.9, 1001.0, 1001.2, 1001.3])
     write(tmp_path / "frame14.npy")
     source.begin()
-    assert source.frames(0.1) == []
+    assert frames_of(source, 0.1) == []
 
 
 def test_files_that_were_read_are_deleted_if_asked(tmp_path, clock):
     source = folder_frames(tmp_path, clock, delete=True)
     write(tmp_path / "1.npy")
-    assert len(source.frames(0.1)) == 1
+    assert len(frames_of(source, 0.1)) == 1
     write(tmp_path / "1.npy")  # a name may come again
-    assert len(source.frames(0.1)) == 1
+    assert len(frames_of(source, 0.1)) == 1
     write(tmp_path / "2.npy")
     source.begin()
     assert not list(tmp_path.iterdir())
@@ -103,7 +108,7 @@ def test_a_file_that_grows_is_read_once_it_is_whole(tmp_path, clock):
     path = tmp_path / "2.csv"
     for time, size in ((1000.02, 0), (1000.05, 10), (1000.1, len(whole) // 2), (1000.15, len(whole))):
         clock.events[time] = lambda size=size: path.write_bytes(whole[:size])
-    frames = source.frames(0.5)
+    frames = frames_of(source, 0.5)
     assert [frame.image.shape for frame in frames] == [DEGREES.shape] * 2
 
 
@@ -122,7 +127,7 @@ def test_a_file_that_stays_broken_is_left_out_with_a_warning(tmp_path, clock, ca
     source = folder_frames(tmp_path, clock)
     (tmp_path / name).write_bytes(content)
     write(tmp_path / "2.npy")
-    assert len(source.frames(1.0)) == 1
+    assert len(frames_of(source, 1.0)) == 1
     (line,) = caplog.messages
     assert "no whole frame" in line
     assert "\n" not in line
@@ -133,7 +138,7 @@ def test_colours_objects_and_the_largest_integer(tmp_path, clock, caplog):
     np.save(tmp_path / "1.npy", np.zeros((2, 3, 3)))
     np.save(tmp_path / "2.npy", np.array([{}]), allow_pickle=True)
     np.save(tmp_path / "3.npy", np.array([[2**16 - 1, 100]], np.uint16))
-    (frame,) = source.frames(1.0)
+    (frame,) = frames_of(source, 1.0)
     np.testing.assert_allclose(frame.image, [[np.nan, 10.0]])
     assert len(caplog.messages) == 2
 
@@ -146,23 +151,23 @@ def test_a_folder_that_is_not_there_or_may_not_be_read_says_so(tmp_path, clock, 
     with monkeypatch.context() as patch:
         patch.setattr(np, "load", lambda *_, **__: (_ for _ in ()).throw(PermissionError("denied")))
         with pytest.raises(hw.SensorError, match=r"1\.npy: may not be read"):
-            source.frames(0.1)
+            frames_of(source, 0.1)
     source = folder_frames(tmp_path, clock, rate=30)
     write(tmp_path / "frame.npy")
     with pytest.raises(hw.SensorError, match="names must count the frames"):
-        source.frames(0.1)
+        frames_of(source, 0.1)
 
 
 def test_a_function_gives_frames_until_it_fails():
     images = iter([DEGREES, None, DEGREES + 1, DEGREES[0]])
     times = iter(np.arange(0, 9, 0.05))
     source = hw.CallableFrames(lambda: next(images), clock=lambda: next(times))
-    frames = source.frames(0.3)
+    frames = frames_of(source, 0.3)
     assert [float(frame.image[0, 0]) for frame in frames] == [21.5, 22.5]
     with pytest.raises(hw.SensorError, match=r"no frame of the camera: .*one number a pixel"):
-        source.frames(0.4)
+        frames_of(source, 0.4)
     with pytest.raises(hw.SensorError, match="no frame of the camera"):
-        source.begin() or source.frames(0.4)
+        source.begin() or frames_of(source, 0.4)
 
 
 @contextlib.contextmanager
@@ -202,7 +207,7 @@ def test_a_usb_camera_gives_degrees_and_is_released_when_it_is_unplugged(monkeyp
     counts = np.full((2, 3), 29515, np.uint16)
     with usb_camera(monkeypatch, iter([counts] * 12)) as released:
         with pytest.raises(hw.SensorError, match="unplugged"), hw.uvc_frames() as source:
-            source.begin() or source.frames(10.0)
+            source.begin() or frames_of(source, 10.0)
         assert len(released) == 1
         with pytest.raises(hw.SensorError, match="cannot be opened"), hw.uvc_frames(1):
             pass
@@ -215,7 +220,7 @@ def test_a_usb_camera_gives_degrees_and_is_released_when_it_is_unplugged(monkeyp
         hw.uvc_frames() as source,
         pytest.raises(hw.SensorError, match="16-bit integers"),
     ):
-        source.frames(1.0)
+        frames_of(source, 1.0)
 
 
 def test_a_usb_camera_needs_the_extra(monkeypatch):

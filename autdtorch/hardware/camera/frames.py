@@ -74,8 +74,11 @@ class FrameSource(Protocol):
     def begin(self) -> None:
         """Drop the frames that have arrived so far."""
 
-    def frames(self, seconds: float) -> list[Frame]:
-        """Return the frames that arrived since the call before, and those of the next seconds.
+    def wait(self, seconds: float) -> None:
+        """Let frames arrive for a number of seconds, no longer: the sound may be on."""
+
+    def frames(self) -> list[Frame]:
+        """Return the frames that arrived since this was called before.
 
         `SensorError` if the camera is gone.
         """
@@ -137,12 +140,15 @@ class FolderFrames:
             names = []
         self._seen, self._incomplete, self._first = set(names), {}, None
 
-    def frames(self, seconds: float) -> list[Frame]:
-        """Return the frames of files that appeared since the call before, and in the next seconds."""
-        end = self.clock() + seconds
+    def wait(self, seconds: float) -> None:
+        """Wait; files are read later, as that may take longer."""
+        self._sleep(seconds)
+
+    def frames(self) -> list[Frame]:
+        """Return the frames of files that appeared since the call before, once they are complete."""
         frames = self._new_frames()
-        while (left := end - self.clock()) > 1e-9:
-            self._sleep(min(_POLL, left))
+        while self._incomplete:
+            self._sleep(_POLL)
             frames += self._new_frames()
         return frames
 
@@ -157,14 +163,20 @@ class FolderFrames:
 
     def _new_frames(self) -> list[Frame]:
         frames = []
-        for name in self._names():
+        names = self._names()
+        self._incomplete = {name: time for name, time in self._incomplete.items() if name in names}
+        for name in names:
             if name not in self._seen and (frame := self._tried(name)) is not None:
                 frames.append(frame)
-                self._seen.add(name)
+                self._done(name)
                 if self._delete:
                     (self._folder / name).unlink(missing_ok=True)
                     self._seen.discard(name)
         return frames
+
+    def _done(self, name: str) -> None:
+        self._seen.add(name)
+        self._incomplete.pop(name, None)
 
     def _tried(self, name: str) -> Frame | None:
         """Return the frame of a file; None if it is not complete yet, or never will be."""
@@ -178,7 +190,7 @@ class FolderFrames:
                 raise SensorError(f"{path}: may not be read; give this program the right to") from error
             if waited > _PATIENCE:
                 logger.warning("%s: no whole frame, and is left out: %s", path, error)
-                self._seen.add(name)
+                self._done(name)
             return None
         if self._shape not in (None, image.shape) and waited <= _PATIENCE:  # half of its lines
             return None
@@ -268,19 +280,25 @@ class CallableFrames:
         self._scale = positive("scale", scale, "K")
         self._offset = finite_number("offset", offset, "degrees C")
         self._stale = integer_at_least("stale", stale, 0)
+        self._frames: list[Frame] = []
 
     def begin(self) -> None:
         """Drop the frames that the driver holds."""
+        self._frames = []
         for _ in range(self._stale):
             self._image()
 
-    def frames(self, seconds: float) -> list[Frame]:
-        """Return the frames of the next seconds."""
-        end, frames = self.clock() + seconds, []
+    def wait(self, seconds: float) -> None:
+        """Take the frames of the next seconds."""
+        end = self.clock() + seconds
         while self.clock() < end - 1e-9:
             image = self._image()
             if image is not None:
-                frames.append(Frame(self.clock(), image))
+                self._frames.append(Frame(self.clock(), image))
+
+    def frames(self) -> list[Frame]:
+        """Return the frames that were taken since the call before."""
+        frames, self._frames = self._frames, []
         return frames
 
     def _image(self) -> Degrees | None:

@@ -130,15 +130,17 @@ class ThermalCamera:
         source = self._source
         source.begin()
         began = source.clock()
-        frames = source.frames(self._before)
+        source.wait(self._before)
         start = source.clock()
         on()
-        frames += source.frames(self._pulse)
+        source.wait(self._pulse)
         end = source.clock()
         off()
-        frames += source.frames(self._after)
+        source.wait(self._after)
+        frames = source.frames()
         if len(_within(frames, start, end)) < _LEAST_DURING:
-            frames += source.frames(_LATE)
+            source.wait(_LATE)
+            frames += source.frames()
         self._require_clock(frames, began, source.clock())
         doubts: list[str] = []
         usable = _usable(frames, doubts)
