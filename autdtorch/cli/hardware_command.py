@@ -28,6 +28,7 @@ from autdtorch.cli.settings import (
     section_of,
     solver_of,
 )
+from autdtorch.hardware.camera.orientation import turned
 from autdtorch.hardware.sensors.by_hand import typed
 from autdtorch.hardware.sensors.sensor import AnySensor, SensorConfig, Setup
 from autdtorch.io.drive_file import save_drive
@@ -379,7 +380,9 @@ class _Trial:
                 "the sensor sees no single transducer: no check of each, but of silence and a picture"
             )
             progress.begin("a first picture, of the simulated drive")
-            return hardware.check_picture(limited, sensor, points, self._expected.drive[0], readings)
+            check = hardware.check_picture(limited, sensor, points, self._expected.drive[0], readings)
+            self._warn_of_turned(getattr(sensor, "picture", None))
+            return check
         progress.begin("checking the transducers, one by one")
         show = progress.begin if self._bench.by_hand else progress.describe
         with _silence_expected():
@@ -400,6 +403,14 @@ class _Trial:
         if check.failed:
             logger.warning("failed transducers, counted from 0: %s", ", ".join(map(str, check.failed)))
         return check
+
+    def _warn_of_turned(self, picture: object) -> None:
+        """Warn if a picture of the simulated drive looks like the simulated plane once it is turned."""
+        if not isinstance(picture, hardware.Picture):
+            return
+        field = self._propagator.field(self._expected.drive, picture.points)[0]
+        if how := turned(picture, field.abs().reshape(picture.pressure.shape)):
+            logger.warning("the first picture is %s, by the simulation: check the order of the corners", how)
 
 
 @contextlib.contextmanager
