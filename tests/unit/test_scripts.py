@@ -16,6 +16,7 @@ from benchmarks.accuracy import Row, compare, observed_order, store_reference, w
 from benchmarks.peer_programs.task import Answer, Task
 from benchmarks.peer_scene import next_smooth, scene_grid, spread
 from benchmarks.peers import OURS, Point, requirements, settled
+from benchmarks.pictures import measured
 from checks.damage import check
 from shared import cases, document
 from shared.cases import cube_case, free_space_case, piston_case, simulate, slab_case, sphere_case, wall_case
@@ -271,3 +272,14 @@ def test_requirements_compare_the_fastest_settled_peer_to_each_error() -> None:
     assert rows == [["20", "at least 4", "10", "yes |"], ["10", "at least 20", "10", "**no** |"]]
     run = [point("jwave", 0.1, t, left) for t, left in ((1, 0.3), (2, 0.009), (3, 0.02), (4, 0.005), (5, 0))]
     assert [p.seconds for p in settled(run)] == [4]
+
+
+def test_foci_are_equal_after_few_pictures() -> None:
+    # the transducers' gains and phases, and the array's place, from two dozen pictures of 45 points
+    array = at.TransducerArray.grid((5, 5), 10e-3, (0.0, 0.0, 0.0), (1, 0, 0))
+    places = [[80e-3, 5e-3 * y, 5e-3 * z] for y in range(-3, 4) for z in range(-3, 3)]
+    foci = [[80e-3, -20e-3, 0.0], [80e-3, 20e-3, 10e-3], [80e-3, 0.0, 20e-3]]
+    scene = at.Scene(array, at.Medium(1.2, 340.0), frequency=40e3, control_points=torch.tensor(foci + places))
+    result = measured(at.make_propagator(scene), {"array.y": 2e-3}, 3, "pictures", 16, 8, seed=0)
+    assert result.weakest > 0.97
+    assert result.largest < 0.03

@@ -1,0 +1,227 @@
+"""Equal foci behind the two cubes by pictures of a camera, or by microphones at the foci.
+
+An array of 16 x 16 plays 16 foci. The measured array differs from the simulated one in gains and phases, and
+the obstacle stands 2 mm aside. A camera sees the plane of the foci in steps of half a wavelength, with 2.5 %
+of error and a floor in |p|^2. Random drives are read, `calibrate` fits gains, phases and the pose, and
+`identify` reads on. Prints medians and quartiles of the true pressures. Takes 40 minutes on 2 idle cores.
+"""
+
+import dataclasses
+import functools
+import itertools
+import math
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from typing import NamedTuple
+
+import torch
+from shared.document import printed, table
+from shared.scenes import MIDDLE, paper_scene, with_array
+
+import autdtorch as at
+from autdtorch.methods.gradient import random_drives
+from autdtorch.propagators import Propagator
+from autdtorch.propagators.scene_changes import SceneChanges
+
+GAIN, PHASE = 0.1, 0.5  # rms deviations of the transducers: of the logarithm of the gain, and [rad]
+SHIFT = 2e-3  # of the obstacle, in any direction [m]
+RELATIVE, FLOOR = 0.025, 0.2  # of the camera: of high pressures, and of the pressure of the foci
+MICROPHONE_FLOOR = 0.02
+FOCI = 16
+REST = 0.05  # of single entries, as a simulation may be off
+SIDE, PLACES = 80e-3, 19  # of the seen plane [m], and places along it
+CASES = (
+    ("pictures", 8, 4),
+    ("pictures", 16, 8),
+    ("pictures", 32, 12),
+    ("microphones", 16, 8),
+    ("microphones", 32, 12),
+    ("microphones", 64, 24),
+)
+"""What is read, random drives, and drives of `identify`."""
+UNKNOWN = (256, 384, 512, 768, 1024)
+"""Pictures of random drives where nothing is known but that fields are band-limited."""
+
+OPTIONS = {
+    "--trials": {"type": int, "default": 20, "help": "arrays that are measured"},
+    "--processes": {"type": int, "default": 1, "help": "that measure arrays side by side"},
+    "--unknown": {"action": "store_true", "help": "nothing is known of array and obstacle"},
+}
+
+
+def main(trials: int, processes: int, unknown: bool) -> None:
+    """Print the table."""
+    cases = [("no model", count, 0) for count in UNKNOWN] if unknown else CASES
+    header = ["read", "drives", "weakest over optimum", "rms off equal [%]", "largest [%]", "CPU time"]
+    print("", table(header, printed(rows(cases, trials, processes))), sep="\n")
+
+
+class Result(NamedTuple):
+    """The true pressures of a drive, in numbers."""
+
+    weakest: float  # focus, over that of the true optimum
+    rms: float  # deviation from equal pressures, relative
+    largest: float
+    seconds: float
+
+
+def rows(cases: Iterable[tuple[str, int, int]], trials: int, processes: int) -> Iterator[list[str]]:
+    """Yield a row for each case, with quartiles."""
+    two_cubes()  # the processes find it in the cache
+    with ProcessPoolExecutor(processes) as pool:
+        for case in cases:
+            results = [*pool.map(functools.partial(trial, case), range(trials))]
+            yield [case[0], f"{case[1]} + {case[2]}", *summary(results)]
+
+
+def trial(case: tuple[str, int, int], seed: int) -> Result:
+    """Return the pressures of a measured array behind the two cubes."""
+    propagator, what, before, more = two_cubes(), *case
+    if what == "no model":
+        return without_model(propagator, before, seed)
+    changes = dict.fromkeys((f"obstacles.{axis}" for axis in "xyz"), SHIFT / 3**0.5)
+    return measured(propagator, changes, FOCI, what, before, more, seed)
+
+
+@functools.cache
+def two_cubes() -> Propagator:
+    """Return the propagator of the scene."""
+    return at.make_propagator(scene_of(16), "tmatrix", 1.5e-3, tolerance=1e-2)
+
+
+def summary(results: list[Result]) -> list[str]:
+    """Return medians and quartiles of results, as cells."""
+    columns = torch.tensor(results, dtype=torch.float64).T
+    low, middle, high = columns.quantile(columns.new_tensor([0.25, 0.5, 0.75]), dim=1)
+    cells = [f"{middle[0]:.3f} ({low[0]:.3f} to {high[0]:.3f})"]
+    cells += [f"{100 * middle[n]:.1f} ({100 * low[n]:.1f} to {100 * high[n]:.1f})" for n in (1, 2)]
+    return [*cells, f"{middle[3]:.0f} s"]
+
+
+def scene_of(across: int) -> at.Scene:
+    """Return the two cubes, 16 foci behind them, and places of their plane after the foci."""
+    array = at.TransducerArray.grid(
+        (across, across), 10e-3, MIDDLE, (1, 0, 0), source_strength=at.PAPER_SOURCE_STRENGTH
+    )
+    points = torch.cat([grid(4, 60e-3), grid(PLACES, SIDE)])
+    return dataclasses.replace(with_array(paper_scene("two_cubes"), array), control_points=points)
+
+
+def grid(count: int, side: float) -> torch.Tensor:
+    """Return centres (count^2, 3) [m] of the cells of a square in the plane of the paper's foci."""
+    steps = (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * side / count
+    return torch.tensor([[80e-3, 50e-3 + y, 50e-3 + z] for y, z in itertools.product(steps, steps)])
+
+
+class Bench:
+    """An array and a scene that both differ from the simulation."""
+
+    def __init__(self, propagator: Propagator, changes: Mapping[str, float], seed: int) -> None:
+        """Draw the deviations, and compute the matrix of the scene as it is."""
+        draws = torch.Generator().manual_seed(seed)
+        self.scene, self.evaluations = propagator.scene, 0
+        gain, phase = torch.randn(2, len(self.scene.array), dtype=torch.float64, generator=draws)
+        direction = torch.randn(len(changes), dtype=torch.float64, generator=draws)
+        widths = torch.tensor([*changes.values()], dtype=torch.float64)
+        amounts = len(changes) ** 0.5 * widths * direction / direction.norm()
+        there = SceneChanges(propagator, [*changes]).matrix(amounts)
+        self.matrix = there * torch.polar((GAIN * gain).exp(), PHASE * phase)
+
+    def __call__(self, drive: torch.Tensor) -> torch.Tensor:
+        """Observe drives (B, M)."""
+        self.evaluations += len(drive)
+        return (drive @ self.matrix.T).abs()
+
+
+def measured(
+    propagator: Propagator,
+    changes: Mapping[str, float],
+    foci: int,
+    what: str,
+    before: int,
+    more: int,
+    seed: int,
+) -> Result:
+    """Read random drives, calibrate, identify, and return the true pressures of the solution."""
+    if what == "microphones":  # at the foci alone
+        scene = propagator.scene
+        alone = dataclasses.replace(scene, control_points=scene.control_points[:foci])
+        propagator = propagator.for_scene(alone)
+    bench = Bench(propagator, changes, seed)
+    best = float(at.gradient_ascent(bench.matrix[:foci]).score[0])
+    floor = (FLOOR if what == "pictures" else MICROPHONE_FLOOR) * best
+    sensor = at.CameraNoise(bench, RELATIVE, floor, seed)
+    start = time.process_time()
+    drives = random_drives(before, len(propagator.scene.array), torch.Generator().manual_seed(seed))
+    pressure = sensor(drives)
+    readings = at.Readings(drives, pressure, deviation=sensor.deviation(pressure))
+    calibration = at.calibrate(propagator, readings, at.Prior(variants=changes, rest=REST), folds=0)
+    goal: at.Goal = at.WeakestFocus()
+    if len(bench.matrix) > foci:
+        goal = at.SeenPoints(goal, range(foci, len(bench.matrix)))
+    prior = calibration.prior_with_readings
+    drive = at.identify(sensor, more, prior=prior, readings=readings, goal=goal, seed=seed).drive
+    return result_of(bench.matrix[:foci], drive[0], best, time.process_time() - start)
+
+
+def result_of(matrix: torch.Tensor, drive: torch.Tensor, best: float, seconds: float) -> Result:
+    """Return how strong and how equal the foci of a matrix (P, M) are by a drive (M,)."""
+    true = (drive @ matrix.T).abs()
+    away = true / true.mean() - 1
+    return Result(
+        float(true.min()) / best, float(away.square().mean().sqrt()), float(away.abs().max()), seconds
+    )
+
+
+def without_model(propagator: Propagator, count: int, seed: int, steps: int = 2000) -> Result:
+    """Return the pressures after joint phase retrieval of whole pictures, without any simulation.
+
+    Relaxed Douglas-Rachford splitting seeks phasors (N, P) that have the magnitudes of the pictures, that the
+    drives produce by some matrix, and whose fields are band-limited. Places are a quarter of a wavelength
+    apart, as |p|^2 has twice the band.
+    """
+    fine = fine_points()
+    finer = propagator.for_scene(dataclasses.replace(propagator.scene, control_points=fine))
+    bench = Bench(finer, dict.fromkeys((f"obstacles.{axis}" for axis in "xyz"), SHIFT / 3**0.5), seed)
+    best = float(at.gradient_ascent(bench.matrix[:FOCI]).score[0])
+    sensor = at.CameraNoise(bench, RELATIVE, FLOOR * best, seed)
+    start, where = time.process_time(), "cuda" if torch.cuda.is_available() else "cpu"
+    draws = torch.Generator().manual_seed(seed)
+    played = random_drives(count, bench.matrix.shape[1], draws)
+    read, drives = sensor(played).to(where), played.to(where)
+    basis, inverse = band(finer.scene.wavelength).to(where), torch.linalg.pinv(drives)
+
+    def rows_of(phasors: torch.Tensor) -> torch.Tensor:
+        return (inverse @ phasors) @ basis.conj()
+
+    first = torch.randn(drives.shape[1], basis.shape[1], dtype=drives.dtype, generator=draws).to(where)
+    phasors = drives @ first @ basis.T
+    phasors = phasors * (read.norm() / phasors.norm())
+    for _ in range(steps):
+        right = read * phasors.sgn()
+        phasors = phasors + 0.7 * (drives @ rows_of(2 * right - phasors) @ basis.T - right)
+    for _ in range(100):  # alternating projections take the nearest such phasors
+        phasors = drives @ rows_of(read * phasors.sgn()) @ basis.T
+    matrix = (rows_of(phasors) @ basis.T).T[:FOCI].cpu()
+    drive = at.gradient_ascent(matrix).drive[0]
+    return result_of(bench.matrix[:FOCI], drive, best, time.process_time() - start)
+
+
+def fine_points() -> torch.Tensor:
+    """Return the foci, and places of their plane a quarter of a wavelength apart."""
+    return torch.cat([grid(4, 60e-3), grid(2 * PLACES - 1, SIDE)])
+
+
+@functools.cache
+def band(wavelength: float) -> torch.Tensor:
+    """Return an orthonormal basis (P, R) of fields at the fine points that are sums of plane waves."""
+    ends = fine_points()[:, 1:]
+    waves = 2 * math.ceil(2 * SIDE / wavelength) + 3
+    steps = torch.linspace(-1, 1, waves, dtype=torch.float64) * 2 * math.pi / wavelength
+    numbers = torch.cartesian_prod(steps, steps)
+    numbers = numbers[numbers.norm(dim=1) <= 1.001 * steps[-1]]
+    left, sizes, _ = torch.linalg.svd(
+        torch.exp(1j * ((ends - ends.mean(dim=0)) @ numbers.T)), full_matrices=False
+    )
+    return left[:, sizes > 1e-2 * sizes[0]]
