@@ -6,6 +6,7 @@ of error and a floor in |p|^2. Random drives are read, `calibrate` fits gains, p
 `identify` reads on. Prints medians and quartiles of the true pressures. Takes 40 minutes on 2 idle cores.
 """
 
+import contextlib
 import dataclasses
 import functools
 import itertools
@@ -68,10 +69,11 @@ class Result(NamedTuple):
 
 def rows(cases: Iterable[tuple[str, int, int]], trials: int, processes: int) -> Iterator[list[str]]:
     """Yield a row for each case, with quartiles."""
-    two_cubes()  # the processes find it in the cache
-    with ProcessPoolExecutor(processes) as pool:
+    two_cubes()  # processes that are forked have it then
+    with ProcessPoolExecutor(processes) if processes > 1 else contextlib.nullcontext() as pool:
+        side_by_side = map if pool is None else pool.map
         for case in cases:
-            results = [*pool.map(functools.partial(trial, case), range(trials))]
+            results = [*side_by_side(functools.partial(trial, case), range(trials))]
             yield [case[0], f"{case[1]} + {case[2]}", *summary(results)]
 
 
@@ -125,7 +127,7 @@ class Bench:
         direction = torch.randn(len(changes), dtype=torch.float64, generator=draws)
         widths = torch.tensor([*changes.values()], dtype=torch.float64)
         amounts = len(changes) ** 0.5 * widths * direction / direction.norm()
-        there = SceneChanges(propagator, [*changes]).matrix(amounts)
+        there = SceneChanges(propagator, [*changes]).matrix(amounts).to("cpu", torch.complex128)
         self.matrix = there * torch.polar((GAIN * gain).exp(), PHASE * phase)
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
