@@ -44,7 +44,7 @@ NOT_CALLED_BY_USERS = {
     *("Calibration", "Picture", "TMatrixPropagator", "TMatrix", "SimulatedPropagator"),
     "UsbtmcPort",
     *("EmulatedBench.receive", "EmulatedScope.execute", "Goal", "Method", "State", "Waveform"),
-    *("CallableFrames.wait", "EmulatedCamera.write", "FolderFrames.wait", "ThermalCamera.read_pulse"),
+    *("CallableFrames.wait", "FolderFrames.wait", "ThermalCamera.read_pulse"),
     "uvc_frames",
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
     *("Device.pack", "lock_log", "open_autd3"),  # the one only makes a context, the other asks the network

@@ -152,8 +152,8 @@ ENDING = {
     "turned": (image(lambda values, _: np.rot90(values)), "was the camera turned"),
     "another size": (image(lambda values, _: values[::2, ::2]), "another size"),
     "two sizes": (every(3, lambda values: values[:-1]), "of one shape"),
-    "kelvin": (image(lambda values, _: values + 273.15), "check scale and offset"),
-    "raw counts": (image(lambda values, _: 100 * (values + 273.15)), "check scale and offset"),
+    "kelvin": (image(lambda values, _: values + 273.15), "check scale and zero"),
+    "raw counts": (image(lambda values, _: 100 * (values + 273.15)), "check scale and zero"),
     "saturated": (image(lambda values, _: np.where(values > 24.0, np.nan, values)), "saturated"),
     "clock of another machine": (
         frame_by_frame(lambda _, frame: replace(frame, time=frame.time + 3600)),

@@ -50,7 +50,7 @@ def write(path, degrees=DEGREES, time=1000.0):
 
 @pytest.mark.parametrize("name", ["a1.csv", "a1.tif", "a1.tiff", "a1.npy", "counts1.npy", "a1.TIFF"])
 def test_files_of_every_kind_are_degrees(tmp_path, clock, name):
-    source = folder_frames(tmp_path, clock, scale=0.01, offset=-273.15)
+    source = folder_frames(tmp_path, clock, scale=0.01, zero=-273.15)
     write(tmp_path / name, time=1000.5)
     write(tmp_path / f".hidden{name}")
     (frame,) = frames_of(source, 0.1)

@@ -75,7 +75,7 @@ class FrameSource(Protocol):
         """Drop the frames that have arrived so far."""
 
     def wait(self, seconds: float) -> None:
-        """Let frames arrive for a number of seconds, no longer: the sound may be on."""
+        """Let frames arrive for seconds [s], no longer: the sound may be on."""
 
     def frames(self) -> list[Frame]:
         """Return the frames that arrived since this was called before.
@@ -96,7 +96,7 @@ class FolderFrames:
         self,
         folder: str | Path,
         scale: float = 1.0,
-        offset: float = 0.0,
+        zero: float = 0.0,
         rate: float | None = None,
         delete: bool = False,
         clock: Callable[[], float] = time.time,
@@ -106,9 +106,9 @@ class FolderFrames:
 
         Args:
             folder: where the files appear.
-            scale: degrees C are `scale` times a file's integers, plus `offset`: 0.01 and -273.15 for
+            scale: degrees C are `scale` times a file's integers, plus `zero`: 0.01 and -273.15 for
                 hundredths of a kelvin. Files of decimal numbers are degrees C.
-            offset: [degrees C].
+            zero: temperature of the integer 0 [degrees C].
             rate: of the frames [1/s], if the last number in a file's name counts them: files then tell the
                 order and the gaps, and the first one the time. By default a file's time of change is the
                 frame's.
@@ -120,7 +120,7 @@ class FolderFrames:
         """
         self._folder = path_of("folder", folder, "a folder")
         self._scale = positive("scale", scale, "K")
-        self._offset = finite_number("offset", offset, "degrees C")
+        self._zero = finite_number("zero", zero, "degrees C")
         self._rate = None if rate is None else number_between("rate", rate, *_RATES, "1/s")
         self._delete = boolean("delete", delete)
         for name, function in (("clock", clock), ("sleep", sleep)):
@@ -141,7 +141,7 @@ class FolderFrames:
         self._seen, self._incomplete, self._first = set(names), {}, None
 
     def wait(self, seconds: float) -> None:
-        """Wait; files are read later, as that may take longer."""
+        """Wait for seconds [s]; files are read later, as that may take longer."""
         self._sleep(seconds)
 
     def frames(self) -> list[Frame]:
@@ -184,7 +184,7 @@ class FolderFrames:
         waited = self.clock() - self._incomplete.setdefault(name, self.clock())
         try:
             changed = path.stat().st_mtime
-            image = _read_image(path, self._scale, self._offset)
+            image = _read_image(path, self._scale, self._zero)
         except (OSError, ValueError, SyntaxError, EOFError) as error:  # of Pillow, too
             if isinstance(error, PermissionError):
                 raise SensorError(f"{path}: may not be read; give this program the right to") from error
@@ -213,7 +213,7 @@ def _by_numbers(name: str) -> tuple[list[int], str]:
     return [int(digits) for digits in re.findall(r"\d+", name)], name
 
 
-def _read_image(path: Path, scale: float, offset: float) -> Degrees:
+def _read_image(path: Path, scale: float, zero: float) -> Degrees:
     """Return the image (H, W) [degrees C] of a file."""
     if path.suffix.lower() == ".csv":
         return _matrix(_read_csv(path))
@@ -222,17 +222,17 @@ def _read_image(path: Path, scale: float, offset: float) -> Degrees:
     else:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as opened:
             values = np.asarray(opened)
-    return _matrix(values, scale, offset)
+    return _matrix(values, scale, zero)
 
 
-def _matrix(values: ArrayLike, scale: float = 1.0, offset: float = 0.0) -> Degrees:
-    """Return values (H, W) in degrees C; integers by scale and offset, their largest as NaN."""
+def _matrix(values: ArrayLike, scale: float = 1.0, zero: float = 0.0) -> Degrees:
+    """Return values (H, W) in degrees C; integers by scale and zero, their largest as NaN."""
     array = np.asarray(values)
     if array.ndim != 2 or not 0 < array.size <= _MOST_PIXELS or array.dtype.kind not in "iuf":
         raise ValueError(f"shape {array.shape} of {array.dtype}; must be an image of one number a pixel")
     if array.dtype.kind == "f":
         return array.astype(np.float64)
-    degrees = scale * array.astype(np.float64) + offset
+    degrees = scale * array.astype(np.float64) + zero
     largest = min(int(np.iinfo(array.dtype).max), 2**16 - 1)  # Pillow widens to 32 bits
     degrees[array >= largest] = np.nan
     return degrees
@@ -259,7 +259,7 @@ class CallableFrames:
         take: Callable[[], ArrayLike | None],
         clock: Callable[[], float] = time.monotonic,
         scale: float = 1.0,
-        offset: float = 0.0,
+        zero: float = 0.0,
         stale: int = 0,
     ) -> None:
         """Set the function.
@@ -268,8 +268,8 @@ class CallableFrames:
             take: returns an image (H, W), or None where none came in time. Any error it raises ends the
                 trial.
             clock: returns the time [s]; a frame's time is that of its return.
-            scale: degrees C are `scale` times integers, plus `offset`; decimal numbers are degrees C.
-            offset: [degrees C].
+            scale: degrees C are `scale` times integers, plus `zero`; decimal numbers are degrees C.
+            zero: temperature of the integer 0 [degrees C].
             stale: frames that a driver may hold from before a pulse, and that are dropped as it begins.
 
         `ValueError` for an argument out of range.
@@ -278,7 +278,7 @@ class CallableFrames:
             require_callable(name, function)
         self._take, self.clock = take, clock
         self._scale = positive("scale", scale, "K")
-        self._offset = finite_number("offset", offset, "degrees C")
+        self._zero = finite_number("zero", zero, "degrees C")
         self._stale = integer_at_least("stale", stale, 0)
         self._frames: list[Frame] = []
 
@@ -289,7 +289,7 @@ class CallableFrames:
             self._image()
 
     def wait(self, seconds: float) -> None:
-        """Take the frames of the next seconds."""
+        """Take the frames of the next seconds [s]."""
         end = self.clock() + seconds
         while self.clock() < end - 1e-9:
             image = self._image()
@@ -304,26 +304,26 @@ class CallableFrames:
     def _image(self) -> Degrees | None:
         try:
             image = self._take()
-            return None if image is None else _matrix(image, self._scale, self._offset)
+            return None if image is None else _matrix(image, self._scale, self._zero)
         except Exception as error:
             raise SensorError(f"no frame of the camera: {error}") from error
 
 
 @contextlib.contextmanager
-def uvc_frames(number: int = 0, scale: float = 0.01, offset: float = -273.15) -> Iterator[CallableFrames]:
+def uvc_frames(number: int = 0, scale: float = 0.01, zero: float = -273.15) -> Iterator[CallableFrames]:
     """Open a UVC camera whose frames are 16-bit integers (Y16), such as a FLIR Lepton on a PureThermal.
 
     Args:
         number: of the camera among those of the system, from 0.
-        scale: degrees C are `scale` times an integer, plus `offset`; by default hundredths of a kelvin.
-        offset: [degrees C].
+        scale: degrees C are `scale` times an integer, plus `zero`; by default hundredths of a kelvin.
+        zero: temperature of the integer 0 [degrees C].
 
     `ImportError` without the extra ``camera``, `SensorError` if there is no such camera.
     """
     number = integer_at_least("number", number, 0)
     camera = _opened(number)
     try:
-        yield CallableFrames(lambda: _y16(camera), scale=scale, offset=offset, stale=_STALE)
+        yield CallableFrames(lambda: _y16(camera), scale=scale, zero=zero, stale=_STALE)
     finally:
         camera.release()
 

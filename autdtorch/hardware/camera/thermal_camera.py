@@ -71,7 +71,7 @@ class ThermalCamera:
         spacing: float = 1.5e-3,
         pulse: float = 0.5,
         before: float = 0.4,
-        after: float = 0.3,
+        after: float = 1.0,
         blur: float = 0.5,
         saturation: float | None = None,
     ) -> None:
@@ -80,7 +80,7 @@ class ThermalCamera:
         Args:
             frames: source of the frames.
             plane: the plane of the screen.
-            corners: pixels (4, 2), column and row, of the plane's `corners`; or a `Registration`.
+            corners: pixels (4, 2), column and row, of the plane's `corners` [m]; or a `Registration`.
             points: (P, 3) [m] in the plane, where the pressure is read; by default all cells of the picture.
             screen: the screen's properties.
             wavelength: of the sound [m]; by default at 40 kHz in air.
@@ -263,7 +263,7 @@ def _usable(frames: Sequence[Frame], doubts: list[str]) -> list[Frame]:
     medians = np.array([np.nanmedian(frame.image) for frame in shown])
     middle = float(np.median(medians))
     if not _USUAL[0] <= middle <= _USUAL[1]:
-        accepted = f"must be {_USUAL[0]:g} to {_USUAL[1]:g} degrees C; check scale and offset"
+        accepted = f"must be {_USUAL[0]:g} to {_USUAL[1]:g} degrees C; check scale and zero"
         raise SensorError(f"the frames show {middle:.4g}: {accepted}")
     flashes = _flashes(medians)
     if flashes.mean() > _MOST_FLASHES:
@@ -315,7 +315,7 @@ class CameraConfig(SensorConfig):
     path: Any
     number: int
     scale: float
-    offset: float
+    zero: float
     rate: float | None
     corners: Any
     screen: Mapping[str, Any]
@@ -369,9 +369,9 @@ class CameraConfig(SensorConfig):
         bench = setup.bench
         if bench is None:
             if self.frames == "folder":
-                yield FolderFrames(self.path, self.scale, self.offset, self.rate), self.corners
+                yield FolderFrames(self.path, self.scale, self.zero, self.rate), self.corners
             else:
-                with uvc_frames(self.number, self.scale, self.offset) as camera:
+                with uvc_frames(self.number, self.scale, self.zero) as camera:
                     yield camera, self.corners
             return
         from autdtorch.hardware.emulator.emulated_camera import EmulatedCamera  # needs pyusb

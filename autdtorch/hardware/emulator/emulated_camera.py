@@ -169,9 +169,9 @@ class EmulatedCamera:
         degrees += self._noise * self._generator.standard_normal(rows)
         counts = np.clip(np.round((degrees + _ZERO) / _COUNT), 0, 2**16 - 1).astype(np.uint16)
         counts[self._dead] = 2**15
-        self.write(f"frame_{self._number:06d}.tif", counts)
+        self._write(f"frame_{self._number:06d}.tif", counts)
 
-    def write(self, name: str, counts: NDArray[np.uint16]) -> None:
+    def _write(self, name: str, counts: NDArray[np.uint16]) -> None:
         """Write the file of an image, with the bench's time; leave it out if the folder does not take it."""
         hidden = self._folder / f".{name}"
         with contextlib.suppress(OSError):
