@@ -176,6 +176,7 @@ SURVIVED_FAULTS = {
     "out of order": lambda source, frames: frames[::-1],
     "one black": every(9, lambda values: 0 * values),
     "one flash": every(11, lambda values: values + 3),
+    "one of long ago": lambda source, frames: [replace(frames[0], time=frames[0].time - 60), *frames],
     "dead rows": image(lambda values, _: painted(values, slice(12, 14), 19.0)),
     "dead rows of NaN": image(lambda values, _: painted(values, (slice(None), slice(8, 10)), np.nan)),
     "hot spot": image(lambda values, _: painted(values, (slice(2, 6), slice(2, 6)), 60.0)),

@@ -141,7 +141,7 @@ class ThermalCamera:
         if len(_within(frames, start, end)) < _LEAST_DURING:
             source.wait(_LATE)
             frames += source.frames()
-        self._require_clock(frames, began, source.clock())
+        frames = _of_reading(frames, began, source.clock())
         doubts: list[str] = []
         usable = _usable(frames, doubts)
         self._require_enough(usable, frames, start, end)
@@ -207,14 +207,6 @@ class ThermalCamera:
                 raise SensorError(f"pixels are saturated {1e3 * distance:.1f} mm from a point; {accepted}")
             doubts.append(f"{counted(len(rows), 'pixel')} saturated")
 
-    def _require_clock(self, frames: Sequence[Frame], began: float, now: float) -> None:
-        """Require that the frames' times are those of the reading."""
-        for frame in frames:
-            off = max(began - frame.time, frame.time - now)
-            if off > _CLOCKS:
-                accepted = "their clock differs from this machine's, or has jumped"
-                raise SensorError(f"a frame is {off:.3g} s outside the time it arrived in: {accepted}")
-
     def _require_enough(
         self, usable: Sequence[Frame], frames: Sequence[Frame], start: float, end: float
     ) -> None:
@@ -240,6 +232,18 @@ class _Warmth:
 
     def add(self, rise: float, time: float) -> None:
         self._rise, self._time = self._rise + rise, time
+
+
+def _of_reading(frames: Sequence[Frame], began: float, now: float) -> list[Frame]:
+    """Return the frames of the times in which they arrived: late ones of before are dropped."""
+    recent = [frame for frame in frames if frame.time > began - _CLOCKS]
+    off = max((frame.time - now for frame in recent), default=0.0)
+    if frames and not recent:
+        off = began - max(frame.time for frame in frames)
+    if off > _CLOCKS:
+        accepted = "their clock differs from this machine's, or has jumped"
+        raise SensorError(f"frames are {off:.3g} s outside the time they arrived in: {accepted}")
+    return recent
 
 
 def _within(frames: Sequence[Frame], start: float, end: float) -> list[Frame]:
