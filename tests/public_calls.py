@@ -28,6 +28,12 @@ MATRIX = torch.randn(3, 4, dtype=torch.complex128, generator=torch.Generator().m
 DRIVE = torch.ones(4, dtype=torch.complex128)
 GRID = np.stack(np.meshgrid(*(1e-3 * np.arange(count) for count in (2, 3, 4)), indexing="ij"), axis=-1)
 CHIP = (1, 2)
+SPOTS = np.stack(
+    [
+        np.exp(-((np.arange(20) - row)[:, None] ** 2 + (np.arange(20) - column) ** 2) / 18)
+        for row, column in ((5, 5), (14, 5), (5, 14), (14, 14))
+    ]
+)
 SCENE_FILE = """
 array: {type: grid, shape: [2, 2], pitch: 0.01, center: [0, 0, 0]}
 medium: {density: 1.2, sound_speed: 340}
@@ -134,6 +140,14 @@ def picture() -> hardware.Picture:
     return hardware.Picture(
         PLANE, torch.ones(4, 4, dtype=torch.float64), torch.ones(4, 4, dtype=torch.float64)
     )
+
+
+def registration() -> hardware.Registration:
+    return hardware.Registration(PLANE, np.array([[1e3, 0.0, 9.5], [0.0, 1e3, 9.5], [0.0, 0.0, 1.0]]))
+
+
+def heat_inversion() -> hardware.HeatInversion:
+    return hardware.HeatInversion(registration(), (20, 20), (4, 4), 8.5e-3)
 
 
 def picture_file(folder: Path) -> Path:
@@ -252,6 +266,12 @@ ARGUMENTS: dict[str, Any] = {
     "distance": [0.1, 0.2],
     "domain": SCENE.domain,
     "drive": DRIVE,
+    "duration": 0.5,
+    "images": np.random.default_rng(0).normal(22, 0.05, (24, 20, 20)),
+    "times": np.linspace(-0.4, 0.8, 24),
+    "measured": 1000.0,
+    "pictured": 900.0,
+    "registration": Made(lambda _: registration()),
     "evaluations": 11,
     "field": torch.ones(4, 4, dtype=torch.complex128),
     "folder": Made(lambda folder: folder),
@@ -309,6 +329,7 @@ ARGUMENTS: dict[str, Any] = {
     "vmax": 3.0,
     "vmin": 0.5,
     "volume": torch.ones(3, 3, 3, dtype=torch.complex128),
+    "wavelength": 8.5e-3,
     "wavenumber": 7.0,
 }
 
@@ -325,6 +346,18 @@ OTHERS: dict[str, Any] = {
     "ThermalCamera.corners": [[0, 0], [0, 9], [9, 0], [9, 9]],
     "ThermalCamera.frames": Made(lambda _: hardware.CallableFrames(lambda: np.ones((4, 4)))),
     "ThermalCamera.points": None,
+    "Registration.matrix": np.eye(3),
+    "Registration.of.pixels": [[0, 0], [0, 9], [9, 0], [9, 9]],
+    "Registration.of.places": PLANE.corners,
+    "Registration.on_grid.counts": (4, 4),
+    "Registration.on_grid.image": np.ones((20, 20)),
+    "Registration.to_pixels.coordinates": [[1e-3, 2e-3]],
+    "Registration.to_plane.pixels": [[1.0, 2.0]],
+    "HeatInversion.counts": (4, 4),
+    "HeatInversion.shape": (20, 20),
+    "registered_by_foci.places": PLANE.corners,
+    "registered_by_foci.rises": SPOTS,
+    "Screen.absorbed": 0.1,
     "EmulatedCamera.bench": Made(lambda _: bench()),
     "EmulatedCamera.folder": Made(lambda folder: folder),
     "EmulatedCamera.matrix_of": lambda points: torch.ones(len(points), 4, dtype=torch.complex128),
@@ -430,6 +463,7 @@ INSTANCES = {
     "Medium": Made(lambda _: AIR),
     "TMatrix": Made(lambda _: operator()),
     "TMatrixCluster": Made(lambda _: at.TMatrixCluster([operator()])),
+    "HeatInversion": Made(lambda _: heat_inversion()),
     "Picture": Made(lambda _: picture()),
     "OpenMPDBoard": Made(lambda folder: at.OpenMPDBoard.load(board_file(folder))),
 }

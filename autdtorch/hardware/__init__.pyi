@@ -3,7 +3,11 @@ from .camera.frames import FolderFrames as FolderFrames
 from .camera.frames import Frame as Frame
 from .camera.frames import FrameSource as FrameSource
 from .camera.frames import uvc_frames as uvc_frames
+from .camera.heat import HeatInversion as HeatInversion
 from .camera.picture import Picture as Picture
+from .camera.registration import Registration as Registration
+from .camera.registration import registered_by_foci as registered_by_foci
+from .camera.screen import Screen as Screen
 from .camera.thermal_camera import ThermalCamera as ThermalCamera
 from .devices import AUTD3 as AUTD3
 from .devices import DEVICES as DEVICES

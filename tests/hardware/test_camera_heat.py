@@ -13,7 +13,7 @@ import autdtorch as at
 from autdtorch.hardware.camera.cosines import Cosines
 from autdtorch.hardware.camera.heat import HeatInversion
 from autdtorch.hardware.camera.picture import Picture
-from autdtorch.hardware.camera.screen import Screen
+from autdtorch.hardware.camera.screen import Screen, decay_of, rise_of
 from autdtorch.utils.array_types import Array
 
 PLANE = at.Plane((0.0, 0.0, 0.12), (0.0, 0.0, 1.0), (0.05, 0.04))
@@ -220,8 +220,8 @@ def test_a_screen_is_fitted_to_frames_of_its_heat() -> None:
 
 def test_rises_solve_the_equation_of_heat() -> None:
     screen, times = Screen(4e-7, 1.5, 2e-6), np.linspace(-0.1, 2, 2101)
-    decay = screen.decay(np.array([[0.0], [700.0]]))
-    rise = screen.rise(decay, times, 0.8)
+    decay = decay_of(screen, np.array([[0.0], [700.0]]))
+    rise = rise_of(screen, decay, times, 0.8)
     source = screen.rate * ((times[:-1] >= 0) & (times[1:] <= 0.8 + 1e-9))
     middle = (rise[:, 1:] + rise[:, :-1]) / 2
     np.testing.assert_allclose(np.diff(rise) / np.diff(times), source - decay * middle, atol=1e-11)

@@ -30,6 +30,16 @@ EXPECTED = {
         for call in ("Readings", "Readings.of_rows")
         for name in ("pressure", "phase")
     ),
+    # pixels that say nothing
+    *(
+        (call, name, "itself, with nan")
+        for call, name in (
+            ("HeatInversion.fitted_screen", "images"),
+            ("HeatInversion.picture", "images"),
+            ("Registration.on_grid", "image"),
+            ("registered_by_foci", "rises"),
+        )
+    ),
     # whole metres, which move the obstacles out of the domain
     *(
         (call, "offset", f"a tensor {kind}")

@@ -24,10 +24,21 @@ from autdtorch.hardware.camera.pulse_fit import PulseFit
 from autdtorch.hardware.camera.registration import Registration
 from autdtorch.hardware.camera.screen import Screen
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.validation import finite_number, invalid, not_negative, positive, positive_integers
+from autdtorch.utils.validation import (
+    ArrayLike,
+    finite_number,
+    gappy_tensor,
+    invalid,
+    not_negative,
+    positive,
+    positive_integers,
+    real_tensor,
+    require_kind,
+)
 
 _DRIFT = 0.02  # of all pixels [K/s], standard deviation
 _LATE = 0.1  # unit of a latency that is fitted with a screen [s]
+_FARTHEST = 3.0  # of a fitted screen from the one assumed: logarithms of factors, and latencies
 _SMOOTH = 0.2  # length over which the density of pixels is smoothed, in wavelengths
 _UNSEEN = 0.1  # of the median density of pixels
 _MISFIT = 1.3  # of the frames, by their noise, from which on it is a doubt
@@ -58,7 +69,9 @@ class HeatInversion:
         Raises:
             ValueError: an argument is out of range, or an image shows nothing of the plane.
         """
-        self.registration, self.screen = registration, screen or Screen()
+        require_kind("registration", registration, Registration)
+        self.registration, self.screen = registration, Screen() if screen is None else screen
+        require_kind("screen", self.screen, Screen)
         self.shape = positive_integers("shape", shape, 2)
         self.counts = positive_integers("counts", counts, 2)
         self._wavelength = positive("wavelength", wavelength, "m")
@@ -67,12 +80,12 @@ class HeatInversion:
 
     def picture(
         self,
-        times: Array,
-        images: Array,
+        times: ArrayLike,
+        images: ArrayLike,
         duration: float,
         *,
         latency: float | None = None,
-        saturation: float = math.inf,
+        saturation: float | None = None,
         drift: float = _DRIFT,
         remaining: float = 0.0,
     ) -> Picture:
@@ -83,25 +96,27 @@ class HeatInversion:
             images: (T, H, W) [degC or K]; NaN where a pixel says nothing.
             duration: of the sound [s], > 0.
             latency: time after which the frames show the screen [s]; None to find it in them.
-            saturation: temperature from which on a pixel says nothing.
+            saturation: temperature from which on a pixel says nothing; None for no limit.
             drift: of all pixels together [K/s], standard deviation.
             remaining: heat of earlier sounds at time 0 [K], standard deviation.
 
         Raises:
             ValueError: shapes that do not fit, too few frames, or none before or after 0.
         """
-        times, values = self._checked(times, images, saturation)
+        moments, values = self._checked(times, images, saturation)
         duration = positive("duration", duration, "s")
         settings = duration, not_negative("drift", drift, "K/s"), not_negative("remaining", remaining, "K")
         shift = 0.0 if latency is None else finite_number("latency", latency, "s")
-        fit = PulseFit(self._cosines, self.screen, times - shift, values, *settings)
+        if not moments.min() <= shift < moments.max():
+            raise invalid("latency", latency, f"must be in {moments.min():g} to {moments.max():g}", "s")
+        fit = PulseFit(self._cosines, self.screen, moments - shift, values, *settings)
         doubts, uncertainty = [], 0.0
         if latency is None:
             if (seen := fit.latency()) is None:
                 doubts.append("the latency of the frames is not seen, and taken as 0 s")
             else:
                 shift, uncertainty = seen
-                fit = PulseFit(self._cosines, self.screen, times - shift, values, *settings)
+                fit = PulseFit(self._cosines, self.screen, moments - shift, values, *settings)
         square = self._cosines.on_plane(fit.solve(), self.counts)
         if (misfit := fit.misfit()) > _MISFIT:
             doubts.append(f"the frames differ from a heated screen by {misfit:.3g} times their noise")
@@ -121,7 +136,7 @@ class HeatInversion:
         )
 
     def fitted_screen(
-        self, times: Array, images: Array, duration: float, saturation: float = math.inf
+        self, times: ArrayLike, images: ArrayLike, duration: float, saturation: float | None = None
     ) -> Screen:
         """Return the screen with the diffusivity and the loss time that fit the frames; takes seconds.
 
@@ -129,12 +144,12 @@ class HeatInversion:
             times: of the frames (T,) [s]; the last ones a loss time or more after the sound.
             images: of strong foci (T, H, W) [degC or K]; NaN where a pixel says nothing.
             duration: of the sound [s], > 0.
-            saturation: temperature from which on a pixel says nothing.
+            saturation: temperature from which on a pixel says nothing; None for no limit.
 
         Raises:
             ValueError: as for `picture`.
         """
-        times, values = self._checked(times, images, saturation)
+        moments, values = self._checked(times, images, saturation)
         duration = positive("duration", duration, "s")
 
         def screen_of(unknowns: Array) -> Screen:
@@ -142,24 +157,32 @@ class HeatInversion:
             return replace(self.screen, diffusivity=float(diffusivity), loss_time=float(loss_time))
 
         def residuals(unknowns: Array) -> Array:
-            late = times - _LATE * unknowns[2]
+            late = moments - _LATE * unknowns[2]
             fit = PulseFit(self._cosines, screen_of(unknowns), late, values, duration, _DRIFT, 0.0)
             fit.solve()
             return fit.residuals().ravel() / first.noise
 
-        first = PulseFit(self._cosines, self.screen, times, values, duration, _DRIFT, 0.0)
-        latency, _ = first.latency() or (0.0, 0.0)
-        start = [math.log(self.screen.diffusivity), math.log(self.screen.loss_time), latency / _LATE]
+        first = PulseFit(self._cosines, self.screen, moments, values, duration, _DRIFT, 0.0)
+        if (seen := first.latency()) is None:
+            raise invalid("images", "no pulse in the noise", "must show one of strong foci")
+        start = np.log([self.screen.diffusivity, self.screen.loss_time, math.exp(seen[0] / _LATE)])
         steps = {"diff_step": 0.01, "x_scale": 0.1, "xtol": 1e-2, "ftol": 1e-5}
-        return screen_of(least_squares(residuals, start, **steps).x)
+        bounds = start - _FARTHEST, start + _FARTHEST
+        return screen_of(least_squares(residuals, start, bounds=bounds, **steps).x)
 
-    def _checked(self, times: Array, images: Array, saturation: float) -> tuple[Array, Array]:
+    def _checked(self, times: ArrayLike, images: ArrayLike, saturation: float | None) -> tuple[Array, Array]:
         """Return times (T,) and the values (T, N) of the pixels around the plane, NaN without one."""
-        times, images = np.asarray(times, dtype=np.float64), np.asarray(images, dtype=np.float64)
-        if times.ndim != 1 or images.shape != (len(times), *self.shape):
+        moments, frames = _numbers(real_tensor("times", times, "s")), _numbers(gappy_tensor("images", images))
+        if moments.ndim != 1 or frames.shape != (len(moments), *self.shape):
             accepted = f"must be {('T', *self.shape)}, and times (T,)"
-            raise ValueError(f"images: shape {images.shape}, times: shape {times.shape}; {accepted}")
-        if not times.min(initial=math.inf) <= 0 < times.max(initial=-math.inf):
-            raise invalid("times", times, "must have frames before and after 0, when the sound begins", "s")
-        values = images.reshape(len(times), -1)[:, self._cosines.pixels]
-        return times, np.where(values < saturation, values, np.nan)
+            raise ValueError(f"images: shape {frames.shape}, times: shape {moments.shape}; {accepted}")
+        if not moments.min(initial=math.inf) <= 0 < moments.max(initial=-math.inf):
+            raise invalid("times", moments, "must have frames before and after 0, when the sound begins", "s")
+        values = frames.reshape(len(moments), -1)[:, self._cosines.pixels]
+        if saturation is not None:
+            values = np.where(values < finite_number("saturation", saturation), values, np.nan)
+        return moments, values
+
+
+def _numbers(tensor: torch.Tensor) -> Array:
+    return np.asarray(tensor.detach().cpu().numpy(), dtype=np.float64)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from autdtorch.hardware.camera.cosines import Cosines
-from autdtorch.hardware.camera.screen import Screen
+from autdtorch.hardware.camera.screen import Screen, decay_of, rise_of
 from autdtorch.utils.array_types import AnyArray, Array
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import invalid
@@ -51,9 +51,9 @@ class PulseFit:
         """
         self._cosines, self._screen, self._times, self._duration = cosines, screen, times, duration
         self.frames = len(times)
-        decay = screen.decay(cosines.wavenumber)
+        decay = decay_of(screen, cosines.wavenumber)
         rates = np.geomspace(decay.min(), decay.max(), _RATES)[:, None]
-        courses = [screen.rise(rates, times, duration), (times - times.mean())[None]]
+        courses = [rise_of(screen, rates, times, duration), (times - times.mean())[None]]
         courses += [np.exp(-rates * times)] if remaining else []
         self._basis = _orthonormal(np.concatenate(courses).T)  # (T, R)
         valid = np.isfinite(values)
@@ -62,7 +62,7 @@ class PulseFit:
             raise invalid("images", "no pixel in all frames", "some must be finite and below saturation")
         self._reduce(np.where(valid, values, 0.0), valid)
         self._measure_noise(drift)
-        self._courses = [np.moveaxis(screen.rise(decay[..., None], times, duration) @ self._basis, -1, 0)]
+        self._courses = [np.moveaxis(rise_of(screen, decay[..., None], times, duration) @ self._basis, -1, 0)]
         self._prior = [self._strongest() ** 2 * cosines.spectrum]
         if remaining:
             self._courses.append(np.moveaxis(np.exp(-decay[..., None] * times) @ self._basis, -1, 0))
@@ -186,14 +186,14 @@ class PulseFit:
         coefficients = self.solve(_ROUGH)
         heat = np.maximum(self._cosines.forward(coefficients), 0.0) * self._full
         weights = (coefficients * self._cosines.adjoint(heat)).ravel()
-        decay = self._screen.decay(self._cosines.wavenumber).ravel()
+        decay = decay_of(self._screen, self._cosines.wavenumber).ravel()
         rates = np.geomspace(0.999 * decay.min(), 1.001 * decay.max(), 4 * _RATES)
         parts = np.bincount(np.searchsorted(rates, decay), weights, len(rates))
         curve, ones = self._values @ heat, np.ones_like(self._times)
 
         def course(latency: float) -> Array:
             return np.asarray(
-                parts @ self._screen.rise(rates[:, None], self._times - latency, self._duration)
+                parts @ rise_of(self._screen, rates[:, None], self._times - latency, self._duration)
             )
 
         def misfit(latency: float) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,10 +12,18 @@ from scipy.optimize import least_squares
 
 from autdtorch.hardware.camera.picture import plane_coordinates
 from autdtorch.scene.geometry import Plane
-from autdtorch.utils.array_types import Array
-from autdtorch.utils.validation import ArrayLike, invalid, real_tensor
+from autdtorch.utils.array_types import AnyArray, Array
+from autdtorch.utils.validation import (
+    ArrayLike,
+    gappy_tensor,
+    invalid,
+    positive_integers,
+    real_tensor,
+    require_kind,
+)
 
 _LARGE_RESIDUAL = 0.5e-3  # [m]; 6 % of a wavelength at 40 kHz
+_LARGEST_CONDITION = 1e12  # of a matrix
 _LEAST_SPREAD = 1e-4  # of the equations of four marks in line, by those of a square: about 0
 
 
@@ -37,6 +44,15 @@ class Registration:
     matrix: Array
     residuals: Array = field(default_factory=lambda: np.zeros(4))
 
+    def __post_init__(self) -> None:
+        """Check the attributes, and copy the arrays."""
+        require_kind("plane", self.plane, Plane)
+        matrix = _array("matrix", self.matrix)
+        if matrix.shape != (3, 3) or np.linalg.cond(matrix / np.abs(matrix).max()) > _LARGEST_CONDITION:
+            raise ValueError(f"matrix: shape {matrix.shape}; must be (3, 3), and invertible")
+        object.__setattr__(self, "matrix", matrix)
+        object.__setattr__(self, "residuals", _array("residuals", self.residuals))
+
     @classmethod
     def of(cls, plane: Plane, pixels: ArrayLike, places: ArrayLike) -> Registration:
         """Return the registration by marks whose places are known.
@@ -49,11 +65,11 @@ class Registration:
         Raises:
             ValueError: shapes that do not fit, places off the plane, or too near to a line.
         """
-        seen = _pixels("pixels", pixels)
-        coordinates = plane_coordinates(plane, places, "places")
-        if len(seen) < 4 or len(coordinates) != len(seen):
-            accepted = "must be K, and one place for each, K >= 4"
-            raise invalid("pixels", f"{len(seen)} pixels and {len(coordinates)} places", accepted)
+        require_kind("plane", plane, Plane)
+        seen, coordinates = _pairs("pixels", pixels), plane_coordinates(plane, places, "places")
+        if seen.ndim != 2 or len(seen) < 4 or len(coordinates) != len(seen):
+            accepted = f"must be (K, 2), K >= 4, one for each of {len(coordinates)} places"
+            raise ValueError(f"pixels: shape {seen.shape}; {accepted}")
         matrix = _refined(_homography(coordinates, seen), coordinates, seen)
         registration = cls(plane, matrix)
         residuals = np.linalg.norm(registration.to_plane(seen) - coordinates, axis=1)
@@ -72,41 +88,49 @@ class Registration:
         free = len(self.residuals) - 4
         return math.sqrt(float((self.residuals**2).sum()) / free) if free > 0 else 0.0
 
-    def to_pixels(self, coordinates: Array) -> Array:
-        """Return the pixels (..., 2), as (column, row), of coordinates (..., 2) [m]."""
-        return _projected(self.matrix, coordinates)
+    def to_pixels(self, coordinates: ArrayLike) -> Array:
+        """Return the pixels (..., 2), as (column, row), of coordinates (..., 2) [m], or ValueError."""
+        return _projected(self.matrix, _pairs("coordinates", coordinates))
 
-    def to_plane(self, pixels: Array) -> Array:
-        """Return the coordinates (..., 2) [m] of pixels (..., 2), as (column, row)."""
-        return _projected(np.asarray(np.linalg.inv(self.matrix), dtype=np.float64), pixels)
+    def to_plane(self, pixels: ArrayLike) -> Array:
+        """Return the coordinates (..., 2) [m] of pixels (..., 2), as (column, row), or ValueError."""
+        return _projected(np.linalg.inv(self.matrix), _pairs("pixels", pixels))
 
-    def on_grid(self, image: Array, counts: tuple[int, int]) -> Array:
+    def on_grid(self, image: ArrayLike, counts: tuple[int, ...]) -> Array:
         """Return an image (H, W) at the centres (Nu, Nv) of equal cells of the plane, NaN where unseen.
 
-        Places next to a pixel that is NaN, or outside the image, are NaN.
+        Places next to a pixel that is NaN, or outside the image, are NaN. ValueError for other shapes.
         """
+        values = gappy_tensor("image", image)
+        if values.ndim != 2 or values.numel() == 0:
+            raise ValueError(f"image: shape {tuple(values.shape)}; must be (H, W), with a pixel")
+        counts = positive_integers("counts", counts, 2)
         along = [
             size * ((np.arange(n) + 0.5) / n - 0.5) for size, n in zip(self.plane.size, counts, strict=True)
         ]
         pixels = self.to_pixels(np.stack(np.meshgrid(*along, indexing="ij"), axis=-1))
-        return np.asarray(
-            map_coordinates(image, [pixels[..., 1], pixels[..., 0]], order=1, cval=np.nan), dtype=np.float64
-        )
+        where = [pixels[..., 1], pixels[..., 0]]
+        grid = map_coordinates(values.detach().cpu().numpy(), where, order=1, cval=np.nan)
+        return np.asarray(grid, dtype=np.float64)
 
 
-def registered_by_foci(plane: Plane, rises: Sequence[Array], places: ArrayLike) -> Registration:
+def registered_by_foci(plane: Plane, rises: ArrayLike, places: ArrayLike) -> Registration:
     """Return the registration by foci that the array played, one for each image.
 
     Args:
         plane: the plane.
-        rises: K images (H, W) of the rise of temperature, each while one focus is played; NaN where a pixel
-            is dead.
+        rises: K images (K, H, W) of the rise of temperature [K], each by one focus; NaN for a dead pixel.
         places: (K, 3) [m], where |p| is largest in the plane for each of the foci; K >= 4.
 
     Raises:
         ValueError: an image without a hot spot, or as for `Registration.of`.
     """
-    return Registration.of(plane, np.stack([hot_spot(rise) for rise in rises]), places)
+    images = gappy_tensor("rises", rises)
+    if images.ndim != 3 or images.numel() == 0:
+        raise ValueError(f"rises: shape {tuple(images.shape)}; must be (K, H, W), with a pixel")
+    return Registration.of(
+        plane, np.stack([hot_spot(image) for image in images.detach().cpu().numpy()]), places
+    )
 
 
 def hot_spot(rise: Array) -> Array:
@@ -148,14 +172,18 @@ def _connected(mask: Array, row: int, column: int) -> Array:
     return np.asarray(labels == labels[row, column])
 
 
-def _pixels(name: str, value: object) -> Array:
-    pixels = real_tensor(name, value)
-    if pixels.ndim != 2 or pixels.shape[1] != 2:
-        raise ValueError(f"{name}: shape {tuple(pixels.shape)}; must be (K, 2), as (column, row)")
-    return pixels.detach().cpu().numpy()
+def _array(name: str, value: object) -> Array:
+    return np.asarray(real_tensor(name, value).detach().cpu().numpy(), dtype=np.float64)
 
 
-def _projected(matrix: Array, places: Array) -> Array:
+def _pairs(name: str, value: object) -> Array:
+    pairs = _array(name, value)
+    if pairs.ndim == 0 or pairs.shape[-1] != 2:
+        raise ValueError(f"{name}: shape {pairs.shape}; must be (..., 2)")
+    return pairs
+
+
+def _projected(matrix: AnyArray, places: Array) -> Array:
     x, y = places[..., 0], places[..., 1]
     a, b, w = (row[0] * x + row[1] * y + row[2] for row in matrix)
     return np.stack([a / w, b / w], axis=-1)

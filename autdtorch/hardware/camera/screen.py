@@ -51,24 +51,23 @@ class Screen:
 
     def __post_init__(self) -> None:
         """Check the attributes."""
-        positive("Screen.diffusivity", self.diffusivity, "m^2/s")
-        positive("Screen.loss_time", self.loss_time, "s")
-        if self.heating is not None:
-            positive("Screen.heating", self.heating, "K/(s Pa^2)")
+        for name, unit in (("diffusivity", "m^2/s"), ("loss_time", "s"), ("heating", "K/(s Pa^2)")):
+            if (value := getattr(self, name)) is not None or name != "heating":
+                object.__setattr__(self, name, positive(f"Screen.{name}", value, unit))
 
     @classmethod
-    def of_thickness(cls, thickness: float, absorption: float = 0.04) -> Screen:
+    def of_thickness(cls, thickness: float, absorbed: float = 0.04) -> Screen:
         """Return a polymer screen in air.
 
         Args:
             thickness: volume per area [m], > 0; a mesh has less than its threads' diameter.
-            absorption: share of the intensity that heats the screen, 0 to 1.
+            absorbed: share of the intensity that heats the screen, > 0 and up to 1.
 
         Raises:
             ValueError: an argument is out of range.
         """
         capacity = _CAPACITY * positive("thickness", thickness, "m")
-        share = number_between("absorption", absorption, 0.0, 1.0)
+        share = number_between("absorbed", positive("absorbed", absorbed), 0.0, 1.0)
         return cls(_CONDUCTION / capacity, capacity / _TRANSFER, share / (2 * _IMPEDANCE * capacity))
 
     def calibrated(self, pictured: float, measured: float) -> Screen:
@@ -77,6 +76,9 @@ class Screen:
         Args:
             pictured: magnitude at a place of a picture taken with this screen [Pa], > 0.
             measured: magnitude there, by a microphone for example [Pa], > 0.
+
+        Raises:
+            ValueError: an argument is not a finite number > 0.
         """
         ratio = positive("pictured", pictured, "Pa") / positive("measured", measured, "Pa")
         return replace(self, heating=self.rate * ratio**2)
@@ -86,14 +88,16 @@ class Screen:
         """The heating [K/(s Pa^2)]; a nominal value if it is not calibrated."""
         return NOMINAL_HEATING if self.heating is None else self.heating
 
-    def decay(self, wavenumber: Array) -> Array:
-        """Return the rate [1/s] at which patterns of wavenumbers [rad/m] decay."""
-        return self.diffusivity * wavenumber**2 + 1 / self.loss_time
 
-    def rise(self, decay: Array, times: Array, duration: float) -> Array:
-        """Return the temperature (..., T) by |p|^2 [K/Pa^2] of patterns that decay at rates (..., 1) [1/s].
+def decay_of(screen: Screen, wavenumber: Array) -> Array:
+    """Return the rate [1/s] at which patterns of wavenumbers [rad/m] decay."""
+    return screen.diffusivity * wavenumber**2 + 1 / screen.loss_time
 
-        The sound begins at time 0 [s] and lasts for a duration [s].
-        """
-        end = np.clip(times, 0.0, duration)
-        return self.rate * -np.expm1(-decay * end) / decay * np.exp(-decay * np.maximum(times - end, 0.0))
+
+def rise_of(screen: Screen, decay: Array, times: Array, duration: float) -> Array:
+    """Return the temperature (..., T) by |p|^2 [K/Pa^2] of patterns that decay at rates (..., 1) [1/s].
+
+    The sound begins at time 0 [s] and lasts for a duration [s].
+    """
+    end = np.clip(times, 0.0, duration)
+    return screen.rate * -np.expm1(-decay * end) / decay * np.exp(-decay * np.maximum(times - end, 0.0))

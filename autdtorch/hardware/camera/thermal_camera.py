@@ -159,7 +159,7 @@ class ThermalCamera:
                 images,
                 end - start,
                 latency=self._latency,
-                saturation=self._saturation,
+                saturation=self._saturation if math.isfinite(self._saturation) else None,
                 remaining=self._warmth.at(start, self.screen),
             )
         except ValueError as error:
