@@ -76,7 +76,7 @@ class HeatInversion:
         self.counts = positive_integers("counts", counts, 2)
         self._wavelength = positive("wavelength", wavelength, "m")
         spread = math.hypot(not_negative("blur", blur, "pixels"), 12**-0.5)
-        self._cosines = Cosines(registration, self.shape, wavelength, spread)
+        self._cosines = Cosines(registration, self.shape, self._wavelength, spread)
 
     def picture(
         self,
