@@ -101,6 +101,22 @@ def test_many_cells_get_the_bound(monkeypatch, caplog):
     assert f"{len(index)} heterogeneous cells" in caplog.text
 
 
+@settings(max_examples=8)
+@given(st.floats(0.01, 100.0), st.floats(0.4e-3, 3e-3))
+def test_long_bodies_are_shortened_where_their_planes_repeat(density, thickness):
+    """By at most a third of the margin, which the iteration needs little of."""
+    plate = Box((30e-3, 30e-3, 30e-3), (45e-3, 42e-3, thickness), density=density * 1.2, sound_speed=500.0)
+    region = region_of(small_scene((plate,), extent=60e-3))
+    grid = make_grid(region, 1e-3)
+    stencil = tuned_stencil(grid.kappa)
+    cells = heterogeneous_cells(elements_of(region, grid, stencil), stencil)
+    with pytest.MonkeyPatch.context() as patch:
+        whole = largest_eigenvalue(cells.index, cells.weight, stencil, grid.shape)
+        patch.setattr(stability, "_LARGE", 0)
+        short = largest_eigenvalue(cells.index, cells.weight, stencil, grid.shape)
+    assert short == pytest.approx(whole, rel=(stability.MARGIN - 1) / 3)
+
+
 @given(st.floats(2.5, 1e3))
 def test_steps_are_whole_in_the_shortest_block_that_is_long_enough(fewest):
     steps = whole_steps(fewest)
