@@ -164,7 +164,7 @@ class ThermalCamera:
             )
         except ValueError as error:
             raise SensorError(f"no picture: {error}") from error
-        if picture.pressure.max() > _SEEN * picture.deviation.median():
+        if not picture.doubts and picture.pressure.max() > _SEEN * picture.deviation.median():
             self._latency = picture.latency
         self._warmth.add(self.screen.rate * float(picture.pressure.max()) ** 2 * (end - start), end)
         doubts += picture.doubts
