@@ -201,6 +201,19 @@ OPENMPD = ("hardware=openmpd", "hardware.limits.amplitude=1", "hardware.transduc
             "hardware.sensor: 'emulated'; must be scope, file, manual or",
         ),
         ((*OPENMPD, "hardware/sensor=file"), "hardware.sensor.path: none; must be given"),
+        ((*OPENMPD, "hardware/sensor=camera"), "hardware.sensor.corners: None; must be the pixels"),
+        (
+            (*OPENMPD, "hardware/sensor=camera", "hardware.sensor.corners=[[0,0],[0,9],[9,0],[9,9]]"),
+            "hardware.sensor.path: None; must be the folder",
+        ),
+        (
+            (*EMULATED, "hardware/sensor=camera", "hardware.sensor.screen.heating=-1"),
+            "Screen.heating: -1",
+        ),
+        (
+            (*EMULATED, "hardware/sensor=camera"),
+            "scene.observation_plane: None; must be the plane of the screen",
+        ),
         (OPENMPD, "hardware.sensor.chip: None; must be the oscilloscope's VID:PID"),
         ((*OPENMPD, "hardware.sensor.chip=1:2:3"), "hardware.sensor.chip: '1:2:3'; must be VID:PID"),
         ((*OPENMPD, "hardware/sensor=manual", "hardware.failed=[1]"), "hardware.failed: (1,); must be null"),

@@ -339,6 +339,7 @@ class CameraConfig(SensorConfig):
         super().check(emulated)
         require_one_of("hardware.sensor.frames", self.frames, _KINDS)
         require_known("hardware.sensor.screen", self.screen, [field.name for field in fields(Screen)])
+        Screen(**self.screen)
         if emulated:
             return
         for key, wanted in (("corners", True), ("path", self.frames == "folder")):
