@@ -165,7 +165,8 @@ class HeatInversion:
         first = PulseFit(self._cosines, self.screen, moments, values, duration, _DRIFT, 0.0)
         if (seen := first.latency()) is None:
             raise invalid("images", "no pulse in the noise", "must show one of strong foci")
-        start = np.log([self.screen.diffusivity, self.screen.loss_time, math.exp(seen[0] / _LATE)])
+        logarithms = math.log(self.screen.diffusivity), math.log(self.screen.loss_time)
+        start = np.array([*logarithms, seen[0] / _LATE])
         steps = {"diff_step": 0.01, "x_scale": 0.1, "xtol": 1e-2, "ftol": 1e-5}
         bounds = start - _FARTHEST, start + _FARTHEST
         return screen_of(least_squares(residuals, start, bounds=bounds, **steps).x)

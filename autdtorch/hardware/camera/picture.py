@@ -119,7 +119,7 @@ class Picture:
 
 
 def deviation_of(pressure: Array, of_square: Array) -> Array:
-    """Return the deviation [Pa] of magnitudes [Pa] by that of their squares [Pa^2]."""
+    """Return the deviation [Pa] of magnitudes [Pa] whose squares deviate by `of_square` [Pa^2]."""
     return np.asarray(of_square / np.maximum(np.sqrt(pressure**2 + of_square) + pressure, 1e-300))
 
 

@@ -15,7 +15,7 @@ from autdtorch.utils.validation import invalid
 
 _RATES = 48  # of decay, that stand for those of all cosines
 _RANK = 1e-3  # smallest singular value of the combinations of frames, by the largest
-_CONVERGED, _ITERATIONS = 1e-4, 300  # of conjugate gradients: residual norm by that of the right side
+_CONVERGED, _ITERATIONS = 1e-4, 300  # of conjugate gradients: residual norm relative to the right side
 _ROUGH = 1e-2  # of the coefficients by which the latency is found
 _LATENCIES = np.linspace(-0.1, 0.4, 251)  # that are tried [s]
 _CERTAIN = 0.02  # largest standard deviation of a latency [s]
@@ -138,7 +138,7 @@ class PulseFit:
         return np.asarray(fields[0])
 
     def misfit(self) -> float:
-        """Return the root mean square of what the solution leaves, by that of the noise."""
+        """Return the root mean square of the combinations' residuals, in standard deviations of the noise."""
         information = self._information(1.0)
         unknowns = float((information / (1 + information)).sum())
         freedom = max(int(self._full.sum()) * self._basis.shape[1] - unknowns, 1.0)
@@ -153,7 +153,7 @@ class PulseFit:
         """Return the posterior variance (Nu, Nv) of |p|^2 [Pa^4] in cells of the plane, and their density.
 
         The density of valid pixels, by its mean, is smoothed over a length [m]. The variance at a place
-        is that of a plane with its density everywhere.
+        is that of a plane with equal density.
         """
         density = np.maximum(self._cosines.density(self._seen(), counts, length), 1e-6)
         steps = np.geomspace(density.min() * 0.99, density.max() * 1.01, 40)
@@ -163,7 +163,7 @@ class PulseFit:
         return common + np.exp(np.interp(np.log(density), np.log(steps), np.log(variances))), density
 
     def _information(self, density: float) -> Array:
-        """Return the weight (Ku, Kv) of the data on each cosine, by that of its prior."""
+        """Return the information (Ku, Kv) of the data on each cosine, relative to its prior."""
         gram = density * len(self._data) * self._cosines.blur**2 / self.noise**2
         weight = (self._courses[0] ** 2).sum(axis=0)
         if len(self._courses) > 1:  # what could also be heat that remains is no information
@@ -201,12 +201,13 @@ class PulseFit:
             left = curve - columns @ np.linalg.lstsq(columns, curve, rcond=None)[0]
             return float(left @ left)
 
-        misfits = [misfit(latency) for latency in _LATENCIES]
-        best, step = int(np.argmin(misfits)), float(_LATENCIES[1] - _LATENCIES[0])
+        latencies = _LATENCIES[0.7 * self._times.max() > _LATENCIES]  # for frames in the rise
+        misfits = [misfit(latency) for latency in latencies]
+        best, step = int(np.argmin(misfits)), float(latencies[1] - latencies[0])
         if best in (0, len(misfits) - 1):
             return None
         below, at, above = misfits[best - 1 : best + 2]
-        latency = float(_LATENCIES[best]) + 0.5 * step * (below - above) / (below + above - 2 * at)
+        latency = float(latencies[best]) + 0.5 * step * (below - above) / (below + above - 2 * at)
         rise, change = course(latency), (course(latency + step) - course(latency - step)) / (2 * step)
         noise = self.noise**2 * float(heat @ heat)
         free = noise * _inverse_gram(rise, change, ones)
