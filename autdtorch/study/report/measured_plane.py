@@ -19,6 +19,7 @@ from autdtorch.scene.scene import Scene
 from autdtorch.study.report import alt_texts
 from autdtorch.study.report.document import picture
 from autdtorch.utils.files import naming
+from autdtorch.utils.text import in_digits
 
 _FIGURE = "plane.png"
 
@@ -93,7 +94,7 @@ def _foci(scene: Scene, names: Sequence[str], measured: Picture, simulated: Pict
     columns += [one.at(place)[0] for one, place in zip((measured, simulated), places, strict=True)]
     head = ["from the simulated [mm]", "simulated, from the point [mm]", "measured [Pa]", "simulated [Pa]"]
     rows = [
-        [name, f"{apart:.2f}", f"{off:.2f}", f"{one:#.4g}", f"{other:#.4g}"]
+        [name, f"{apart:.2f}", f"{off:.2f}", in_digits(one, 4), in_digits(other, 4)]
         for name, apart, off, one, other in zip(names, *(one.tolist() for one in columns), strict=True)
     ]
     return [["control point [mm]", *head], *rows]
