@@ -52,6 +52,7 @@ NOT_CALLED_BY_USERS = {
     *("EmulatedBench.receive", "EmulatedScope.execute", "Goal", "Method", "State", "Waveform"),
     *("CallableFrames.wait", "FolderFrames.wait", "ThermalCamera.read_pulse"),
     "uvc_frames",
+    *("HeatInversion", "Registration", "registered_by_foci", "Screen.decay", "Screen.rise"),
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
     *("Device.pack", "lock_log", "open_autd3"),  # the one only makes a context, the other asks the network
 }
@@ -344,6 +345,8 @@ OTHERS: dict[str, Any] = {
     "Frame.time": 1.0,
     "FolderFrames.folder": Made(lambda folder: folder),
     "ThermalCamera.corners": [[0, 0], [0, 9], [9, 0], [9, 9]],
+    "Screen.calibrated.measured": 2.0,
+    "Screen.calibrated.pictured": 1.0,
     "ThermalCamera.frames": Made(lambda _: hardware.CallableFrames(lambda: np.ones((4, 4)))),
     "ThermalCamera.points": None,
     "Registration.matrix": np.eye(3),
