@@ -73,7 +73,7 @@ class Bench:
         files = hw.FolderFrames(folder, 0.01, -273.15, delete=True, clock=self.camera.clock, sleep=sleep)
         self.source = Disturbed(files, folder, change)
         self.sensor = hw.ThermalCamera(
-            self.source, PLANE, self.camera.corners, SCENE.control_points, screen=SCREEN, after=0.2
+            self.source, PLANE, self.camera.corners, SCENE.control_points, screen=SCREEN, pulse=0.5, after=0.2
         )
         self.log = log
 

@@ -69,7 +69,7 @@ class ThermalCamera:
         screen: Screen | None = None,
         wavelength: float = 8.5e-3,
         spacing: float = 1.5e-3,
-        pulse: float = 0.5,
+        pulse: float = 1.0,
         before: float = 0.4,
         after: float = 1.0,
         blur: float = 0.5,
