@@ -50,7 +50,7 @@ NOT_CALLED_BY_USERS = {
     *("Calibration", "Picture", "TMatrixPropagator", "TMatrix", "SimulatedPropagator"),
     "UsbtmcPort",
     *("EmulatedBench.receive", "EmulatedScope.execute", "Goal", "Method", "State", "Waveform"),
-    *("CallableFrames.wait", "FolderFrames.wait", "ThermalCamera.read_pulse"),
+    *("CallableFrames.wait", "FolderFrames.wait", "ThermalCamera.deviation", "ThermalCamera.read_pulse"),
     "uvc_frames",
     *("HeatInversion", "Registration", "registered_by_foci", "Screen.decay", "Screen.rise"),
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),

@@ -280,6 +280,7 @@ class _Trial:
         self._readings = given_readings(value)
         if self._readings is None:
             return None
+        self._readings = replace(self._readings, deviation=None)  # the sensor's are those of all
         self._settings["readings"] = digest_of(self._readings)[:16]
         earlier = Problem.of(self._simulated, readings=self._readings).readings
         assert earlier is not None

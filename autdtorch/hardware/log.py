@@ -40,12 +40,14 @@ class Evaluation:
         drive: (M,), complex128, as requested.
         pressure: (P,) [Pa], float64, as read.
         seconds_on: total time that the outputs were on so far [s].
+        deviation: standard deviations (P,) [Pa], as `Readings` has them; None if the sensor tells none.
     """
 
     time: str
     drive: torch.Tensor
     pressure: torch.Tensor
     seconds_on: float
+    deviation: torch.Tensor | None = None
 
 
 class EvaluationLog:
@@ -116,18 +118,27 @@ class EvaluationLog:
             "give the method, seed and version of autdtorch of that trial, or another log"
         )
 
-    def append(self, drive: torch.Tensor, pressure: torch.Tensor, seconds_on: float) -> Evaluation:
+    def append(
+        self,
+        drive: torch.Tensor,
+        pressure: torch.Tensor,
+        seconds_on: float,
+        deviation: torch.Tensor | None = None,
+    ) -> Evaluation:
         """Add an evaluation under the first number that the log lacks, and return it with its time.
 
         It has a requested `drive` (M,), the `pressure` (P,) [Pa] as read, and the total time that the outputs
-        were on so far, `seconds_on` [s]. `LogError` if the file has changed meanwhile.
+        were on so far, `seconds_on` [s], perhaps standard deviations (P,) [Pa]. `LogError` if the file has
+        changed meanwhile.
         """
         while self._lacking in self._evaluations:
             self._lacking += 1
         number = self._lacking
-        evaluation = Evaluation(_now(), drive, pressure, seconds_on)
+        evaluation = Evaluation(_now(), drive, pressure, seconds_on, deviation)
         asked, read = torch.view_as_real(drive).tolist(), pressure.tolist()
         row = {"time": evaluation.time, "drive": asked, "pressure": read, "seconds_on": seconds_on}
+        if deviation is not None:
+            row["deviation"] = deviation.tolist()
         self._append({_NUMBER: number, **row})
         self._keep(number, evaluation)
         self.seconds_on = seconds_on
@@ -179,7 +190,7 @@ class EvaluationLog:
             drive = validate_single_drive(drive, transducers)
             pressure = validate_magnitudes("pressure", row["pressure"], points)
             number = integer_at_least(_NUMBER, row[_NUMBER], 0)
-            self._keep(number, Evaluation(row["time"], drive, pressure, seconds_on))
+            self._keep(number, Evaluation(row["time"], drive, pressure, seconds_on, _deviation(row)))
         self.seconds_on = max(self.seconds_on, seconds_on)
 
     def _keep(self, number: int, evaluation: Evaluation) -> None:
@@ -220,8 +231,12 @@ def read_log(path: Path) -> tuple[dict[str, Any], list[Evaluation]]:
         if _NUMBER in row:
             drive = torch.view_as_complex(real_tensor("drive", row["drive"]))
             pressure = real_tensor("pressure", row["pressure"], "Pa")
-            evaluations.append(Evaluation(row["time"], drive, pressure, row["seconds_on"]))
+            evaluations.append(Evaluation(row["time"], drive, pressure, row["seconds_on"], _deviation(row)))
     return origin, evaluations
+
+
+def _deviation(row: Mapping[str, Any]) -> torch.Tensor | None:
+    return real_tensor("deviation", row["deviation"], "Pa") if "deviation" in row else None
 
 
 @contextlib.contextmanager

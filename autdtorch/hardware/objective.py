@@ -147,7 +147,8 @@ class HardwareObjective:
         if self.evaluations >= most:
             raise LimitError(f"{most} evaluations are made, the limit")
         pressure = self._link.measure(drive, self._sensor, len(self.scene.control_points))[0]
-        evaluation = self.log.append(drive, pressure, self._link.seconds_on)
+        deviation = None if self.deviation is None else self.deviation(pressure)
+        evaluation = self.log.append(drive, pressure, self._link.seconds_on, deviation)
         self._watch(evaluation)
         return pressure
 

@@ -199,7 +199,9 @@ def _from_log(path: Path, points: torch.Tensor | None) -> Readings:
         raise ValueError(f"{path}: no evaluation; must have at least one")
     drives = torch.stack([evaluation.drive for evaluation in evaluations])
     pressure = torch.stack([evaluation.pressure for evaluation in evaluations])
-    return Readings(_played(origin, drives), pressure, points)
+    known = [one.deviation for one in evaluations if one.deviation is not None]
+    deviation = torch.stack(known) if len(known) == len(evaluations) else None
+    return Readings(_played(origin, drives), pressure, points, deviation=deviation)
 
 
 def _played(origin: Mapping[str, Any], drives: torch.Tensor) -> torch.Tensor:

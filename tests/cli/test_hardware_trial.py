@@ -33,6 +33,7 @@ from autdtorch.hardware import (
 from autdtorch.hardware.sensors.sensor import SensorConfig
 from autdtorch.io.drive_file import load_drive
 from autdtorch.io.picture_file import PICTURES, load_picture, save_picture
+from autdtorch.io.readings_file import load_readings
 from autdtorch.io.scene_file import load_scene
 from autdtorch.objectives.goals import TargetPressures, WeakestFocus
 from autdtorch.objectives.quiet import QuietPoints
@@ -569,5 +570,10 @@ def test_a_trial_by_camera_keeps_its_pictures(run, write, tmp_path):
     last = load_drive(pictures["again_0"])
     assert torch.equal(last, load_drive(folder / "drive.npz"))
     points = load_scene(tmp_path / "ours/scene/bright.yaml").control_points
+    pressure, deviation = load_picture(pictures[names[0]]).at(points)
+    noise = ((pressure + deviation).square() - pressure.square()).median()
+    logged = load_readings(folder).deviation[0]
+    # Single precision of the picture's file.
+    torch.testing.assert_close(logged, (pressure.square() + noise).sqrt() - pressure, rtol=1e-3, atol=0)
     again = torch.stack([load_picture(pictures[f"again_{n}"]).at(points)[0] for n in range(2)])
     assert f"**{float(again.mean(dim=0).min()):#.4g} Pa**" in report

@@ -121,6 +121,7 @@ class ThermalCamera:
         self._warmth = _Warmth()
         self._told: set[str] = set()
         self.picture: Picture | None = None
+        self._noise = 1.0  # standard deviation of |p|^2 at the points [Pa^2], of the last reading
 
     def read_pulse(self, on: Callable[[], None], off: Callable[[], None]) -> torch.Tensor:
         """Return magnitudes (P,) [Pa] of a pulse that `on` begins and `off` ends.
@@ -146,7 +147,17 @@ class ThermalCamera:
         usable = _usable(frames, doubts)
         self._require_enough(usable, frames, start, end)
         self.picture = self._picture(usable, start, end, doubts)
-        return self.picture.at(self._points)[0]
+        pressure, deviation = self.picture.at(self._points)
+        self._noise = float(((pressure + deviation).square() - pressure.square()).median())
+        return pressure
+
+    def deviation(self, pressure: torch.Tensor) -> torch.Tensor:
+        """Return the standard deviations (..., P) [Pa] of readings (..., P) [Pa], as `Readings` has them.
+
+        The squares of pressures have the noise of the last reading, alike at all points.
+        """
+        square = pressure.square()
+        return (square + self._noise).sqrt() - pressure
 
     def _picture(self, frames: list[Frame], start: float, end: float, doubts: list[str]) -> Picture:
         images = np.stack([frame.image for frame in frames])
