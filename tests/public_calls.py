@@ -52,7 +52,6 @@ NOT_CALLED_BY_USERS = {
     *("EmulatedBench.receive", "EmulatedScope.execute", "Goal", "Method", "State", "Waveform"),
     *("CallableFrames.wait", "FolderFrames.wait", "ThermalCamera.deviation", "ThermalCamera.read_pulse"),
     "uvc_frames",
-    *("HeatInversion", "Registration", "registered_by_foci", "Screen.decay", "Screen.rise"),
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
     *("Device.pack", "lock_log", "open_autd3"),  # the one only makes a context, the other asks the network
 }
