@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import logging
 import math
 import tempfile
@@ -13,13 +12,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from autdtorch.hardware.camera.frames import Degrees, FolderFrames, Frame, FrameSource, uvc_frames
 from autdtorch.hardware.camera.heat import HeatInversion
 from autdtorch.hardware.camera.picture import Picture, plane_coordinates
 from autdtorch.hardware.camera.registration import Registration
 from autdtorch.hardware.camera.screen import Screen
+from autdtorch.hardware.camera.usable_frames import frames_between, of_reading, reason_for, usable_frames
 from autdtorch.hardware.sensors.sensor import PulsedSensor, SensorConfig, SensorError, Setup
 from autdtorch.scene.geometry import Plane
 from autdtorch.utils.text import counted
@@ -42,10 +41,6 @@ _LONGEST_PULSE = 1.0  # [s]
 _LONGEST_WAIT = 60.0  # [s]
 _LEAST_BEFORE, _LEAST_DURING = 3, 4  # frames
 _LATE = 1.0  # [s] that late frames are waited for
-_CLOCKS = 0.5  # largest difference between a frame's time and the clock [s]
-_USUAL = (-40.0, 200.0)  # of a screen's frames [degrees C]
-_FLASH = 0.3  # smallest jump of a whole image that is a flash, or a shutter [K]
-_MOST_FLASHES = 0.25  # share of the frames
 _NEAR = 3e-3  # of a saturated pixel to a point [m]
 _MOST_DEAD = 0.3  # share of the pixels
 _SEEN = 10.0  # standard deviations of a picture's maximum, from which on its latency is that of the camera
@@ -139,12 +134,12 @@ class ThermalCamera:
         off()
         source.wait(self._after)
         frames = source.frames()
-        if len(_within(frames, start, end)) < _LEAST_DURING:
+        if len(frames_between(frames, start, end)) < _LEAST_DURING:
             source.wait(_LATE)
             frames += source.frames()
-        frames = _of_reading(frames, began, source.clock())
+        frames = of_reading(frames, began, source.clock())
         doubts: list[str] = []
-        usable = _usable(frames, doubts)
+        usable = usable_frames(frames, doubts)
         self._require_enough(usable, frames, start, end)
         self.picture = self._picture(usable, start, end, doubts)
         pressure, deviation = self.picture.at(self._points)
@@ -222,11 +217,11 @@ class ThermalCamera:
         self, usable: Sequence[Frame], frames: Sequence[Frame], start: float, end: float
     ) -> None:
         before = sum(frame.time <= start for frame in usable)
-        during = len(_within(usable, start, end))
+        during = len(frames_between(usable, start, end))
         if before >= _LEAST_BEFORE and during >= _LEAST_DURING:
             return
         what = f"{counted(before, 'usable frame')} before the pulse and {during} in it, of {len(frames)}"
-        reason = _reason(frames, usable)
+        reason = reason_for(frames, usable)
         raise SensorError(f"{what}; must be at least {_LEAST_BEFORE} and {_LEAST_DURING}: {reason}")
 
 
@@ -243,76 +238,6 @@ class _Warmth:
 
     def add(self, rise: float, time: float) -> None:
         self._rise, self._time = self._rise + rise, time
-
-
-def _of_reading(frames: Sequence[Frame], began: float, now: float) -> list[Frame]:
-    """Return the frames of the times in which they arrived: late ones of before are dropped."""
-    recent = [frame for frame in frames if frame.time > began - _CLOCKS]
-    off = max((frame.time - now for frame in recent), default=0.0)
-    if frames and not recent:
-        off = began - max(frame.time for frame in frames)
-    if off > _CLOCKS:
-        accepted = "their clock differs from this machine's, or has jumped"
-        raise SensorError(f"frames are {off:.3g} s outside the time they arrived in: {accepted}")
-    return recent
-
-
-def _within(frames: Sequence[Frame], start: float, end: float) -> list[Frame]:
-    return [frame for frame in frames if start < frame.time <= end]
-
-
-def _usable(frames: Sequence[Frame], doubts: list[str]) -> list[Frame]:
-    """Return the frames that differ, show something and do not flash, by time; say what is left out."""
-    ordered = sorted(frames, key=lambda frame: frame.time)
-    fresh = ordered[:1]
-    fresh += [frame for before, frame in itertools.pairwise(ordered) if not _repeats(before, frame)]
-    shown = [frame for frame in fresh if _shows(frame.image)]
-    for count, what in ((len(ordered) - len(fresh), "repeated"), (len(fresh) - len(shown), "empty")):
-        if count:
-            doubts.append(f"{counted(count, 'frame')} {what}")
-    if not shown:
-        return []
-    sizes = {frame.image.shape for frame in shown}
-    if len(sizes) > 1:
-        raise SensorError(f"images of shapes {sorted(sizes)} in one reading; must be of one shape")
-    medians = np.array([np.nanmedian(frame.image) for frame in shown])
-    middle = float(np.median(medians))
-    if not _USUAL[0] <= middle <= _USUAL[1]:
-        accepted = f"must be {_USUAL[0]:g} to {_USUAL[1]:g} degrees C; check scale and zero"
-        raise SensorError(f"the frames show {middle:.4g}: {accepted}")
-    flashes = _flashes(medians)
-    if flashes.mean() > _MOST_FLASHES:
-        raise SensorError(
-            f"{flashes.sum()} of {len(shown)} frames jump as a whole; does a shutter or a light come in?"
-        )
-    if flashes.any():
-        doubts.append(f"{counted(int(flashes.sum()), 'frame')} with a flash or a shutter")
-    return [frame for frame, flash in zip(shown, flashes, strict=True) if not flash]
-
-
-def _repeats(before: Frame, frame: Frame) -> bool:
-    return frame.time == before.time or np.array_equal(frame.image, before.image, equal_nan=True)
-
-
-def _shows(image: Degrees) -> bool:
-    """Return true if an image has at least two different numbers."""
-    finite = image[np.isfinite(image)]
-    return bool(finite.size) and bool(finite.max() > finite.min())
-
-
-def _flashes(medians: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which of the frames' medians (T,) are off those of their neighbours."""
-    padded = np.pad(medians, 2, mode="reflect") if len(medians) > 2 else np.pad(medians, 2, mode="edge")
-    usual = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
-    return np.asarray(np.abs(medians - usual) > _FLASH)
-
-
-def _reason(frames: Sequence[Frame], usable: Sequence[Frame]) -> str:
-    if not frames:
-        return "no frame came; is the camera on, and does its program write?"
-    if len(usable) < len(frames) / 2:
-        return "most repeat each other or are empty; is the camera frozen or covered?"
-    return "they come too seldom or too late; raise the camera's rate, or pulse and before"
 
 
 _KINDS = ("folder", "uvc")
