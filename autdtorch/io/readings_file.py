@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,7 @@ def load_readings(
       `amplitude 0`, by default 1; `pressure 0 [kPa rms]`; `pressure phase 0 [rad]`. With `x [mm]`, `y [mm]`
       and `z [mm]`, each row has any point and its pressure. Empty cells and nan are gaps of the pressure.
     - `.npz` of `save_readings`, or with the arrays `drives` or `phases` (R, M), perhaps `amplitudes` (R, M),
-      `pressure` (R, P), `phase` (R, P) and `points` (P, 3) [m].
+      `pressure` (R, P), `phase` (R, P), `deviation` (R, P) [Pa peak] and `points` (P, 3) [m].
     - `.jsonl`: the log of a hardware trial, or the folder that holds it. Drives are those that the device
       played.
 
@@ -105,10 +106,14 @@ def load_readings(
         return readings_of(csv_table(path, named), named, units, rows, places)
     _refuse(path, {"columns": named})
     if path.suffix.lower() == ".npz":
-        table, stored = _array_table(path)
+        arrays = read_arrays(path)
+        deviation = arrays.pop("deviation", None)
+        table, stored = _array_table(path, arrays)
         if rows is not None and stored is not None:
             raise ValueError(f"drives: given, but {path} has drives; must be one of both")
-        return readings_of(table, None, units, rows if stored is None else stored, places)
+        readings = readings_of(table, None, units, rows if stored is None else stored, places)
+        with within(path):
+            return readings if deviation is None else replace(readings, deviation=deviation)
     _refuse(path, {**units._asdict(), "drives": rows})
     return _from_log(path, places)
 
@@ -117,7 +122,7 @@ def save_readings(path: str | os.PathLike[str], readings: Readings) -> None:
     """Write readings to a file that `load_readings` reads without further arguments.
 
     `.csv` has a row for each drive, with `phase 0 [rad]`, `amplitude 0`, `pressure 0 [Pa peak]` and so on;
-    gaps are nan, and comments have the points. `.npz` is exact.
+    gaps are nan, and comments have the points. `.npz` is exact, and alone has deviations.
 
     Args:
         path: of the file, which is replaced; the suffix decides the format.
@@ -126,10 +131,13 @@ def save_readings(path: str | os.PathLike[str], readings: Readings) -> None:
     path = path_of("path", path, suffixes=(".csv", ".npz"))
     require_kind("readings", readings, Readings)
     if path.suffix.lower() == ".npz":
-        parts = {name: getattr(readings, name) for name in ("drives", "pressure", "points", "phase")}
+        names = ("drives", "pressure", "points", "phase", "deviation")
+        parts = {name: getattr(readings, name) for name in names}
         arrays = {name: part.numpy() for name, part in parts.items() if part is not None}
         write_arrays(path, arrays | {"unit": _UNITS["pressure"]})
         return
+    if readings.deviation is not None:
+        raise ValueError(f"path: {path}; must be .npz for readings with deviations")
     columns = _numbered("phase {} [rad]", phases_of(readings.drives))
     columns |= _numbered("amplitude {}", amplitudes_of(readings.drives).clamp(max=1.0))
     columns |= _numbered(f"pressure {{}} [{_UNITS['pressure']}]", readings.pressure)
@@ -160,9 +168,8 @@ def _refuse(path: Path, arguments: Mapping[str, object]) -> None:
             raise invalid(name, str(value), f"must not be given: {path} states its own")
 
 
-def _array_table(path: Path) -> tuple[Table, torch.Tensor | None]:
+def _array_table(path: Path, arrays: dict[str, AnyArray]) -> tuple[Table, torch.Tensor | None]:
     """Return the arrays of a NumPy file side by side, and its drives if it has them as complex numbers."""
-    arrays = read_arrays(path)
     require_known(str(path), arrays, (*_TITLES, "drives", "points", "unit"), "array")
     if "pressure" not in arrays:
         raise ValueError(f"{path}: no array 'pressure'; must have pressure, and drives or phases")

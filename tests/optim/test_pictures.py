@@ -100,6 +100,14 @@ def test_stated_intervals_hold_at_pictures_held_back(bench):
     assert fit.noise == pytest.approx(float(fit.fit.read.stated), rel=0.15)
 
 
+def test_files_keep_deviations(bench, tmp_path):
+    readings = readings_of(bench[2], 3)
+    at.save_readings(tmp_path / "pictures.npz", readings)
+    torch.testing.assert_close(at.load_readings(tmp_path / "pictures.npz").deviation, readings.deviation)
+    with pytest.raises(ValueError, match=r"must be \.npz"):
+        at.save_readings(tmp_path / "pictures.csv", readings)
+
+
 METHODS = [
     at.Identify(6, CLOSE),
     at.BayesOpt(6, model="foci", kernel="phasor", noise="inferred", prior=CLOSE),
