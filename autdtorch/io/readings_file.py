@@ -113,7 +113,11 @@ def load_readings(
             raise ValueError(f"drives: given, but {path} has drives; must be one of both")
         readings = readings_of(table, None, units, rows if stored is None else stored, places)
         with within(path):
-            return readings if deviation is None else replace(readings, deviation=deviation)
+            return (
+                readings
+                if deviation is None
+                else replace(readings, deviation=torch.as_tensor(deviation, device="cpu"))
+            )
     _refuse(path, {**units._asdict(), "drives": rows})
     return _from_log(path, places)
 
