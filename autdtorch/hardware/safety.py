@@ -1,17 +1,15 @@
-"""Safety of a bench: limits on amplitudes and times, outputs off however a trial ends, a check before it."""
+"""Safety of a bench: limits on amplitudes and times, and outputs off however a trial ends."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
 import logging
-import math
 import signal
 import sys
 import threading
 import time
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,7 +27,6 @@ from autdtorch.hardware.sensors.sensor import (
     checked_reading,
     require_sensor,
 )
-from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.process import send_again
 from autdtorch.utils.validation import (
     integer_at_least,
@@ -37,7 +34,6 @@ from autdtorch.utils.validation import (
     not_negative,
     number_between,
     positive,
-    require_callable,
     require_kind,
 )
 
@@ -51,6 +47,7 @@ _SIGNALS = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
 _LONGEST = 1e6  # time limit [s]: 12 days; timers of some systems take no more than 49
 _LONGEST_REST = 86_400.0  # [s]
 _LEAST_DUTY_CYCLE = 1e-4
+_MOST_READINGS = 10_000
 _GRACE = 0.1  # from when the timer switches off until a reading is interrupted [s]
 
 
@@ -252,7 +249,7 @@ class LimitedLink:
         off afterwards; with another sensor the drive plays on. Errors are those of `play` and `reading`.
         """
         require_sensor(sensor)
-        points, readings = integer_at_least("points", points, 1), _count("readings", readings)
+        points, readings = integer_at_least("points", points, 1), readings_count("readings", readings)
         if isinstance(sensor, PulsedSensor):
             return torch.stack([self._read_pulse(drive, sensor, points) for _ in range(readings)])
         self.play(drive)
@@ -330,136 +327,6 @@ class LimitedLink:
             raise self._failure
 
 
-_DEVIATIONS = 6.0  # threshold above the noise, in standard deviations of its mean power
-_WEAK = 0.1  # threshold below the median of all transducers: 20 dB, as some sensors round silence to 0
-
-_MOST_READINGS = 10_000
-
-
-@dataclass(frozen=True, eq=False)
-class Preflight:
-    """The pressure of each transducer alone, and of silence.
-
-    Attributes:
-        pressure: of each transducer (M,) [Pa], rms over readings and control points; (0,) where a sensor does
-            not see a transducer alone.
-        silence: with the outputs off [Pa].
-        threshold: pressure that a working transducer exceeds [Pa].
-    """
-
-    pressure: torch.Tensor
-    silence: float
-    threshold: float
-
-    @property
-    def failed(self) -> list[int]:
-        """The failed transducers, whose pressure is not above the threshold."""
-        return torch.nonzero(self.pressure <= self.threshold)[:, 0].tolist()
-
-    @property
-    def dead(self) -> list[int]:
-        """The former name of `failed`."""
-        warnings.warn("Preflight.dead is now Preflight.failed", DeprecationWarning, stacklevel=2)
-        return self.failed
-
-
-def check_transducers(
-    link: LimitedLink,
-    sensor: Sensor,
-    points: int,
-    readings: int = 4,
-    background: int = 32,
-    watch: Callable[[str], object] | None = None,
-) -> Preflight:
-    """Play every transducer alone, after silence, and switch the outputs off, however it ends.
-
-    The power of circular Gaussian noise, averaged over n readings, deviates by 1/sqrt(n) of its mean. The
-    threshold is six deviations above that mean, or 20 dB below the median of all transducers if that is more.
-
-    Args:
-        link: plays the transducers.
-        sensor: reads their pressure.
-        points: number of control points P.
-        readings: number of readings of every transducer, 1 to 10,000.
-        background: number of readings of the silence, 1 to 10,000.
-        watch: takes the name of each reading: "silence, outputs off", then "transducer 1 of 16" and so on.
-
-    Raises:
-        ValueError: the link is not limited, there is no sensor or it does not give P finite magnitudes, or
-            another number of readings.
-        LimitError: the time limit of the outputs is reached.
-        LinkError: the device does not take the bytes.
-    """
-    require_kind("link", link, LimitedLink)
-    require_kind("sensor", sensor, Sensor)
-    watch = (lambda _: None) if watch is None else watch
-    require_callable("watch", watch)
-    points = integer_at_least("points", points, 1)
-    readings = _count("readings", readings)
-    background = _count("background", background)
-    watch("silence, outputs off")
-    silence = _power(partial(checked_reading, sensor, points), background)
-    count = len(link.link.transducers)
-    powers = []
-    try:
-        for number, alone in enumerate(torch.eye(count, **COMPLEX), start=1):
-            watch(f"transducer {number} of {count}")
-            link.play(alone)
-            powers.append(_power(partial(link.reading, sensor, points), readings))
-    finally:
-        link.off()
-    pressure = torch.tensor(powers, **REAL).sqrt()
-    above_noise = math.sqrt(silence * (1 + _DEVIATIONS / math.sqrt(readings * points)))
-    return Preflight(pressure, math.sqrt(silence), max(above_noise, _WEAK * float(pressure.median())))
-
-
-def check_picture(
-    link: LimitedLink, sensor: PulsedSensor, points: int, drive: torch.Tensor, readings: int = 4
-) -> Preflight:
-    """Read silence and one drive (M,), in place of single transducers, which a camera does not see.
-
-    The threshold is as of `check_transducers`, with the drive's loudest control point for all transducers.
-    `SensorError` if the drive is not above it anywhere; other errors are those of `check_transducers`.
-    """
-    require_kind("link", link, LimitedLink)
-    require_kind("sensor", sensor, PulsedSensor)
-    points = integer_at_least("points", points, 1)
-    readings = _count("readings", readings)
-    silence = _power(_silent(sensor, points), readings)
-    loudest = float(link.measure(drive, sensor, points).max())
-    threshold = math.sqrt(silence * (1 + _DEVIATIONS / math.sqrt(readings * points)))
-    if loudest <= threshold:
-        accepted = f"must be above {threshold:.3g} Pa, the noise; check the device's power, and the sensor"
-        raise SensorError(
-            f"the first picture shows {loudest:.3g} Pa at the loudest control point; {accepted}"
-        )
-    return Preflight(torch.empty(0, **REAL), math.sqrt(silence), max(threshold, _WEAK * loudest))
-
-
-def hears_silence(sensor: AnySensor, check: Preflight, points: int, readings: int = 4) -> bool:
-    """Return True if a sensor of P points reads no more than at the `check` before, with the outputs off.
-
-    `ValueError` if the sensor does not give P finite magnitudes, or for another number of readings.
-    """
-    require_sensor(sensor)
-    require_kind("check", check, Preflight)
-    points = integer_at_least("points", points, 1)
-    readings = _count("readings", readings)
-    return math.sqrt(_power(_silent(sensor, points), readings)) <= check.threshold
-
-
-def _silent(sensor: AnySensor, points: int) -> Callable[[], torch.Tensor]:
-    """Return a function that reads (P,) [Pa] and leaves the outputs off."""
-    silent = Pulse(sensor, _nothing, _nothing) if isinstance(sensor, PulsedSensor) else sensor
-    return partial(checked_reading, silent, points)
-
-
-def _nothing() -> None: ...
-
-
-def _count(name: str, value: object) -> int:
+def readings_count(name: str, value: object) -> int:
+    """Return a number of readings after checking it, 1 to 10,000."""
     return int(number_between(name, integer_at_least(name, value, 1), 1, _MOST_READINGS))
-
-
-def _power(read: Callable[[], torch.Tensor], readings: int) -> float:
-    return float(torch.stack([read() for _ in range(readings)]).square().mean())

@@ -13,7 +13,7 @@ import torch
 
 import autdtorch
 from autdtorch.hardware.log import EvaluationLog
-from autdtorch.hardware.safety import Preflight
+from autdtorch.hardware.preflight import Preflight
 from autdtorch.io.goal_section import score_label
 from autdtorch.methods.calibration.calibration import Calibration
 from autdtorch.methods.solution import Solution
