@@ -133,8 +133,22 @@ class HardwareObjective:
 
     @property
     def deviation(self) -> Callable[[torch.Tensor], torch.Tensor] | None:
-        """The sensor's function of readings (..., P) [Pa] that gives their deviations, if it has one."""
-        return getattr(self._sensor, "deviation", None)
+        """The function of readings (..., P) [Pa] that gives their deviations, if the sensor has one.
+
+        Readings in the log have those of the log, so that a trial goes on as it began.
+        """
+        sensed: Callable[[torch.Tensor], torch.Tensor] | None = getattr(self._sensor, "deviation", None)
+        if sensed is None:
+            return None
+
+        def deviation(pressure: torch.Tensor) -> torch.Tensor:
+            logged = {tuple(one.pressure.tolist()): one.deviation for one in self.log.evaluations}
+            rows = pressure.reshape(-1, pressure.shape[-1])
+            found = [logged.get(tuple(row.tolist())) for row in rows]
+            parts = [sensed(row) if one is None else one for one, row in zip(found, rows, strict=True)]
+            return torch.stack(parts).reshape(pressure.shape)
+
+        return deviation
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
         try:
@@ -147,7 +161,8 @@ class HardwareObjective:
         if self.evaluations >= most:
             raise LimitError(f"{most} evaluations are made, the limit")
         pressure = self._link.measure(drive, self._sensor, len(self.scene.control_points))[0]
-        deviation = None if self.deviation is None else self.deviation(pressure)
+        sensed = getattr(self._sensor, "deviation", None)
+        deviation = None if sensed is None else sensed(pressure)
         evaluation = self.log.append(drive, pressure, self._link.seconds_on, deviation)
         self._watch(evaluation)
         return pressure

@@ -117,8 +117,11 @@ def check_picture(
     points = integer_at_least("points", points, 1)
     readings = readings_count("readings", readings)
     silence = _power(_silent(sensor, points), readings)
-    loudest = float(link.measure(drive, sensor, points).max())
     threshold = math.sqrt(silence * (1 + _DEVIATIONS / math.sqrt(readings * points)))
+    if (deviation := getattr(sensor, "deviation", None)) is not None:  # its silence may be 0 by chance
+        of_silence = float(deviation(torch.zeros(points, **REAL)).max())
+        threshold = max(threshold, math.sqrt(_DEVIATIONS) * of_silence)
+    loudest = float(link.measure(drive, sensor, points).max())
     if loudest <= threshold:
         accepted = f"must be above {threshold:.3g} Pa, the noise; check the device's power, and the sensor"
         raise SensorError(

@@ -6,21 +6,19 @@ import os
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from autdtorch.hardware.camera.picture import Picture
 from autdtorch.scene.drive import validate_single_drive
 from autdtorch.scene.geometry import Plane
 from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.files import read_arrays, write_arrays
-from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid, path_of, require_kind, within
+from autdtorch.utils.validation import ArrayLike, complex_tensor, path_of, real_tensor, require_kind, within
 
 #: Folder of a trial for its pictures: `evaluation_00012.npz` of evaluation 12 (from 0), and `again_0.npz`,
 #: `again_1.npz`, ... of the drive that the search found, when it was played again.
 PICTURES = "pictures"
 AGAIN = "again"  # begins the names of these
 
-_MOST_CELLS = 2**22  # of a picture; a camera has 2**20 pixels at most
 _MAPS = ("pressure", "deviation")
 _PLANE = {"center": 3, "normal": 3, "size": 2}
 
@@ -65,11 +63,7 @@ def load_picture(path: str | os.PathLike[str]) -> Picture:
         wanted = {*_MAPS, *_PLANE, "relative", "frames", "latency", "doubts"}
         if missing := sorted(wanted - set(arrays)):
             raise ValueError(f"no array {missing[0]!r}; must be written by save_picture")
-        pressure, deviation = (_map(name, arrays[name]) for name in _MAPS)
-        if pressure.shape != deviation.shape:
-            raise invalid(
-                "deviation", tuple(deviation.shape), f"must be {tuple(pressure.shape)}, as pressure"
-            )
+        pressure, deviation = (real_tensor(name, arrays[name], "Pa") for name in _MAPS)
         center, normal, size = (_numbers(name, arrays[name], count) for name, count in _PLANE.items())
         relative, frames, latency = (
             _numbers(name, arrays[name], 1)[0] for name in ("relative", "frames", "latency")
@@ -90,17 +84,6 @@ def newest_picture(folder: Path) -> Path | None:
         except OSError:  # removed meanwhile
             continue
     return max(times, key=lambda path: (times[path], path.name), default=None)
-
-
-def _map(name: str, values: AnyArray) -> torch.Tensor:
-    """Return a map (Nu, Nv) in double precision, after checking it."""
-    if values.ndim != 2 or values.size == 0 or values.dtype.kind != "f":
-        raise ValueError(f"{name}: shape {values.shape}, type {values.dtype}; must be real, (Nu, Nv)")
-    if values.size > _MOST_CELLS:
-        raise ValueError(f"{name}: {values.size} cells; must be at most {_MOST_CELLS}")
-    if not (np.isfinite(values) & (values >= 0)).all():
-        raise ValueError(f"{name}: must be finite and >= 0 in every cell")
-    return torch.from_numpy(values.astype(np.float64))
 
 
 def _numbers(name: str, values: AnyArray, count: int) -> list[float]:

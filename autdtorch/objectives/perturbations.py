@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from autdtorch.objectives.objective import Objective, observe_drives, require_objective, validate_drives
+from autdtorch.objectives.readings import deviation_by_square
 from autdtorch.scene.drive import PhaseLevels, drive_from_phases, validate_drive
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.text import counted
@@ -227,9 +228,7 @@ class CameraNoise(Perturbation):
     def deviation(self, pressure: torch.Tensor) -> torch.Tensor:
         """Return the deviations (..., P) [Pa] of readings (..., P) [Pa], as `Readings.deviation`."""
         pressure = real_tensor("pressure", pressure, "Pa")
-        square = pressure.square()
-        deviation = (square + self._of_square(square)).sqrt() - pressure
-        return deviation.clamp_min(torch.finfo(deviation.dtype).tiny)
+        return deviation_by_square(pressure, self._of_square(pressure.square()))
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
         square = self.inner(drive).square()

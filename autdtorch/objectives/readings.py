@@ -173,3 +173,11 @@ def _repeats(keys: Iterable[tuple[int, int]]) -> list[int]:
         repeats.append(counts.get(key, 0))
         counts[key] = repeats[-1] + 1
     return repeats
+
+
+def deviation_by_square(pressure: torch.Tensor, of_square: torch.Tensor) -> torch.Tensor:
+    """Return the `Readings.deviation` [Pa] of magnitudes [Pa] whose squares deviate by `of_square` [Pa^2]."""
+    least = torch.finfo(pressure.dtype).tiny
+    above = (pressure.square() + of_square).sqrt()
+    deviation: torch.Tensor = (of_square / (above + pressure).clamp_min(least)).clamp_min(least)
+    return deviation

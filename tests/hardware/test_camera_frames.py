@@ -1,6 +1,7 @@
 """Frames of a camera from files, functions and a USB camera, and files that are wrong."""
 
 import contextlib
+import io
 import os
 import sys
 from types import SimpleNamespace
@@ -10,6 +11,7 @@ import pytest
 from PIL import Image
 
 from autdtorch import hardware as hw
+from autdtorch.hardware.camera import frames as camera_frames
 
 DEGREES = np.array([[21.5, 22.25, 23.0], [24.0, -3.5, 150.25]])
 
@@ -112,6 +114,21 @@ def test_a_file_that_grows_is_read_once_it_is_whole(tmp_path, clock):
     assert [frame.image.shape for frame in frames] == [DEGREES.shape] * 2
 
 
+def tiff_of(width: int, height: int) -> bytes:
+    """A file of 2 x 2 pixels that says it has others."""
+    file = io.BytesIO()
+    Image.fromarray(np.zeros((2, 2), np.uint16)).save(file, format="TIFF")
+    content = bytearray(file.getvalue())
+    start = int.from_bytes(content[4:8], "little") + 2
+    for entry in range(int.from_bytes(content[start - 2 : start], "little")):
+        place = start + 12 * entry
+        tag = int.from_bytes(content[place : place + 2], "little")
+        if tag in (256, 257):
+            content[place + 2 : place + 4] = (4).to_bytes(2, "little")
+            content[place + 8 : place + 12] = (width if tag == 256 else height).to_bytes(4, "little")
+    return bytes(content)
+
+
 @pytest.mark.parametrize(
     ("name", "content"),
     [
@@ -121,6 +138,8 @@ def test_a_file_that_grows_is_read_once_it_is_whole(tmp_path, clock):
         ("1.npy", b"\x93NUMPY\x01"),
         ("1.tif", b"II*\x00\x08\x00\x00\x00"),
         ("1.tif", b""),
+        ("1.tif", tiff_of(60_000, 60_000)),
+        ("1.npy", b"\x93NUMPY\x01\x00\x10\x00{'descr': '<u2',("),
     ],
 )
 def test_a_file_that_stays_broken_is_left_out_with_a_warning(tmp_path, clock, caplog, name, content):
@@ -156,6 +175,20 @@ def test_a_folder_that_is_not_there_or_may_not_be_read_says_so(tmp_path, clock, 
     write(tmp_path / "frame.npy")
     with pytest.raises(hw.SensorError, match="names must count the frames"):
         frames_of(source, 0.1)
+
+
+def test_infinite_numbers_are_gaps(tmp_path, clock):
+    source = folder_frames(tmp_path, clock)
+    (tmp_path / "1.csv").write_text("21.5,inf\n-inf,22\n")
+    (frame,) = frames_of(source, 0.1)
+    np.testing.assert_array_equal(frame.image, [[21.5, np.nan], [np.nan, 22]])
+
+
+def test_a_function_that_does_not_wait_for_the_next_frame_is_refused(monkeypatch):
+    monkeypatch.setattr(camera_frames, "_MOST_VALUES", 100)
+    source = hw.CallableFrames(lambda: DEGREES, clock=lambda: 0.0)
+    with pytest.raises(hw.SensorError, match=r"take: \d+ frames in a reading; must wait"):
+        source.wait(1.0)
 
 
 def test_a_function_gives_frames_until_it_fails():

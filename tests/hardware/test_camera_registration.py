@@ -57,6 +57,20 @@ def test_marks_in_a_line_are_refused() -> None:
         Registration.of(PLANE, [[0, 0], [10, 0], [20, 0], [30, 20]], [*places[:3], [0, 0, 0.2]])
 
 
+def test_pixels_in_an_order_that_no_camera_sees_are_refused() -> None:
+    corners = np.array([[10.0, 10.0], [12.0, 110.0], [150.0, 8.0], [155.0, 120.0]])
+    registration = Registration.of(PLANE, corners, PLANE.corners)
+    half = np.array(PLANE.size) / 2
+    np.testing.assert_allclose(registration.to_pixels(-half), corners[0])
+    for order in ([0, 1, 3, 2], [0, 3, 2, 1], [1, 0, 2, 3]):  # round the plane, and others that cross
+        with pytest.raises(ValueError, match=r"pixels: .*order of the places"):
+            Registration.of(PLANE, corners[order], PLANE.corners)
+    with pytest.raises(ValueError, match=r"pixels: .*three of four in a line"):
+        Registration.of(PLANE, [[0, 0], [1, 1], [2, 2], [3, 9]], PLANE.corners)
+    with pytest.raises(ValueError, match="before the camera"):
+        Registration(PLANE, np.array([[1.0, 0, 0], [0, 1, 0], [100 / half[0], 0, 1]]))
+
+
 def test_an_image_is_sampled_on_the_plane() -> None:
     truth = camera(tilt=0.4)
     rows, columns = np.mgrid[:150, :160]

@@ -5,6 +5,7 @@ import time
 import pytest
 import torch
 
+import autdtorch as at
 from autdtorch import hardware as hw
 from autdtorch.hardware import safety
 
@@ -109,4 +110,27 @@ def test_a_first_picture_takes_the_place_of_the_check_by_single_transducers(tria
         assert not hw.hears_silence(sensor, check, 2)
         sensor.noise = 2 * strongest
         with pytest.raises(hw.SensorError, match="the first picture shows"):
+            hw.check_picture(link, sensor, 2, FULL)
+
+
+def test_a_trial_goes_on_with_the_deviations_of_its_log(trial):
+    prior = at.Prior(trial.simulated.transfer_matrix, gain=0.3, phase=1.0)
+    drives = []
+    for share in (0.01, 3.0):  # as a camera that is less sure after an interruption
+        with trial.limited(failed=[3]) as (bench, link):
+            sensor = Heat(bench)
+            sensor.deviation = lambda pressure, share=share: share * (pressure + pressure.mean())
+            objective = trial.objective(link, sensor)
+            drives.append(at.identify(objective, evaluations=6, prior=prior).drive)
+    assert torch.equal(*drives)
+
+
+def test_a_first_picture_must_be_above_the_deviation_that_a_sensor_states(trial):
+    with trial.limited() as (bench, link):
+        sensor = Heat(bench)  # without noise: it reads silence as 0
+        peak = float(link.measure(FULL, sensor, 2).max())
+        sensor.deviation = lambda pressure: torch.full_like(pressure, 0.3 * peak)
+        assert hw.check_picture(link, sensor, 2, FULL).threshold > 0.3 * peak
+        sensor.deviation = lambda pressure: torch.full_like(pressure, peak)
+        with pytest.raises(hw.SensorError, match="first picture"):
             hw.check_picture(link, sensor, 2, FULL)

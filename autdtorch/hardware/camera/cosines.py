@@ -110,7 +110,8 @@ class Cosines:
         """
         rows, columns = np.divmod(self.pixels, self.shape[1])
         nodes = [(-(3**0.5), 1 / 6), (0.0, 2 / 3), (3**0.5, 1 / 6)]
-        weights, places = [], []
+        row = np.repeat(np.arange(len(self.pixels)), 16)
+        sampling = csr_array((len(self.pixels), int(self._cells.prod())))
         for (across, weight), (down, other) in ((one, two) for one in nodes for two in nodes):
             pixels = np.stack([columns + spread * across, rows + spread * down], axis=-1)
             position = (self._registration.to_plane(pixels) / self._size + 0.5) * self._cells - 0.5
@@ -120,11 +121,11 @@ class Cosines:
             last = self._cells[:, None] - 1
             index = np.clip(np.where(index > last, 2 * last + 1 - index, index), 0, last)
             splines = _bspline(position - start)
-            weights.append(weight * other * splines[:, 0, :, None] * splines[:, 1, None, :])
-            places.append(index[:, 0, :, None] * self._cells[1] + index[:, 1, None, :])
-        row = np.repeat(np.tile(np.arange(len(self.pixels)), len(weights)), 16)
-        entries = np.concatenate(weights).ravel(), (row, np.concatenate(places).ravel())
-        return csr_array(entries, shape=(len(self.pixels), int(self._cells.prod())))
+            entries = weight * other * splines[:, 0, :, None] * splines[:, 1, None, :]
+            places = index[:, 0, :, None] * self._cells[1] + index[:, 1, None, :]
+            # All entries at once would be several gigabytes for a camera of 640 x 480.
+            sampling = sampling + csr_array((entries.ravel(), (row, places.ravel())), shape=sampling.shape)
+        return sampling
 
 
 def _overlap_of_discs(ratio: Array) -> Array:

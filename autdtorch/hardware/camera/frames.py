@@ -36,6 +36,7 @@ Degrees: TypeAlias = NDArray[np.float64]
 _POLL = 0.01  # [s] between looks at a folder
 _PATIENCE = 0.25  # [s] for a file to become complete
 _MOST_PIXELS = 2**24
+_MOST_VALUES = 2**28  # of the frames of a function in a reading: 2 GiB
 _RATES = (0.1, 10_000.0)  # [frames/s]
 _SUFFIXES = (".csv", ".npy", ".tif", ".tiff")
 _STALE = 8  # frames that a driver may hold back from before a pulse
@@ -185,7 +186,7 @@ class FolderFrames:
         try:
             changed = path.stat().st_mtime
             image = _read_image(path, self._scale, self._zero)
-        except (OSError, ValueError, SyntaxError, EOFError) as error:  # of Pillow, too
+        except Exception as error:  # Pillow and NumPy raise many kinds for damaged files
             if isinstance(error, PermissionError):
                 raise SensorError(f"{path}: may not be read; give this program the right to") from error
             if waited > _PATIENCE:
@@ -226,12 +227,12 @@ def _read_image(path: Path, scale: float, zero: float) -> Degrees:
 
 
 def _matrix(values: ArrayLike, scale: float = 1.0, zero: float = 0.0) -> Degrees:
-    """Return values (H, W) in degrees C; integers by scale and zero, their largest as NaN."""
+    """Return values (H, W) in degrees C; integers by scale and zero; NaN for their largest, and infinite."""
     array = np.asarray(values)
     if array.ndim != 2 or not 0 < array.size <= _MOST_PIXELS or array.dtype.kind not in "iuf":
         raise ValueError(f"shape {array.shape} of {array.dtype}; must be an image of one number a pixel")
     if array.dtype.kind == "f":
-        return array.astype(np.float64)
+        return np.where(np.isfinite(array), array, np.nan).astype(np.float64)
     degrees = scale * array.astype(np.float64) + zero
     largest = min(int(np.iinfo(array.dtype).max), 2**16 - 1)  # Pillow widens to 32 bits
     degrees[array >= largest] = np.nan
@@ -295,6 +296,9 @@ class CallableFrames:
             image = self._image()
             if image is not None:
                 self._frames.append(Frame(self.clock(), image))
+                if len(self._frames) * image.size > _MOST_VALUES:
+                    accepted = "must wait for the next frame; else lower the rate, or before and after"
+                    raise SensorError(f"take: {len(self._frames)} frames in a reading; {accepted}")
 
     def frames(self) -> list[Frame]:
         """Return the frames that were taken since the call before."""

@@ -19,10 +19,11 @@ import torch
 from scipy.optimize import least_squares
 
 from autdtorch.hardware.camera.cosines import Cosines
-from autdtorch.hardware.camera.picture import Picture, deviation_of
+from autdtorch.hardware.camera.picture import Picture
 from autdtorch.hardware.camera.pulse_fit import PulseFit
 from autdtorch.hardware.camera.registration import Registration
 from autdtorch.hardware.camera.screen import Screen
+from autdtorch.objectives.readings import deviation_by_square
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import (
     ArrayLike,
@@ -124,11 +125,11 @@ class HeatInversion:
         if unseen := float(np.mean(density < _UNSEEN * np.median(density))):
             doubts.append(f"{100 * unseen:.2g} % of the plane is not seen")
         of_square = np.hypot(max(1.0, misfit) * np.sqrt(variance), uncertainty * square)
-        pressure = np.sqrt(np.maximum(square, 0.0))
+        pressure = torch.from_numpy(np.sqrt(np.maximum(square, 0.0)))
         return Picture(
             self.registration.plane,
-            torch.from_numpy(pressure),
-            torch.from_numpy(deviation_of(pressure, of_square)),
+            pressure,
+            deviation_by_square(pressure, torch.from_numpy(of_square)),
             self.screen.heating is None,
             fit.frames,
             shift,

@@ -8,13 +8,23 @@ import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
-from autdtorch.objectives.readings import Readings
+from autdtorch.objectives.readings import Readings, deviation_by_square
 from autdtorch.scene.geometry import Plane, cell_centers_of
 from autdtorch.utils.array_types import REAL, Array
-from autdtorch.utils.validation import ArrayLike, invalid, points_tensor, positive
+from autdtorch.utils.validation import (
+    ArrayLike,
+    finite_number,
+    integer_at_least,
+    invalid,
+    points_tensor,
+    positive,
+    real_tensor,
+    require_kind,
+)
 
 _OFF_PLANE = 0.02  # largest distance of a point from its plane, by the plane's longer edge
 _WIDER = 3  # cells around a picture, for its splines
+_MOST_CELLS = 2**22  # a camera has 2**20 pixels at most
 _SMOOTHING, _FINEST = 0.2, 1e-4  # for the place of a focus, by the radius
 
 
@@ -33,6 +43,8 @@ class Picture:
         frames: number of frames used.
         latency: time from the start of the sound until the frames show it [s].
         doubts: what is wrong with the frames, a sentence each.
+
+    `ValueError` for other shapes or kinds, or values that are not finite and >= 0.
     """
 
     plane: Plane
@@ -42,6 +54,24 @@ class Picture:
     frames: int = 0
     latency: float = 0.0
     doubts: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the attributes."""
+        require_kind("plane", self.plane, Plane)
+        for name in ("pressure", "deviation"):
+            values = real_tensor(name, getattr(self, name), "Pa").detach().cpu()
+            if values.ndim != 2 or not 0 < values.numel() <= _MOST_CELLS:
+                raise ValueError(
+                    f"{name}: shape {tuple(values.shape)}; must be (Nu, Nv), up to {_MOST_CELLS} cells"
+                )
+            if values.min() < 0:
+                raise invalid(name, float(values.min()), "must be >= 0 in every cell", "Pa")
+            object.__setattr__(self, name, values)
+        if self.pressure.shape != self.deviation.shape:
+            shape = tuple(self.deviation.shape)
+            raise invalid("deviation", shape, f"must be {tuple(self.pressure.shape)}, as pressure")
+        integer_at_least("frames", self.frames, 0)
+        finite_number("latency", self.latency, "s")
 
     def __repr__(self) -> str:
         """Return the size and the largest pressure."""
@@ -69,10 +99,10 @@ class Picture:
         """
         cells = self._cells(plane_coordinates(self.plane, points))
         spline = _spline(self.pressure.square().numpy())
-        pressure = np.sqrt(np.maximum(_interpolated(spline, cells), 0.0))
+        pressure = torch.from_numpy(np.sqrt(np.maximum(_interpolated(spline, cells), 0.0)))
         of_square = (self.pressure + self.deviation).square() - self.pressure.square()
         spread = map_coordinates(of_square.numpy(), cells.T, order=1, mode="nearest")
-        return torch.from_numpy(pressure), torch.from_numpy(deviation_of(pressure, spread))
+        return pressure, deviation_by_square(pressure, torch.from_numpy(spread))
 
     def foci(self, near: ArrayLike, radius: float = 5e-3) -> torch.Tensor:
         """Return the places (P, 3) [m] of the largest |p| within a radius [m] of points (P, 3) [m].
@@ -99,7 +129,8 @@ class Picture:
     def _climb(self, spline: Array, start: Array, radius: float) -> Array:
         """Return the largest place (2,) of a spline near a start (2,), by ever finer patches of 5 x 5."""
         offsets = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
-        place, step, bound = start, radius / 2, np.asarray(self.plane.size) / 2
+        step, bound = radius / 2, np.asarray(self.plane.size) / 2
+        place = start = np.clip(start, -bound, bound)
         while step > _FINEST * radius:
             around = np.clip(place + step * offsets, -bound, bound)
             around = around[np.linalg.norm(around - start, axis=1) <= 1.01 * radius]
@@ -116,11 +147,6 @@ class Picture:
     def _cells(self, coordinates: Array) -> Array:
         """Return the indices (P, 2), in parts of a cell, of coordinates (P, 2) [m]."""
         return np.asarray((coordinates / np.asarray(self.plane.size) + 0.5) * self._counts - 0.5)
-
-
-def deviation_of(pressure: Array, of_square: Array) -> Array:
-    """Return the deviation [Pa] of magnitudes [Pa] whose squares deviate by `of_square` [Pa^2]."""
-    return np.asarray(of_square / np.maximum(np.sqrt(pressure**2 + of_square) + pressure, 1e-300))
 
 
 def _spline(values: Array) -> Array:

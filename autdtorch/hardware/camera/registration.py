@@ -48,8 +48,9 @@ class Registration:
         """Check the attributes, and copy the arrays."""
         require_kind("plane", self.plane, Plane)
         matrix = _array("matrix", self.matrix)
-        if matrix.shape != (3, 3) or np.linalg.cond(matrix / np.abs(matrix).max()) > _LARGEST_CONDITION:
-            raise ValueError(f"matrix: shape {matrix.shape}; must be (3, 3), and invertible")
+        if matrix.shape != (3, 3) or not _is_view(matrix, self.plane):
+            accepted = "must be (3, 3), invertible, with all of the plane before the camera"
+            raise ValueError(f"matrix: shape {matrix.shape}; {accepted}")
         object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "residuals", _array("residuals", self.residuals))
 
@@ -63,14 +64,19 @@ class Registration:
             places: (K, 3) [m], in the plane; no three of four in a line.
 
         Raises:
-            ValueError: shapes that do not fit, places off the plane, or too near to a line.
+            ValueError: shapes that do not fit, places off the plane or too near to a line, or pixels that
+                no camera sees in this order.
         """
         require_kind("plane", plane, Plane)
         seen, coordinates = _pairs("pixels", pixels), plane_coordinates(plane, places, "places")
         if seen.ndim != 2 or len(seen) < 4 or len(coordinates) != len(seen):
             accepted = f"must be (K, 2), K >= 4, one for each of {len(coordinates)} places"
             raise ValueError(f"pixels: shape {seen.shape}; {accepted}")
-        matrix = _refined(_homography(coordinates, seen), coordinates, seen)
+        matrix = _homography(coordinates, seen)
+        if not _is_view(matrix, plane):
+            accepted = "must be in the order of the places, and no three of four in a line"
+            raise invalid("pixels", seen.round(2).tolist(), accepted)
+        matrix = _refined(matrix, coordinates, seen)
         registration = cls(plane, matrix)
         residuals = np.linalg.norm(registration.to_plane(seen) - coordinates, axis=1)
         registration = cls(plane, matrix, residuals)
@@ -187,6 +193,14 @@ def _projected(matrix: AnyArray, places: Array) -> Array:
     x, y = places[..., 0], places[..., 1]
     a, b, w = (row[0] * x + row[1] * y + row[2] for row in matrix)
     return np.stack([a / w, b / w], axis=-1)
+
+
+def _is_view(matrix: Array, plane: Plane) -> bool:
+    """Return true if a camera can see all of a plane by a homography (3, 3)."""
+    u, v = np.asarray(plane.size) / 2
+    depths = np.array([[-u, -v, 1], [-u, v, 1], [u, -v, 1], [u, v, 1]]) @ matrix[2]
+    is_invertible = np.linalg.cond(matrix / np.abs(matrix).max()) <= _LARGEST_CONDITION
+    return bool(is_invertible and (depths > 0).all() | (depths < 0).all())
 
 
 def _normalised(places: Array) -> tuple[Array, Array]:

@@ -17,6 +17,7 @@ from autdtorch.hardware.camera.registration import Registration
 from autdtorch.hardware.camera.screen import Screen
 from autdtorch.hardware.camera.usable_frames import frames_between, of_reading, reason_for, usable_frames
 from autdtorch.hardware.sensors.sensor import SensorError
+from autdtorch.objectives.readings import deviation_by_square
 from autdtorch.scene.geometry import Plane
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import (
@@ -145,8 +146,8 @@ class ThermalCamera:
 
         The squares of pressures have the noise of the last reading, alike at all points.
         """
-        square = pressure.square()
-        return (square + self._noise).sqrt() - pressure
+        pressure = real_tensor("pressure", pressure, "Pa")
+        return deviation_by_square(pressure, torch.full_like(pressure, self._noise))
 
     def _picture(self, frames: list[Frame], start: float, end: float, doubts: list[str]) -> Picture:
         images = np.stack([frame.image for frame in frames])
