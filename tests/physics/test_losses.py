@@ -25,6 +25,7 @@ from autdtorch.analytic import fluid_slab
 from autdtorch.fdtd.absorption import absorption
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import heterogeneous_cells
+from autdtorch.fdtd.assembly.losses import positive_part
 from autdtorch.fdtd.grid import make_box, make_grid
 from autdtorch.fdtd.region import Body, Fluid
 from autdtorch.fdtd.stencil import OFFSETS, flat_offsets
@@ -114,6 +115,26 @@ def forms(cells, assembly):
 
     whole = np.diag(mass)
     return whole, c.keep * whole + matrix(loss), -matrix(weight)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(-1, 1), st.floats(0, 8))
+def test_losses_without_their_negative_part_are_as_small_as_they_were(seed, share, digits):
+    """Also where a constant pressure loses next to no power: nothing may be divided by that.
+
+    At most four fields keep their flow, each no larger than the form; the rest is at most five times as large.
+    """
+    spread = np.random.default_rng(seed).normal(size=(8, 8))
+    form = spread + share * spread.T
+    form = (form + form.T)[None]
+    constant = np.full(8, 8**-0.5)
+    power = constant @ form[0] @ constant
+    form += (10**-digits - power) * np.outer(constant, constant)
+    positive = positive_part(form)
+    size = np.linalg.norm(form)
+    assert np.linalg.eigvalsh(positive).min() > -1e-12 * size
+    assert np.linalg.norm(positive) < 9 * size
+    passive = spread @ spread.T
+    np.testing.assert_allclose(positive_part(passive[None])[0], passive, atol=1e-12 * np.linalg.norm(passive))
 
 
 @settings(max_examples=12)

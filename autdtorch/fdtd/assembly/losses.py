@@ -83,7 +83,7 @@ def _passive(coupling: Array, mass: Array, air: Array) -> Array:
     form = stiffness_matrix(coupling)
     form[:, range(8), range(8)] += mass + air
     some = np.flatnonzero(_negative(form))
-    positive = _positive(form[some])
+    positive = positive_part(form[some])
     coupling[some] = -positive[:, PAIRS[:, 0], PAIRS[:, 1]]
     mass[some] = positive.sum(axis=2) - air[some]
     return np.concatenate((coupling, mass, np.zeros_like(mass)), axis=1)
@@ -93,14 +93,18 @@ def _passive(coupling: Array, mass: Array, air: Array) -> Array:
 _LINEAR = np.column_stack((np.full(8, 0.5), VERTICES - 0.5)) / math.sqrt(2)
 
 
-def _positive(form: Array) -> Array:
+def positive_part(form: Array) -> Array:
     """Return forms (n, 8, 8) without their negative parts.
 
-    Constant and linear fields keep the power that they have, if it is positive: only the rest is cut.
+    Constant and linear fields keep the power that they have, if it is positive: only the rest is cut. Forces
+    whose power is less than any positive form of this size gives count as if it were that: others would be
+    amplified without limit.
     """
     power, directions = np.linalg.eigh(_LINEAR.T @ form @ _LINEAR)
-    share = np.divide(1, power, out=np.zeros_like(power), where=power > 0)
     forces = form @ _LINEAR @ directions
+    size = np.linalg.norm(form, axis=(1, 2))[:, None]
+    least = np.divide((forces**2).sum(axis=1), size, out=np.zeros_like(power), where=size > 0)
+    share = np.divide(1, np.maximum(power, least), out=np.zeros_like(power), where=power > 0)
     flow = (forces * share[:, None]) @ forces.transpose(0, 2, 1)
     values, vectors = np.linalg.eigh(form - flow)
     return np.asarray(flow + (vectors * np.maximum(values, 0)[:, None]) @ vectors.transpose(0, 2, 1))
