@@ -121,9 +121,9 @@ def forms(cells, assembly):
 def test_losses_without_their_negative_part_are_as_small_as_they_were(seed, share, digits):
     """Also where a constant pressure loses next to no power: nothing may be divided by that.
 
-    At most four fields keep their flow, each no larger than the form; the rest is at most five times as large.
+    Four fields keep their flow, each no larger than the form; the rest is at most five times as large.
     """
-    spread = np.random.default_rng(seed).normal(size=(8, 8))
+    spread = np.random.default_rng(seed).standard_normal((8, 8))
     form = spread + share * spread.T
     form = (form + form.T)[None]
     constant = np.full(8, 8**-0.5)
