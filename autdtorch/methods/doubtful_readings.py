@@ -28,6 +28,7 @@ _CONSTANT = 1e-6  # relative deviation of constant readings
 _UNEXPLAINED = 0.3  # rms residual of the fit over rms readings; noise 10 dB below them leaves 0.22
 _SURPRISE = 6.0  # deviation of the last reading, in standard deviations of the noise, of an outlier
 _LEAST_SURPRISE = 0.3  # its least deviation relative to the fitted pressure
+_FINEST = 1e-6  # least deviation of a reading that counts, by their rms: what rounding allows
 _SHOWN = 3  # outliers that are listed
 
 
@@ -62,6 +63,7 @@ class Magnitudes:
         limit = outliers | (observed >= (1 - _EQUAL) * highest)
         if deviation is not None:
             deviation = torch.where(deviation.isnan(), deviation.nanmedian(), deviation)  # of gaps
+            deviation = deviation.clamp_min(_FINEST * float(observed.nan_to_num().square().mean().sqrt()))
         return cls(observed.masked_fill(outliers, 0), limit, phase, deviation)
 
     @property

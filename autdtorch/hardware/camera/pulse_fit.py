@@ -135,6 +135,7 @@ class PulseFit:
         solution = _conjugate_gradients(normal, adjoint(self._data, *nothing), tolerance)
         fields, offsets = parts(solution)
         self._left = self._data - weighted(fields, offsets)
+        self._fields = fields
         return np.asarray(fields[0])
 
     def misfit(self) -> float:
@@ -181,15 +182,19 @@ class PulseFit:
         """Return the latency [s], and its part of the relative deviation of |p|^2; None if it is not seen.
 
         The pixels, weighted by their heat, are summed for one curve over time. Its scale and its latency are
-        fitted together.
+        fitted together, with the heat that remains of earlier pulses.
         """
-        coefficients = self.solve(_ROUGH)
-        heat = np.maximum(self._cosines.forward(coefficients), 0.0) * self._full
-        weights = (coefficients * self._cosines.adjoint(heat)).ravel()
+        heat = np.maximum(self._cosines.forward(self.solve(_ROUGH)), 0.0) * self._full
+        weights = self._fields * self._cosines.adjoint(heat)
         decay = decay_of(self._screen, self._cosines.wavenumber).ravel()
         rates = np.geomspace(0.999 * decay.min(), 1.001 * decay.max(), 4 * _RATES)
-        parts = np.bincount(np.searchsorted(rates, decay), weights, len(rates))
-        curve, ones = self._values @ heat, np.ones_like(self._times)
+        place = np.searchsorted(rates, decay)
+        parts, *remains = (np.bincount(place, each.ravel(), len(rates)) for each in weights)
+        curve = self._values @ heat
+        rest = [
+            np.ones_like(self._times),
+            *(each @ np.exp(-rates[:, None] * self._times) for each in remains),
+        ]
 
         def course(latency: float) -> Array:
             return np.asarray(
@@ -197,7 +202,7 @@ class PulseFit:
             )
 
         def misfit(latency: float) -> float:
-            columns = np.stack([course(latency), ones], axis=1)
+            columns = np.stack([course(latency), *rest], axis=1)
             left = curve - columns @ np.linalg.lstsq(columns, curve, rcond=None)[0]
             return float(left @ left)
 
@@ -210,8 +215,8 @@ class PulseFit:
         latency = float(latencies[best]) + 0.5 * step * (below - above) / (below + above - 2 * at)
         rise, change = course(latency), (course(latency + step) - course(latency - step)) / (2 * step)
         noise = self.noise**2 * float(heat @ heat)
-        free = noise * _inverse_gram(rise, change, ones)
-        fixed = noise * _inverse_gram(rise, ones)
+        free = noise * _inverse_gram(rise, change, *rest)
+        fixed = noise * _inverse_gram(rise, *rest)
         if free[1, 1] > _CERTAIN**2:
             return None
         return latency, math.sqrt(max(free[0, 0] - fixed[0, 0], 0.0))
