@@ -164,6 +164,8 @@ def test_heat_of_an_earlier_sound_is_told_from_that_of_this() -> None:
     pressure, deviation = informed.at(truth.foci)
     assert float(((pressure - truth.pressure) / deviation).abs().max()) < 3
     assert float((naive.at(truth.foci)[0] / truth.pressure).max()) < 0.95
+    unknown = inversion().picture(TIMES, frames, DURATION, remaining=0.3)
+    assert unknown.latency == pytest.approx(LATENCY, abs=0.015)  # measured: 4 to 6 ms
 
 
 def test_places_of_foci_are_found_between_cells() -> None:

@@ -128,3 +128,12 @@ def test_methods_learn_from_points_that_are_only_seen(bench, make_objective, met
 
     assert share(measured, FOCI + PLACES) > 0.95
     assert share(measured, FOCI + PLACES) > share(measured, FOCI)
+
+
+def test_deviations_of_next_to_nothing_count_as_rounding(bench):
+    simulated, measured, _ = bench
+    drives = random_drives(40, TRANSDUCERS, generator(5))
+    exact = (drives @ measured.T).abs()
+    readings = at.Readings(drives, exact, deviation=torch.full_like(exact, 1e-12))
+    predicted = at.calibrate(simulated, readings, CLOSE, folds=0).predict(drives).pressure
+    torch.testing.assert_close(predicted, exact, rtol=1e-4, atol=1e-4)
