@@ -191,10 +191,8 @@ class PulseFit:
         place = np.searchsorted(rates, decay)
         parts, *remains = (np.bincount(place, each.ravel(), len(rates)) for each in weights)
         curve = self._values @ heat
-        rest = [
-            np.ones_like(self._times),
-            *(each @ np.exp(-rates[:, None] * self._times) for each in remains),
-        ]
+        faded = np.exp(-rates[:, None] * self._times)
+        rest: list[Array] = [np.ones_like(self._times), *(np.asarray(each @ faded) for each in remains)]
 
         def course(latency: float) -> Array:
             return np.asarray(
