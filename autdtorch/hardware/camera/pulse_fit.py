@@ -192,7 +192,7 @@ class PulseFit:
         parts, *remains = (np.bincount(place, each.ravel(), len(rates)) for each in weights)
         curve = self._values @ heat
         faded = np.exp(-rates[:, None] * self._times)
-        rest: list[Array] = [np.ones_like(self._times), *(np.asarray(each @ faded) for each in remains)]
+        rest = [np.ones_like(self._times), *(np.asarray(each @ faded, np.float64) for each in remains)]
 
         def course(latency: float) -> Array:
             return np.asarray(
