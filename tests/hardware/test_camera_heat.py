@@ -168,6 +168,13 @@ def test_heat_of_an_earlier_sound_is_told_from_that_of_this() -> None:
     assert unknown.latency == pytest.approx(LATENCY, abs=0.015)  # measured: 4 to 6 ms
 
 
+def test_a_latency_out_of_range_is_a_doubt_and_silence_has_none() -> None:
+    truth = pulse()
+    late = inversion().picture(TIMES - 0.3, truth.frames(), DURATION)  # the sound begins before time 0
+    assert any("latency" in doubt for doubt in late.doubts)
+    assert inversion().picture(TIMES, truth.frames() - truth.rises, DURATION).doubts == ()
+
+
 def test_places_of_foci_are_found_between_cells() -> None:
     truth = pulse(2)
     fine = at.Plane((*truth.foci[0, :2].tolist(), 0.12), (0.0, 0.0, 1.0), (4e-3, 4e-3)).points(0.05e-3)

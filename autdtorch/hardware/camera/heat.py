@@ -22,7 +22,7 @@ import torch
 from scipy.optimize import least_squares
 
 from autdtorch.hardware.camera.cosines import Cosines
-from autdtorch.hardware.camera.picture import Picture
+from autdtorch.hardware.camera.picture import Picture, clarity
 from autdtorch.hardware.camera.pulse_fit import PulseFit
 from autdtorch.hardware.camera.registration import Registration
 from autdtorch.hardware.camera.screen import Screen
@@ -45,6 +45,7 @@ _LATE = 0.1  # unit of a latency that is fitted with a screen [s]
 _FARTHEST = 3.0  # of a fitted screen from the one assumed: logarithms of factors, and latencies
 _SMOOTH = 0.2  # length over which the density of pixels is smoothed, in wavelengths
 _UNSEEN = 0.1  # of the median density of pixels
+_SOUND = 3.0  # clarity of a picture with sound in it; silence has 2
 _MISFIT = 1.3  # of the frames, by their noise, from which on it is a doubt
 
 
@@ -115,12 +116,10 @@ class HeatInversion:
             raise invalid("latency", latency, f"must be in {moments.min():g} to {moments.max():g}", "s")
         fit = PulseFit(self._cosines, self.screen, moments - shift, values, *settings)
         doubts, uncertainty = [], 0.0
-        if latency is None:
-            if (seen := fit.latency()) is None:
-                doubts.append("the latency of the frames is not seen, and taken as 0 s")
-            else:
-                shift, uncertainty = seen
-                fit = PulseFit(self._cosines, self.screen, moments - shift, values, *settings)
+        seen = fit.latency() if latency is None else (shift, 0.0)
+        if latency is None and seen is not None:
+            shift, uncertainty = seen
+            fit = PulseFit(self._cosines, self.screen, moments - shift, values, *settings)
         square = self._cosines.on_plane(fit.solve(), self.counts)
         if (misfit := fit.misfit()) > _MISFIT:
             doubts.append(f"the frames differ from a heated screen by {misfit:.3g} times their noise")
@@ -129,10 +128,13 @@ class HeatInversion:
             doubts.append(f"{100 * unseen:.2g} % of the plane is not seen")
         of_square = np.hypot(max(1.0, misfit) * np.sqrt(variance), uncertainty * square)
         pressure = torch.from_numpy(np.sqrt(np.maximum(square, 0.0)))
+        deviation = deviation_by_square(pressure, torch.from_numpy(of_square))
+        if seen is None and clarity(pressure, deviation) > _SOUND:
+            doubts.append("the latency of the frames is not seen, and taken as 0 s")
         return Picture(
             self.registration.plane,
             pressure,
-            deviation_by_square(pressure, torch.from_numpy(of_square)),
+            deviation,
             self.screen.heating is None,
             fit.frames,
             shift,

@@ -149,6 +149,11 @@ class Picture:
         return np.asarray((coordinates / np.asarray(self.plane.size) + 0.5) * self._counts - 0.5)
 
 
+def clarity(pressure: torch.Tensor, deviation: torch.Tensor) -> float:
+    """Return the largest pressure of a map (Nu, Nv) in its median deviations, as of dark places."""
+    return float(pressure.max() / deviation.median())
+
+
 def _spline(values: Array) -> Array:
     """Return the coefficients of a spline of fifth order through cells (Nu, Nv) and beyond their edges."""
     wide = np.pad(values, _WIDER, mode="reflect", reflect_type="odd")

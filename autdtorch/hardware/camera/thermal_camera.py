@@ -12,7 +12,7 @@ import torch
 
 from autdtorch.hardware.camera.frames import Degrees, Frame, FrameSource
 from autdtorch.hardware.camera.heat import HeatInversion
-from autdtorch.hardware.camera.picture import Picture, plane_coordinates
+from autdtorch.hardware.camera.picture import Picture, clarity, plane_coordinates
 from autdtorch.hardware.camera.registration import Registration
 from autdtorch.hardware.camera.screen import Screen
 from autdtorch.hardware.camera.usable_frames import frames_between, of_reading, reason_for, usable_frames
@@ -37,8 +37,8 @@ _LONGEST_WAIT = 60.0  # [s]
 _LEAST_BEFORE, _LEAST_DURING = 3, 4  # frames
 _LATE = 1.0  # [s] that late frames are waited for
 _NEAR = 3e-3  # of a saturated pixel to a point [m]
+_CLEAR = 10.0  # clarity of a picture from which on its latency is that of the camera
 _MOST_DEAD = 0.3  # share of the pixels
-_SEEN = 10.0  # standard deviations of a picture's maximum, from which on its latency is that of the camera
 
 
 class ThermalCamera:
@@ -165,7 +165,7 @@ class ThermalCamera:
             )
         except ValueError as error:
             raise SensorError(f"no picture: {error}") from error
-        if not picture.doubts and picture.pressure.max() > _SEEN * picture.deviation.median():
+        if not picture.doubts and clarity(picture.pressure, picture.deviation) > _CLEAR:
             self._latency = picture.latency
         self._warmth.add(self.screen.rate * float(picture.pressure.max()) ** 2 * (end - start), end)
         doubts += picture.doubts
