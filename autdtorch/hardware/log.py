@@ -236,7 +236,9 @@ def read_log(path: Path) -> tuple[dict[str, Any], list[Evaluation]]:
 
 
 def _deviation(row: Mapping[str, Any]) -> torch.Tensor | None:
-    return real_tensor("deviation", row["deviation"], "Pa") if "deviation" in row else None
+    if "deviation" not in row:
+        return None
+    return validate_magnitudes("deviation", row["deviation"], len(row["pressure"]))
 
 
 @contextlib.contextmanager

@@ -257,17 +257,23 @@ class LimitedLink:
 
     def _read_pulse(self, drive: torch.Tensor, sensor: PulsedSensor, points: int) -> torch.Tensor:
         """Return the reading (P,) [Pa] of a pulse; `LimitError` if the outputs go off before its end."""
+        is_over = False
 
         def end() -> None:
+            nonlocal is_over
             self.require_on()
             self.off()
+            is_over = True
 
         self._scale.asked(drive)  # an invalid one must not wait
         self.off()
         self._rest_now()
         self._seconds_left()
         try:
-            return checked_reading(Pulse(sensor, partial(self.play, drive), end), points)
+            reading = checked_reading(Pulse(sensor, partial(self.play, drive), end), points)
+            if not is_over:  # the sensor leaves it to the link
+                end()
+            return reading
         finally:
             self.off()
 

@@ -134,3 +134,20 @@ def test_a_first_picture_must_be_above_the_deviation_that_a_sensor_states(trial)
         sensor.deviation = lambda pressure: torch.full_like(pressure, peak)
         with pytest.raises(hw.SensorError, match="first picture"):
             hw.check_picture(link, sensor, 2, FULL)
+
+
+def test_a_pulse_that_its_sensor_does_not_end_is_void_if_the_time_was_up(trial):
+    class Endless(Heat):
+        def read_pulse(self, on, off):
+            return super().read_pulse(on, self._bench.drive)
+
+    def sensor(bench, seconds):
+        sensor = Endless(bench, lambda: time.sleep(seconds))
+        sensor._bench = type("Bench", (), {"drive": lambda: torch.zeros(1), "pressure": bench.pressure})
+        return sensor
+
+    with trial.limited(seconds_in_a_row=0.1) as (bench, link):
+        assert link.measure(FULL, sensor(bench, 0.0), 2).shape == (1, 2)
+        assert not bench.drive().any()
+        with pytest.raises(hw.LimitError):
+            link.measure(FULL, sensor(bench, 0.3), 2)

@@ -45,7 +45,7 @@ _LATE = 0.1  # unit of a latency that is fitted with a screen [s]
 _FARTHEST = 3.0  # of a fitted screen from the one assumed: logarithms of factors, and latencies
 _SMOOTH = 0.2  # length over which the density of pixels is smoothed, in wavelengths
 _UNSEEN = 0.1  # of the median density of pixels
-_SOUND = 3.0  # clarity of a picture with sound in it; silence has 2
+_SOUND = 4.0  # clarity of a picture with sound in it; silence has 1.6 to 3
 _MISFIT = 1.3  # of the frames, by their noise, from which on it is a doubt
 
 
