@@ -83,7 +83,7 @@ class _GoalBesideOthers(_BesideOthers):
         """Check goal and indices."""
         require_kind("goal", self.goal, Goal)
         if isinstance(self.goal, _BesideOthers) and not self._takes(self.goal):
-            raise invalid("goal", self.goal, "must be a goal without quiet points")
+            raise invalid("goal", self.goal, "must be a goal without quiet or seen points")
         super().__post_init__()
 
     def _takes(self, goal: _BesideOthers) -> bool:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from autdtorch.hardware import CallableFrames, ThermalCamera
 from autdtorch.hardware.camera.registration import Registration, hot_spot
 from autdtorch.scene.geometry import Plane
 
@@ -65,6 +66,8 @@ def test_pixels_in_an_order_that_no_camera_sees_are_refused() -> None:
     for order in ([0, 1, 3, 2], [0, 3, 2, 1], [1, 0, 2, 3]):  # round the plane, and others that cross
         with pytest.raises(ValueError, match=r"pixels: .*order of the places"):
             Registration.of(PLANE, corners[order], PLANE.corners)
+    with pytest.raises(ValueError, match=r"corners: pixels: .*order of the places"):
+        ThermalCamera(CallableFrames(lambda: None), PLANE, corners[[0, 1, 3, 2]])
     with pytest.raises(ValueError, match=r"pixels: .*three of four in a line"):
         Registration.of(PLANE, [[0, 0], [1, 1], [2, 2], [3, 9]], PLANE.corners)
     with pytest.raises(ValueError, match="before the camera"):

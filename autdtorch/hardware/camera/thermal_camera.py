@@ -28,6 +28,7 @@ from autdtorch.utils.validation import (
     positive,
     real_tensor,
     require_kind,
+    within,
 )
 
 logger = logging.getLogger(__name__)
@@ -92,7 +93,8 @@ class ThermalCamera:
             pixels = real_tensor("corners", corners)
             if pixels.shape != (4, 2):
                 raise ValueError(f"corners: shape {tuple(pixels.shape)}; must be (4, 2), as (column, row)")
-            self.registration = Registration.of(plane, pixels, plane.corners)
+            with within("corners"):
+                self.registration = Registration.of(plane, pixels, plane.corners)
         self._source, self._plane = frames, plane
         grid = plane.points(spacing)
         self._counts = grid.shape[0], grid.shape[1]
