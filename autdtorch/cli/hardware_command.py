@@ -363,6 +363,8 @@ class _Trial:
     def _calibration(self, preflight: hardware.Preflight) -> Calibration | str:
         """Return the simulation fitted to the evaluations, or the reason why there is none."""
         readings = load_readings(self._folder / _LOG_FILE)
+        if len(readings.drives) == 1:
+            return "one evaluation does not tell the transducers apart"
         drives = readings.drives.clone()
         drives[:, preflight.failed] = 0
         rows = torch.linspace(0, len(drives) - 1, min(len(drives), _MOST_FITTED), **REAL).round().long()
@@ -378,7 +380,7 @@ class _Trial:
         count, points = len(self._scene.array), len(self._scene.control_points)
         if isinstance(sensor, hardware.PulsedSensor):
             logger.info(
-                "the sensor sees no single transducer: no check of each, but of silence and a picture"
+                "the sensor does not see a transducer alone: silence and one picture are checked instead"
             )
             progress.begin("a first picture, of the simulated drive")
             check = hardware.check_picture(limited, sensor, points, self._expected.drive[0], readings)

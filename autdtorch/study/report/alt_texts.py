@@ -56,7 +56,7 @@ def of_planes(pressure: Spread) -> str:
 
 def of_measured(measured: torch.Tensor, simulated: torch.Tensor) -> str:
     """Return the text of the maps of the plane of a camera: the highest pressures."""
-    peaks = f"up to {measured.max():.3g} Pa as measured, up to {simulated.max():.3g} Pa as simulated"
+    peaks = f"up to {measured.max():.4g} Pa as measured, up to {simulated.max():.4g} Pa as simulated"
     return f"Maps of the pressure on the plane of the camera: {peaks}"
 
 

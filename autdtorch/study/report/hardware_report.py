@@ -75,10 +75,13 @@ def write_hardware_report(
     fit = compare(measured, predicted)
     # A pressure scales with the transducers; a score without unit does not.
     scale = fit.scale if goal.unit else 1.0
-    histories = {"bench": solution.history, "simulation": scale * expected.history}
-    label = score_label(f"{goal.name}, best so far", goal.unit)
-    with naming(folder / _FIGURE):
-        plot_convergence({scene.name: histories}, label=label).savefig(folder / _FIGURE)
+    convergence = None
+    if len(evaluations) > 1:
+        histories = {"bench": solution.history, "simulation": scale * expected.history}
+        label = score_label(f"{goal.name}, best so far", goal.unit)
+        with naming(folder / _FIGURE):
+            plot_convergence({scene.name: histories}, label=label).savefig(folder / _FIGURE)
+        convergence = picture(_FIGURE, alt_texts.of_bench(solution, scale, expected, goal.unit))
     if isinstance(calibration, Calibration):
         with naming(folder / _CALIBRATION_FIGURE):
             plot_calibration(calibration).savefig(folder / _CALIBRATION_FIGURE)
@@ -97,7 +100,7 @@ def write_hardware_report(
         times=times,
         interval=statistics.median_low(gaps) if gaps else 0.0,  # an interruption does not change it
         found=solution,
-        convergence=picture(_FIGURE, alt_texts.of_bench(solution, scale, expected, goal.unit)),
+        convergence=convergence,
         goal=score_label(goal.name),
         unit=goal.unit and f" {goal.unit}",
         score_again=float(goal(again_mean)),
