@@ -52,7 +52,9 @@ def usable_frames(frames: Sequence[Frame], doubts: list[str]) -> list[Frame]:
     medians = np.array([np.nanmedian(frame.image) for frame in shown])
     middle = float(np.median(medians))
     if not _USUAL[0] <= middle <= _USUAL[1]:
-        accepted = f"must be {_USUAL[0]:g} to {_USUAL[1]:g} degrees C; check scale and zero (of integers alone)"
+        accepted = (
+            f"must be {_USUAL[0]:g} to {_USUAL[1]:g} degrees C; check scale and zero (of integers alone)"
+        )
         raise SensorError(f"the frames show {middle:.4g}: {accepted}")
     flashes = _flashes(medians)
     if flashes.mean() > _MOST_FLASHES:
