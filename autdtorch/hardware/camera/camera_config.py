@@ -12,7 +12,7 @@ from autdtorch.hardware.camera.frames import FolderFrames, FrameSource, uvc_fram
 from autdtorch.hardware.camera.screen import Screen
 from autdtorch.hardware.camera.thermal_camera import ThermalCamera
 from autdtorch.hardware.sensors.sensor import PulsedSensor, SensorConfig, Setup
-from autdtorch.utils.validation import invalid, require_known, require_one_of
+from autdtorch.utils.validation import invalid, require_known, require_one_of, within
 
 _KINDS = ("folder", "uvc")
 _NEEDED = {
@@ -49,7 +49,8 @@ class CameraConfig(SensorConfig):
         super().check(emulated)
         require_one_of("hardware.sensor.frames", self.frames, _KINDS)
         require_known("hardware.sensor.screen", self.screen, [field.name for field in fields(Screen)])
-        Screen(**self.screen)
+        with within("hardware.sensor.screen"):
+            Screen(**self.screen)
         if emulated:
             return
         for key, wanted in (("corners", True), ("path", self.frames == "folder")):
@@ -66,17 +67,19 @@ class CameraConfig(SensorConfig):
             accepted = "must be the plane of the screen, which holds the control points"
             raise invalid("scene.observation_plane", None, accepted)
         with self._source(setup, screen) as (source, corners):
-            yield ThermalCamera(
-                source,
-                scene.observation_plane,
-                corners,
-                scene.control_points,
-                screen=screen,
-                wavelength=scene.medium.sound_speed / scene.frequency,
-                pulse=self.pulse,
-                before=self.before,
-                after=self.after,
-            )
+            with within("hardware.sensor"):
+                camera = ThermalCamera(
+                    source,
+                    scene.observation_plane,
+                    corners,
+                    scene.control_points,
+                    screen=screen,
+                    wavelength=scene.medium.sound_speed / scene.frequency,
+                    pulse=self.pulse,
+                    before=self.before,
+                    after=self.after,
+                )
+            yield camera
 
     @contextlib.contextmanager
     def _source(self, setup: Setup, screen: Screen) -> Iterator[tuple[FrameSource, Any]]:
