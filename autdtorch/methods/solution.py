@@ -49,16 +49,18 @@ class Solution:
         return html_facts("Solution", self._facts())
 
     def _facts(self) -> list[tuple[str, str]]:
-        weakest = self.pressure.amin(dim=1)
-        reached = f"{weakest.max():.4g} Pa"
-        if len(weakest) > 1:
-            reached = f"best {reached}, median {weakest.quantile(0.5):.4g} Pa, worst {weakest.min():.4g} Pa"
+        is_weakest = torch.equal(self.score, self.pressure.amin(dim=1))  # else of another goal
+        name, unit = ("weakest focus", " Pa") if is_weakest else ("score", "")
+        score = self.score
+        reached = f"{score.max():.4g}{unit}"
+        if len(score) > 1:
+            reached = f"best {reached}, median {score.quantile(0.5):.4g}{unit}, worst {score.min():.4g}{unit}"
         low, high = int(self.evaluations.min()), int(self.evaluations.max())
         return [
-            ("trials", str(len(weakest))),
+            ("trials", str(len(score))),
             ("transducers", str(self.drive.shape[1])),
             ("foci", str(self.pressure.shape[1])),
-            ("weakest focus", reached),
+            (name, reached),
             ("evaluations", str(low) if low == high else f"{low} to {high}"),
         ]
 
