@@ -158,7 +158,16 @@ def main(page: Page, seeds: int) -> None:
         f"Error of |p| at a focus: medians and quartiles of {seeds} seeds, and dots as stated. Where an axis "
         "does not say otherwise: a polyester mesh of 28 µm, 1 s, 50 mK, 30 frames/s, pixels of 0.8 mm.",
         table(
-            ["peaks", "error of a pressure [%]", "as stated", "place [mm]", "foci", "loud cells", "dark cells", "edges"],
+            [
+                "peaks",
+                "error of a pressure [%]",
+                "as stated",
+                "place [mm]",
+                "foci",
+                "loud cells",
+                "dark cells",
+                "edges",
+            ],
             rows,
         ),
         "Last four columns: rms errors over stated ones. Registered by nine foci of 2 kPa, places are "
