@@ -55,7 +55,7 @@ class Identify(Method):
     than another drive whose readings the matrix explains.
 
     Earlier readings of the problem, and drives told that were not asked for, are fitted together with the
-    others. They stand for random drives as far as they show something else of the matrix.
+    others. They replace random drives where these would show nothing new of the matrix.
 
     Readings far from the fit of the others are left out, and readings at the end of a sensor's range are
     taken as lower limits. Both are logged, like a sensor that does not respond to the drives.

@@ -60,7 +60,7 @@ class LinearisedReadings:
     ) -> LinearisedReadings:
         """Linearise readings (N, P) of drives (N, M) around a matrix (P, M) [Pa].
 
-        `variance` (P,) [Pa^2] is that of the noise of each point. See the class for the others.
+        `variance` (P,) [Pa^2] belongs to the noise of each point. See the class for the others.
         """
         pressure = drives @ matrix.T
         magnitudes, unit = pressure.abs(), pressure.sgn().conj()
@@ -69,7 +69,7 @@ class LinearisedReadings:
         turns = unit * decided
         weight = None
         if read.deviation is not None:
-            # The noise is that of |p|^2, as a camera has it; magnitudes near 0 would have a bias.
+            # A camera's noise is in |p|^2; magnitudes near 0 would have a bias.
             weight = read.stated / read.deviation
             by_square = weight / (2 * read.value + read.deviation)
             left = left * (magnitudes + read.nearest(magnitudes)) * by_square

@@ -268,7 +268,7 @@ class CallableFrames:
         Args:
             take: returns an image (H, W), or None where none came in time. Any error it raises ends the
                 trial.
-            clock: returns the time [s]; a frame's time is that of its return.
+            clock: returns the time [s]; each frame gets the time of its return.
             scale: degrees C are `scale` times integers, plus `zero`; decimal numbers are degrees C.
             zero: temperature of the integer 0 [degrees C].
             stale: frames that a driver may hold from before a pulse, and that are dropped as it begins.

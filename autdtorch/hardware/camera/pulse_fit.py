@@ -153,8 +153,8 @@ class PulseFit:
     def variance(self, counts: tuple[int, ...], length: float) -> tuple[Array, Array]:
         """Return the posterior variance (Nu, Nv) of |p|^2 [Pa^4] in cells of the plane, and their density.
 
-        The density of valid pixels, by its mean, is smoothed over a length [m]. The variance at a place
-        is that of a plane with equal density.
+        The density of valid pixels, by its mean, is smoothed over a length [m]. A place has
+        the variance of a plane with its density throughout.
         """
         density = np.maximum(self._cosines.density(self._seen(), counts, length), 1e-6)
         steps = np.geomspace(density.min() * 0.99, density.max() * 1.01, 40)

@@ -32,8 +32,8 @@ class Screen:
     - Diffusivity: air conducts k |kappa| from a pattern of wavenumber kappa to each side, which at the
       finest of |p|^2 at 40 kHz (4.3 mm) is as much as D = 7e-7 m^2/s; less at longer ones, so 5e-7.
     - Heating: holes of 80 um in such a mesh resist the flow with 28 Pa s/m (Maa's micro-perforated plate
-      at 40 kHz), which absorbs 6 % of the intensity |p|^2 / (2 rho c): 1.6e-6 K/(s Pa^2), of which the
-      threads are taken to get two thirds.
+      at 40 kHz), which absorbs 6 % of the intensity |p|^2 / (2 rho c). That is 1.6e-6 K/(s Pa^2); the threads
+      are taken to get two thirds.
 
     Attributes:
         diffusivity: D along the screen [m^2/s], > 0.

@@ -38,7 +38,7 @@ _LONGEST_WAIT = 60.0  # [s]
 _LEAST_BEFORE, _LEAST_DURING = 3, 4  # frames
 _LATE = 1.0  # [s] that late frames are waited for
 _NEAR = 3e-3  # of a saturated pixel to a point [m]
-_CLEAR = 10.0  # clarity of a picture from which on its latency is that of the camera
+_CLEAR = 10.0  # clarity of a picture from which on its latency holds for the camera
 _MOST_DEAD = 0.3  # share of the pixels
 
 

@@ -193,7 +193,7 @@ class _View:
         self._axes = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ np.array(lean)
 
     def pixels(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return pixels (..., 2) of places (..., 2); the centre of the image is that of the plane."""
+        """Return pixels (..., 2) of places (..., 2); the image and the plane have one centre."""
         seen = np.concatenate([places, np.zeros_like(places[..., :1])], axis=-1) @ self._axes.T
         middle = (np.array(self._shape[::-1]) - 1) / 2
         return np.asarray(middle + self._scale * seen[..., :2] / (_DISTANCE - seen[..., 2:]))

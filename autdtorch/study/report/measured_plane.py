@@ -27,7 +27,7 @@ _FIGURE = "plane.png"
 def measured_plane(
     folder: Path, propagator: Propagator, drive: torch.Tensor, scale: float, names: Sequence[str]
 ) -> dict[str, Any]:
-    """Draw the plane that a camera saw, and return what the report tells of it; nothing without pictures.
+    """Draw the plane that a camera saw, and return its values for the report; none without pictures.
 
     Args:
         folder: of the trial, with the pictures of its drive; the figure goes there.
