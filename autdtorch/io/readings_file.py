@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Mapping
 from dataclasses import replace
@@ -32,6 +33,8 @@ from autdtorch.utils.validation import (
     require_known,
     within,
 )
+
+logger = logging.getLogger(__name__)
 
 _LOG = "trial.jsonl"  # in the folder of a hardware trial
 _TITLES = {"phases": "phase", "amplitudes": "amplitude", "pressure": "pressure", "phase": "pressure phase"}
@@ -212,6 +215,9 @@ def _from_log(path: Path, points: torch.Tensor | None) -> Readings:
     pressure = torch.stack([evaluation.pressure for evaluation in evaluations])
     known = [one.deviation for one in evaluations if one.deviation is not None]
     deviation = torch.stack(known) if len(known) == len(evaluations) else None
+    if known and deviation is None:
+        count = len(evaluations)
+        logger.warning("%s: %d of %d evaluations have deviations: none is used", path, len(known), count)
     return Readings(_played(origin, drives), pressure, points, deviation=deviation)
 
 
