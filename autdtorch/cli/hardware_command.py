@@ -207,6 +207,8 @@ def _ask(question: str) -> str:
 _Measured: TypeAlias = tuple[Solution, torch.Tensor, hardware.Preflight, hardware.EvaluationLog]
 
 _LOG_FILE = "trial.jsonl"
+_MOST_PICTURES = 24  # of 249 transducers and 500 places, these take some 30 s
+_SEEN_APART = 0.5  # of places in pictures, in wavelengths
 _MOST_FITTED = 200  # evaluations: of 249 transducers and 4 points, these take 40 s on two busy cores
 
 
@@ -362,12 +364,16 @@ class _Trial:
 
     def _calibration(self, preflight: hardware.Preflight) -> Calibration | str:
         """Return the simulation fitted to the evaluations, or the reason why there is none."""
-        readings = load_readings(self._folder / _LOG_FILE)
+        readings, most = load_readings(self._folder / _LOG_FILE), _MOST_FITTED
+        pictures, plane = self._folder / PICTURES, self._scene.observation_plane
+        if plane is not None and any(pictures.glob("evaluation_*.npz")):  # they see more than the points
+            places = plane.points(_SEEN_APART * self._scene.medium.sound_speed / self._scene.frequency)
+            readings, most = load_readings(pictures, points=places.reshape(-1, 3)), _MOST_PICTURES
         if len(readings.drives) == 1:
             return "one evaluation does not tell the transducers apart"
         drives = readings.drives.clone()
         drives[:, preflight.failed] = 0
-        rows = torch.linspace(0, len(drives) - 1, min(len(drives), _MOST_FITTED), **REAL).round().long()
+        rows = torch.linspace(0, len(drives) - 1, min(len(drives), most), **REAL).round().long()
         try:
             return calibrate(self._propagator, replace(readings, drives=drives)[rows])
         except Exception as error:  # the trial has succeeded, and its report does not need a fit

@@ -16,6 +16,8 @@ from autdtorch.hardware.devices import DEVICES
 from autdtorch.hardware.link import AmplitudeScale, Wiring
 from autdtorch.hardware.log import read_log
 from autdtorch.io.csv_table import write_table
+from autdtorch.io.drive_file import load_drive
+from autdtorch.io.picture_file import PICTURES, load_picture
 from autdtorch.io.readings_columns import Named, checked_names
 from autdtorch.io.readings_table import Table, Units, csv_table, frame_table, plain_number, readings_of
 from autdtorch.io.readings_units import angle_unit, phase_unit, pressure_unit
@@ -37,6 +39,7 @@ from autdtorch.utils.validation import (
 logger = logging.getLogger(__name__)
 
 _LOG = "trial.jsonl"  # in the folder of a hardware trial
+_APART = 2e-3  # of places in a picture [m], a quarter of a wavelength at 40 kHz
 _TITLES = {"phases": "phase", "amplitudes": "amplitude", "pressure": "pressure", "phase": "pressure phase"}
 _UNITS = {"pressure": "Pa peak", "phase": "rad"}  # of files that `save_readings` writes
 
@@ -61,6 +64,8 @@ def load_readings(
       `pressure` (R, P), `phase` (R, P), `deviation` (R, P) [Pa peak] and `points` (P, 3) [m].
     - `.jsonl`: the log of a hardware trial, or the folder that holds it. Drives are those that the device
       played.
+    - The folder `pictures` of a trial with a camera: a row for each evaluation, at places 2 mm apart, nearer
+      than which errors are alike. `points` in the plane choose other places.
 
     Units are stated by the titles or here, and never guessed. Phases are phi of the drive q = a e^{-i phi};
     titles `arg q 0 [deg]`, or `phases="arg deg"`, state arg q = -phi, and so do levels. Phases of the
@@ -99,6 +104,9 @@ def load_readings(
     if hasattr(source, "columns") and hasattr(source, "to_numpy"):
         return readings_of(frame_table(source), named, units, rows, places)
     path = path_of("source", source, "a file, or a data frame")
+    if path.is_dir() and path.name == PICTURES:
+        _refuse(path, {"columns": named, **units._asdict(), "drives": rows})
+        return _from_pictures(path, places)
     path = path / _LOG if path.is_dir() else path
     if not (path.suffix or path.exists()):
         raise FileNotFoundError(f"source: {path}; there is no such file or folder")
@@ -219,6 +227,19 @@ def _from_log(path: Path, points: torch.Tensor | None) -> Readings:
         count = len(evaluations)
         logger.warning("%s: %d of %d evaluations have deviations: none is used", path, len(known), count)
     return Readings(_played(origin, drives), pressure, points, deviation=deviation)
+
+
+def _from_pictures(folder: Path, points: torch.Tensor | None) -> Readings:
+    """Return the readings of a trial's pictures, with the drives that its device played."""
+    paths = sorted(folder.glob("evaluation_*.npz"))
+    if not paths:
+        raise ValueError(f"{folder}: no picture of an evaluation; must have at least one")
+    pictures = [load_picture(path) for path in paths]
+    places = pictures[0].plane.points(_APART).reshape(-1, 3) if points is None else points
+    pressure, deviation = map(torch.stack, zip(*(one.at(places) for one in pictures), strict=True))
+    origin, _ = read_log(folder.parent / _LOG)
+    drives = torch.stack([load_drive(path) for path in paths])
+    return Readings(_played(origin, drives), pressure, places, deviation=deviation)
 
 
 def _played(origin: Mapping[str, Any], drives: torch.Tensor) -> torch.Tensor:
