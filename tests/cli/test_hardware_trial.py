@@ -17,7 +17,7 @@ import yaml
 from filelock import FileLock
 
 import autdtorch.cli.hardware_command
-from autdtorch.cli.hardware_command import Bench, indices_of
+from autdtorch.cli.configured_bench import Bench, indices_of
 from autdtorch.cli.main import CONFIGS
 from autdtorch.hardware import (
     DEVICES,
