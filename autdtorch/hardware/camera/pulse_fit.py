@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
+from scipy.sparse.linalg import LinearOperator, cg
 
 from autdtorch.hardware.camera.cosines import Cosines
 from autdtorch.hardware.camera.screen import Screen, decay_of, rise_of
@@ -132,7 +132,9 @@ class PulseFit:
             return adjoint(weighted(fields, offsets), fields, offsets)
 
         nothing = np.zeros_like(scale), np.zeros_like(offset_scale)
-        solution = _conjugate_gradients(normal, adjoint(self._data, *nothing), tolerance)
+        right = adjoint(self._data, *nothing)
+        matrix = LinearOperator((len(right), len(right)), normal, dtype=np.float64)
+        solution, _ = cg(matrix, right, rtol=tolerance, maxiter=_ITERATIONS)
         fields, offsets = parts(solution)
         self._left = self._data - weighted(fields, offsets)
         self._fields = fields
@@ -233,20 +235,3 @@ def _orthonormal(courses: Array) -> Array:
 def _inverse_gram(*columns: Array) -> Array:
     table = np.stack(columns, axis=1)
     return np.asarray(np.linalg.inv(table.T @ table))
-
-
-def _conjugate_gradients(normal: Callable[[Array], Array], right: Array, tolerance: float) -> Array:
-    """Return the solution of normal(x) = right."""
-    solution, residual = np.zeros_like(right), right.copy()
-    direction, square = right.copy(), float(right @ right)
-    goal = tolerance**2 * square
-    for _ in range(_ITERATIONS):
-        if square <= goal:
-            break
-        image = normal(direction)
-        step = square / float(direction @ image)
-        solution += step * direction
-        residual -= step * image
-        square, before = float(residual @ residual), square
-        direction = residual + (square / before) * direction
-    return solution
