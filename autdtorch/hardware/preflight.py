@@ -100,8 +100,8 @@ def check_transducers(
     finally:
         link.off()
     pressure = torch.tensor(powers, **REAL).sqrt()
-    above_noise = math.sqrt(silence * (1 + _DEVIATIONS / math.sqrt(readings * points)))
-    return Preflight(pressure, math.sqrt(silence), max(above_noise, _WEAK * float(pressure.median())))
+    threshold = max(_above_noise(silence, readings * points), _WEAK * float(pressure.median()))
+    return Preflight(pressure, math.sqrt(silence), threshold)
 
 
 def check_picture(
@@ -117,7 +117,7 @@ def check_picture(
     points = integer_at_least("points", points, 1)
     readings = readings_count("readings", readings)
     silence = _power(_silent(sensor, points), readings)
-    threshold = math.sqrt(silence * (1 + _DEVIATIONS / math.sqrt(readings * points)))
+    threshold = _above_noise(silence, readings * points)
     if (deviation := getattr(sensor, "deviation", None)) is not None:  # its silence may be 0 by chance
         of_silence = float(deviation(torch.zeros(points, **REAL)).max())
         threshold = max(threshold, math.sqrt(_DEVIATIONS) * of_silence)
@@ -140,6 +140,11 @@ def hears_silence(sensor: AnySensor, check: Preflight, points: int, readings: in
     points = integer_at_least("points", points, 1)
     readings = readings_count("readings", readings)
     return math.sqrt(_power(_silent(sensor, points), readings)) <= check.threshold
+
+
+def _above_noise(power: float, numbers: int) -> float:
+    """Return the pressure [Pa] above noise of a mean power [Pa^2] over so many numbers."""
+    return math.sqrt(power * (1 + _DEVIATIONS / math.sqrt(numbers)))
 
 
 def _silent(sensor: AnySensor, points: int) -> Callable[[], torch.Tensor]:

@@ -175,6 +175,11 @@ def _repeats(keys: Iterable[tuple[int, int]]) -> list[int]:
     return repeats
 
 
+def deviation_of_square(pressure: torch.Tensor, deviation: torch.Tensor) -> torch.Tensor:
+    """Return how much [Pa^2] the squares of magnitudes [Pa] deviate by their `Readings.deviation` [Pa]."""
+    return (pressure + deviation).square() - pressure.square()
+
+
 def deviation_by_square(pressure: torch.Tensor, of_square: torch.Tensor) -> torch.Tensor:
     """Return the `Readings.deviation` [Pa] of magnitudes [Pa] whose squares deviate by `of_square` [Pa^2]."""
     least = torch.finfo(pressure.dtype).tiny

@@ -74,7 +74,7 @@ class CameraConfig(SensorConfig):
                     corners,
                     scene.control_points,
                     screen=screen,
-                    wavelength=scene.medium.sound_speed / scene.frequency,
+                    wavelength=scene.wavelength,
                     pulse=self.pulse,
                     before=self.before,
                     after=self.after,

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
-from autdtorch.objectives.readings import Readings, deviation_by_square
+from autdtorch.objectives.readings import Readings, deviation_by_square, deviation_of_square
 from autdtorch.scene.geometry import Plane, cell_centers_of
 from autdtorch.utils.array_types import REAL, Array
 from autdtorch.utils.validation import (
@@ -100,7 +100,7 @@ class Picture:
         cells = self._cells(plane_coordinates(self.plane, points))
         spline = _spline(self.pressure.square().numpy())
         pressure = torch.from_numpy(np.sqrt(np.maximum(_interpolated(spline, cells), 0.0)))
-        of_square = (self.pressure + self.deviation).square() - self.pressure.square()
+        of_square = deviation_of_square(self.pressure, self.deviation)
         spread = map_coordinates(of_square.numpy(), cells.T, order=1, mode="nearest")
         return pressure, deviation_by_square(pressure, torch.from_numpy(spread))
 

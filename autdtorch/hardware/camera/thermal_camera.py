@@ -17,7 +17,7 @@ from autdtorch.hardware.camera.registration import Registration
 from autdtorch.hardware.camera.screen import Screen
 from autdtorch.hardware.camera.usable_frames import frames_between, of_reading, reason_for, usable_frames
 from autdtorch.hardware.sensors.sensor import SensorError
-from autdtorch.objectives.readings import deviation_by_square
+from autdtorch.objectives.readings import deviation_by_square, deviation_of_square
 from autdtorch.scene.geometry import Plane
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import (
@@ -140,7 +140,7 @@ class ThermalCamera:
         self._require_enough(usable, frames, start, end)
         self.picture = self._picture(usable, start, end, doubts)
         pressure, deviation = self.picture.at(self._points)
-        self._noise = float(((pressure + deviation).square() - pressure.square()).median())
+        self._noise = float(deviation_of_square(pressure, deviation).median())
         return pressure
 
     def deviation(self, pressure: torch.Tensor) -> torch.Tensor:
@@ -162,7 +162,6 @@ class ThermalCamera:
                 images,
                 end - start,
                 latency=self._latency,
-                saturation=self._saturation if math.isfinite(self._saturation) else None,
                 remaining=self._warmth.at(start, self.screen),
             )
         except ValueError as error:
@@ -192,7 +191,7 @@ class ThermalCamera:
         return self._heat
 
     def _leave_out(self, images: Degrees, doubts: list[str]) -> None:
-        """Set dead pixels to NaN; `SensorError` if pixels at a point are saturated, or most are dead."""
+        """Set dead and saturated pixels to NaN; `SensorError` if most are dead, or a point is saturated."""
         finite = np.isfinite(images)
         dead = np.where(finite, images, -np.inf).max(axis=0) <= np.where(finite, images, np.inf).min(axis=0)
         if dead.mean() > _MOST_DEAD:
@@ -200,7 +199,8 @@ class ThermalCamera:
         if dead.any():
             images[:, dead] = np.nan
             doubts.append(f"{counted(int(dead.sum()), 'pixel')} dead")
-        hot = (~finite | (images >= self._saturation)).any(axis=0) & ~dead
+        images[images >= self._saturation] = np.nan
+        hot = ~np.isfinite(images).all(axis=0) & ~dead
         if hot.any():
             rows, columns = np.nonzero(hot)
             places = self.registration.to_plane(np.stack([columns, rows], axis=1).astype(np.float64))

@@ -11,6 +11,7 @@ import torch
 from autdtorch.hardware.camera.picture import Picture
 from autdtorch.io.picture_file import AGAIN, PICTURES, load_picture
 from autdtorch.objectives.metrics import focus_metrics
+from autdtorch.objectives.readings import deviation_by_square, deviation_of_square
 from autdtorch.plot.camera_figure import camera_figure
 from autdtorch.plot.data import outside_on_plane
 from autdtorch.propagators import Propagator
@@ -65,13 +66,13 @@ def measured_plane(
 def _mean(pictures: Sequence[Picture]) -> Picture:
     """Return the picture of the mean |p|^2, with the deviation of this mean."""
     first, square = pictures[0], torch.stack([one.pressure.square() for one in pictures])
-    above = torch.stack([(one.pressure + one.deviation).square() for one in pictures])
+    of_square = torch.stack([deviation_of_square(one.pressure, one.deviation) for one in pictures])
     mean = square.mean(dim=0)
-    spread = (above - square).square().mean(dim=0).sqrt() / len(pictures) ** 0.5
+    spread = of_square.square().mean(dim=0).sqrt() / len(pictures) ** 0.5
     doubts = dict.fromkeys(doubt for one in pictures for doubt in one.doubts)
     frames = sum(one.frames for one in pictures)
     pressure = mean.sqrt()
-    deviation = (mean + spread).sqrt() - pressure
+    deviation = deviation_by_square(pressure, spread)
     return Picture(first.plane, pressure, deviation, first.relative, frames, first.latency, tuple(doubts))
 
 
