@@ -32,7 +32,7 @@ from autdtorch.hardware.camera.orientation import turned
 from autdtorch.hardware.sensors.sensor import AnySensor
 from autdtorch.io.drive_file import save_drive
 from autdtorch.io.goal_section import goal_section, load_goal, score_label
-from autdtorch.io.picture_file import AGAIN, PICTURES, save_picture
+from autdtorch.io.picture_file import AGAIN, EVALUATION, PICTURES, pictures_of_evaluations, save_picture
 from autdtorch.io.readings_file import load_readings
 from autdtorch.methods.calibration.calibrate import calibrate
 from autdtorch.methods.calibration.calibration import Calibration
@@ -211,11 +211,12 @@ class _Trial:
 
     def _calibration(self, preflight: hardware.Preflight) -> Calibration | str:
         """Return the simulation fitted to the evaluations, or the reason why there is none."""
-        readings, most = load_readings(self._folder / _LOG_FILE), _MOST_FITTED
         pictures, plane = self._folder / PICTURES, self._scene.observation_plane
-        if plane is not None and any(pictures.glob("evaluation_*.npz")):  # they see more than the points
-            places = plane.points(_SEEN_APART * self._scene.medium.sound_speed / self._scene.frequency)
-            readings, most = load_readings(pictures, points=places.reshape(-1, 3)), _MOST_PICTURES
+        if plane is not None and pictures_of_evaluations(pictures):  # they see more than the points
+            places = plane.points(_SEEN_APART * self._scene.wavelength).reshape(-1, 3)
+            readings, most = load_readings(pictures, points=places), _MOST_PICTURES
+        else:
+            readings, most = load_readings(self._folder / _LOG_FILE), _MOST_FITTED
         if len(readings.drives) == 1:
             return "one evaluation does not tell the transducers apart"
         drives = readings.drives.clone()
@@ -311,7 +312,7 @@ def _watcher(progress: Progress, goal: Goal, pictures: _Pictures) -> Callable[[h
 
     def watch(evaluation: hardware.Evaluation) -> None:
         nonlocal best
-        pictures.keep(f"evaluation_{next(numbers):05d}", evaluation.drive)
+        pictures.keep(f"{EVALUATION}_{next(numbers):05d}", evaluation.drive)
         progress.advance(1)
         score = float(goal(evaluation.pressure))
         if score > best:

@@ -111,10 +111,10 @@ def _shortened(
             before, here = pairs[number]
             if np.abs(weight[here] - weight[before]).max(initial=0) <= _ROUNDING:
                 repeats[number + 1] = repeats[number] + 1
-        kept = repeats < _REPEATS
-        stays = kept[place[:, axis]]
-        place, weight, lengths[axis] = place[stays], weight[stays], int(kept.sum())
-        place[:, axis] = (np.cumsum(kept) - 1)[place[:, axis]]
+        few = repeats < _REPEATS
+        stays = few[place[:, axis]]
+        place, weight, lengths[axis] = place[stays], weight[stays], int(few.sum())
+        place[:, axis] = (np.cumsum(few) - 1)[place[:, axis]]
     x, y, z = lengths
     index = np.ravel_multi_index(tuple(place.T), (x, y, z))
     order = np.argsort(index)

@@ -84,6 +84,7 @@ class HardwareObjective:
         if transfer_matrix is not None:
             self.transfer_matrix = validate_matrix("transfer_matrix", transfer_matrix, points, count)
         self.scene, self._link, self._sensor, self._watch = scene, link, sensor, watch
+        self._sensed: Callable[[torch.Tensor], torch.Tensor] | None = getattr(sensor, "deviation", None)
         origin = {
             "scene": f"{scene.name} {digest_of(scene)[:16]}",
             "device": link.link.device.name,
@@ -137,15 +138,14 @@ class HardwareObjective:
 
         Readings in the log have those of the log, so that a trial goes on as it began.
         """
-        sensed: Callable[[torch.Tensor], torch.Tensor] | None = getattr(self._sensor, "deviation", None)
-        if sensed is None:
+        if (sensed := self._sensed) is None:
             return None
 
         def deviation(pressure: torch.Tensor) -> torch.Tensor:
             logged = {tuple(one.pressure.tolist()): one.deviation for one in self.log.evaluations}
             rows = pressure.reshape(-1, pressure.shape[-1])
-            found = [logged.get(tuple(row.tolist())) for row in rows]
-            parts = [sensed(row) if one is None else one for one, row in zip(found, rows, strict=True)]
+            known = [logged.get(tuple(row.tolist())) for row in rows]
+            parts = [sensed(row) if one is None else one for one, row in zip(known, rows, strict=True)]
             return torch.stack(parts).reshape(pressure.shape)
 
         return deviation
@@ -161,8 +161,7 @@ class HardwareObjective:
         if self.evaluations >= most:
             raise LimitError(f"{most} evaluations are made, the limit")
         pressure = self._link.measure(drive, self._sensor, len(self.scene.control_points))[0]
-        sensed = getattr(self._sensor, "deviation", None)
-        deviation = None if sensed is None else sensed(pressure)
+        deviation = None if self._sensed is None else self._sensed(pressure)
         evaluation = self.log.append(drive, pressure, self._link.seconds_on, deviation)
         self._watch(evaluation)
         return pressure

@@ -17,7 +17,7 @@ from autdtorch.utils.validation import ArrayLike, complex_tensor, path_of, real_
 #: Folder of a trial for its pictures: `evaluation_00012.npz` of evaluation 12 (from 0), and `again_0.npz`,
 #: `again_1.npz`, ... of the drive that the search found, when it was played again.
 PICTURES = "pictures"
-AGAIN = "again"  # begins the names of these
+EVALUATION, AGAIN = "evaluation", "again"  # begin the names of these
 
 _MAPS = ("pressure", "deviation")
 _PLANE = {"center": 3, "normal": 3, "size": 2}
@@ -73,6 +73,11 @@ def load_picture(path: str | os.PathLike[str]) -> Picture:
         )
         doubts = tuple(map(str, arrays["doubts"].ravel()))
         return Picture(plane, pressure, deviation, bool(relative), int(frames), latency, doubts)
+
+
+def pictures_of_evaluations(folder: Path) -> list[Path]:
+    """Return the pictures of a trial's evaluations in a folder, in their order."""
+    return sorted(folder.glob(f"{EVALUATION}_*.npz"))
 
 
 def newest_picture(folder: Path) -> Path | None:

@@ -17,7 +17,7 @@ from autdtorch.hardware.link import AmplitudeScale, Wiring
 from autdtorch.hardware.log import read_log
 from autdtorch.io.csv_table import write_table
 from autdtorch.io.drive_file import load_drive
-from autdtorch.io.picture_file import PICTURES, load_picture
+from autdtorch.io.picture_file import PICTURES, load_picture, pictures_of_evaluations
 from autdtorch.io.readings_columns import Named, checked_names
 from autdtorch.io.readings_table import Table, Units, csv_table, frame_table, plain_number, readings_of
 from autdtorch.io.readings_units import angle_unit, phase_unit, pressure_unit
@@ -231,7 +231,7 @@ def _from_log(path: Path, points: torch.Tensor | None) -> Readings:
 
 def _from_pictures(folder: Path, points: torch.Tensor | None) -> Readings:
     """Return the readings of a trial's pictures, with the drives that its device played."""
-    paths = sorted(folder.glob("evaluation_*.npz"))
+    paths = pictures_of_evaluations(folder)
     if not paths:
         raise ValueError(f"{folder}: no picture of an evaluation; must have at least one")
     pictures = [load_picture(path) for path in paths]

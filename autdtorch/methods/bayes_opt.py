@@ -149,8 +149,8 @@ class BayesOpt(Method):
     def numbers_kept(self, problem: Problem) -> float:
         """Return the numbers of the processes: a few matrices of all pairs of evaluations."""
         earlier = 0 if problem.readings is None else len(problem.readings)
-        kept = 4.0 * self._outputs(problem) * (self.evaluations + earlier) ** 2
-        return kept if self.prior is None else kept + numbers_of_factors(self.prior, problem)
+        numbers = 4.0 * self._outputs(problem) * (self.evaluations + earlier) ** 2
+        return numbers if self.prior is None else numbers + numbers_of_factors(self.prior, problem)
 
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Observe the initial points that earlier readings do not stand for, or what these show."""
