@@ -62,6 +62,7 @@ from .scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
 from .scene.porous import porous
 from .scene.reflectors import Reflector
 from .scene.scene import OverlapWarning, ScaleWarning, Scene
+from .scene.sequence import Sequence, modulated
 from .study.results_file import load_results
 from .study.sweeps import Sweep, collect_results
 
@@ -107,6 +108,7 @@ __all__ = [
     "ScaleWarning",
     "Scene",
     "SeenPoints",
+    "Sequence",
     "SimulatedObjective",
     "Solution",
     "Sphere",
@@ -153,6 +155,7 @@ __all__ = [
     "lss",
     "lssg",
     "make_propagator",
+    "modulated",
     "phases_of",
     "plot_calibration",
     "plot_convergence",

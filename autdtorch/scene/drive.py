@@ -118,15 +118,15 @@ def normalise(drive: torch.Tensor) -> torch.Tensor:
     return drive / largest
 
 
-def drive_tensor(drive: ArrayLike) -> torch.Tensor:
+def drive_tensor(drive: ArrayLike, name: str = "drive") -> torch.Tensor:
     """Return `drive` as a finite complex128 tensor of any shape; phases alone are refused."""
     accepted = "must be complex, q = a e^(-i phi), as drive_from_phases(phases) makes it"
-    return complex_tensor("drive", drive, accepted)
+    return complex_tensor(name, drive, accepted)
 
 
 def validate_drive(drive: ArrayLike, transducers: int, name: str = "drive") -> torch.Tensor:
     """Return `drive` as complex128 after checking that it is complex (..., transducers) with |q| <= 1."""
-    drive = drive_tensor(drive)
+    drive = drive_tensor(drive, name)
     if drive.ndim == 0 or drive.shape[-1] != transducers:
         raise ValueError(f"{name}: shape {tuple(drive.shape)}; must be (..., {transducers})")
     if drive.numel():
