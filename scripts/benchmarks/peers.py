@@ -63,11 +63,8 @@ REPETITIONS = 3
 OURS = "autdtorch"
 NAMES = {"deepwave": "Deepwave", "devito": "Devito", "jwave": "j-Wave", "kwave": "k-wave-python"}
 
-REQUIRED = (("three cubes", 0.2, 4), ("three cubes", 0.1, 20), (AIR, 0.03, 1))
-"""Scene, error, and the required ratio of run times to it, the fastest peer's over ours."""
-
-ERRORS = (0.1, 0.01)
-"""Errors to which run times are compared."""
+ERROR = 0.1
+"""Error to which run times are compared."""
 
 STEADY = 1e-2
 """Relative distance to the end of the run within which a peer counts as steady; our default tolerance."""
@@ -263,10 +260,8 @@ def write_report(points: Sequence[Point], refusals: Sequence[Refusal], page: Pag
     steady = list(settled(points))
     parts = [
         "![Error over run time](peers.png)",
-        "Time of steady runs to a given error, on any grid:",
+        f"Shortest time of steady runs to an error of {percent(ERROR)}, and the least error, on any grid:",
         times(steady),
-        "Required times of the fastest peer, relative to ours:",
-        requirements(steady),
     ]
     if refusals:
         lines = [[r.case, NAMES[r.program], r.setting, r.reason] for r in refusals]
@@ -284,39 +279,16 @@ def settled(points: Sequence[Point]) -> Iterator[Point]:
         yield run[late[-1] + 1 if late else 0]
 
 
-def time_to(error: float, steady: Sequence[Point], case: str, *programs: str) -> float | None:
-    """Return the shortest run time to an error; None if no point reaches it."""
-    enough = (p.seconds for p in steady if p.case == case and p.program in programs and p.error <= error)
-    return min(enough, default=None)
-
-
-def requirements(steady: Sequence[Point]) -> str:
-    """Return a table of required and measured ratios of run times, as far as errors are reached."""
-    lines = []
-    for case, error, least in REQUIRED:
-        ours, theirs = (time_to(error, steady, case, *programs) for programs in ((OURS,), tuple(NAMES)))
-        if ours is not None and theirs is not None:
-            met = "yes" if theirs >= least * ours else "**no**"
-            lines.append([case, percent(error), f"at least {least}", f"{theirs / ours:.3g}", met])
-    return table(["scene", "error", "required", "measured", "kept"], lines)
-
-
 def times(steady: Sequence[Point]) -> str:
-    """Return a table of the run times to each error, and of the least error; a column for each program."""
+    """Return a table of the shortest run times to `ERROR`, and of the least errors, of each program."""
     programs = list(dict.fromkeys(p.program for p in steady))
     lines = []
     for case in dict.fromkeys(p.case for p in steady):
-        for error in ERRORS:
-            seconds = [time_to(error, steady, case, program) for program in programs]
-            cells = ["" if time is None else f"{time:.3g}" for time in seconds]
-            lines.append([f"{case}, to {percent(error)} [s]", *cells])
-        least = [
-            min((p.error for p in steady if (p.case, p.program) == (case, program)), default=None)
-            for program in programs
-        ]
-        lines.append(
-            [f"{case}, best error [%]", *("" if error is None else f"{100 * error:.3g}" for error in least)]
-        )
+        runs = [[p for p in steady if (p.case, p.program) == (case, program)] for program in programs]
+        seconds = [[p.seconds for p in run if p.error <= ERROR] for run in runs]
+        errors = [[100 * p.error for p in run] for run in runs]
+        for title, values in ((f"to {percent(ERROR)} [s]", seconds), ("best error [%]", errors)):
+            lines.append([f"{case}, {title}", *(f"{min(each):.3g}" if each else "" for each in values)])
     return table(["scene", *(NAMES.get(program, program) for program in programs)], lines)
 
 

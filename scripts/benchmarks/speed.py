@@ -33,8 +33,8 @@ def main(page: Page) -> None:
     page.write(
         "Transfer matrix of four foci and 16 transducers by the box method, to 1e-3 from the steady state:",
         table(["scene", "spacing", "error", "time", "periods"], printed(matrices())),
-        "Box against whole domain at 1 mm, for the paper's foci (one run by symmetry) and foci off axis:",
-        table(["scene", "runs", "difference", "box", "full", "ratio"], printed(box_and_domain())),
+        "Box against whole domain at 1 mm, for four foci off axis:",
+        table(["scene", "difference", "box", "full", "ratio"], printed(box_and_domain())),
         f"{large_array(0.5)} {first}",
     )
 
@@ -62,15 +62,14 @@ def matrices() -> Iterator[list[str]]:
 
 def box_and_domain() -> Iterator[list[str]]:
     """Compare the box with the whole domain at 1 mm; foci off the axis have no mirror images."""
-    for shift in ((0.0, 0.0, 0.0), (0.0, 2e-3, 1e-3)):
-        for name in CUBES:
-            scene = paper_scene(name)
-            foci = scene.control_points + torch.tensor(shift, dtype=torch.float64)
-            scene = dataclasses.replace(scene, control_points=foci)
-            small, fast, box = measure(scene, "box", 1.0)
-            whole, slow, _ = measure(scene, "full", 1.0)
-            times = [f"{fast:.2f} s", f"{slow:.2f} s", f"{slow / fast:.1f}"]
-            yield [name, str(len(box.runs)), f"{100 * relative_error(small, whole):.3f} %", *times]
+    for name in CUBES:
+        scene = paper_scene(name)
+        foci = scene.control_points + torch.tensor((0.0, 2e-3, 1e-3), dtype=torch.float64)
+        scene = dataclasses.replace(scene, control_points=foci)
+        small, fast, _ = measure(scene, "box", 1.0)
+        whole, slow, _ = measure(scene, "full", 1.0)
+        times = [f"{fast:.2f} s", f"{slow:.2f} s", f"{slow / fast:.1f}"]
+        yield [name, f"{100 * relative_error(small, whole):.3f} %", *times]
 
 
 def large_array(spacing: float) -> str:

@@ -69,10 +69,9 @@ def hologram_parts(holograms: Holograms) -> Iterator[str]:
     yield (
         f"Drives for the {3 * TARGETS} targets by {FEW} readings: of the loudest drive of step 3, then of "
         "the one whose prediction is least sure. Deviations from the targets by the calibration of all "
-        "readings, mean over each kind of target:"
+        "readings:"
     )
-    header = ("readings of", "all", "phases", "amplitudes", "both", "largest")
-    yield table(header, printed(target_rows(holograms)))
+    yield table(("readings of", "mean", "largest"), printed(target_rows(holograms)))
 
 
 def scatter(readings: at.Readings) -> float:
@@ -132,9 +131,8 @@ def target_rows(holograms: Holograms) -> Iterator[list[str]]:
         wanted = [predicted_drive(row, *each) for each in pairs]
         reached = torch.stack(wanted) @ judge
         off = deviations(reached, *targets(holograms))
-        means = [off.mean(), *off.reshape(3, -1).mean(dim=1), off.max()]
         print("readings:", *(f"A{KINDS[n // TARGETS]} {n % TARGETS}" for n in chosen))
-        yield [f"repetition {attempt + 1}", *(percent(float(mean)) for mean in means)]
+        yield [f"repetition {attempt + 1}", percent(float(off.mean())), percent(float(off.max()))]
 
 
 def targets(holograms: Holograms) -> tuple[torch.Tensor, list[str]]:

@@ -24,7 +24,7 @@ from autdtorch.plot.style import TICK_SIZE, Look, label_of, looks_of, new_figure
 DOCUMENT = "conditions.md"
 SHOWN = "three_cubes"
 """Scene of the table in the document."""
-ONLY_DRAWN = {"SNR 30 dB", "SNR 20 dB, 4 reads", "32 levels, on/off", "4 levels", "drift 0.3 rad"}
+ONLY_DRAWN = {"SNR 30 dB", "SNR 20 dB, 4 reads", "32 levels, on/off", "8 levels", "4 levels", "drift 0.3 rad"}
 """Conditions that its table leaves out; the figure and the printed tables have them."""
 
 Wrap = Callable[[at.Objective, int], at.Objective]
