@@ -55,6 +55,7 @@ from .sensors.sensor import EmulatedSensor as EmulatedSensor
 from .sensors.sensor import PulsedSensor as PulsedSensor
 from .sensors.sensor import Sensor as Sensor
 from .sensors.sensor import SensorError as SensorError
+from .streaming import Playback as Playback
 from .transport.port import LinkError as LinkError
 from .transport.port import Port as Port
 from .transport.serial_chips import Adapter as Adapter

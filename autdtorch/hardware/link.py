@@ -1,21 +1,24 @@
-"""A link to a device: it plays drives on the nearest of its levels, and is silent when it is closed."""
+"""A link to a device: it plays drives and sequences on the nearest levels, and is silent once closed."""
 
 from __future__ import annotations
 
 import atexit
+import collections.abc
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeAlias
 
 import torch
 
 from autdtorch.hardware.devices import require_device
 from autdtorch.hardware.devices.autd3 import AUTD3
 from autdtorch.hardware.devices.device import Device
-from autdtorch.hardware.transport.port import LinkError, Port, closed_on_error
+from autdtorch.hardware.streaming import Playback, frames_within, outlast, require_sequence, stream
+from autdtorch.hardware.transport.port import LinkError, MemoryPort, Port, closed_on_error
 from autdtorch.scene.drive import AMPLITUDE_TOLERANCE, validate_drive, validate_single_drive
+from autdtorch.scene.sequence import Sequence
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.validation import (
     indices,
@@ -33,6 +36,8 @@ _LONGEST_SETTLE = 60.0  # [s]
 _ATTEMPTS = 10  # to switch off, each after a signal
 _FINEST = 2.0**-14  # resolution of the search; two levels of a device here are further apart
 
+_Transducers: TypeAlias = collections.abc.Sequence[int] | torch.Tensor | None
+
 
 class OffError(LinkError):
     """A device was not switched off: its outputs may still be on."""
@@ -41,7 +46,7 @@ class OffError(LinkError):
 class Wiring:
     """A device, and its transducer for each of a scene's (M,), int64; other transducers stay off."""
 
-    def __init__(self, device: Device, transducers: Sequence[int] | torch.Tensor | None = None) -> None:
+    def __init__(self, device: Device, transducers: _Transducers = None) -> None:
         """Wire a device; by default all its transducers in order."""
         require_device(device)
         self.device = device
@@ -51,15 +56,18 @@ class Wiring:
 
     def frame(self, drive: torch.Tensor) -> bytes:
         """Return the bytes for a drive (M,), |q| <= 1, on the nearest levels."""
-        return self.device.frame(self._of_device(drive))
+        return self.device.frame(self.of_device(validate_single_drive(drive, len(self.transducers))))
 
     def quantised(self, drive: torch.Tensor) -> torch.Tensor:
         """Return the device's nearest drive (M,) to a `drive` (M,)."""
-        return self.device.quantised(self._of_device(drive))[self.transducers]
+        single = validate_single_drive(drive, len(self.transducers))
+        return self.device.quantised(self.of_device(single))[self.transducers]
 
-    def _of_device(self, drive: torch.Tensor) -> torch.Tensor:
-        everyone = torch.zeros(self.device.transducers, **COMPLEX)
-        everyone[self.transducers] = validate_single_drive(drive, len(self.transducers))
+    def of_device(self, drive: torch.Tensor) -> torch.Tensor:
+        """Return the drive (..., N) of all the device's transducers for a `drive` (..., M)."""
+        drive = validate_drive(drive, len(self.transducers))
+        everyone = torch.zeros((*drive.shape[:-1], self.device.transducers), **COMPLEX)
+        everyone[..., self.transducers] = drive
         return everyone
 
 
@@ -84,7 +92,11 @@ class AmplitudeScale:
 
     def asked(self, drive: torch.Tensor) -> torch.Tensor:
         """Return the drive to ask of the device, in the device's scale, for a trial's `drive` (M,)."""
-        wanted = self.largest * validate_single_drive(drive, len(self._most))
+        return self.frames_asked(validate_single_drive(drive, len(self._most)))
+
+    def frames_asked(self, drives: torch.Tensor) -> torch.Tensor:
+        """Return the drives to ask of the device, in the device's scale, for a trial's `drives` (..., M)."""
+        wanted = self.largest * validate_drive(drives, len(self._most))
         return torch.polar(wanted.abs().minimum(self._most), wanted.angle())
 
     def quantised(self, drive: torch.Tensor) -> torch.Tensor:
@@ -112,6 +124,8 @@ class AmplitudeScale:
 class Link(contextlib.AbstractContextManager["Link"]):
     """A device at the end of a port: `play` a drive, and it plays until the next, or until `off`.
 
+    `play_sequence` plays a sequence to its end.
+
     Use it as a context manager. The outputs are switched off when it is opened, as some devices start with
     all transducers on, and however the block ends; at the latest when Python exits. Threads may share it.
     Methods raise `LinkError` if the device does not take the bytes; `off` and `close` then raise `OffError`.
@@ -122,7 +136,7 @@ class Link(contextlib.AbstractContextManager["Link"]):
         self,
         device: Device,
         port: Port,
-        transducers: Sequence[int] | torch.Tensor | None = None,
+        transducers: _Transducers = None,
         settle: float = SETTLE,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
@@ -147,6 +161,7 @@ class Link(contextlib.AbstractContextManager["Link"]):
         self.device, self._port, self._sleep = device, port, sleep
         self._lock = threading.RLock()
         self._open = True
+        self._ended = threading.Event()  # ends the sequence that was begun last
         with closed_on_error(port.close):
             self.off()
             self.wiring = Wiring(device, transducers)
@@ -167,17 +182,63 @@ class Link(contextlib.AbstractContextManager["Link"]):
         """Play a drive (M,) as `play` does, but return when its frame is on the device."""
         frame = self.wiring.frame(drive)
         with self._lock:
-            if not self._open:
-                raise LinkError(f"{self.device.name} is closed; open it again")
+            self._require_open()
+            self._end_sequence()
             self._send(frame)
 
     def wait_for_sound(self) -> None:
         """Wait for the settle time; other threads may switch the outputs off meanwhile."""
         self._sleep(self.settle)
 
+    def play_sequence(self, sequence: Sequence, seconds: float | None = None) -> Playback:
+        """Play a sequence on the nearest levels and switch off; return its times when it is over.
+
+        A device with a memory for sequences plays by its own clock; to others the frames are sent one by one,
+        each when it is due. A loop without `seconds` plays until another thread calls `off` or plays
+        something else.
+
+        Args:
+            sequence: frames of drives (T, M).
+            seconds: time to play [s], > 0; by default all frames once, or a loop without end.
+
+        Raises:
+            ValueError: no sequence, another number of transducers, a rate that the device does not have, more
+                frames than fit in its memory, or `seconds` beyond the end of a sequence that does not loop.
+            LinkError: the link is closed, the device does not take the bytes, or the computer is too slow.
+        """
+        require_sequence(sequence, len(self.transducers))
+        device, rate = self.device, sequence.rate
+        device.require_rate(rate)
+        count = frames_within(sequence, seconds)
+        drives = self.wiring.of_device(sequence.drives)
+        held = device.held(drives, rate, sequence.loop)
+        frames = device.frames(drives).reshape(len(drives), len(device.serials), -1)
+
+        def send(chunk: bytes) -> bool:
+            with self._lock:
+                if not ended.is_set():
+                    self._port.write(chunk)
+            return not ended.is_set()
+
+        with self._lock:
+            self._require_open()
+            ended = self._end_sequence()
+        try:
+            with self._lock:
+                if by_itself := held is not None and isinstance(self._port, MemoryPort):
+                    self._port.hold(held)
+            if by_itself:
+                return outlast(rate, count, ended)
+            return stream(send, frames, rate, count, ended, device.wire_time(frames[0].tobytes()))
+        finally:
+            with self._lock:
+                if self._ended is ended:
+                    self.off()
+
     def off(self) -> None:
         """Switch all outputs of the device off, after a recovery of the port if need be."""
         with self._lock:
+            self._end_sequence()
             if not self._open:  # pyusb would open it once more
                 return
             try:
@@ -221,6 +282,16 @@ class Link(contextlib.AbstractContextManager["Link"]):
             self._send(silence)
         self._port.flush()
 
+    def _end_sequence(self) -> threading.Event:
+        """End the sequence that plays, if any, and return the event that ends the next one."""
+        self._ended.set()
+        self._ended = threading.Event()
+        return self._ended
+
+    def _require_open(self) -> None:
+        if not self._open:
+            raise LinkError(f"{self.device.name} is closed; open it again")
+
     def _release(self) -> None:
         self._open = False
         atexit.unregister(self.close)
@@ -237,7 +308,7 @@ class Link(contextlib.AbstractContextManager["Link"]):
 
 def open_link(
     device: Device,
-    transducers: Sequence[int] | torch.Tensor | None = None,
+    transducers: _Transducers = None,
     serial: str | None = None,
     backend: Any = None,
     settle: float = SETTLE,
@@ -266,7 +337,7 @@ def open_link(
 
 def open_autd3(
     boards: int = 1,
-    transducers: Sequence[int] | torch.Tensor | None = None,
+    transducers: _Transducers = None,
     network: Any = None,
     settle: float = SETTLE,
 ) -> Link:

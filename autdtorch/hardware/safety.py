@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
+import math
 import signal
 import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -27,6 +28,8 @@ from autdtorch.hardware.sensors.sensor import (
     checked_reading,
     require_sensor,
 )
+from autdtorch.hardware.streaming import Playback, frames_within, require_sequence
+from autdtorch.scene.sequence import Sequence
 from autdtorch.utils.process import send_again
 from autdtorch.utils.validation import (
     integer_at_least,
@@ -209,15 +212,51 @@ class LimitedLink:
         left = self._seconds_left()
         with self._lock:
             self._raise_failure()
-            if self._on_since is None:
-                self._on_since = time.monotonic()
-                most = min(left, self.limits.seconds_in_a_row)
-                self._on_until = self._on_since + most
-                self._timer = threading.Timer(most, functools.partial(self._time_is_up, self._on_since))
-                self._timer.daemon = True
-                self._timer.start()
+            self._start_timer(left)
             self.link.begin(asked)
         self.link.wait_for_sound()  # without the lock, which the timer needs
+
+    def play_sequence(self, sequence: Sequence, seconds: float | None = None) -> Playback:
+        """Play a sequence, scaled to the limit, as `Link.play_sequence` does; the outputs are off afterwards.
+
+        A loop without `seconds` plays until the end of the time, unless another thread calls `off`.
+
+        Raises:
+            LimitError: the time limit of the outputs is reached, before or meanwhile.
+            ValueError: as of `Link.play_sequence`, or a duration above `seconds_in_a_row`.
+            LinkError: the device does not take the bytes, or the computer is too slow.
+        """
+        require_sequence(sequence, len(self.link.transducers))
+        asked = replace(sequence, drives=self._scale.frames_asked(sequence.drives))
+        wanted = frames_within(sequence, seconds) / sequence.rate
+        most = self.limits.seconds_in_a_row
+        if most < wanted < math.inf:
+            raise invalid("seconds", wanted, f"must be at most {most:g}, the limit in a row", "s")
+        self.off()
+        self._rest_now()
+        left = self._seconds_left()
+        if left < wanted < math.inf:
+            raise LimitError(f"the sequence takes {wanted:g} s, and the limit leaves {left:.3g} s")
+        with self._lock:
+            self._raise_failure()
+            self._start_timer(left)
+        try:
+            playback = self.link.play_sequence(asked, seconds)
+            if playback.seconds < wanted - _GRACE and time.monotonic() >= self._on_until:
+                self.require_on()
+            return playback
+        finally:
+            self.off()
+
+    def _start_timer(self, left: float) -> None:
+        """Have the outputs switched off when they were on for as long as they may be, `left` [s] in all."""
+        if self._on_since is None:
+            self._on_since = time.monotonic()
+            most = min(left, self.limits.seconds_in_a_row)
+            self._on_until = self._on_since + most
+            self._timer = threading.Timer(most, functools.partial(self._time_is_up, self._on_since))
+            self._timer.daemon = True
+            self._timer.start()
 
     def quantised(self, drive: torch.Tensor) -> torch.Tensor:
         """Return the device's nearest drives to drives (..., M), both in the scale of `play`."""
@@ -284,7 +323,7 @@ class LimitedLink:
             if self._on_since is None:
                 self._seconds_left()
                 most = f"{self.limits.seconds_in_a_row:g} s in a row"
-                raise LimitError(f"settling and reading took longer than the outputs may stay on, {most}")
+                raise LimitError(f"playing and reading took longer than the outputs may stay on, {most}")
 
     def off(self) -> None:
         """Switch all outputs off, and begin the rest of the duty cycle."""

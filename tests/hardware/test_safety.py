@@ -188,7 +188,7 @@ def test_while_the_sound_settles_the_timer_may_switch_off(trial):
     with hw.open_link(hw.SONICSURFACE, range(16), backend=bench.bus, settle=0.2) as link:
         limits = hw.LimitedLink(link, hw.Limits(1.0, seconds_in_a_row=0.02))
         limits.play(FULL)
-        with pytest.raises(hw.LimitError, match="settling and reading took longer"):
+        with pytest.raises(hw.LimitError, match="playing and reading took longer"):
             limits.require_on()
 
 

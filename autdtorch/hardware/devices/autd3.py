@@ -6,6 +6,7 @@ import asyncio
 import cmath
 import math
 import threading
+import time
 from collections.abc import Callable, Coroutine, Mapping
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -14,10 +15,10 @@ import numpy as np
 import torch
 
 from autdtorch.hardware.devices.device import Device, Firmware
-from autdtorch.hardware.transport.port import LinkError, Port, closed_on_error
+from autdtorch.hardware.transport.port import HeldSequence, LinkError, Port, closed_on_error
 from autdtorch.scene.arrays import AUTD3_TRANSDUCERS
 from autdtorch.scene.drive import PhaseLevels
-from autdtorch.utils.array_types import COMPLEX
+from autdtorch.utils.array_types import COMPLEX, REAL, Bytes
 from autdtorch.utils.hints import with_extra
 from autdtorch.utils.validation import invalid
 
@@ -27,6 +28,14 @@ if TYPE_CHECKING:
 _ANSWER_MS = 100  # wait of the kit for an answer; its default of 10 ms is too short on a busy computer
 _TIMEOUT = 5.0  # of a command [s]; the kit asks boards that do not answer 8 times more before it gives up
 _OPENING_TIMEOUT = 60.0  # [s]; the kit takes up to 10 s to find the boards and 30 s to synchronise them
+
+_CLOCK = 40_000.0  # ticks per second, of which every frame lasts a whole number [Hz]
+_MOST_TICKS, _MOST_PATTERNS, _MOST_FACTORS = 65_535, 1024, 65_536  # by the kit
+_ROUNDING = 1e-6  # relative error of a rate that was written in decimals
+_SAME = 1e-9  # largest difference of drives that count as equal
+_SILENCER = (10, 40)  # ticks in which a change of amplitude, and of phase, is smoothed by default
+_LEAD = 0.1  # time from a command until a sequence begins that does not loop [s]; the kit asks for 10 ms
+_SECONDS_A_FRAME = 0.02  # further time that the network has to take a frame of a sequence [s]
 
 _Command = Callable[[], Coroutine[Any, Any, None]]
 _Asked = tuple[_Command, SimpleQueue[BaseException | None]]  # with the queue that its end goes into
@@ -48,8 +57,25 @@ class _Autd3(Device):
     def emulated_port(self, bench: EmulatedBench) -> Port:
         return EmulatedAutd3Port(self.boards, bench)
 
+    def require_rate(self, rate: float) -> None:
+        super().require_rate(rate)
+        if rate < (least := _CLOCK / _MOST_TICKS):
+            raise invalid("rate", rate, f"must be at least {least:.3g} for {self.name}", "Hz")
+        ticks = _CLOCK / rate
+        if abs(ticks - round(ticks)) > _ROUNDING * ticks:
+            near = f"{_CLOCK / math.ceil(ticks):.7g} or {_CLOCK / math.floor(ticks):.7g}"
+            accepted = f"must be {_CLOCK:g} over a whole number for {self.name}, such as {near} by at_rate"
+            raise invalid("rate", rate, accepted, "Hz")
+
+    def held(self, drives: torch.Tensor, rate: float, loop: bool) -> HeldSequence:
+        patterns, factors = _modulated(drives)
+        _require_room(len(patterns), _MOST_PATTERNS, "frames, unless only the amplitude of all changes")
+        _require_room(len(factors), _MOST_FACTORS, "frames in which only the amplitude of all changes")
+        levels = (255 * factors).round().to(torch.uint8).numpy()
+        return HeldSequence(_two(self.frames(patterns)), _two(levels), round(_CLOCK / rate), loop)
+
     def pack(self, *levels: torch.Tensor) -> bytes:
-        return torch.cat(levels).to(torch.uint8).numpy().tobytes()
+        return torch.cat(levels, dim=-1).to(torch.uint8).numpy().tobytes()
 
     def firmware(self, transducers: int) -> Firmware:
         return _Autd3Firmware(transducers)
@@ -66,15 +92,52 @@ class _Autd3Firmware:
     def __init__(self, transducers: int) -> None:
         """Switch boards of so many `transducers` on; they are silent until the first pattern."""
         self._playing = bytes(2 * transducers)
+        self._held: HeldSequence | None = None
+        self._since = 0.0
 
     def receive(self, data: bytes) -> None:
-        self._playing = data
+        self._held, self._playing = None, data
+
+    def hold(self, sequence: HeldSequence) -> None:
+        self._held, self._since = sequence, time.perf_counter()
 
     def drive(self) -> torch.Tensor:
-        """Return the drive (N,): phase n / 256 of a period, amplitude i / 255."""
-        levels = np.frombuffer(self._playing, np.uint8).reshape(2, -1).T.tolist()
-        played = [cmath.rect(i / 255, 2 * math.pi * n / 256) for n, i in levels]
+        """Return the drive (N,): phase n / 256 of a period, amplitude i / 255, perhaps modulated."""
+        frame, factor = np.frombuffer(self._playing, np.uint8), 255
+        if (held := self._held) is not None:
+            number = int((time.perf_counter() - self._since) * 40_000 / held.divider)
+            frame, factor = (
+                part[number % len(part) if held.loop else min(number, len(part) - 1)]
+                for part in (held.frames, held.modulation)
+            )
+        played = [
+            cmath.rect(i * int(factor) / 255**2, 2 * math.pi * n / 256)
+            for n, i in frame.reshape(2, -1).T.tolist()
+        ]
         return torch.tensor(played, **COMPLEX)
+
+
+def _modulated(drives: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return drives (1, N) and factors (T,) from 0 to 1 whose products are drives (T, N).
+
+    If there are none, return the drives themselves and a factor of 1.
+    """
+    loudest = drives[drives.abs().square().sum(dim=1).argmax()]
+    power = torch.vdot(loudest, loudest).real
+    factors = (drives @ loudest.conj()).real / power if power > 0 else torch.ones(len(drives), **REAL)
+    if (drives - factors[:, None] * loudest).abs().max() <= _SAME:
+        return loudest[None], factors.clamp(0, 1)
+    return drives, torch.ones(1, **REAL)
+
+
+def _require_room(count: int, most: int, what: str) -> None:
+    if count > most:
+        raise ValueError(f"sequence: {count} frames; must be at most {most} {what}, the memory of AUTD3")
+
+
+def _two(rows: Bytes) -> Bytes:
+    """Return rows, the only one twice: the firmware takes no fewer."""
+    return rows.repeat(2, axis=0) if len(rows) == 1 else rows
 
 
 #: One board. An intensity i is proportional to the amplitude, as the firmware gives it the pulse width
@@ -84,6 +147,7 @@ AUTD3 = _Autd3(
     board=AUTD3_TRANSDUCERS,
     phase_levels=PhaseLevels(256, 255),
     columns=("phase", "intensity"),
+    most_rate=_CLOCK,
     most_boards=None,
 )
 
@@ -93,6 +157,7 @@ def autd3_kit() -> Any:
     try:
         import autd3
         import autd3_core  # noqa: F401
+        import autd3_modulation  # noqa: F401
         import autd3_pattern  # noqa: F401
     except ImportError as error:
         raise ImportError(f"{error}; {with_extra('autd3')} brings it") from error
@@ -118,6 +183,7 @@ class Autd3Port(Port):
         config = autd3.ClientConfig(ack_timeout=autd3.Duration.from_millis(_ANSWER_MS))
         self._error: type[Exception] = autd3.Autd3Error
         self._boards = boards
+        self._holds_sequence = False
         self._client: Any = None
         self._commands: SimpleQueue[_Asked | None] = SimpleQueue()
         # A daemon: others are waited for before `atexit` calls the link's switching off.
@@ -132,7 +198,34 @@ class Autd3Port(Port):
 
     def write(self, data: bytes) -> None:
         """Play a frame; its boards have taken it when this returns."""
-        self._send("be written to", autd3_pattern(data, self._boards))
+        from autd3.commands import Clear
+
+        pattern = autd3_pattern(data, self._boards)
+        # Before it `Clear` ends modulation and smoothing of a sequence, and is silent.
+        self._send("be written to", [Clear(), pattern] if self._holds_sequence else pattern)
+        self._holds_sequence = False
+
+    def hold(self, sequence: HeldSequence) -> None:
+        """Begin a sequence; a loop begins anywhere, as the boards count by their common clock."""
+        from autd3.commands import ActivateModulationBank, ActivatePatternBank
+        from autd3.value import ModulationBank, PatternBank, TransitionMode
+        from autd3_core import Duration
+
+        self._holds_sequence = True
+        seconds = _TIMEOUT + _SECONDS_A_FRAME * len(sequence.frames)
+        self._send("take a sequence", autd3_sequence(sequence, self._boards), seconds)
+        if sequence.loop:
+            return
+
+        async def start() -> None:
+            moment = self._client.device_time_now() + Duration.from_secs_f64(_LEAD)
+            at = TransitionMode.SysTime(moment)
+            await self._client.send(
+                [ActivateModulationBank(ModulationBank.B1, at), ActivatePatternBank(PatternBank.B1, at)]
+            )
+
+        self._run("start a sequence", start, _TIMEOUT)
+        time.sleep(_LEAD)
 
     def close(self) -> None:
         """Release the boards, even if they do not answer."""
@@ -147,11 +240,11 @@ class Autd3Port(Port):
         finally:
             self._commands.put(None)
 
-    def _send(self, what: str, command: Any) -> None:
+    def _send(self, what: str, command: Any, seconds: float | None = None) -> None:
         async def send() -> None:
             await self._client.send(command)
 
-        self._run(what, send, _TIMEOUT)
+        self._run(what, send, _TIMEOUT if seconds is None else seconds)
 
     def _run(self, what: str, command: _Command, seconds: float) -> None:
         """Have the thread run a command after all earlier ones, and wait for its end.
@@ -196,6 +289,41 @@ def autd3_pattern(frame: bytes, boards: int) -> Any:
     return Pattern(PhaseBuffer.from_array(phases), IntensityBuffer.from_array(intensities))
 
 
+def autd3_sequence(sequence: HeldSequence, boards: int) -> list[Any]:
+    """Return the kit's commands for a sequence; one that does not loop waits in bank B1 for its activation.
+
+    The silencer smooths a change over at most one frame, at whose end every level is reached.
+    """
+    from autd3.commands import (
+        Clear,
+        FixedCompletionTime,
+        Modulation,
+        PatternStm,
+        PatternStmOption,
+        SetSilencer,
+    )
+    from autd3.value import LoopBehavior, ModulationBank, PatternBank, SamplingConfig, TransitionMode
+    from autd3_core import Duration
+    from autd3_modulation import ModulationBuffer
+    from autd3_pattern import IntensityBuffer, PhaseBuffer
+
+    intensity, phase = (Duration.from_micros(25 * min(ticks, sequence.divider)) for ticks in _SILENCER)
+    sampling = SamplingConfig(sequence.divider)
+    loops = LoopBehavior.Infinite if sequence.loop else LoopBehavior.Once
+    begins = TransitionMode.Immediate if sequence.loop else TransitionMode.Later
+    frames = sequence.frames.reshape(-1, 2, boards, AUTD3_TRANSDUCERS)
+    phases = [PhaseBuffer.from_array(frame) for frame in frames[:, 0]]
+    intensities = [IntensityBuffer.from_array(frame) for frame in frames[:, 1]]
+    option = PatternStmOption(PatternBank.B1, loop_behavior=loops, transition_mode=begins)
+    factors = ModulationBuffer.from_array(sequence.modulation)
+    return [
+        Clear(),
+        SetSilencer(FixedCompletionTime(intensity, phase)),
+        Modulation(sampling, factors, ModulationBank.B1, loops, begins),
+        PatternStm(sampling, phases, intensities, option),
+    ]
+
+
 class EmulatedAutd3Port(Autd3Port):
     """The port of AUTD3 boards that the kit emulates on this machine, silently; a bench plays for them."""
 
@@ -209,6 +337,12 @@ class EmulatedAutd3Port(Autd3Port):
         """Play a frame, on boards and bench."""
         super().write(data)
         self._bench.receive(data)
+
+    def hold(self, sequence: HeldSequence) -> None:
+        """Begin a sequence, on boards and bench."""
+        super().hold(sequence)
+        if isinstance(self._bench.firmware, _Autd3Firmware):
+            self._bench.firmware.hold(sequence)
 
 
 def _network(text: str) -> Any:

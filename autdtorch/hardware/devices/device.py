@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
+import numpy as np
 import torch
 
-from autdtorch.hardware.transport.port import Port, SerialPort, SharedPort, closed_on_error
+from autdtorch.hardware.transport.port import HeldSequence, Port, SerialPort, SharedPort, closed_on_error
 from autdtorch.hardware.transport.serial_chips import Adapter
 from autdtorch.hardware.transport.usb import find_device
 from autdtorch.scene.drive import PhaseLevels, drive_tensor, validate_drive
+from autdtorch.utils.array_types import COMPLEX, Bytes
 from autdtorch.utils.validation import ArrayLike, integer_at_least, invalid
 
 if TYPE_CHECKING:
@@ -51,6 +54,7 @@ class Device(ABC):
         columns: names of its integer levels, as files of drives have them.
         adapters: USB chips that it may be connected by, for pyusb; the first is the usual one.
         baud: rate of its serial line [bits/s]; None without one.
+        most_rate: frames per second that it takes without a serial line [Hz].
         boot_time: time that it needs after its serial port was opened by name [s].
         most_boards: largest number of boards; None for any number.
         boards: number of boards.
@@ -66,6 +70,7 @@ class Device(ABC):
     columns: tuple[str, ...]
     adapters: tuple[Adapter, ...] = ()
     baud: int | None = None
+    most_rate: float = math.inf
     boot_time: float = 0.0
     most_boards: int | None = 1
     boards: int = 1
@@ -73,7 +78,10 @@ class Device(ABC):
 
     @abstractmethod
     def pack(self, *levels: torch.Tensor) -> bytes:
-        """Return the frame for levels (N,), one tensor for each of `columns`."""
+        """Return the frame for levels (N,), or frames for levels (T, N), one after the other.
+
+        There is a tensor of levels for each of `columns`.
+        """
 
     @abstractmethod
     def firmware(self, transducers: int) -> Firmware:
@@ -172,9 +180,35 @@ class Device(ABC):
             raise ValueError(f"drive: shape {tuple(levels[0].shape)}; must be ({self.transducers},)")
         return self.pack(*levels)
 
+    def frames(self, drives: torch.Tensor) -> Bytes:
+        """Return the bytes (T, B) of frames for drives (T, N) on the nearest levels; errors as `frame`."""
+        levels = self.levels(drives)
+        if levels[0].shape != (len(drives), self.transducers):
+            raise ValueError(f"drives: shape {tuple(drives.shape)}; must be (T, {self.transducers})")
+        return np.frombuffer(self.pack(*levels), np.uint8).reshape(len(drives), -1)
+
     def wire_time(self, frame: bytes) -> float:
         """Return the time [s] that a frame takes on the serial line; 0 without one."""
         return 0.0 if self.baud is None else _BITS * len(frame) / self.baud
+
+    @property
+    def highest_rate(self) -> float:
+        """Frames per second that it can play [Hz]."""
+        if self.baud is None:
+            return self.most_rate
+        return 1 / self.wire_time(self.frame(torch.zeros(self.transducers, **COMPLEX)))
+
+    def require_rate(self, rate: float) -> None:
+        """Refuse frames per second [Hz] that it cannot play."""
+        if rate > self.highest_rate:
+            raise invalid("rate", rate, f"must be at most {self.highest_rate:.4g} for {self.name}", "Hz")
+
+    def held(self, drives: torch.Tensor, rate: float, loop: bool) -> HeldSequence | None:
+        """Return the sequence of drives (T, N) for the device's memory; None if frames are sent one by one.
+
+        `ValueError` if it does not fit in the memory.
+        """
+        return None
 
     def _checked(self, levels: tuple[ArrayLike, ...], most: tuple[int, ...]) -> tuple[torch.Tensor, ...]:
         """Return the `levels` as int64 of one shape, each from 0 to its `most`."""

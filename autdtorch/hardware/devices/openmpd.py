@@ -209,11 +209,9 @@ class _OpenMPD(Device):
         return torch.where(by_file == 0, by_file, by_file / self._corrections())
 
     def pack(self, *levels: torch.Tensor) -> bytes:
-        by_board = torch.cat([level.reshape(-1, _BOARD) for level in levels], dim=1)
-        frame = bytearray(by_board.to(torch.uint8).numpy().tobytes())
-        for first in range(0, len(frame), 2 * _BOARD):
-            frame[first] |= _FIRST
-        return bytes(frame)
+        messages = torch.cat([level.reshape(-1, _BOARD) for level in levels], dim=1).to(torch.uint8)
+        messages[:, 0] |= _FIRST
+        return messages.numpy().tobytes()
 
     def firmware(self, transducers: int) -> Firmware:
         return _OpenMPDFirmware()
@@ -236,12 +234,18 @@ class _OpenMPDFirmware:
         self._message = bytearray()
         self._playing = bytes(512)
 
+    _BEGINNING, _VALUES = re.compile(rb"[\x80-\xff]"), bytes(byte & 127 for byte in range(256))
+
     def receive(self, data: bytes) -> None:
-        for byte in data:
-            if self._message or byte & 128:
-                self._message.append(byte & 127)
+        while data:
+            if not self._message:
+                beginning = self._BEGINNING.search(data)
+                data = b"" if beginning is None else data[beginning.start() :]
+            missing = 512 - len(self._message)
+            self._message += data[:missing]
+            data = data[missing:]
             if len(self._message) == 512:
-                self._playing = bytes(self._message)
+                self._playing = bytes(self._message).translate(self._VALUES)
                 self._message.clear()
 
     def drive(self) -> torch.Tensor:
@@ -261,6 +265,7 @@ OPENMPD = _OpenMPD(
     phase_levels=PhaseLevels(128, 64, pulses=True),
     columns=("phase", "duty"),
     adapters=(FT232H,),
+    most_rate=10_000.0,  # 40 kHz by the divider that its firmware starts with (CommandReader.vhd)
 )
 
 

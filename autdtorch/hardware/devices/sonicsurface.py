@@ -34,9 +34,10 @@ class _SonicSurface(Device):
         return self.phase_levels.drive(level % _OFF, level != _OFF)
 
     def pack(self, *levels: torch.Tensor) -> bytes:
-        by_channel = np.empty(_BOARD, np.uint8)
-        by_channel[sonicsurface_channels()] = levels[0].numpy()
-        return bytes([_START, *by_channel, _COMMIT])
+        frames = np.empty((levels[0].numel() // _BOARD, 1 + _BOARD + 1), np.uint8)
+        frames[:, 0], frames[:, -1] = _START, _COMMIT
+        frames[:, 1 + sonicsurface_channels()] = levels[0].reshape(-1, _BOARD).numpy()
+        return frames.tobytes()
 
     def firmware(self, transducers: int) -> Firmware:
         return _SonicSurfaceFirmware()

@@ -33,16 +33,15 @@ class _Ultraino(Device):
     keys = ("boards",)
 
     def pack(self, *levels: torch.Tensor) -> bytes:
-        phase, duty = levels
+        phase, duty = (level.reshape(-1, self.boards, 1, _BOARD) for level in levels)
         tenth = torch.arange(_TENTHS, device="cpu")[:, None]
-        high = (tenth - phase) % _TENTHS < duty
-        frame = bytearray()
-        for board in range(high.shape[1] // _BOARD):
-            pins = np.zeros((_TENTHS, 8 * _PORTS), np.uint8)
-            pins[:, ultraino_pins()] = high[:, _BOARD * board :][:, :_BOARD].numpy()
-            halves = np.packbits(pins, bitorder="little")[:, None] << np.array([0, 4], np.uint8) & 0xF0
-            frame += (halves | board + 1).tobytes()
-        return bytes(frame) + _END
+        pins = np.zeros((len(phase), self.boards, _TENTHS, 8 * _PORTS), np.uint8)
+        pins[..., ultraino_pins()] = ((tenth - phase) % _TENTHS < duty).numpy()
+        halves = np.packbits(pins, axis=-1, bitorder="little")[..., None] << np.array([0, 4], np.uint8) & 0xF0
+        numbers = np.arange(1, self.boards + 1, dtype=np.uint8)[:, None, None, None]
+        patterns = (halves | numbers).reshape(len(phase), -1)
+        ends = np.tile(np.frombuffer(_END, np.uint8), (len(phase), 1))
+        return np.hstack([patterns, ends]).tobytes()
 
     def firmware(self, transducers: int) -> Firmware:
         return _UltrainoFirmware(transducers // _BOARD)

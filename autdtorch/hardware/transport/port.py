@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
+from autdtorch.utils.array_types import Bytes
 from autdtorch.utils.validation import require_kind
 
 _TIMEOUT = 1.0  # [s]
@@ -26,6 +27,23 @@ def closed_on_error(close: Callable[[], None]) -> Iterator[None]:
         with contextlib.suppress(LinkError):
             close()
         raise
+
+
+@dataclass(frozen=True)
+class HeldSequence:
+    """A sequence that a device holds in its memory and plays by its own clock.
+
+    Attributes:
+        frames: bytes of its frames (T, B).
+        modulation: factors of all amplitudes (S,), of 255, one after the other at the rate of the frames.
+        divider: number of ticks of the device's clock that a frame lasts.
+        loop: whether the first frame follows the last one; otherwise that stays.
+    """
+
+    frames: Bytes
+    modulation: Bytes
+    divider: int
+    loop: bool
 
 
 @runtime_checkable
@@ -49,6 +67,15 @@ class Port(Protocol):
     def close(self) -> None:
         """Release the device."""
         return
+
+
+@runtime_checkable
+class MemoryPort(Port, Protocol):
+    """The port of a device with a memory for a sequence."""
+
+    def hold(self, sequence: HeldSequence) -> None:
+        """Begin a sequence, which the device plays by itself until the next `write`."""
+        ...
 
 
 @dataclass

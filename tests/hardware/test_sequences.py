@@ -1,0 +1,418 @@
+"""Sequences on devices: every frame, in order and in time; refused where a device cannot play them."""
+
+import math
+import signal
+import threading
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from faulty_bus import FAULTS, FaultyBus
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from autdtorch import hardware as hw
+from autdtorch.hardware import streaming
+from autdtorch.hardware.devices import autd3
+from autdtorch.hardware.emulator.bench import BenchPort
+from autdtorch.scene.sequence import Sequence, modulated
+
+COUNT = 16  # transducers of the bench
+
+
+def frames_of(count: int, transducers: int, seed: int = 0) -> torch.Tensor:
+    """Random drives (count, transducers)."""
+    generator = torch.Generator().manual_seed(seed)
+    phases, amplitudes = torch.rand((2, count, transducers), generator=generator, dtype=torch.float64)
+    return torch.polar(amplitudes, 2 * math.pi * phases)
+
+
+def played(bench: hw.EmulatedBench) -> list[torch.Tensor]:
+    """A list that grows by the drive that the firmware emits after each transfer."""
+
+    def receive(data: bytes) -> None:
+        real(data)
+        drives.append(bench.emitted())
+
+    drives: list[torch.Tensor] = []
+    real = bench.firmware.receive
+    bench.firmware.receive = receive
+    return drives
+
+
+class Clock(SimpleNamespace):
+    """A clock that goes on in sleeps alone, and each sleep by a little too much."""
+
+    def __init__(self) -> None:
+        super().__init__(now=100.0)
+
+    def perf_counter(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds + 50e-6
+
+
+class Sink:
+    """Takes bytes, and notes when each frame came; the delays [s] of some transfers are by their number."""
+
+    def __init__(self, clock: Clock, frame: int, delays: dict[int, float]) -> None:
+        self.clock, self.frame, self.delays = clock, frame, delays
+        self.data, self.times, self.transfers = b"", [], 0
+
+    def __call__(self, data: bytes) -> bool:
+        self.clock.now += 20e-6 + self.delays.get(self.transfers, 0.0)
+        self.transfers += 1
+        self.data += data
+        self.times += [self.clock.now] * (len(data) // self.frame)
+        return True
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(streaming, "time", clock)
+    monkeypatch.setattr(streaming, "_NAP", math.inf)  # a clock that stands still cannot wait for an event
+    return clock
+
+
+@pytest.mark.parametrize("rate", [0.9, 89.0, 1000.0, 9000.0, 40_000.0])
+def test_frames_are_sent_in_order_when_they_are_due_and_without_drift(clock, rate):
+    frames = np.arange(7 * 2, dtype=np.uint8).reshape(7, 1, 2)
+    sink = Sink(clock, 2, {})
+    count = 10_000
+    playback = streaming.stream(sink, frames, rate, count, threading.Event())
+    assert sink.data == (frames.tobytes() * (count // 7 + 1))[: 2 * count]
+    delay = np.array(sink.times) - 100.0 - np.arange(count) / rate
+    # Early by the frames that share a transfer; late by a sleep and a transfer.
+    assert -0.5e-3 - 1e-9 <= delay.min() <= delay.max() <= 75e-6
+    assert (playback.frames, playback.late) == (count, 0)
+    assert playback.latest == pytest.approx(delay.max(), abs=1e-9)
+    assert playback.seconds == pytest.approx(count / rate, abs=75e-6)
+
+
+@settings(max_examples=30)
+@given(
+    rate=st.floats(500, 40_000),
+    delays=st.dictionaries(st.integers(0, 100), st.floats(0, 20e-3), max_size=5),
+)
+def test_late_frames_are_sent_all_the_same_and_counted(rate, delays):
+    with pytest.MonkeyPatch.context() as patch:
+        clock = Clock()
+        patch.setattr(streaming, "time", clock)
+        sink = Sink(clock, 2, delays)
+        frames = np.arange(50, dtype=np.uint8).reshape(25, 1, 2)
+        playback = streaming.stream(sink, frames, rate, 1000, threading.Event())
+    assert sink.data == frames.tobytes() * 40
+    delay = np.array(sink.times) - 100.0 - np.arange(1000) / rate
+    certain = np.abs(delay - streaming.LATE) > 1e-9  # rounding of times around 100 s
+    assert (delay[certain] > streaming.LATE).sum() <= playback.late <= (delay > streaming.LATE - 1e-9).sum()
+    assert playback.latest == pytest.approx(delay.max(), abs=1e-9)
+
+
+def test_a_sequence_that_falls_behind_by_a_second_ends(clock):
+    sink = Sink(clock, 2, {3: 1.2})
+    with pytest.raises(hw.LinkError, match=r"frame 3 was 1.2 s late; must be sent at 100 frames/s"):
+        streaming.stream(sink, np.zeros((5, 1, 2), np.uint8), 100.0, 50, threading.Event())
+
+
+@pytest.mark.parametrize("name", hw.DEVICES)
+def test_frames_together_are_those_of_drives_one_by_one(name):
+    device = hw.DEVICES[name]
+    device = device.with_boards(2) if device.most_boards != 1 else device
+    drives = frames_of(9, device.transducers)
+    assert [frame.tobytes() for frame in device.frames(drives)] == [device.frame(drive) for drive in drives]
+
+
+@pytest.mark.parametrize(
+    ("device", "rate"), [(hw.OPENMPD, 500.0), (hw.SONICSURFACE, 80.0), (hw.ULTRAINO, 50.0)]
+)
+def test_every_frame_is_emitted_in_order_and_the_outputs_are_off_in_the_end(trial, device, rate):
+    sequence = Sequence(frames_of(3, COUNT), rate)
+    bench = hw.EmulatedBench(device, trial.simulated.transfer_matrix, range(COUNT))
+    with hw.open_link(device, range(COUNT), backend=bench.bus) as link:
+        drives = played(bench)
+        playback = link.play_sequence(sequence, seconds=8 / rate)
+        assert playback.frames == 8
+        expected = [
+            device.quantised(link.wiring.of_device(sequence.drives[number % 3])) for number in range(8)
+        ]
+        # Transfers of a busy computer may hold several frames, of which the last is seen.
+        assert len(drives) >= 4
+        torch.testing.assert_close(drives[0], expected[0], rtol=0, atol=1e-14)
+        torch.testing.assert_close(drives[-3], expected[-1], rtol=0, atol=1e-14)
+        assert not bench.emitted().any()
+        link.play(sequence.drives[0])
+        torch.testing.assert_close(bench.emitted(), expected[0], rtol=0, atol=1e-14)
+
+
+def test_boards_of_openmpd_share_every_transfer(tmp_path):
+    boards = [_board(tmp_path, name) for name in ("left", "right")]
+    device = hw.openmpd_boards(boards)
+    bench = hw.EmulatedBench(device, torch.ones(1, 512).cdouble())
+    sequence = Sequence(frames_of(40, 512), 9000.0, loop=False)
+    with hw.open_link(device, backend=bench.bus) as link:
+        received = [bytearray(), bytearray()]
+        for number, firmware in enumerate(bench._firmwares):
+            firmware.receive = received[number].extend
+        link.play_sequence(sequence)
+        frames = device.frames(sequence.drives).reshape(40, 2, 512)
+    for number, data in enumerate(received):
+        assert bytes(data[: 40 * 512]) == frames[:, number].tobytes()
+
+
+def _board(folder, name):
+    import autdtorch as at
+
+    lines = [name, "256", "128", "(0,0,0)" * 256, ",".join(map(str, range(256))), ",".join("0" * 256)]
+    path = folder / f"{name}.pat"
+    path.write_text("\n".join([*lines, ",".join("1" * 256)]), encoding="utf-8")
+    return at.OpenMPDBoard.load(path)
+
+
+@pytest.mark.parametrize("how", ["off", "another drive", "another sequence", "close"])
+def test_another_thread_ends_a_loop(trial, how):
+    bench = trial.bench(hw.OPENMPD)
+    with trial.link(bench, hw.OPENMPD) as link:
+        loop, full = Sequence(frames_of(5, COUNT), 1000.0), torch.ones(COUNT).cdouble()
+        ends = {
+            "off": link.off,
+            "another drive": lambda: link.play(full),
+            "another sequence": lambda: link.play_sequence(Sequence(full[None], 1000.0), 0.05),
+            "close": link.close,
+        }
+        timer = threading.Timer(0.05, ends[how])
+        timer.start()
+        playback = link.play_sequence(loop)
+        timer.join()
+        assert 0 < playback.frames < 10_000
+        assert bench.drive().any() == (how == "another drive")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_loop_with_the_outputs_off(trial, number):
+    before = signal.signal(number, signal.default_int_handler)
+    bench = trial.bench(hw.OPENMPD)
+    main = threading.main_thread().ident
+
+    def play() -> None:
+        with hw.ended_by_signals(), trial.link(bench, hw.OPENMPD) as link:
+            threading.Timer(0.03, signal.pthread_kill, (main, number)).start()
+            link.play_sequence(Sequence(frames_of(5, COUNT), 1000.0))
+
+    try:
+        with pytest.raises(hw.Signalled):
+            play()
+    finally:
+        signal.signal(number, before)
+    assert not bench.emitted().any()
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_of_the_bus_ends_a_loop_with_the_outputs_off(trial, fault):
+    bench = trial.bench(hw.OPENMPD)
+    bench.bus = FaultyBus([bench.chip], fault, 512 * 20 + 300)
+    with pytest.raises(hw.LinkError) as raised, trial.link(bench, hw.OPENMPD) as link:
+        link.play_sequence(Sequence(frames_of(5, COUNT), 1000.0))
+    assert bench.bus.struck
+    assert "\n" not in str(raised.value)
+    if fault == "unplug":
+        assert "outputs may still be on" in str(raised.value)
+    else:
+        assert not bench.emitted().any()
+
+
+def test_a_limited_link_scales_a_sequence_and_counts_its_time(trial):
+    sequence = Sequence(frames_of(4, COUNT), 100.0)
+    with trial.limited(hw.OPENMPD, amplitude=0.5, seconds=0.3) as (bench, link):
+        drives = played(bench)
+        link.play_sequence(sequence, 0.08)
+        assert 0.08 <= link.seconds_on < 0.3
+        assert max(float(drive.abs().max()) for drive in drives) <= 0.5 + 1e-9
+        assert drives[0].abs().max() > 0.3
+        assert not bench.emitted().any()
+        with pytest.raises(hw.LimitError, match=r"the sequence takes 0.29 s, and the limit leaves 0\.\d+ s"):
+            link.play_sequence(sequence, 0.29)
+        with pytest.raises(hw.LimitError, match=r"the outputs were on for 0.3 s, the limit"):
+            link.play_sequence(sequence)
+        assert not bench.emitted().any()
+
+
+def test_the_timer_of_a_limited_link_ends_a_loop_and_its_off_is_no_error(trial):
+    loop = Sequence(frames_of(4, COUNT), 100.0)
+    with trial.limited(hw.OPENMPD, seconds_in_a_row=0.06) as (bench, link):
+        with pytest.raises(hw.LimitError, match=r"longer than the outputs may stay on, 0.06 s in a row"):
+            link.play_sequence(loop)
+        assert not bench.emitted().any()
+    with trial.limited(hw.OPENMPD) as (_, link):
+        threading.Timer(0.05, link.off).start()
+        assert link.play_sequence(loop).seconds < 60
+
+
+class TestOnAutd3:
+    """By the kit, against its emulators of the network and of the boards."""
+
+    @pytest.fixture(autouse=True)
+    def kit(self):
+        pytest.importorskip("autd3_modulation", reason="the kit of AUTD3: install autdtorch[autd3]")
+        return pytest.importorskip("autd3", reason="the kit of AUTD3: install autdtorch[autd3]")
+
+    def test_limits_are_those_of_the_kit(self, kit):
+        assert kit.params.EMISSION_MAX_INDICES == autd3._MOST_PATTERNS
+        assert kit.params.MOD_BUFFER_SAMPLES == autd3._MOST_FACTORS
+        assert kit.params.ULTRASOUND_FREQ_HZ == autd3._CLOCK
+
+    @pytest.mark.parametrize("loop", [True, False])
+    def test_boards_play_a_sequence_and_then_a_drive_without_its_modulation(self, kit, loop, monkeypatch):
+        def state():
+            async def read():
+                states.extend(await link._port._client.read_fpga_state())
+
+            states = []
+            link._port._run("be asked", read, 5.0)
+            return states
+
+        def begun(rate, count, ended):
+            end = time.monotonic() + 10
+            while not all(one.is_stm_mode() for one in state()) and time.monotonic() < end:
+                time.sleep(0.01)
+            begins.append([one.is_stm_mode() for one in state()])
+            return real(rate, count, ended)
+
+        begins, real = [], streaming.outlast
+        monkeypatch.setattr("autdtorch.hardware.link.outlast", begun)
+        boards = kit.UdpEmulator(2)
+        with hw.open_autd3(2, network=boards.option(), settle=0) as link:
+            playback = link.play_sequence(Sequence(frames_of(50, 498), 1000.0, loop), seconds=0.05)
+            assert (playback.frames, playback.late) == (50, None)
+            assert begins == [[True, True]]
+            assert not any(one.is_stm_mode() for one in state())
+            link.play_sequence(modulated(frames_of(1, 498)[0], 200.0), seconds=0.01)
+            link.play(torch.ones(498).cdouble())
+            assert all(one.current_mod_bank() == kit.value.ModulationBank.B0 for one in state())
+
+    def recorded(self, sequence, laps):
+        """Phases and pulse widths (M, ticks) of the boards that the kit emulates."""
+        emulator = pytest.importorskip("autd3_emulator", reason="install autdtorch[crosscheck]")
+        from autd3_core import Autd3, Duration, Geometry
+
+        recorder = emulator.Recorder(Geometry([Autd3()]), 0)
+        held = hw.AUTD3.held(sequence.drives, sequence.rate, sequence.loop)
+        recorder.send(autd3.autd3_sequence(held, 1))
+        recorder.tick(Duration.from_nanos(round(1e9 * laps * sequence.duration)))
+        record = recorder.into_record()
+        return [part.to_numpy().astype(int) for part in (record.phase(), record.pulse_width())]
+
+    @pytest.mark.parametrize("rate", [500.0, 4000.0, 40_000.0])
+    def test_the_emulated_boards_emit_every_frame_in_order_at_its_time(self, rate):
+        # Phases that swing: emulator 0.12.0 smooths in the wrong direction where they wind down twice.
+        start, frame = frames_of(1, 249)[0], torch.arange(20)[:, None]
+        drives = start.abs() * torch.polar(
+            torch.ones(20, 249).double(), start.angle() + torch.sin(math.pi * frame / 10)
+        )
+        sequence = Sequence(drives, rate)
+        phases, widths = self.recorded(sequence, 3)
+        ticks = round(40_000 / rate)
+        ends = slice(ticks - 1, None, ticks)  # of each frame, when the silencer has reached it
+        levels = [level.T.repeat(1, 3).numpy() for level in hw.AUTD3.levels(drives)]
+        assert np.array_equal(phases[:, ends], levels[0])
+        pulses = 512 * np.arcsin(levels[1] / 255) / math.pi
+        assert np.abs(widths[:, ends] - pulses).max() <= 1  # counts of 512
+
+    def test_amplitude_modulation_has_its_frequency_and_depth_within_a_hundredth(self):
+        sequence = modulated(torch.ones(249).cdouble(), 200.0)
+        widths = self.recorded(sequence, 8)[1]
+        drive = np.sin(math.pi * widths / 512)
+        ends = (drive[:, 9::10] ** 2).mean(axis=0)  # radiation pressure goes with the square
+        wanted = (1 + np.sin(2 * math.pi * np.arange(160) / 20)) / 2
+        # 8 bits of the factor and of the intensity, 9 bits of the pulse width.
+        assert np.abs(ends - wanted).max() < 0.01
+        spectrum = np.abs(np.fft.rfft(ends - ends.mean()))
+        assert spectrum.argmax() * 4000 / 160 == 200.0
+
+
+CLOSED, LIMITED = "closed", "limited"
+SMALL = frames_of(4, COUNT)
+MISTAKES = [
+    (hw.OPENMPD, lambda: Sequence(SMALL[:0], 10.0), {}, r"drives: shape \(0, 16\)"),
+    (
+        hw.OPENMPD,
+        lambda: Sequence(SMALL * math.nan, 10.0),
+        {},
+        r"drives\[0, 0\]: \(nan\+nanj\); .* finite",
+    ),
+    (hw.OPENMPD, lambda: Sequence(2 * SMALL, 10.0), {}, "drives: amplitude 1.9"),
+    (hw.OPENMPD, lambda: Sequence(SMALL, 0.0), {}, "rate: 0.0 Hz; must be finite and > 0"),
+    (hw.OPENMPD, lambda: Sequence(SMALL, math.nan), {}, "rate: nan Hz"),
+    (hw.OPENMPD, lambda: SMALL, {}, "sequence: .*must be a Sequence"),
+    (hw.OPENMPD, lambda: None, {}, "sequence: None; must be a Sequence"),
+    (hw.OPENMPD, lambda: Sequence(SMALL[:, :10], 10.0), {}, "sequence: 10 transducers; must be 16"),
+    (hw.OPENMPD, lambda: Sequence(SMALL, 10.0), {"seconds": 0}, "seconds: 0 s; must be finite and > 0"),
+    (hw.OPENMPD, lambda: Sequence(SMALL, 10.0), {"seconds": -1.0}, "seconds: -1.0 s; must be finite and > 0"),
+    (hw.OPENMPD, lambda: Sequence(SMALL, 10.0), {"seconds": math.nan}, "seconds: nan s"),
+    (hw.OPENMPD, lambda: Sequence(SMALL, 10.0), {"seconds": "5"}, "seconds: '5'"),
+    (
+        hw.OPENMPD,
+        lambda: Sequence(SMALL, 10.0, loop=False),
+        {"seconds": 0.5},
+        "seconds: 0.5 s; must be at most 0.4",
+    ),
+    (hw.OPENMPD, lambda: Sequence(SMALL, 12e3), {}, "rate: 12000.0 Hz; must be at most 1e.04 for OpenMPD"),
+    (
+        hw.SONICSURFACE,
+        lambda: Sequence(SMALL, 100.0),
+        {},
+        "rate: 100.0 Hz; must be at most 89.3 for SonicSurface",
+    ),
+    (hw.ULTRAINO, lambda: Sequence(SMALL, 60.0), {}, "rate: 60.0 Hz; must be at most 54.86 for Ultraino"),
+    (
+        hw.ultraino_boards(2),
+        lambda: Sequence(SMALL, 50.0),
+        {},
+        "rate: 50.0 Hz; must be at most 28.1 for Ultraino",
+    ),
+    (hw.AUTD3, lambda: Sequence(SMALL, 50e3), {}, "rate: 50000.0 Hz; must be at most 4e.04 for AUTD3"),
+    (hw.AUTD3, lambda: Sequence(SMALL, 3e3), {}, "rate: 3000.0 Hz; .* such as 2857.143 or 3076.923"),
+    (hw.AUTD3, lambda: Sequence(SMALL, 0.5), {}, "rate: 0.5 Hz; must be at least 0.61 for AUTD3"),
+    (
+        hw.AUTD3,
+        lambda: Sequence(frames_of(1025, COUNT), 1e3),
+        {},
+        "sequence: 1025 frames; must be at most 1024",
+    ),
+    (LIMITED, lambda: SMALL, {}, "sequence: .*must be a Sequence"),
+    (LIMITED, lambda: Sequence(SMALL[:, :3], 10.0), {}, "sequence: 3 transducers; must be 16"),
+    (CLOSED, lambda: Sequence(SMALL, 10.0), {}, "OpenMPD is closed; open it again"),
+]
+
+
+@pytest.mark.parametrize(("device", "make", "arguments", "message"), MISTAKES)
+def test_a_mistake_is_refused_in_one_line_and_nothing_plays(trial, device, make, arguments, message):
+    kind = hw.OPENMPD if isinstance(device, str) else device
+    bench = hw.EmulatedBench(kind, trial.simulated.transfer_matrix, range(COUNT))
+    port = kind.emulated_port(bench) if kind.adapters else BenchPort(bench)
+    with hw.Link(kind, port, range(COUNT), 0, bench.bus.sleep) as link:
+        if device == CLOSED:
+            link.close()
+        player = hw.LimitedLink(link, hw.Limits(1.0)) if device == LIMITED else link
+        drives = played(bench)
+        with pytest.raises((ValueError, hw.LinkError), match=message) as raised:
+            player.play_sequence(make(), **arguments)
+        assert "\n" not in str(raised.value)
+        assert not any(drive.any() for drive in drives)
+
+
+def test_a_modulation_longer_than_the_memory_of_autd3_is_refused():
+    drives = torch.linspace(0, 1, 65_537, dtype=torch.float64)[:, None] * torch.ones(2).cdouble()
+    with pytest.raises(ValueError, match="sequence: 65537 frames; must be at most 65536 frames"):
+        hw.AUTD3.held(drives, 4000.0, True)
+
+
+def test_a_loop_lasts_as_long_as_asked(trial):
+    bench = trial.bench(hw.OPENMPD)
+    with trial.link(bench, hw.OPENMPD) as link:
+        begin = time.perf_counter()
+        link.play_sequence(Sequence(SMALL, 1000.0), seconds=0.1)
+        assert time.perf_counter() - begin >= 0.1
