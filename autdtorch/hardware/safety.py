@@ -221,6 +221,10 @@ class LimitedLink:
 
         A loop without `seconds` plays until the end of the time, unless another thread calls `off`.
 
+        Args:
+            sequence: frames of drives (T, M), scaled as in `play`.
+            seconds: time to play [s], > 0; by default all frames once, or a loop without end.
+
         Raises:
             LimitError: the time limit of the outputs is reached, before or meanwhile.
             ValueError: as of `Link.play_sequence`, or a duration above `seconds_in_a_row`.
