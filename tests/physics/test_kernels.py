@@ -13,7 +13,8 @@ from small_scenes import CUBE, NO_RECEIVERS, NO_SOURCES, all_tensors, assembled_
 from autdtorch.analytic.discs import waves_of
 from autdtorch.analytic.green import green
 from autdtorch.fdtd.kernels.contract import uniform_state
-from autdtorch.fdtd.kernels.cpu import CpuKernel, _cuts
+from autdtorch.fdtd.kernels.cpu import CpuKernel, _alike, _cuts
+from autdtorch.fdtd.kernels.cpu_intrinsics import ALIKE
 from autdtorch.fdtd.kernels.cpu_waves import superposition, wave_matrix
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import assemble, drive_signal
@@ -102,6 +103,28 @@ def test_no_cell_reads_those_inside_rigid_bodies(monkeypatch):
 
     whole = stepped(replace(c, idle=c.idle[:0]), 0)
     assert all(map(torch.equal, stepped(c, math.nan), whole))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_rows_of_equal_weights_change_no_bit(dtype, monkeypatch):
+    """A kernel computes them many at a time, outside of the layers."""
+    face = Box((12e-3, 21.7e-3, 12e-3), (30e-3, 1.7e-3, 40e-3), density=5.0, sound_speed=300.0)
+    parts = assembled_parts(small_scene((face,)), 1e-3, dtype)
+    assembly, sources, receivers = parts
+    c, signal = assembly.coefficients, drive_signal(assembly.steps_per_period, 0, 41).to(dtype)
+    used = []
+
+    def stepped(alike):
+        monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._alike", alike)
+        state, recorded = CpuKernel().advance(assembly.silence(sources), c, sources, receivers, signal)
+        return all_tensors(state, recorded)
+
+    together = stepped(lambda *cells: used.append(_alike(*cells)) or used[-1])
+    layers = torch.isin(c.heterogeneous_index, c.layer_index).numpy()
+    assert used[0].max() >= ALIKE
+    assert layers.any()
+    assert not used[0][layers].any()
+    assert all(map(torch.equal, together, stepped(lambda *cells: 0 * _alike(*cells))))
 
 
 def test_one_worker_steps_where_processors_are_busy(monkeypatch):

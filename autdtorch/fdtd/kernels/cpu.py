@@ -32,6 +32,7 @@ from autdtorch.fdtd.kernels.contract import (
     uniform_state,
 )
 from autdtorch.fdtd.kernels.cpu_intrinsics import (
+    ALIKE,
     add_to_counter,
     give_way,
     read_counter,
@@ -42,7 +43,7 @@ from autdtorch.fdtd.kernels.cpu_layers import FlatMemory, plane_profiles, rows_p
 from autdtorch.fdtd.kernels.cpu_sweep import sweep_planes
 from autdtorch.fdtd.kernels.cpu_waves import superposition
 from autdtorch.fdtd.stencil import OFFSETS
-from autdtorch.utils.array_types import COMPLEX, REAL, AnyArray
+from autdtorch.utils.array_types import COMPLEX, REAL, AnyArray, Index
 from autdtorch.utils.process import spread, thread_count
 
 # Fewest cells and planes of a chunk, for which a second thread and the sums at its ends pay
@@ -120,7 +121,7 @@ def _finish_chunk(c, q, medium, cells, losses, outermost, sources, row, sound_ha
             for j in range(1, ny - 1):
                 for k in range(j * nz + 1, j * nz + nz - 1):
                     q[at * plane + k] += outermost[other, (1 - end) * plane + k]
-    index, _, _, _, scale, _, new, swept = cells
+    index, _, _, _, scale, _, _, new, swept = cells
     for n in range(starts[cuts[c]], starts[cuts[c + 1]]):
         absorbed = scale[n] * (q[index[n]] - swept[n]) if scale[n] != 0 else scale[n]
         q[index[n]] = new[n] + absorbed
@@ -255,13 +256,27 @@ def _columns(c: Coefficients, columns: Columns) -> tuple[AnyArray, ...]:
 
 
 def _heterogeneous_cells(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, ...]:
-    """Return indices, kinds, weights by kind, offsets, layer scale, weights of air, and workspace."""
+    """Return indices, kinds, weights by kind, offsets, layer scale, weights of air, runs, and workspace."""
     index, (kind, weight) = c.heterogeneous_index.numpy(), c.distinct_rows
     air = np.array((c.center, c.face, c.edge, c.corner), weight.dtype)[np.abs(OFFSETS).sum(axis=1)]
     scale = np.zeros_like(weight, shape=len(index))
     scale[np.searchsorted(index, c.layer_index.numpy())] = c.layer_scale.numpy()
     new, swept = np.empty_like(scale), np.empty_like(scale)
-    return index, kind, weight.reshape(-1), row_offsets(shape), scale, air, new, swept
+    alike = _alike(index, kind, scale)
+    return index, kind, weight.reshape(-1), row_offsets(shape), scale, air, alike, new, swept
+
+
+def _alike(index: Index, kind: Index, scale: AnyArray) -> NDArray[np.int64]:
+    """Return for each cell (n,) how many follow it in a row, itself included, with equal weights.
+
+    It is zero in the layers, and in rows of fewer than `ALIKE` such cells.
+    """
+    number = np.arange(len(index))
+    kind = np.where(scale == 0, kind, -1 - number)
+    starts = np.flatnonzero((np.diff(index, prepend=-1) != 1) | (np.diff(kind, prepend=-1) != 0))
+    length = np.diff(starts, append=len(index))
+    ends = np.repeat(starts + np.where(length < ALIKE, 0, length), length)
+    return np.asarray((ends - number).clip(min=0), np.int64)
 
 
 def _losses(c: Coefficients, plane: int, cuts: NDArray[np.int64], dtype: type) -> tuple[AnyArray, ...]:

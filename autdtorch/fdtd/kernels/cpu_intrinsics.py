@@ -1,4 +1,4 @@
-"""Operations that Numba lacks: on four cells of a row at a time, and on counters of several threads.
+"""Operations that Numba lacks: on several cells of a row at a time, and on counters of several threads.
 
 Numba vectorises neither the rows around heterogeneous cells, which are scattered and whose sums keep an
 order, nor the short ends of rows with the cells of boundary layers.
@@ -21,8 +21,11 @@ from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.utils.array_types import Index
 
 _WIDTH = 4  # Cells of a row that are read: three neighbours, and a lane of padding with weight zero
+_MIDDLE = 13  # The cell itself among its neighbours, from which it does not differ
 # Neighbour read first in each row, and the lane of padding: no read leaves the grid or the weights
 _FIRST, _PADDING = (*range(0, 24, 3), 23), (*8 * (3,), 0)
+ALIKE = 16
+"""Neighbouring cells with equal weights that are computed at once."""
 
 
 def row_offsets(shape: tuple[int, ...]) -> Index:
@@ -72,6 +75,43 @@ def _sum_of_rows(typing_context: Any, p: Any, cell: Any, offset: Any, weight: An
     return p.dtype(p, types.int64, offset, weight, types.int64), generate
 
 
+def _sums_of_rows(
+    typing_context: Any, p: Any, cell: Any, offset: Any, weight: Any, at: Any, out: Any, place: Any
+) -> Any:
+    """Write the sums of `_sum_of_rows` for `ALIKE` cells from `cell` on with equal weights, bit for bit."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        number, long = context.get_data_type(p.dtype), ir.IntType(64)
+        cells, size = ir.VectorType(number, ALIKE), context.get_abi_sizeof(number)
+        zeros = ir.Constant(ir.VectorType(ir.IntType(32), ALIKE), None)
+        _, first_cell, _, _, first_weight, _, first_out = arguments
+
+        def pointer(array: int, index: Any) -> Any:
+            return _item(context, builder, signature, arguments, array, index)
+
+        def load(index: Any) -> Any:
+            return builder.load(builder.bitcast(pointer(0, index), cells.as_pointer()), align=size)
+
+        def repeated(value: Any) -> Any:
+            first = builder.insert_element(ir.Constant(cells, ir.Undefined), value, ir.IntType(32)(0))
+            return builder.shuffle_vector(first, first, zeros)
+
+        here, parts = load(first_cell), 4 * [ir.Constant(cells, None)]
+        for r, (first, padding) in enumerate(zip(_FIRST, _PADDING, strict=True)):
+            start = builder.add(first_cell, builder.load(pointer(2, ir.Constant(long, r))))
+            for j in range(_WIDTH):
+                if j == padding or first + j == _MIDDLE:
+                    continue
+                rise = builder.fsub(load(builder.add(start, ir.Constant(long, j))), here)
+                share = builder.load(pointer(3, builder.add(first_weight, ir.Constant(long, first + j))))
+                parts[j] = builder.fadd(parts[j], builder.fmul(repeated(share), rise))
+        total = builder.fadd(builder.fadd(parts[0], parts[2]), builder.fadd(parts[1], parts[3]))
+        builder.store(total, builder.bitcast(pointer(5, first_out), cells.as_pointer()), align=size)
+        return context.get_dummy_value()
+
+    return types.void(p, types.int64, offset, weight, types.int64, out, types.int64), generate
+
+
 def _add_four(typing_context: Any, u: Any, at: Any, v: Any, start: Any) -> Any:
     """Add four cells of v from `start` on to those of u from `at` on."""
 
@@ -110,6 +150,7 @@ def _read_atomically(typing_context: Any, counters: Any, place: Any) -> Any:
 
 
 sum_of_rows: Any = intrinsic(_sum_of_rows)
+sums_of_rows: Any = intrinsic(_sums_of_rows)
 add_four: Any = intrinsic(_add_four)
 add_to_counter: Any = intrinsic(_add_atomically)
 read_counter: Any = intrinsic(_read_atomically)

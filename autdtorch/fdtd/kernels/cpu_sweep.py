@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 
 from autdtorch.fdtd.kernels.compiled import INNER
-from autdtorch.fdtd.kernels.cpu_intrinsics import sum_of_rows
+from autdtorch.fdtd.kernels.cpu_intrinsics import ALIKE, sum_of_rows, sums_of_rows
 from autdtorch.fdtd.kernels.cpu_layers import absorb_x, add_terms, stretch_planes
 
 _U = np.uint64
@@ -46,13 +46,24 @@ def _sweep(p, at, n, row, q, old, back, across, here, behind, weights):  # type:
 @njit(**INNER)
 def _heterogeneous(p, q, cells, first, last, keep):  # type: ignore[no-untyped-def]
     """Compute new pressures of heterogeneous cells; in layers also the result of the sweep in them."""
-    index, kind, weight, offset, scale, air, new, swept = cells
-    for n in range(first, last):
+    index, kind, weight, offset, scale, air, alike, new, swept = cells
+    n = first
+    while n < last:
+        if alike[n] > 0:
+            m = n + min(alike[n] - ALIKE, 0)  # the last cells of a run are computed with some before them
+            cell = index[m]
+            sums_of_rows(p, cell, offset, weight, kind[n] * len(air), new, m)
+            for k in range(ALIKE):
+                here, before = p[cell + k], q[cell + k]
+                new[m + k] = here + keep * (here - before) + new[m + k]
+            n = m + ALIKE
+            continue
         cell = index[n]
         here, before = p[cell], q[cell]
         new[n] = here + keep * (here - before) + sum_of_rows(p, cell, offset, weight, kind[n] * len(air))
         if scale[n] != 0:
             swept[n] = here + keep * (here - before) + sum_of_rows(p, cell, offset, air, 0)
+        n += 1
 
 
 @njit(**INNER)
