@@ -81,11 +81,13 @@ def run_to_steady_state(
     earliest, block = fewest_periods(assembly.grid.arrival), block_of(assembly.steps_per_period)[1]
     if echo:
         earliest += block  # the first answer to an echo is a block late
-    sequence = Extrapolation(phasors_kept(len(cells)), single=assembly.dtype == torch.float32)
+    kept, (steps, _) = phasors_kept(len(cells)), block_of(assembly.steps_per_period)
+    sequence = Extrapolation(kept, single=assembly.dtype == torch.float32)
     values: deque[Sequence[Tensor]] = deque(maxlen=_JUDGED)
     first_judged = min(earliest, max_periods) - (_JUDGED - 1) * block
     ramp = math.ceil(RAMP_PERIODS * assembly.steps_per_period)
-    for count, windows in windows_of_run(assembly, kernel, sources, cells, echo):
+    unused = (math.ceil(first_judged / block) - 1) * steps - (kept - 1) * _shift(steps)
+    for count, windows in windows_of_run(assembly, kernel, sources, cells, echo, unused):
         stepped(block)
         for start, phasor in windows:
             if start >= ramp:
@@ -160,23 +162,32 @@ class Extrapolation:
 
 
 def windows_of_run(
-    assembly: Assembly, kernel: Kernel, sources: Sources, cells: Index, echo: Echo | None = None
+    assembly: Assembly,
+    kernel: Kernel,
+    sources: Sources,
+    cells: Index,
+    echo: Echo | None = None,
+    unused: int = 0,
 ) -> Iterator[tuple[int, list[tuple[int, Phasors]]]]:
     """Step from silence; yield after each block the periods so far, and start and phasors of its windows.
+
+    Blocks within the first `unused` steps are not recorded, and have no windows.
 
     With an `echo`, `sources` fade over the next block into those that it returns for the phasors of a block:
     what the cells radiate comes back while they are stepped, and blocks still follow x_(n+1) = A x_n + b.
     """
     steps_per_period = assembly.steps_per_period
     steps, periods = block_of(steps_per_period)
-    shift = steps if echo else max(1, steps // _PARTS)
+    shift = steps if echo else _shift(steps)
+    recorded_from = 0 if echo else max(0, unused // steps * steps)
     rising = _smooth((torch.arange(steps, device="cpu") + 0.5) / steps)[:, None].to(assembly.dtype)
     before = sources
     ones = torch.ones((len(cells), 1), dtype=assembly.dtype, device="cpu")
     receivers = Receivers(torch.from_numpy(cells[:, None]), ones)
+    nothing = Receivers(receivers.index[:0], ones[:0])
     state, basis = assembly.silence(sources), drive_basis(steps, periods)
     total = silence = torch.zeros(len(cells), **COMPLEX)
-    sums: dict[int, Tensor] = {}  # Fourier sums from the beginning to where windows begin and end
+    sums: dict[int, Tensor] = {}  # Fourier sums from the first recorded step to where windows begin and end
     for block in itertools.count():
         first = block * steps
         signal = drive_signal(steps_per_period, first, steps).to(assembly.dtype)
@@ -184,7 +195,11 @@ def windows_of_run(
         if echo:
             signal = torch.cat([(1 - rising) * signal, rising * signal], dim=1)
             driven = Sources(sources.index, torch.cat([before.force, sources.force], dim=1))
-        state, recorded = kernel.advance(state, assembly.coefficients, driven, receivers, signal)
+        read = receivers if first >= recorded_from else nothing
+        state, recorded = kernel.advance(state, assembly.coefficients, driven, read, signal)
+        if read is nothing:
+            yield (block + 1) * periods, []
+            continue
         sums = {time: value for time, value in sums.items() if time > first - steps}
         inside = (time for time in range(first + 1, first + steps) if _is_needed(time, steps, shift))
         for begin, end in itertools.pairwise((first, *inside, first + steps)):
@@ -192,13 +207,16 @@ def windows_of_run(
             total = total + fourier_sum(basis[:, part], recorded[part]).cpu()
             sums[end] = total
         starts = range(-(-(first + 1) // shift) * shift - steps, first + 1, shift)
-        windows = []
-        for start in starts:
-            until = sums[start] if start > 0 else silence
-            windows.append((start, (sums[start + steps] - until).numpy()))
+        whole = (start for start in starts if start >= recorded_from or not recorded_from)
+        windows = [(start, (sums[start + steps] - sums.get(start, silence)).numpy()) for start in whole]
         yield (block + 1) * periods, windows
         if echo:
             before, sources = sources, echo(torch.from_numpy(windows[-1][1]))
+
+
+def _shift(steps: int) -> int:
+    """Return the steps from a window to the next, for blocks of `steps`."""
+    return max(1, steps // _PARTS)
 
 
 def _smooth(share: Tensor) -> Tensor:

@@ -1,13 +1,17 @@
 """The full-domain propagator against exact fields and itself; warnings of scenes and grids, each once."""
 
 import dataclasses
+import itertools
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
-from small_scenes import AIR, CUBE, relative_error, small_scene
+from small_scenes import AIR, CUBE, assembled_parts, relative_error, small_scene
 
+from autdtorch.fdtd.kernels.cpu import CpuKernel
+from autdtorch.fdtd.steady_state import block_of, windows_of_run
 from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.propagators import (
     FreeSpacePropagator,
@@ -149,6 +153,22 @@ def test_the_distance_to_the_steady_state_is_below_the_tolerance():
     }
     for tolerance, matrix in matrices.items():
         assert relative_error(matrix, matrices[1e-7]) <= tolerance
+
+
+def test_windows_are_those_of_a_run_that_is_recorded_from_its_first_step():
+    assembly, sources, receivers = assembled_parts(small_scene((CUBE,)), 2e-3, torch.float64)
+    cells, (steps, _) = receivers.index[:, 0].numpy(), block_of(assembly.steps_per_period)
+
+    def windows(unused):
+        run = windows_of_run(assembly, CpuKernel(), sources, cells, unused=unused)
+        return [dict(each) for _, each in itertools.islice(run, 6)]
+
+    whole, later = windows(0), windows(3 * steps + 1)
+    assert [bool(each) for each in later] == 3 * [False] + 3 * [True]
+    for one, other in zip(whole[3:], later[3:], strict=True):
+        assert set(other) == {start for start in one if start >= 3 * steps}
+        for start, phasors in other.items():  # sums of a few dozen terms, from another first one
+            assert np.abs(phasors - one[start]).max() <= 1e-12 * np.abs(phasors).max()
 
 
 @pytest.mark.parametrize("method", ["free_space", "full"])
