@@ -523,7 +523,7 @@ def _annotations(function: Callable[..., Any]) -> dict[str, str]:
 
 
 def public_calls() -> dict[str, Call]:
-    """All that have parameters, by name."""
+    """All that have parameters, by name; a method that classes inherit is that of the first of them."""
     calls = [
         call
         for module in (at, at.analytic, hardware, propagators)
@@ -531,7 +531,8 @@ def public_calls() -> dict[str, Call]:
         if callable(thing := getattr(module, name))
         for call in (_calls_of(thing) if inspect.isclass(thing) else [Call(name, thing)])
     ]
-    return {call.name: call for call in calls if call.parameters and call.name not in NOT_CALLED_BY_USERS}
+    called = [call for call in calls if call.parameters and call.name not in NOT_CALLED_BY_USERS]
+    return {call.name: call for call in {call.function: call for call in reversed(called)}.values()}
 
 
 def _calls_of(kind: type) -> Iterator[Call]:

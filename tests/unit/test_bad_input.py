@@ -58,17 +58,18 @@ LET_IN = {
 
 
 class Accepted(Exception):
-    """All arguments were checked; nothing needs to be drawn."""
+    """All arguments were checked; nothing needs to be drawn or simulated."""
 
 
 @pytest.fixture(autouse=True)
-def nothing_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+def the_checks_are_all(monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(*_: Any) -> None:
         raise Accepted
 
     monkeypatch.setattr("autdtorch.plot.pressure_maps._draw_plane", stop)
     monkeypatch.setattr("autdtorch.plot.view3d.require_rendering", stop)
     monkeypatch.setattr(explore, "require_rendering", stop)
+    monkeypatch.setattr(at.NearbyPoses, "_coarse", stop)
 
 
 def refusal(function: Callable[..., Any], arguments: dict[str, Any]) -> Exception | None:
