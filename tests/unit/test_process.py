@@ -152,12 +152,12 @@ def test_the_first_evaluations_by_strength_count(monkeypatch: pytest.MonkeyPatch
 def test_a_study_needs_the_memory_of_a_block_of_its_trials(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(process, "available_memory", lambda: 20_000_000)
+    monkeypatch.setattr(process, "available_memory", lambda: 5_000_000)
     with pytest.raises(ValueError, match=r"^evaluations: 3000; needs about"):
-        at.random_search(OBJECTIVE, evaluations=3000, trials=300)
+        at.random_search(OBJECTIVE, evaluations=3000, trials=75)
     method = functools.partial(at.random_search, evaluations=3000)
-    study = run_study({"a": AIR}, {"random": method}, tmp_path, trials=300)
-    assert len(study.scenes["a"].methods["random"].solution.score) == 300
+    study = run_study({"a": AIR}, {"random": method}, tmp_path, trials=75)
+    assert len(study.scenes["a"].methods["random"].solution.score) == 75
 
 
 def test_a_chosen_spacing_is_refused_by_the_tolerance(monkeypatch: pytest.MonkeyPatch) -> None:
