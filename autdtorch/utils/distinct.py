@@ -25,8 +25,11 @@ def distinct_rows(rows: AnyArray) -> tuple[Index, Index]:
             mixed = (digest[some] ^ column) * _MULTIPLIER
             digest[some] = mixed ^ (mixed >> _HALF)  # the upper bits, where those of numbers differ, count
     _, first, kind = np.unique(digest, return_index=True, return_inverse=True)
-    if (rows[first][kind] != rows).any():
-        return np.arange(len(rows)), np.arange(len(rows))
+    distinct = rows[first]
+    for first_row in range(0, len(rows), _TOGETHER):
+        some = slice(first_row, first_row + _TOGETHER)
+        if (distinct[kind[some]] != rows[some]).any():
+            return np.arange(len(rows)), np.arange(len(rows))
     return first, kind
 
 

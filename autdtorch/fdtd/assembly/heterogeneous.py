@@ -117,8 +117,10 @@ def heterogeneous_cells(
         coupling *= _both_open(hard, touched, shape)
     largest = _ROW_SUM_MARGIN * stencil.total * float(elements.materials.speed.max())
     mass = _transferred_mass(coupling, mass, elements, touched, shape, largest)
-    weight = coupling / mass[:, None]
-    changed = (np.abs(weight - stencil.weights) > _ROW_ROUNDING).any(axis=1) | (mass != 1)
+    coupling /= mass[:, None]
+    weight, air = coupling, stencil.weights
+    changed = [(np.abs(part - air) > _ROW_ROUNDING).any(axis=1) for part in _in_parts(weight)]
+    changed = np.concatenate(changed) | (mass != 1)
     loss = _touched_losses(elements, interface, touched, hard, shape, stencil)
     changed |= loss.any(axis=1)
     changed &= ~hard[touched]
@@ -126,8 +128,11 @@ def heterogeneous_cells(
     uniform = _uniform_cells(elements, touched, hard, shape, stencil)
     index, weight, mass, loss = (np.concatenate(part) for part in zip(surface, uniform, strict=True))
     order = np.argsort(index)
-    around = distinct_cells(_neighbours(touched, shape), math.prod(shape))
-    shell = around[hard[around] & _inner(around, shape)]
+    around = np.zeros(math.prod(shape), bool)
+    for part in _in_parts(touched):
+        around[_neighbours(part, shape)] = True
+    shell = np.flatnonzero(around & hard)
+    shell = shell[_inner(shell, shape)]
     rows = index[order], weight[order], mass[order]
     losses = elements.materials.losses
     tangent = 0.0 if losses is None else losses.tangent
@@ -172,13 +177,15 @@ def _without_rigid(
     hard[vertices] = elements.materials.rigid[interface.material]
     inside, count = hard[touched], -1
     densest = _densest(elements)
-    least = np.full(len(hard), _RIGID_COUPLING * stencil.total)
-    least[vertices[interface.finite]] = max(_SLIVER_COUPLING / densest, _LEAST_COUPLING) * stencil.total
+    sliver = np.zeros(len(hard), bool)
+    sliver[vertices[interface.finite]] = True
+    least = np.where(sliver[touched], max(_SLIVER_COUPLING / densest, _LEAST_COUPLING), _RIGID_COUPLING)
+    least *= stencil.total
     hard[touched] = False
     coupling, mass = _assembled(elements, _stiffness(elements, interface, stencil), touched, shape)
     while True:
         coupling *= _both_open(hard, touched, shape)
-        hard[touched] |= inside & (np.abs(coupling).sum(axis=1) <= least[touched])
+        hard[touched] |= inside & (np.abs(coupling).sum(axis=1) <= least)
         if hard.sum() == count or not inside.any():
             return coupling, mass, hard, interface
         count, out = hard.sum(), hard[vertices]
@@ -223,7 +230,9 @@ def _densest(elements: Elements) -> float:
 
 def _both_open(hard: NDArray[np.bool_], touched: Index, shape: GridShape) -> NDArray[np.bool_]:
     """Return the mask (n, 27) of neighbours of touched cells where neither is in `hard` (k,)."""
-    return np.asarray(~(hard[touched, None] | hard[_neighbours(touched, shape)]))
+    return np.concatenate(
+        [~(hard[part, None] | hard[_neighbours(part, shape)]) for part in _in_parts(touched)]
+    )
 
 
 def condensed(interface: InterfaceElements, out: NDArray[np.bool_]) -> InterfaceElements:
@@ -259,12 +268,12 @@ def _assembled(
     cells = tuple(cells - 1 for cells in shape)
     # elements by kind: of one material, then those that surfaces intersect
     count = len(elements.materials.density)
-    kind = elements.material.astype(np.int64).ravel()
+    kind = elements.material.astype(np.int32).ravel()
     kind[elements.index] = count + np.arange(len(elements.index))
     # at flat faces many elements are equal, and many cells are among equal ones
     first, equal = distinct_rows(np.concatenate(parts, axis=1))
     of_pairs, masses = (part[first] for part in parts)
-    kind = equal[kind]
+    kind = equal.astype(np.int32)[kind]
     around = [kind[np.ravel_multi_index(tuple((places - vertex).T), cells)] for vertex in VERTICES]
     some, number_of = distinct_rows(np.stack(around, axis=1))
     coupling, mass = np.zeros((len(some), 27)), np.zeros(len(some))
@@ -433,10 +442,15 @@ def _connections(
     coupling: Array, touched: Index, places: Index, free: NDArray[np.bool_], shape: GridShape, usual: float
 ) -> tuple[Index, Index]:
     """Return the pairs of cells (k,) and (k,) between which sound passes, of the touched ones at `places`."""
-    size = np.abs(coupling)
-    row, neighbour = size.sum(axis=1).clip(min=usual), touched[places, None] + flat_offsets(shape)
-    place = np.searchsorted(touched, neighbour).clip(max=len(touched) - 1)
-    theirs = np.where(touched[place] == neighbour, row[place], np.inf)
-    passes = (size[places] > _BLOCKED * np.minimum(row[places, None], theirs)) & free[neighbour]
-    first, offset = np.nonzero(passes)
-    return touched[places[first]], neighbour[first, offset]
+    row = np.concatenate([np.abs(part).sum(axis=1) for part in _in_parts(coupling)]).clip(min=usual)
+    place_of = places_among(touched, math.prod(shape))
+    pairs = []
+    for part in _in_parts(places):
+        neighbour = _neighbours(touched[part], shape)
+        place = place_of[neighbour]
+        theirs = np.where(touched[place] == neighbour, row[place], np.inf)
+        passes = np.abs(coupling[part]) > _BLOCKED * np.minimum(row[part, None], theirs)
+        first, offset = np.nonzero(passes & free[neighbour])
+        pairs.append((touched[part[first]], neighbour[first, offset]))
+    one, other = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
+    return one, other
