@@ -183,8 +183,9 @@ def test_places_of_foci_are_found_between_cells() -> None:
     loudest = fine.reshape(-1, 3)[
         magnitudes(ARRAY, focused_drive(ARRAY, truth.foci, generator), fine.reshape(-1, 3)).argmax()
     ]
-    places = inversion().picture(TIMES, truth.frames(), DURATION).foci(truth.foci[:1] + 1e-3 * PLANE.basis[0])
-    # 0.2 mm is the goal, with pixels of 0.8 mm.
+    frames = truth.frames(noise=NOISE / 4)  # as at 2 kPa
+    places = inversion().picture(TIMES, frames, DURATION).foci(truth.foci[:1] + 1e-3 * PLANE.basis[0])
+    # 0.2 mm is the goal, with pixels of 0.8 mm; the median is 0.04 mm by scripts/benchmark.py camera.
     assert float((places[0] - loudest).norm()) < 0.2e-3
 
 

@@ -12,7 +12,7 @@ from autdtorch.hardware.camera.registration import Registration
 from autdtorch.utils.array_types import AnyArray, Array
 from autdtorch.utils.validation import invalid
 
-_MARGIN = 1.0  # of the rectangle around the plane, in wavelengths
+_MARGIN = 0.4  # of the rectangle around the plane, in wavelengths: kinks at its edges go no further
 _SPACING = 1 / 11  # of the grid between cosines and pixels, in wavelengths
 _BEYOND = 1.1  # largest wavenumber relative to 2 k: the mirror images at the edges have kinks
 _FLOOR = 1e-3  # of the spectrum beyond the wavenumbers of |p|^2, by its maximum

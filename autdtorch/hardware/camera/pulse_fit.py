@@ -15,8 +15,8 @@ from autdtorch.utils.validation import invalid
 
 _RATES = 48  # of decay, that stand for those of all cosines
 _RANK = 1e-3  # smallest singular value of the combinations of frames, by the largest
-_CONVERGED, _ITERATIONS = 1e-4, 300  # of conjugate gradients: residual norm relative to the right side
-_ROUGH = 1e-2  # of the coefficients by which the latency is found
+_CONVERGED, _ITERATIONS = 0.03, 300  # of conjugate gradients: rms residual, relative to the noise in it
+_ROUGH = 0.5  # of the coefficients by which the latency is found
 _LATENCIES = np.linspace(-0.1, 0.4, 251)  # that are tried [s]
 _CERTAIN = 0.02  # largest standard deviation of a latency [s]
 _LEAST_NOISE = 1e-6  # [K]
@@ -69,19 +69,15 @@ class PulseFit:
             self._prior.append(remaining**2 * cosines.spectrum)
 
     def _reduce(self, values: Array, valid: AnyArray) -> None:
-        """Form the combinations (N, R) of frames, and their weights (N, R, R), without constants."""
+        """Form the combinations (N, R) of frames without constants; weights (G, R, R) where frames miss."""
         count = np.maximum(valid.sum(axis=0), 1)
         self._values = np.where(valid, values - values.sum(axis=0) / count, 0.0)
         self._data = self._values.T @ self._basis
-        self._weights = np.broadcast_to(
-            np.eye(self._basis.shape[1]), (len(count), *[self._basis.shape[1]] * 2)
-        )
-        if self._full.all():
-            return
-        self._weights = self._weights.copy()
-        for pixel in np.flatnonzero(~self._full):
+        self._gaps = np.flatnonzero(~self._full)
+        self._weights = np.empty((len(self._gaps), *[self._basis.shape[1]] * 2))
+        for weight, pixel in zip(self._weights, self._gaps, strict=True):
             seen = self._basis[valid[:, pixel]]
-            self._weights[pixel] = seen.T @ (seen - (seen.mean(axis=0) if len(seen) else 0.0))
+            weight[:] = seen.T @ (seen - (seen.mean(axis=0) if len(seen) else 0.0))
 
     def _measure_noise(self, drift: float) -> None:
         """Measure the noise of pixels, and of the offsets of frames, by what no combination holds."""
@@ -97,48 +93,63 @@ class PulseFit:
 
     def _strongest(self) -> float:
         """Return the largest |p|^2 [Pa^2], roughly: twice the largest of pixels that do not conduct."""
-        course = self._courses[0][:, 0, 0]
-        weight = self._weights @ course @ course
-        seen = weight > 0.1 * weight.max()
-        return max(2 * float(np.max(self._data[seen] @ course / weight[seen])), 1e-9)
+        course, seen = self._courses[0][:, 0, 0], self._seen()
+        well = seen > 0.1
+        return max(2 * float(np.max(self._data[well] @ course / seen[well])) / float(course @ course), 1e-9)
 
     def solve(self, tolerance: float = _CONVERGED) -> Array:
         """Return the coefficients (Ku, Kv) of the cosines of |p|^2 [Pa^2]."""
-        variance, shape = self.noise**2, self._cosines.wavenumber.shape
         mask = self._cosines.spectrum > 0
         courses, prior = np.stack(self._courses), np.stack(self._prior)
-        share = len(self._data) * self._cosines.blur**2 * float(np.mean(self._seen()))
-        precision = variance / np.where(mask, prior, 1.0)
-        scale = mask / np.sqrt(share * (courses**2).sum(axis=1) + precision)
-        offset_precision = variance * np.linalg.inv(self._offsets)
-        offset_scale = 1 / np.sqrt(len(self._data) + np.diag(offset_precision))
+        precision = self.noise**2 / np.where(mask, prior, 1.0)
+        scale = mask[..., None, None] * self._scale(courses, precision)
 
-        def parts(unknowns: Array) -> tuple[Array, Array]:
-            fields, offsets = np.split(unknowns, [scale.size])
-            return fields.reshape(-1, *shape) * scale, offsets * offset_scale
+        def fields_of(unknowns: Array) -> Array:
+            return np.asarray(np.einsum("klgf,gkl->fkl", scale, unknowns.reshape(prior.shape)))
 
-        def weighted(fields: Array, offsets: Array) -> Array:
-            images = self._cosines.forward((courses * fields[:, None]).sum(axis=0)) + offsets
-            return np.asarray(np.einsum("nrs,ns->nr", self._weights, images))
+        def weighted(fields: Array) -> Array:
+            return self._weighted(self._cosines.forward((courses * fields[:, None]).sum(axis=0)))
 
-        def adjoint(residual: Array, fields: Array, offsets: Array) -> Array:
-            """Return the gradient, in scaled unknowns, of the data and the priors."""
-            images = (courses * self._cosines.adjoint(residual)).sum(axis=1) + precision * fields
-            total = residual.sum(axis=0) + offset_precision @ offsets
-            return np.concatenate([(scale * images).ravel(), offset_scale * total])
+        def adjoint(residual: Array) -> Array:
+            return np.asarray((courses * self._cosines.adjoint(self._without_offsets(residual))).sum(axis=1))
+
+        def scaled(gradient: Array) -> Array:
+            return np.asarray(np.einsum("klgf,fkl->gkl", scale, gradient).ravel())
 
         def normal(unknowns: Array) -> Array:
-            fields, offsets = parts(unknowns)
-            return adjoint(weighted(fields, offsets), fields, offsets)
+            fields = fields_of(unknowns)
+            return scaled(adjoint(weighted(fields)) + precision * fields)
 
-        nothing = np.zeros_like(scale), np.zeros_like(offset_scale)
-        right = adjoint(self._data, *nothing)
+        right = scaled(adjoint(self._data))
         matrix = LinearOperator((len(right), len(right)), normal, dtype=np.float64)
-        solution, _ = cg(matrix, right, rtol=tolerance, maxiter=_ITERATIONS)
-        fields, offsets = parts(solution)
-        self._left = self._data - weighted(fields, offsets)
-        self._fields = fields
-        return np.asarray(fields[0])
+        least = tolerance * self.noise * math.sqrt(len(right))
+        solution, _ = cg(matrix, right, rtol=0.0, atol=least, maxiter=_ITERATIONS)
+        self._fields = fields_of(solution)
+        self._left = self._without_offsets(self._data - weighted(self._fields))
+        return np.asarray(self._fields[0])
+
+    def _weighted(self, images: Array) -> Array:
+        """Return combinations (N, R), weighted where pixels miss frames."""
+        weighted = np.array(images)
+        weighted[self._gaps] = np.einsum("nrs,ns->nr", self._weights, weighted[self._gaps])
+        return weighted
+
+    def _without_offsets(self, weighted: Array) -> Array:
+        """Return weighted combinations (N, R) less the offsets of frames that fit them best."""
+        total = int(self._full.sum()) * np.eye(weighted.shape[1]) + self._weights.sum(axis=0)
+        precision = total + self.noise**2 * np.linalg.inv(self._offsets)
+        offsets = np.linalg.solve(precision, weighted.sum(axis=0))
+        return weighted - self._weighted(np.broadcast_to(offsets, weighted.shape))
+
+    def _scale(self, courses: Array, precision: Array) -> Array:
+        """Return the inverse Cholesky factors (Ku, Kv, F, F) of the F unknowns of each cosine alone."""
+        share = len(self._data) * self._cosines.blur**2 * float(np.mean(self._seen()))
+        gram = share[..., None, None] * np.einsum("frkl,grkl->klfg", courses, courses)
+        constant = np.eye(courses.shape[1]) / share[0, 0] + self._offsets / self.noise**2
+        gram[0, 0] = courses[..., 0, 0] @ np.linalg.solve(constant, courses[..., 0, 0].T)
+        diagonal = np.arange(len(precision))
+        gram[..., diagonal, diagonal] += np.moveaxis(precision, 0, -1)
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(gram)))
 
     def misfit(self) -> float:
         """Return the root mean square of the combinations' residuals, in standard deviations of the noise."""
@@ -177,8 +188,9 @@ class PulseFit:
 
     def _seen(self) -> Array:
         """Return the weight (N,) of each pixel: 1 with all frames, 0 without."""
-        course = self._courses[0][:, 0, 0]
-        return np.asarray(self._weights @ course @ course / (course @ course))
+        course, seen = self._courses[0][:, 0, 0], np.asarray(self._full, np.float64)
+        seen[self._gaps] = self._weights @ course @ course / (course @ course)
+        return seen
 
     def latency(self) -> tuple[float, float] | None:
         """Return the latency [s], and its part of the relative deviation of |p|^2; None if it is not seen.
