@@ -274,7 +274,8 @@ def gappy_tensor(name: str, value: object, unit: str = "") -> torch.Tensor:
     if tensor.is_complex():
         raise invalid(name, value, accepted)
     tensor = tensor.to(torch.float64)
-    _require_finite(name, torch.where(tensor.isnan(), 0.0, tensor), unit)
+    if tensor.isinf().any():
+        _require_finite(name, torch.where(tensor.isnan(), 0.0, tensor), unit)
     return tensor
 
 

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from scipy import ndimage, sparse
 
 from autdtorch.hardware.camera.screen import Screen
@@ -48,7 +47,7 @@ _COUNT = 0.01  # [K] a count of the files: FLIR's "TLinear" of high resolution
 class EmulatedCamera:
     """A camera that looks at a screen in a plane of an emulated bench, in the bench's own time.
 
-    It leaves 16-bit TIFF files in a folder, in hundredths of a kelvin. Attributes are the pixels `corners`
+    It leaves 16-bit NPY files in a folder, in hundredths of a kelvin. Attributes are the pixels `corners`
     (4, 2), column and row, of the plane's corners, and `drift` [K/s] and `present`, which may be changed.
     """
 
@@ -99,14 +98,14 @@ class EmulatedCamera:
         size = (counts[0] * _SPACING, counts[1] * _SPACING)
         points = Plane(plane.center, plane.normal, size).points(_SPACING)
         self._matrix = matrix_of(points.reshape(-1, 3)).to(torch.complex64)
-        self._excess: NDArray[np.floating] = np.zeros(points.shape[:2], np.float32)  # [K]
-        self._slope = np.zeros_like(self._excess)  # [K/s]
+        self._excess: NDArray[np.float32] = np.zeros(points.shape[:2], np.float32)  # [K]
+        self._slope: NDArray[np.floating] = np.zeros_like(self._excess)  # [K/s]
         self._drive: torch.Tensor | None = None
-        self._heating: NDArray[np.floating] | float = 0.0  # [K/s]
+        self._heating = np.zeros_like(self._excess)  # [K/s]
         self._view = _View(plane, (rows, columns), angle)
         self._samples = self._view.samples(self._excess.shape, _SPACING)
         self.corners = self._view.pixels(_corners(plane))
-        self._offsets = _PATTERN * self._generator.standard_normal((rows, columns))
+        self._offsets = _PATTERN * self._generator.standard_normal((rows, columns), np.float32)
         self._dead = self._generator.random((rows, columns)) < _DEAD
         self._number, self._time = 0, self.clock()
         self.present = True
@@ -123,13 +122,15 @@ class EmulatedCamera:
     def _pass(self, seconds: float) -> None:
         """Let time pass up to now, with the drive that plays; take the frames that are due."""
         self._hear()
-        now = self.clock()
+        now, seen = self.clock(), {}
         while (due := (self._number + 1) * self._period) <= now:
             self._heat(due - self._time)
             self._number += 1
             if self.present:
-                self._take()
+                seen[self._number] = self._excess - _LAG * self._slope
         self._heat(now - self._time)
+        if seen:
+            self._take(list(seen), np.stack([*seen.values()]))
 
     def _hear(self) -> None:
         """Find the heating of the drive that plays."""
@@ -137,46 +138,56 @@ class EmulatedCamera:
         if self._drive is not None and torch.equal(drive, self._drive):
             return
         self._drive = drive
-        if not drive.any():
-            self._heating = 0.0
-            return
         power = (self._matrix @ drive.to(torch.complex64)).abs().square().numpy()
-        self._heating = self._screen.rate * power.reshape(self._excess.shape)
+        self._heating = np.asarray(self._screen.rate * power.reshape(self._excess.shape), np.float32)
 
     def _heat(self, seconds: float) -> None:
-        """Step the screen by Heun's method."""
-        count = math.ceil(seconds / (self._period / 2) - 1e-9)
+        """Step the screen by Heun's method, which is stable up to twice the longest step taken."""
+        fastest = 8 * self._screen.diffusivity / _SPACING**2 + 1 / self._screen.loss_time
+        count = math.ceil(seconds * fastest - 1e-9)
         for _ in range(count):
             step = seconds / count
             first = self._rate_of_change(self._excess)
             second = self._rate_of_change(self._excess + step * first)
             self._slope = (first + second) / 2
-            self._excess = self._excess + step * self._slope
+            self._excess += step * self._slope
         self._time += seconds
 
-    def _rate_of_change(self, excess: NDArray[np.floating]) -> NDArray[np.floating]:
-        edged = np.pad(excess, 1, mode="edge")
-        around = edged[2:, 1:-1] + edged[:-2, 1:-1] + edged[1:-1, 2:] + edged[1:-1, :-2]
+    def _rate_of_change(self, excess: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the heating, less the loss to the air and the flow between cells, none over the edges."""
+        change = self._heating - excess / self._screen.loss_time
         conduction = self._screen.diffusivity / _SPACING**2
-        loss = 4 * conduction + 1 / self._screen.loss_time
-        return np.asarray(conduction * around - loss * excess + self._heating, np.float32)
+        along, across = conduction * np.diff(excess, axis=0), conduction * np.diff(excess, axis=1)
+        change[:-1] += along
+        change[1:] -= along
+        change[:, :-1] += across
+        change[:, 1:] -= across
+        return change
 
-    def _take(self) -> None:
-        """Write the file of a frame: under another name first, as a camera's program should."""
-        rows = self._offsets.shape
-        seen = (self._samples @ (self._excess - _LAG * self._slope).reshape(-1)).reshape(rows)
-        degrees = _ROOM + self.drift * self._time + self._offsets + ndimage.gaussian_filter(seen, _BLUR)
-        degrees += self._noise * self._generator.standard_normal(rows)
-        counts = np.clip(np.round((degrees + _ZERO) / _COUNT), 0, 2**16 - 1).astype(np.uint16)
-        counts[self._dead] = 2**15
-        self._write(f"frame_{self._number:06d}.tif", counts)
+    def _take(self, numbers: list[int], excess: NDArray[np.float32]) -> None:
+        """Write the files of frames with their numbers, by the excess (T, U, V) [K] that they see."""
+        shape = len(numbers), *self._offsets.shape
+        columns = np.ascontiguousarray(excess.reshape(len(numbers), -1).T)
+        seen = np.ascontiguousarray((self._samples @ columns).T).reshape(shape)
+        times = self._period * np.array(numbers)
+        degrees = ndimage.gaussian_filter(seen, _BLUR, axes=(1, 2))
+        degrees += self._offsets
+        degrees += (_ROOM + _ZERO + self.drift * times).astype(np.float32)[:, None, None]
+        degrees += self._noise * self._generator.standard_normal(shape, np.float32)
+        counts = np.rint(degrees / _COUNT).clip(0, 2**16 - 1).astype(np.uint16)
+        counts[:, self._dead] = 2**15
+        for number, time, image in zip(numbers, times, counts, strict=True):
+            self._write(f"frame_{number:06d}.npy", time, image)
 
-    def _write(self, name: str, counts: NDArray[np.uint16]) -> None:
-        """Write the file of an image, with the bench's time; leave it out if the folder does not take it."""
+    def _write(self, name: str, time: float, counts: NDArray[np.uint16]) -> None:
+        """Write the file of an image: under another name first, as a camera's program should.
+
+        It is left out if the folder does not take it.
+        """
         hidden = self._folder / f".{name}"
         with contextlib.suppress(OSError):
-            Image.fromarray(counts).save(hidden, format="TIFF")
-            os.utime(hidden, (self._time, self._time))
+            np.save(hidden, counts)
+            os.utime(hidden, (time, time))
             hidden.replace(self._folder / name)
 
 
