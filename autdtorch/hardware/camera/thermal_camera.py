@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -171,7 +172,7 @@ class ThermalCamera:
         self._warmth.add(self.screen.rate * float(picture.pressure.max()) ** 2 * (end - start), end)
         doubts += picture.doubts
         for doubt in doubts:
-            kind = doubt.strip("0123456789 %.")
+            kind = re.sub(r"[\d.]+", "", doubt)
             if kind not in self._told:
                 logger.warning("camera: %s", doubt)
                 self._told.add(kind)
