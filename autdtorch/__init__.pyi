@@ -56,7 +56,7 @@ from .propagators.nearby import NearbyPoses
 from .propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
 from .scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
 from .scene.drive import amplitudes_of, drive_from_phases, focus_phases, phases_of
-from .scene.geometry import Plane, circle_points, sphere_points
+from .scene.geometry import Plane, circle_points, polyline_points, sphere_points
 from .scene.medium import Medium
 from .scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
 from .scene.porous import porous
@@ -166,6 +166,7 @@ __all__ = [
     "plot_scaling",
     "plot_scene",
     "plot_trials",
+    "polyline_points",
     "porous",
     "random_search",
     "run",

@@ -13,7 +13,7 @@ from hydra._internal.utils import get_args_parser
 
 from autdtorch.utils.hints import did_you_mean, with_extra
 
-COMMANDS = ("explore", "calibrate", "collect")
+COMMANDS = ("explore", "calibrate", "collect", "play")
 """Words that stand for another command than a study, anywhere among the arguments."""
 
 _SWEEP = re.compile(r"\+*hydra\.mode=(RunMode\.)?MULTIRUN")  # as -m

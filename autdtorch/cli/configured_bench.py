@@ -28,8 +28,11 @@ class Bench:
     `transducers` are the device's for each of the scene's. `settings` identify the trial beside its device.
     """
 
-    def __init__(self, section: Mapping[str, Any], scene: Scene, seed: int) -> None:
-        """Check the section `hardware` of a config; `seed` is the seed of emulated noise."""
+    def __init__(self, section: Mapping[str, Any], scene: Scene, seed: int, has_sensor: bool = True) -> None:
+        """Check the section `hardware` of a config, whose sensor may play no part.
+
+        `seed` is the seed of emulated noise.
+        """
         device_keys = {key for each in hardware.DEVICES.values() for key in (*each.keys, *each.port_keys)}
         _require_keys("hardware", section, _KEYS, device_keys)
         require_one_of("hardware.device", section["device"], hardware.DEVICES)
@@ -38,10 +41,11 @@ class Bench:
         _require_keys("hardware.limits", limits, [field.name for field in fields(hardware.Limits)])
         self.limits = hardware.Limits(**limits)
         self.is_dry = boolean("hardware.dry_run", section["dry_run"])  # frames are printed, nothing is opened
-        self._emulated = boolean("hardware.emulated", section["emulated"]) or self.is_dry
-        sensor = {"kind": "emulated", "snr": None} if self.is_dry else section_of(section, "sensor")
-        self._sensor, self._kind = _sensor(sensor, self._emulated), sensor["kind"]
-        _require_fit(section, self._emulated)
+        self.is_emulated = boolean("hardware.emulated", section["emulated"]) or self.is_dry
+        silent = self.is_dry or not has_sensor
+        sensor = {"kind": "emulated", "snr": None} if silent else section_of(section, "sensor")
+        self._sensor, self._kind = _sensor(sensor, self.is_emulated or silent), sensor["kind"]
+        _require_fit(section, self.is_emulated)
         self.device = hardware.DEVICES[section["device"]].configured(section)
         self.transducers = self._wired(len(scene.array))
         failed = section["failed"]
@@ -54,14 +58,14 @@ class Bench:
     def settings(self) -> dict[str, Any]:
         """Settings that identify the trial beside its device."""
         settings = {"sensor": self._kind, **self._sensor.settings}
-        if self._emulated:
+        if self.is_emulated:
             snr = getattr(self._sensor, "snr", None)
             settings |= {"emulated": True, "snr [dB]": snr, "failed": self._failed}
         return settings | self.device.settings
 
     def emulate(self, simulated: SimulatedObjective, propagator: Propagator) -> None:
         """Make the emulated bench, if there is one, with the transfer matrix of a simulated objective."""
-        if self._emulated and simulated.transfer_matrix is not None:
+        if self.is_emulated and simulated.transfer_matrix is not None:
             chosen = torch.tensor(self.transducers, dtype=torch.int64, device="cpu")
             matrix, wired = self.device.as_built(simulated.transfer_matrix, chosen)
             self._bench = hardware.EmulatedBench(self.device, matrix, wired, self._failed)

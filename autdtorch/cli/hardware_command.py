@@ -70,15 +70,20 @@ def hardware_trial(settings: dict[str, Any], modules: list[Any], output: Any, re
             trial = _Trial(settings, modules, output, readings)
             trial.run()
     except (Exception, KeyboardInterrupt) as error:
-        if (left_on := _left_on(error)) is not None:
-            if left_on is not error:
-                error.add_note(str(left_on))
-        elif trial is not None and trial.begun:
-            then = "the same command goes on where the log ends"
-            if isinstance(error, hardware.LimitError):
-                then = "a higher limit goes on from here"
-            error.add_note(f"the outputs are off, and {then}")
+        then = "the same command goes on where the log ends"
+        if isinstance(error, hardware.LimitError):
+            then = "a higher limit goes on from here"
+        note_outputs(error, trial is not None and trial.begun, f", and {then}")
         raise
+
+
+def note_outputs(error: BaseException, begun: bool, then: str = "") -> None:
+    """Add a note to an error on whether the outputs are off, if a device was opened."""
+    if (left_on := _left_on(error)) is not None:
+        if left_on is not error:
+            error.add_note(str(left_on))
+    elif begun:
+        error.add_note(f"the outputs are off{then}")
 
 
 def _left_on(error: BaseException | None) -> BaseException | None:

@@ -1,4 +1,4 @@
-"""The command line `autdtorch`: reads settings with Hydra, runs a study, a hardware trial or a live view.
+"""The command line `autdtorch`: reads settings with Hydra, runs a study, a trial, a sequence or a live view.
 
 Errors are one line on stderr (`errors`). Modules that take seconds to import are imported when a job starts,
 so that help is quick.
@@ -86,7 +86,7 @@ def main() -> None:
                 raise ValueError(f"{command}: a sweep; must be one scene at a time")
             sys.argv[1:] = arguments
             register()
-            {"explore": _explore, "calibrate": _calibrate, None: _run}[command]()
+            {"explore": _explore, "calibrate": _calibrate, "play": _play, None: _run}[command]()
             if sweep:
                 print("autdtorch collect merges the results of a sweep into one table and one report")
     except _Carrier as carrier:
@@ -141,6 +141,17 @@ def _calibrate(config: DictConfig) -> None:
 
         warnings.showwarning = _log_warning
         calibrate_scene(*settings_of(config))
+
+
+@hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")
+def _play(config: DictConfig) -> None:
+    with _errors_carried(), warnings.catch_warnings():
+        with _importing():
+            from autdtorch.cli.play_command import play
+            from autdtorch.cli.settings import settings_of
+
+        warnings.showwarning = _log_warning
+        play(*settings_of(config))
 
 
 @contextlib.contextmanager
@@ -226,8 +237,8 @@ def _job(config: DictConfig, sweep: Path | None) -> None:
         from autdtorch.cli.settings import settings_of
 
     settings, modules, output = settings_of(config)
-    for command in ("explore", "calibrate"):
-        settings.pop(command, None)
+    for unused in ("explore", "calibrate", "play", "path"):
+        settings.pop(unused, None)
     drive, readings = settings.pop("drive", None), settings.pop("readings", None)
     if settings.get("hardware") is None:
         from autdtorch.cli.study_command import study

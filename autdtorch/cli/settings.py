@@ -39,6 +39,8 @@ _SETTINGS = (
     "readings",
     "explore",
     "calibrate",
+    "play",
+    "path",
 )
 _PLACES = ("modules", "output")  # settings that change no result
 _NOT_OF_METHODS = ("objective", "trials", "seed", "goal", "score")  # parameters that a study fills

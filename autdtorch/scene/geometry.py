@@ -16,10 +16,14 @@ from autdtorch.utils.array_types import REAL
 from autdtorch.utils.process import require_memory
 from autdtorch.utils.units import angle as checked_angle
 from autdtorch.utils.validation import (
+    LENGTH_TOLERANCE,
     ArrayLike,
     Vector,
+    boolean,
     finite_vector,
     integer_at_least,
+    invalid,
+    points_tensor,
     positive,
     positive_entries,
     real_tensor,
@@ -143,6 +147,39 @@ def circle_points(
     start = checked_angle("angle", angle)
     angles = start + 2 * math.pi * torch.arange(count, **REAL) / count
     return origin + radius * (angles.cos()[:, None] * u + angles.sin()[:, None] * v)
+
+
+def polyline_points(corners: ArrayLike, count: int, closed: bool = True) -> torch.Tensor:
+    """Return points at equal distances along straight lines from corner to corner.
+
+    Args:
+        corners: (K, 3), K >= 2 [m]; the first point is the first corner.
+        count: number of points, >= 1, and >= 2 if not closed.
+        closed: whether a line leads from the last corner to the first, which does not come twice: two corners
+            are a line there and back. Otherwise the last point is the last corner.
+
+    Returns:
+        Points (count, 3) [m], float64.
+
+    Raises:
+        ValueError: an argument is not finite, has the wrong shape or is out of range, or all corners are in
+            one place.
+    """
+    places = points_tensor("corners", corners).detach().cpu()
+    if len(places) < 2:
+        raise ValueError(f"corners: shape {tuple(places.shape)}; must be (K, 3) with K >= 2")
+    closed = boolean("closed", closed)
+    count = integer_at_least("count", count, 1 if closed else 2)
+    if closed:
+        places = torch.cat([places, places[:1]])
+    lengths = places.diff(dim=0).norm(dim=1)
+    passed = torch.cat([torch.zeros(1, **REAL), lengths.cumsum(dim=0)])
+    if passed[-1] <= LENGTH_TOLERANCE:
+        raise invalid("corners", corners, "must not all be in one place")
+    way = passed[-1] * torch.arange(count, **REAL) / (count if closed else count - 1)
+    line = (torch.searchsorted(passed, way, right=True) - 1).clamp(max=len(lengths) - 1)
+    part = (way - passed[line]) / lengths[line].clamp(min=LENGTH_TOLERANCE)
+    return torch.lerp(places[line], places[line + 1], part.clamp(max=1)[:, None])
 
 
 def sphere_points(center: ArrayLike, radius: float, count: int) -> torch.Tensor:

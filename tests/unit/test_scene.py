@@ -16,7 +16,7 @@ from hypothesis.extra import numpy as hnp
 from small_scenes import small_scene
 
 from autdtorch.scene.arrays import TransducerArray
-from autdtorch.scene.geometry import Plane, circle_points, plane_basis, sphere_points
+from autdtorch.scene.geometry import Plane, circle_points, plane_basis, polyline_points, sphere_points
 from autdtorch.scene.medium import Medium, vapour_fraction
 from autdtorch.scene.obstacles import Box, Mesh, Sphere
 from autdtorch.scene.scene import OverlapWarning, ScaleWarning, Scene
@@ -336,3 +336,40 @@ def test_sphere_points_are_even_on_the_sphere(count):
         apart = torch.pdist(offsets).min() / (5e-3 * math.sqrt(4 * math.pi / count))
         assert 0.8 < apart < 1.08
         assert offsets.mean(dim=0).norm() < 0.01 * 5e-3
+
+
+@pytest.mark.parametrize(("closed", "count"), [(True, 7), (False, 2), (False, 60), (True, 1)])
+def test_points_of_a_polyline_are_at_equal_distances_along_its_lines(closed, count):
+    corners = torch.tensor([[0, 0, 0], [3, 0, 0], [3, 4, 0], [3, 4, 0]], dtype=torch.float64)
+    points = polyline_points(corners, count, closed)
+    length = 12.0 if closed else 7.0
+    steps = count if closed else count - 1
+    expected = [_along(corners, length * number / steps) for number in range(count)]
+    torch.testing.assert_close(points, torch.stack(expected), rtol=0, atol=1e-12)
+    assert points[0].equal(corners[0])
+    assert closed or points[-1].equal(corners[-1])
+
+
+def _along(corners: torch.Tensor, way: float) -> torch.Tensor:
+    """The point after a way along the lines, by walking."""
+    for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
+        length = float((end - start).norm())
+        if way <= length and length:
+            return start + way / length * (end - start)
+        way -= length
+    return corners[0]
+
+
+@pytest.mark.parametrize(
+    ("corners", "arguments", "message"),
+    [
+        ([[0, 0, 0]], {}, r"corners: shape \(1, 3\); must be \(K, 3\) with K >= 2"),
+        ([[0, 0, 0]] * 3, {}, "corners: .* must not all be in one place"),
+        ([[0, 0, 0], [1, 0, 0]], {"count": 0}, "count: 0"),
+        ([[0, 0, 0], [1, 0, 0]], {"count": 1, "closed": False}, "count: 1"),
+        ([[0, 0, 0], [1, 0, 0]], {"closed": "no"}, "closed: 'no'"),
+    ],
+)
+def test_a_wrong_polyline_is_refused(corners, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        polyline_points(corners, **{"count": 5, **arguments})

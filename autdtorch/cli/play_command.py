@@ -1,0 +1,125 @@
+"""A sequence on a device: a focus that moves along the path of a config, or the frames of a file."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+
+from autdtorch import hardware
+from autdtorch.cli.configured_bench import Bench
+from autdtorch.cli.errors import in_one_line
+from autdtorch.cli.hardware_command import note_outputs
+from autdtorch.cli.settings import (
+    folder_of,
+    given_file,
+    is_given,
+    require_effective,
+    scene_of,
+    section_of,
+    solver_of,
+)
+from autdtorch.io.drive_file import load_drive, save_drive
+from autdtorch.io.path_section import path_points
+from autdtorch.methods.holography.sequence import drive_sequence
+from autdtorch.objectives.objective import SimulatedObjective
+from autdtorch.propagators import make_propagator
+from autdtorch.scene.scene import Scene
+from autdtorch.scene.sequence import Sequence, modulated
+from autdtorch.utils.digest import digest_of
+from autdtorch.utils.validation import invalid, positive, require_known, within
+
+_EFFECTIVE = re.compile(r"\+*(scene|modules|solver|path|play|hardware|output|hydra)\b")
+_KEYS = ("rate", "modulation", "sequence", "seconds")
+_MODULATION = ("frequency", "depth", "waveform", "rate")
+
+
+def play(settings: dict[str, Any], modules: list[Any], output: Any) -> None:
+    """Play the sequence of the settings; leave it in a folder, with a note of how it was played.
+
+    Every error carries a note on whether the outputs are off.
+
+    Raises:
+        ValueError: a setting that is unknown, out of range or without effect here, or a sequence that the
+            device cannot play.
+        LimitError: a limit of the outputs is reached.
+        LinkError: the device is missing, or does not take the bytes.
+    """
+    require_effective("play", _EFFECTIVE, "scene, path, hardware, play.KEY, solver.KEY or output")
+    section = section_of(settings, "play")
+    require_known("play", section, _KEYS)
+    if settings.get("hardware") is None:
+        raise invalid("hardware", None, "must be a device, such as hardware=emulated")
+    scene = scene_of("scene", section_of(settings, "scene"), modules)
+    bench = Bench(section_of(settings, "hardware"), scene, settings.get("seed", 0), has_sensor=False)
+    seconds = None if section["seconds"] is None else positive("play.seconds", section["seconds"], "s")
+    folder = Path("outputs") / f"play_{HydraConfig.get().runtime.choices['scene']}"
+    folder = folder_of("output", output) if is_given("output") else folder
+    solver = solver_of(settings)
+    sequence = _sequence(section, section_of(settings, "path"), scene, bench, solver)
+    if bench.is_emulated:
+        propagator = make_propagator(scene, **solver)
+        bench.emulate(SimulatedObjective(scene, propagator), propagator)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_drive(folder / "sequence.npz", sequence.drives, scene.array)
+    playback = _played(bench, sequence, seconds, folder / "play.jsonl")
+    print(f"{playback}\nThe sequence is in {shlex.quote(os.path.relpath(folder / 'sequence.npz'))}")
+
+
+def _sequence(
+    section: dict[str, Any], path: dict[str, Any], scene: Scene, bench: Bench, solver: dict[str, Any]
+) -> Sequence:
+    """Return the sequence of a file, or that of a focus on the path."""
+    rate = positive("play.rate", section["rate"], "Hz")
+    bench.device.require_rate(rate)
+    if (file := given_file("play.sequence", section["sequence"])) is not None:
+        with within("play.sequence"):
+            sequence = Sequence(load_drive(file), rate)
+    else:
+        points = path_points("path", path, scene, rate)
+        matrix = make_propagator(scene, **solver).transfer_matrix(points)
+        sequence = Sequence(drive_sequence(matrix[:, None], closed=path.get("closed", True)), rate)
+    if (modulation := section["modulation"]) is None:
+        return sequence
+    if not isinstance(modulation, dict):
+        raise invalid("play.modulation", modulation, "must be a mapping, such as {frequency: 200}")
+    require_known("play.modulation", modulation, _MODULATION)
+    with within("play.modulation"):
+        return modulated(sequence, **{"frequency": None, "rate": None, **modulation})
+
+
+def _played(bench: Bench, sequence: Sequence, seconds: float | None, log: Path) -> hardware.Playback:
+    """Play a sequence within the limits, and add a line on it to a log; return its times."""
+    begun = False
+    row: dict[str, Any] = {
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "device": bench.device.name,
+        "emulated": bench.is_emulated,
+        "transducers": bench.transducers,
+        "amplitude limit": bench.limits.amplitude,
+        **bench.device.settings,
+        "sequence": digest_of(sequence.drives)[:16],
+        "frames": len(sequence),
+        "rate [Hz]": sequence.rate,
+    }
+    try:
+        with hardware.ended_by_signals(), bench.link() as link:
+            begun = not bench.is_dry
+            playback = hardware.LimitedLink(link, bench.limits).play_sequence(sequence, seconds)
+    except (Exception, KeyboardInterrupt) as error:
+        note_outputs(error, begun)
+        row["error"] = in_one_line(error)
+        raise
+    else:
+        row["played"] = asdict(playback)
+        return playback
+    finally:
+        with log.open("a", encoding="utf-8") as lines:
+            lines.write(f"{json.dumps(row)}\n")
