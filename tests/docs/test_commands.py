@@ -333,6 +333,7 @@ RULES = [
         r"autdtorch calibrate ",
         covered_by("tests/cli/test_calibrate_command.py", "test_a_scene_is_calibrated"),
     ),
+    (r"autdtorch play ", runs("solver.spacing=2e-3 play.seconds=0.1")),
     (r"autdtorch ", runs(SHORT)),
     (r"python -c ", runs()),
 ]
