@@ -17,7 +17,8 @@ Re(e^(-i psi_p) p_p) >= cos(d_p) |p_p|. With any a >= 0 all drives of amplitudes
 
 where t is the least |p_p|, of rows over the wanted pressures. Boxes that together contain all phases bound t
 by the largest of their right sides. The drive with the phases of the last sum attains a level; boxes within a
-tolerance of the highest one are not divided.
+tolerance of the highest one are not divided, nor are small ones: where terms of the sum vanish, that drive is
+not the best one, and its level stays below.
 """
 
 from __future__ import annotations
@@ -55,6 +56,7 @@ _LEAST_SINGULAR, _SINGULAR_MARGIN = 1e-8, 1e-6
 
 _MOST_FOCI = 6  # With more, boxes are too many
 _TOLERANCE = 3e-3  # Relative distance of the bound to the highest level attained
+_SMALLEST = 0.02  # Half edge [rad] of boxes that are not divided: less would lower a bound by 1 - cos, 2e-4
 _PARTS = 3  # of the circle of each phase in the beginning; more than 2, for a cosine > 0
 _MOST_WORK = 3e8  # Products of boxes, foci, transducers and iterations: about half a second
 _BOX_WORK = 60  # of a box, beside foci and transducers
@@ -265,6 +267,7 @@ def _phase_bound(foci: ComplexArray, wanted: Array, known: float) -> float:
         bounds, weights, level = _bounded(rows, boxes)
         attained = max(attained, level)
         open_ = np.minimum(bounds, known) > attained * (1 + _TOLERANCE)
+        open_ &= boxes.halves.max(axis=1) > _SMALLEST
         done = max(done, bounds[~open_].max(initial=0.0))
         boxes = _divided(_Boxes(boxes.centres[open_], boxes.halves[open_], weights[open_]))
     return min(known, done * (1 + _MARGIN))

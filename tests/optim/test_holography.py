@@ -227,8 +227,8 @@ def test_foci_are_not_lost_on_the_way_and_a_wide_limit_costs_nothing():
 def test_targets_hold_along_the_path_and_a_frame_alone_is_near_the_bound():
     matrix = circling(60)
     reached = pressures(matrix, drive_sequence(matrix, [2.0, 1.0], 0.5))
-    # the best weakest focus of ten iterations leaves 9 % for the other at most
-    assert (reached[:, 0] / reached[:, 1] / 2 - 1).abs().max() < 0.2
+    # weights settle; 0.1 % was measured
+    assert (reached[:, 0] / reached[:, 1] / 2 - 1).abs().max() < 0.05
     other = torch.tensor([2.0, 1.0]).double().expand(60, 2)
     assert torch.equal(drive_sequence(matrix, other, 0.5), drive_sequence(matrix, [2.0, 1.0], 0.5))
     # "wgs" from a drive of equal phases leaves half of the bound for two opposite foci; 0.93 was measured
@@ -236,6 +236,37 @@ def test_targets_hold_along_the_path_and_a_frame_alone_is_near_the_bound():
     drive = drive_sequence(matrix)
     assert pressures(matrix, drive).min() > 0.85 * focus_bound(matrix[0])
     assert drive_sequence(matrix, closed=True).shape == (1, 100)
+
+
+@pytest.mark.parametrize("radius", [5e-3, 30e-3])
+def test_two_close_foci_on_a_circle_keep_the_level_that_each_frame_could_have(radius):
+    """Two foci 10 mm apart; solved frame by frame, 0.17 to 0.78 of the bound were left in the worst frame."""
+    array = TransducerArray.autd3((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    apart = 2 * math.asin(5e-3 / radius)
+    places = [circle_points((0.0, 0.0, 0.15), radius, 200, (0.0, 0.0, 1.0), angle) for angle in (0, apart)]
+    rows = free_space_matrix(torch.stack(places, 1).reshape(-1, 3), array, 2 * math.pi * 40e3 / 343.0)
+    matrix = rows.reshape(200, 2, -1)
+    drives = drive_sequence(matrix, phase_step=0.8, closed=True, even=False)
+    assert steps(drives, closed=True).max() <= 0.8 + 1e-9
+    weakest = pressures(matrix, drives).amin(dim=1)[::20]
+    bounds = torch.tensor([focus_bound(frame) for frame in matrix[::20]])
+    assert (weakest / bounds).min() > 0.88  # 0.91 and 0.93 were measured
+    even = pressures(matrix, drive_sequence(matrix, phase_step=0.8, closed=True)).amin(dim=1)
+    assert even.max() < even.min() * (1 + 1e-9)
+    assert even.min() > 0.94 * bounds.min()  # 0.97 and 0.99
+
+
+def test_a_jump_of_a_phase_spreads_over_both_its_sides():
+    """One transducer must turn by pi between frames 10 and 11; in steps of 0.5, it begins before."""
+    jump = torch.where(torch.arange(21) > 10, -1.0, 1.0).to(torch.complex128)
+    matrix = torch.stack([torch.full((21,), 4.0, dtype=torch.complex128), jump], dim=1)[:, None]
+    drives = drive_sequence(matrix, phase_step=0.5, even=False)
+    # relative to the first transducer, which is free to turn the other way
+    lag = (drives[:, 1] * drives[:, 0].conj()).angle().abs()
+    assert lag[0] < 1e-6
+    assert lag[-1] > math.pi - 1e-6
+    assert lag[10] > 0.5  # one step at least before the jump
+    assert lag[15] > math.pi - 0.5  # from frame 11 on, it would end with frame 17
 
 
 @pytest.mark.parametrize(

@@ -1,15 +1,25 @@
-"""Sequences of drives for foci that move: each frame begins at the one before and stays near it.
+"""Drives for foci that move: all frames of the path are one problem, with a limit on steps of phases.
 
 A transducer whose phase jumps is silent for a moment, which is audible (Suzuki, Fujiwara, Makino and Shinoda
-2020, doi:10.1109/TOH.2020.2965946). So phases change by limited steps from one frame to the next. The common
-phase of a frame changes no pressure; it is chosen so that steps have the mean 0.
+2020, doi:10.1109/TOH.2020.2965946). So phases change by limited steps from one frame to the next.
+
+With the pressures p_t = G_t q_t and weights w of the foci, the sum of w |p| over all frames rises in turns:
+
+- c_t = G_t^H (w * sgn(p_t)), as in "wgs"; the sum of Re(c_t^H q_t) is a lower bound of the sum of w |p|;
+- each phase moves as near to that of c_t as the limits to the frame before *and* the frame after allow: the
+  even frames first, then the odd ones. No step lowers the bound.
+
+Weights grow where a focus is weak. The phases of the foci decide how smooth the drives are. Each focus begins
+with phases that keep its back-propagated drive most alike from frame to frame; the difference after a closed
+lap is spread over the lap. Constant phases between the foci remain, of which several are tried. The first
+drives are half-way between those that follow the wanted ones and those that precede them, within the limit,
+so that a jump spreads over both its sides.
 """
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,7 +37,10 @@ from autdtorch.utils.validation import (
     positive,
 )
 
-_FIRST = 10  # Times as many iterations for the first frame, which has none before it
+_STARTS = 8  # Phases between the foci that are tried
+_SETTLED = 1e-9  # Change of all drives at which iterations end
+_TRIAL = 10  # Iterations of each, after which the best goes on
+_GOLDEN = (math.sqrt(5) - 1) / 2  # Multiples of it, modulo 1, are spread evenly
 
 
 @one_library_thread()
@@ -37,21 +50,22 @@ def drive_sequence(
     phase_step: float = math.pi,
     closed: bool = False,
     even: bool = True,
-    iterations: int = 10,
+    iterations: int = 50,
 ) -> torch.Tensor:
-    """Return a drive for each frame of a path of foci, by "wgs" from the frame before.
+    """Return a drive for each frame of a path of foci, phases of which change by limited steps.
 
-    Model-based, as `holography`. A limit below the steps that the path needs lowers the pressure: the drive
-    lags behind the foci. More frames for the path need smaller steps.
+    Model-based, as `holography`. The path is solved as a whole: a phase begins to turn before the foci need
+    it. A limit below the steps that the path needs lowers the pressure; more frames need smaller steps.
 
     Args:
         G: transfer matrices of the frames (T, P, M), complex [Pa].
         targets: wanted pressures (T, P) or (P,), > 0 and relative to each other; None for 1 everywhere.
         phase_step: largest change of a phase from one frame to the next [rad], > 0.
         closed: whether the first frame follows the last one again, within the same limit.
-        even: whether each frame is scaled down to the level of the weakest frame, which is the pressure of
-            its weakest focus over the target; otherwise all amplitudes are 1.
-        iterations: of each frame, >= 1.
+        even: whether the weakest focus of all frames is raised, relative to its target, and each frame is
+            scaled down to its level; otherwise the mean over frames of the weakest focus is raised, and all
+            amplitudes are 1.
+        iterations: most iterations of the path, >= 1.
 
     Returns:
         Drives (T, M), complex128, |q| <= 1.
@@ -74,96 +88,111 @@ def drive_sequence(
         frame, point = torch.nonzero(reached == 0)[0].tolist()
         raise ValueError(f"G[{frame}, {point}]: 0 Pa of all transducers; every focus must be reached")
     rows = (matrix.to(torch.complex128) / (reached.max() * wanted[..., None])).numpy()
-    drives = _forward(rows, _first(rows[0], _FIRST * iterations), limit, iterations)
-    if closed:
-        drives = _closed(rows, drives, limit, iterations)
+    steps = _Steps(limit, closed)
+    starts = _best(rows, steps.between(_starts(rows, closed)), steps, even, min(_TRIAL, iterations))
+    drives = _best(rows, starts, steps, even, iterations)[:, 0]
     if even:
-        level = np.abs(rows @ drives[..., None]).min(axis=(1, 2))
-        drives *= (level.min() / np.maximum(level, TINY))[:, None]
+        level = np.abs(drives[:, None] @ rows.swapaxes(1, 2)).min(axis=(1, 2))
+        drives = drives * (level.min() / np.maximum(level, TINY))[:, None]
     return torch.from_numpy(drives)
 
 
-def _first(matrix: ComplexArray, iterations: int) -> ComplexArray:
-    """Return the drive (M,) that iterations come to from back-propagation."""
-    drive = np.exp(1j * np.angle(matrix.conj().T @ np.ones(len(matrix))))
-    near = functools.partial(_near, drive, math.pi)
-    return _frame(matrix, drive, near, np.ones(len(matrix)), None, iterations)[0]
+def _starts(rows: ComplexArray, closed: bool) -> ComplexArray:
+    """Return drives (T, S, M) of any amplitude that send steady phases of the foci back, S between the foci.
 
-
-def _forward(rows: ComplexArray, first: ComplexArray, limit: float, iterations: int) -> ComplexArray:
-    """Return drives (T, M) of frames (T, P, M), from the first drive on."""
-    drives, weights = first[None].repeat(len(rows), axis=0), np.ones(rows.shape[1])
-    for frame in range(1, len(rows)):
-        before = drives[frame - 1]
-        near = functools.partial(_near, before, limit)
-        drives[frame], weights = _frame(rows[frame], before, near, weights, None, iterations)
-    return drives
-
-
-def _closed(rows: ComplexArray, drives: ComplexArray, limit: float, iterations: int) -> ComplexArray:
-    """Return drives (T, M) of a path that begins again, from the drives of one lap.
-
-    A second lap begins at the end of the first. The difference of the foci's phases after a lap is spread
-    evenly over its frames. The last frames stay near the first one, by a limit for each step that is left.
+    With steady phases the rows (T, P, M) of a focus differ least from frame to frame.
     """
-    ends = _forward(np.stack([rows[-1], rows[0]]), drives[-1], limit, iterations)
-    lap, around = np.concatenate([drives, ends[1:]]), np.concatenate([rows, rows[:1]])
-    pressure = (around @ lap[..., None])[..., 0]
-    missed = np.angle(pressure[-1] * pressure[0].conj())
-    left = 1 - np.arange(len(rows))[:, None] / len(rows)
-    imposed = np.exp(1j * (np.angle(pressure[:-1]) + missed * left))
-    second, weights = np.concatenate([lap[-1:], lap[1:-1]]), np.ones(rows.shape[1])
-    for frame in range(1, len(rows)):
-        reach = limit * (len(rows) - frame)
-        near = functools.partial(_near_both, second[frame - 1], second[0], limit, reach)
-        start = near(rows[frame].conj().T @ (weights * imposed[frame]))
-        second[frame], weights = _frame(rows[frame], start, near, weights, imposed[frame], iterations)
-    return second
+    turns = np.angle((rows.conj() * np.roll(rows, -1, axis=0)).sum(axis=-1))
+    phases = np.concatenate([np.zeros_like(turns[:1]), turns.cumsum(axis=0)])
+    if closed:
+        missing = np.remainder(phases[-1] + math.pi, 2 * math.pi) - math.pi
+        phases -= missing * np.linspace(0, 1, len(phases))[:, None]
+    foci = np.arange(rows.shape[1])
+    between = 2 * math.pi * _GOLDEN * foci * np.arange(_STARTS if len(foci) > 1 else 1)[:, None]
+    back: ComplexArray = (_first_weights(rows) * np.exp(1j * (phases[:-1, None] + between))) @ rows.conj()
+    return back
 
 
-def _frame(
-    matrix: ComplexArray,
-    drive: ComplexArray,
-    near: Callable[[ComplexArray], ComplexArray],
-    weights: Array,
-    imposed: ComplexArray | None,
-    iterations: int,
-) -> tuple[ComplexArray, Array]:
-    """Return the best drive (M,) that the iterations come to from a drive, and the last weights (P,).
-
-    Signs of the pressures (P,) may be imposed.
-    """
-    back, best, highest = matrix.conj().T, drive, -1.0
-    for _ in range(iterations + 1):
-        pressure = matrix @ drive
-        size = np.maximum(np.abs(pressure), TINY)
-        if size.min() > highest:
-            best, highest = drive, float(size.min())
-        weights = weights * (size.mean() / np.maximum(size, UNREACHED * size.max())) ** DAMPING
-        weights /= weights.max()
-        drive = near(back @ (weights * (pressure / size if imposed is None else imposed)))
-    return best, weights
+def _first_weights(rows: ComplexArray) -> Array:
+    """Return weights (T, 1, P): back-propagation of the foci reaches each alone, over its target."""
+    weights: Array = 1 / (np.abs(rows) ** 2).sum(axis=2)[:, None]
+    weights /= weights.max(axis=2, keepdims=True)
+    return weights
 
 
-def _near(before: ComplexArray, limit: float, drive: ComplexArray) -> ComplexArray:
-    """Return the drive (M,) nearest to one of any amplitudes and common phase, within a limit of `before`."""
-    common = (drive * before.conj()).sum()
-    step = np.angle(drive * (common.conjugate() / max(abs(common), TINY)) * before.conj())
-    nearest: ComplexArray = before * np.exp(1j * step.clip(-limit, limit))
-    return nearest
-
-
-def _near_both(
-    before: ComplexArray, first: ComplexArray, limit: float, reach: float, drive: ComplexArray
+def _best(
+    rows: ComplexArray, drives: ComplexArray, steps: _Steps, even: bool, iterations: int
 ) -> ComplexArray:
-    """Return the drive (M,) nearest to one of any amplitudes, within limits of two others.
+    """Return the best drives (T, 1, M) that iterations come to from drives (T, S, M)."""
+    best, highest = drives[:, :1], -1.0
+    weights = _first_weights(rows).repeat(drives.shape[1], axis=1)
+    for _ in range(iterations + 1):
+        pressure = drives @ rows.swapaxes(1, 2)
+        size = np.maximum(np.abs(pressure), TINY)
+        weakest = size.min(axis=2)
+        scores = weakest.min(axis=0) if even else weakest.mean(axis=0)
+        if scores.max() > highest:
+            best, highest = drives[:, [scores.argmax()]], scores.max()
+        weights /= np.maximum(size, UNREACHED * size.max(axis=2, keepdims=True)) ** DAMPING
+        weights /= weights.max(axis=2, keepdims=True)
+        before, drives = drives, steps.nearer(drives, (weights * (pressure / size)) @ rows.conj())
+        if np.abs(drives - before).max() < _SETTLED:
+            break
+    return best
 
-    The phases are at most `limit` from `before` and `reach` from `first`, which are at most the sum of both
-    limits apart.
-    """
-    step = np.angle(drive * before.conj()).clip(-limit, limit)
-    if reach < math.pi:
-        away = np.angle(before * first.conj())
-        step = (away + step).clip(-reach, reach) - away
-    nearest: ComplexArray = before * np.exp(1j * step)
-    return nearest
+
+class _Steps(NamedTuple):
+    """Limits to the steps of phases [rad] from frame to frame, also from the last to the first if closed."""
+
+    limit: float
+    closed: bool
+
+    def between(self, wanted: ComplexArray) -> ComplexArray:
+        """Return drives (T, S, M) half-way between those that lag behind wanted ones and those that lead.
+
+        Where both turn around the circle differently, the lagging ones.
+        """
+        lagging, leading = self.following(wanted), self.following(wanted[::-1])[::-1]
+        turns = _turns(leading) - _turns(lagging)  # [0] is from the last frame to the first
+        gap = np.angle(leading[0] * lagging[0].conj()) + np.concatenate([0 * turns[:1], turns[1:]]).cumsum(0)
+        alike = np.abs(gap).max(axis=0) < 2 * math.pi
+        if self.closed:
+            alike &= np.abs(turns.sum(axis=0)) < 1
+        return lagging * np.exp(0.5j * np.where(alike, gap, 0))
+
+    def following(self, wanted: ComplexArray) -> ComplexArray:
+        """Return drives (T, S, M), each as near to the wanted one as the limit to the frame before allows.
+
+        On a closed path they come back to the first frame in time, by one limit for each step that is left.
+        """
+        drives = wanted / np.maximum(np.abs(wanted), TINY)
+        for frame in range(1, len(drives)):
+            before, left = drives[frame - 1], self.limit * (len(drives) - frame)
+            step = np.angle(wanted[frame] * before.conj()).clip(-self.limit, self.limit)
+            if self.closed and left < math.pi:
+                away = np.angle(before * drives[0].conj())
+                step = (away + step).clip(-left, left) - away
+            drives[frame] = before * np.exp(1j * step)
+        return drives
+
+    def nearer(self, drives: ComplexArray, wanted: ComplexArray) -> ComplexArray:
+        """Return drives (T, S, M), moved as near to wanted ones as the limits to both neighbours allow."""
+        drives, frames = drives.copy(), np.arange(len(drives))
+        # frames that are no neighbours, also where the first follows the last
+        for apart in (frames[:-1:2], frames[1:-1:2], frames[-1:]):
+            before, after = drives[apart - 1], drives[(apart + 1) % len(drives)]
+            if not self.closed:
+                first, last = apart == 0, apart == frames[-1]
+                before[first], after[last] = after[first], before[last]
+            gap = np.angle(after * before.conj())
+            middle = before * np.exp(0.5j * gap)
+            room = self.limit - 0.5 * np.abs(gap) if self.limit < math.pi else math.pi
+            step = np.angle(wanted[apart] * middle.conj())
+            drives[apart] = middle * np.exp(1j * step.clip(-room, room))
+        return drives
+
+
+def _turns(drives: ComplexArray) -> Array:
+    """Return the changes of phases (T, ...) [rad] of drives (T, ...) from the frame before."""
+    turns: Array = np.angle(drives * np.roll(drives, 1, axis=0).conj())
+    return turns
