@@ -306,7 +306,8 @@ def left_out(reason):
     return rule
 
 
-SHORT = "trials=1 solver.spacing=2e-3 plane_spacing=4e-3"
+COARSE = "solver.spacing=2e-3"
+SHORT = f"trials=1 {COARSE} plane_spacing=4e-3"
 RULES = [
     (r"pip install ", installs),
     (r"make ", makes),
@@ -320,13 +321,13 @@ RULES = [
     (r"autdtorch explore\b", lives),
     (r"ssh ", left_out("needs another machine")),
     (r"autdtorch .*hydra/launcher=mine", launches),
-    (r"python scripts/hardware_trial.py \$bench method=identify", runs("hardware.emulated=true")),
+    (r"python scripts/hardware_trial.py \$bench method=identify", runs(f"hardware.emulated=true {COARSE}")),
     (
         r"python scripts/hardware_trial.py \$bench",
-        runs("hardware.emulated=true method=gabs method.levels=2 method.passes=1"),
+        runs(f"hardware.emulated=true method=gabs method.levels=2 method.passes=1 {COARSE}"),
     ),
-    (r"autdtorch hardware=emulated|python scripts/hardware_trial.py ", runs()),
-    (r"autdtorch .*poses=", runs("solver.spacing=2e-3 poses.count=3")),
+    (r"autdtorch hardware=emulated|python scripts/hardware_trial.py ", runs(COARSE)),
+    (r"autdtorch .*poses=", runs(f"{COARSE} poses.count=3")),
     (r"autdtorch --help", starts),
     (r"autdtorch collect ", runs()),
     (
