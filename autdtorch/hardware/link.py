@@ -161,7 +161,7 @@ class Link(contextlib.AbstractContextManager["Link"]):
         self.device, self._port, self._sleep = device, port, sleep
         self._lock = threading.RLock()
         self._open = True
-        self._ended = threading.Event()  # ends the sequence that was begun last
+        self._turn = object()  # of what plays; a sequence plays as long as it is its own
         with closed_on_error(port.close):
             self.off()
             self.wiring = Wiring(device, transducers)
@@ -214,25 +214,29 @@ class Link(contextlib.AbstractContextManager["Link"]):
         held = device.held(drives, rate, sequence.loop)
         frames = device.frames(drives).reshape(len(drives), len(device.serials), -1)
 
+        def ended() -> bool:
+            return self._turn is not turn
+
         def send(chunk: bytes) -> bool:
             with self._lock:
-                if not ended.is_set():
-                    self._port.write(chunk)
-            return not ended.is_set()
+                if ended():
+                    return False
+                self._port.write(chunk)
+                return True
 
         with self._lock:
             self._require_open()
-            ended = self._end_sequence()
+            turn = self._end_sequence()
         try:
             with self._lock:
-                if by_itself := held is not None and isinstance(self._port, MemoryPort):
+                if by_itself := held is not None and isinstance(self._port, MemoryPort) and not ended():
                     self._port.hold(held)
             if by_itself:
                 return outlast(rate, count, ended)
             return stream(send, frames, rate, count, ended, device.wire_time(frames[0].tobytes()))
         finally:
             with self._lock:
-                if self._ended is ended:
+                if not ended():
                     self.off()
 
     def off(self) -> None:
@@ -282,11 +286,10 @@ class Link(contextlib.AbstractContextManager["Link"]):
             self._send(silence)
         self._port.flush()
 
-    def _end_sequence(self) -> threading.Event:
-        """End the sequence that plays, if any, and return the event that ends the next one."""
-        self._ended.set()
-        self._ended = threading.Event()
-        return self._ended
+    def _end_sequence(self) -> object:
+        """End the sequence that plays, if any, and return the turn of what follows."""
+        self._turn = object()
+        return self._turn
 
     def _require_open(self) -> None:
         if not self._open:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ LATE = 1e-3
 _AHEAD = 0.5e-3  # frames due within this time are sent together [s]: a transfer takes as long as many frames
 _MOST_TOGETHER = 32  # as many messages as the buffer of an OpenMPD holds
 _LONGEST_DELAY = 1.0  # [s]; the computer has slept, or the device does not take the rate
-_NAP = 20e-3  # [s]; an event may wake up later than a sleep, by 16 ms on Windows
+_NAP = 20e-3  # longest time until the end of a sequence is seen [s]
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ def frames_within(sequence: Sequence, seconds: float | None) -> float:
     return count
 
 
-def outlast(rate: float, count: float, ended: threading.Event) -> Playback:
+def outlast(rate: float, count: float, ended: Callable[[], bool]) -> Playback:
     """Wait while a device plays a number of frames by its own clock, at a rate [Hz], or until the end."""
     start = time.perf_counter()
     wait_until(start + count / rate, ended)
@@ -83,7 +82,7 @@ def stream(
     frames: Bytes,
     rate: float,
     count: float,
-    ended: threading.Event,
+    ended: Callable[[], bool],
     wire_time: float = 0.0,
 ) -> Playback:
     """Send the frames again and again, each when it is due, and wait for the end of the last.
@@ -96,7 +95,7 @@ def stream(
         frames: (T, C, B) for C chips with B bytes each.
         rate: frames per second [Hz].
         count: number of frames in all; may be infinite.
-        ended: ends the waiting for the next frame.
+        ended: returns whether the sequence was ended meanwhile.
         wire_time: time that a frame takes on the line [s].
 
     Raises:
@@ -120,14 +119,11 @@ def stream(
     return Playback(sent, time.perf_counter() - start, late, latest)
 
 
-def wait_until(moment: float, ended: threading.Event) -> bool:
+def wait_until(moment: float, ended: Callable[[], bool]) -> bool:
     """Wait until a `moment` of `time.perf_counter` [s]; return false if the sequence ends before."""
-    while not ended.is_set():
+    while not ended():
         left = moment - time.perf_counter()
         if left <= 0:
             return True
-        if left > _NAP:
-            ended.wait(left - _NAP)
-        else:
-            time.sleep(left)
+        time.sleep(min(left, _NAP))  # not for an event: a signal amid its methods may leave it locked
     return False

@@ -74,7 +74,6 @@ class Sink:
 def clock(monkeypatch):
     clock = Clock()
     monkeypatch.setattr(streaming, "time", clock)
-    monkeypatch.setattr(streaming, "_NAP", math.inf)  # a clock that stands still cannot wait for an event
     return clock
 
 
@@ -83,7 +82,7 @@ def test_frames_are_sent_in_order_when_they_are_due_and_without_drift(clock, rat
     frames = np.arange(7 * 2, dtype=np.uint8).reshape(7, 1, 2)
     sink = Sink(clock, 2, {})
     count = 10_000
-    playback = streaming.stream(sink, frames, rate, count, threading.Event())
+    playback = streaming.stream(sink, frames, rate, count, bool)
     assert sink.data == (frames.tobytes() * (count // 7 + 1))[: 2 * count]
     delay = np.array(sink.times) - 100.0 - np.arange(count) / rate
     # Early by the frames that share a transfer; late by a sleep and a transfer.
@@ -104,7 +103,7 @@ def test_late_frames_are_sent_all_the_same_and_counted(rate, delays):
         patch.setattr(streaming, "time", clock)
         sink = Sink(clock, 2, delays)
         frames = np.arange(50, dtype=np.uint8).reshape(25, 1, 2)
-        playback = streaming.stream(sink, frames, rate, 1000, threading.Event())
+        playback = streaming.stream(sink, frames, rate, 1000, bool)
     assert sink.data == frames.tobytes() * 40
     delay = np.array(sink.times) - 100.0 - np.arange(1000) / rate
     certain = np.abs(delay - streaming.LATE) > 1e-9  # rounding of times around 100 s
@@ -115,7 +114,7 @@ def test_late_frames_are_sent_all_the_same_and_counted(rate, delays):
 def test_a_sequence_that_falls_behind_by_a_second_ends(clock):
     sink = Sink(clock, 2, {3: 1.2})
     with pytest.raises(hw.LinkError, match=r"frame 3 was 1.2 s late; must be sent at 100 frames/s"):
-        streaming.stream(sink, np.zeros((5, 1, 2), np.uint8), 100.0, 50, threading.Event())
+        streaming.stream(sink, np.zeros((5, 1, 2), np.uint8), 100.0, 50, bool)
 
 
 @pytest.mark.parametrize("name", hw.DEVICES)
@@ -402,6 +401,25 @@ def test_a_mistake_is_refused_in_one_line_and_nothing_plays(trial, device, make,
             player.play_sequence(make(), **arguments)
         assert "\n" not in str(raised.value)
         assert not any(drive.any() for drive in drives)
+
+
+@given(st.lists(st.sampled_from([0.0, 1e-12, 0.3, 1.0, -1.0, 1j]), min_size=1, max_size=6), st.integers(0, 9))
+def test_what_autd3_holds_emits_the_frames(factors, seed):
+    drives = torch.tensor(factors, dtype=torch.complex128)[:, None] * frames_of(1, 249, seed)
+    held = hw.AUTD3.held(drives, 4000.0, True)
+    levels = held.frames.reshape(len(held.frames), 2, 249).astype(float)
+    patterns = levels[:, 1] / 255 * np.exp(2j * math.pi * levels[:, 0] / 256)
+    number = np.arange(len(factors))
+    emitted = patterns[number % len(patterns)] * (held.modulation[number % len(held.modulation), None] / 255)
+    # Half a level of phase, and of both amplitudes.
+    assert np.abs(emitted - drives.numpy()).max() <= math.pi / 256 + 1 / 255
+
+
+def test_a_drive_and_its_opposite_are_two_patterns_for_autd3():
+    drive = frames_of(1, 249)
+    held = hw.AUTD3.held(torch.cat([drive, -drive]), 4000.0, True)
+    assert not np.array_equal(held.frames[0], held.frames[1])
+    assert (held.modulation == 255).all()
 
 
 def test_a_modulation_longer_than_the_memory_of_autd3_is_refused():

@@ -125,8 +125,9 @@ def _modulated(drives: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     loudest = drives[drives.abs().square().sum(dim=1).argmax()]
     power = torch.vdot(loudest, loudest).real
     factors = (drives @ loudest.conj()).real / power if power > 0 else torch.ones(len(drives), **REAL)
+    factors = factors.clamp(0, 1)
     if (drives - factors[:, None] * loudest).abs().max() <= _SAME:
-        return loudest[None], factors.clamp(0, 1)
+        return loudest[None], factors
     return drives, torch.ones(1, **REAL)
 
 
