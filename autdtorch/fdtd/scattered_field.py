@@ -5,6 +5,9 @@ then drives p_scat by the force sum_j (w_ij - w_air) (p_inc,j - p_inc,i), and by
 them chi steps from 1 to 0 between two cells of air. The cells there radiate sum_j w_ij (chi_j - chi_i)
 p_scat,j by the exact Green's function: the sources of a field that is p_scat outside and zero inside (a
 discrete Huygens surface).
+
+Receivers in the box are read by interpolation kernels. Sources there drive by the discrete Green's function
+of the same kernels, so that both ways are each other's transpose.
 """
 
 from __future__ import annotations
@@ -19,11 +22,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from autdtorch.fdtd.discrete_green import field_of_kernel
 from autdtorch.fdtd.face_nodes import FaceNodes
 from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.region import Shape
-from autdtorch.fdtd.stencil import flat_offsets
+from autdtorch.fdtd.stencil import flat_offsets, places_of
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.turning import turned_shape
 from autdtorch.utils.apertures import Apertures, Discs, image_of
@@ -39,7 +43,6 @@ _BESIDE = 1.25
 _TOGETHER = 16  # Targets whose waves are computed at once
 _ROWS = 8192  # Stencil rows that are looked at together, which stay in the cache
 _FEWER = 0.7  # Most nodes of the Huygens surface that are worth their errors, relative to its cells
-_NEAREST = 0.5  # Distance [cells] from a source at which the singular incident field is cut off
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +65,8 @@ class ScatteredField:
         """Positions (n, 3) [m] where the incident field is needed: heterogeneous cells and neighbours."""
         return self.positions(self._driven[0])
 
-    def sources(self, field: Tensor) -> Sources:
-        """Return the forces of an incident field (n,) at the `driven` positions."""
+    def forces(self, field: Tensor) -> Tensor:
+        """Return the forces (h,) on heterogeneous cells of an incident field (n,) at `driven` positions."""
         assembly, incident, around = self.assembly, field.numpy(), self._driven[1]
         factor = assembly.coefficients.face / assembly.stencil.face
         force = np.zeros(len(around), np.complex128)
@@ -79,15 +82,18 @@ class ScatteredField:
             loss, ground = assembly.coefficients.loss_weight, assembly.coefficients.loss_ground
             force[place] += change * (loss.double().numpy() * pressure).sum(axis=1)
             force[place] -= ground.double().numpy() * pressure[:, 13]
-        both = torch.view_as_real(torch.from_numpy(force)).to(assembly.dtype)
-        return Sources(torch.from_numpy(assembly.heterogeneous.index), both)
+        return torch.from_numpy(force)
+
+    def sources(self, force: Tensor) -> Sources:
+        """Return complex forces (h,) at the heterogeneous cells as kernels take them."""
+        both = torch.view_as_real(force).to(self.assembly.dtype)
+        return Sources(torch.from_numpy(self.assembly.heterogeneous.index), both)
 
     def waves(
         self,
         points: Tensor | Discs,
         sources: Tensor | Discs,
         amplitude: Tensor,
-        nearest: float = 0.0,
         images: Sequence[Image] = NO_MIRRORS,
     ) -> Tensor:
         """Return fields (P, R) at points (P, 3) [m] of images of sources (N, 3), amplitudes (N, R) [Pa m]."""
@@ -95,7 +101,7 @@ class ScatteredField:
 
         def of(image: Image) -> Tensor:
             seen = sources if image is SPACE_ITSELF else image_of(sources, image)
-            field = superposition(points, seen, amplitude, self.wavenumber, nearest, self.assembly.dtype)
+            field = superposition(points, seen, amplitude, self.wavenumber, self.assembly.dtype)
             return field if image is SPACE_ITSELF else image.weight * field
 
         total = of(images[0])
@@ -103,20 +109,46 @@ class ScatteredField:
             total = total + of(image)
         return total
 
-    def incident(
-        self, points: Tensor | Discs, sources: Apertures, strength: Tensor, nearest: float = 0.0
-    ) -> Tensor:
+    def incident(self, points: Tensor | Discs, sources: Apertures, strength: Tensor) -> Tensor:
         """Return the incident field (P,) at points (P, 3) [m] of sources with strengths (N,) [Pa m]."""
-        return self.waves(points, sources.places, strength[:, None], nearest)[:, 0]
+        return self.waves(points, sources.places, strength[:, None])[:, 0]
 
     def driving(self, sources: Apertures, strength: Tensor) -> Tensor:
-        """Return the incident field (n,) at the `driven` positions; see `incident`."""
-        return self.incident(self.driven, sources, strength, _NEAREST * self.assembly.grid.spacing)
+        """Return the forces (h,) of the incident field of sources with strengths (N,) [Pa m]."""
+        driven, near = self.driven, self._in_box(sources)
+        field = self.incident(driven, sources.chosen(~near), strength[~near])
+        some = sources.chosen(near)
+        nodes, amplitude = some.positions.flatten(0, 1), (strength[near, None] * some.weights).flatten()
+        inside = self.inside(nodes)
+        field += self.incident(driven, Apertures.of_points(nodes[~inside]), amplitude[~inside])
+        if not inside.any():
+            return self.forces(field)
+        on_grid, more = self._driving_on_grid(nodes[inside], amplitude[inside], driven)
+        return self.forces(field + on_grid) + more
+
+    def _driving_on_grid(self, nodes: Tensor, amplitude: Tensor, driven: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the incident field (n,) of nodes (P, 3) in the box, and forces (h,) beyond those it causes.
+
+        The nodes are spread over cells. Those of another mass than air's take another force.
+        """
+        grid, cells = self.assembly.grid, self.assembly.heterogeneous
+        kernels = self.assembly.interpolation(self._on_axes(nodes))
+        field, force = torch.zeros(len(driven), **COMPLEX), torch.zeros(len(cells.index), **COMPLEX)
+        places = places_of(self._driven[0], grid.shape)
+        for number, (node, value) in enumerate(zip(nodes, amplitude, strict=True)):
+            wave = self.incident(driven, Apertures.of_points(node[None]), value[None])
+            reached, near = field_of_kernel(kernels, number, places, grid.shape, self.assembly.stencil)
+            wave[reached] = value * torch.from_numpy(near / grid.spacing)
+            field += wave
+        index, source = self.assembly.forces(kernels, amplitude)
+        shared, ours, theirs = np.intersect1d(cells.index, index, assume_unique=True, return_indices=True)
+        force[ours] = torch.from_numpy(1 / cells.mass_of(shared) - 1) * source[theirs]
+        return field, force
 
     def near_to_far(self, targets: Apertures) -> NearToFar:
         """Return the transform to P targets, which take the mean over their nodes or discs."""
         _, surface, outward = self.surface
-        far = ~self.inside(targets.positions).any(dim=1)
+        far = ~self._in_box(targets)
         nodes = targets.positions[~far]
         within = self.inside(nodes)
         inner = self.assembly.interpolation(self._on_axes(nodes[within]))
@@ -167,16 +199,22 @@ class ScatteredField:
         nodes = FaceNodes.of(self.assembly.grid, self._radiating, self.wavenumber.real)
         return nodes if len(nodes.positions) < _FEWER * len(self._radiating) else None
 
-    def inside(self, points: Tensor) -> Tensor:
-        """Return the mask of points (..., 3) read from the grid; others are clear of the Huygens surface."""
+    def inside(self, points: Tensor, margin: Tensor | float = 0.0) -> Tensor:
+        """Return the mask of points (..., 3) read from the grid; others are clear of the Huygens surface.
+
+        Points up to a margin (...,) [m] outside count too.
+        """
         grid = self.assembly.grid
         cells = torch.from_numpy(grid.to_cells(self._on_axes(points)))
         first, last = torch.tensor([grid.first, grid.last], dtype=torch.int64, device="cpu").unbind()
-        return ((cells > first + _BESIDE) & (cells < last - 1 - _BESIDE)).all(dim=-1)
+        rim = torch.as_tensor(_BESIDE - margin / grid.spacing)[..., None]
+        return ((cells > first + rim) & (cells < last - 1 - rim)).all(dim=-1)
 
-    def near_obstacle(self, points: Tensor) -> bool:
-        """Return whether the interpolation kernel of any point (N, 3) in the box has heterogeneous cells."""
-        return self.assembly.touches_heterogeneous(self._on_axes(points[self.inside(points)]))
+    def _in_box(self, apertures: Apertures) -> Tensor:
+        """Return the mask (N,) of sources or receivers with any of their nodes in the box."""
+        near = self.inside(apertures.centers, 0.0 if apertures.radii is None else apertures.radii)
+        near[near.clone()] = self.inside(apertures.chosen(near).positions).any(dim=1)
+        return near
 
     def enclosed(self, points: Tensor, walls: Sequence[Shape]) -> Tensor:
         """Return the mask of points (..., 3) [m] in air that rigid bodies, the `walls`, enclose."""

@@ -74,19 +74,10 @@ class Assembly:
     def interpolation(self, points: Tensor, weights: Tensor = _ONE_NODE) -> Interpolation:
         """Return cells and weights of points (P, 3) [m], or of nodes (P, n, 3) with `weights` (n,)."""
         nodes, grid = points.reshape(-1, 3), self.grid
-        kernels = self._in_air(nodes)
+        kernels = interpolate_points(grid.to_cells(nodes), grid.shape, grid.first, grid.last, grid.kappa)
         rigid = np.isin(kernels.index, self.heterogeneous.rigid)  # their pressure is not defined
         kernels = exclude_cells(kernels, grid.to_cells(nodes), rigid, grid.shape, grid.kappa)
         return average_nodes(kernels, weights.numpy())
-
-    def _in_air(self, points: Tensor) -> Interpolation:
-        """Return the interpolation as if all cells were of air."""
-        grid = self.grid
-        return interpolate_points(grid.to_cells(points), grid.shape, grid.first, grid.last, grid.kappa)
-
-    def touches_heterogeneous(self, points: Tensor) -> bool:
-        """Return whether the interpolation of any of the points (N, 3) [m] uses cells that are not of air."""
-        return len(points) > 0 and bool(np.isin(self._in_air(points).index, self.heterogeneous.index).any())
 
     def is_enclosed(self, points: Tensor, walls: Sequence[Shape]) -> NDArray[np.bool_]:
         """Return whether points (N, 3) [m] are nearer to enclosed cells than to others of air.
@@ -119,13 +110,16 @@ class Assembly:
 
         Nodes (P, n, 3) with `weights` (n,) share the strength of a source. Differentiable by strength.
         """
-        kernels = self.interpolation(points, weights)
+        index, force = self.forces(self.interpolation(points, weights), strength)
+        force = force / torch.from_numpy(self.heterogeneous.mass_of(index))
+        return Sources(torch.from_numpy(index), torch.view_as_real(force).to(self.dtype))
+
+    def forces(self, kernels: Interpolation, strength: Tensor) -> tuple[Index, Tensor]:
+        """Return the cells (k,) of the kernels of sources, and the forces (k,) as if all were of air."""
         factor = self.stencil.source_factor(float(self.steps_per_period)) / self.grid.spacing
         index, inverse = np.unique(kernels.index, return_inverse=True)
         force = (strength[:, None] * torch.from_numpy(factor * kernels.weight)).reshape(-1)
-        total = force.new_zeros(len(index)).index_add(0, torch.from_numpy(inverse.reshape(-1)), force)
-        total = total / torch.from_numpy(self.heterogeneous.mass_of(index))
-        return Sources(torch.from_numpy(index), torch.view_as_real(total).to(self.dtype))
+        return index, force.new_zeros(len(index)).index_add(0, torch.from_numpy(inverse.reshape(-1)), force)
 
 
 def assemble(

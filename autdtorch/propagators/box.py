@@ -194,10 +194,6 @@ class BoxSimulation(Simulation):
         parts = zip(radiation.boxes, radiation.amplitudes, strict=True)
         return [Radiators(box.surface[0], amplitude, box.mirrors) for box, amplitude in parts]
 
-    def near_obstacle(self, points: torch.Tensor) -> bool:
-        """Return whether the interpolation kernel of any point (N, 3) has heterogeneous cells."""
-        return any(box.near_obstacle(points) for box in self.boxes)
-
     def _check(self, points: torch.Tensor) -> None:
         require_clear(self.plan.scene.array, "points", points)
         require_in_front(self.plan.scene.reflectors, "points", points)
@@ -233,10 +229,7 @@ class BoxSimulation(Simulation):
         return super()._fields(drive, points)
 
     def _radiates(self, points: torch.Tensor) -> bool:
-        """Return whether the Huygens surfaces radiate the field at points (P, 3), and fit into the store.
-
-        For sources next to an obstacle, runs that begin at points are more accurate.
-        """
+        """Return whether the Huygens surfaces radiate the field at points (P, 3), and fit into the store."""
         places = self._everywhere(points)
         return self._keeps_surfaces and not any(box.inside(places).any() for box in self.boxes)
 
@@ -248,7 +241,7 @@ class BoxSimulation(Simulation):
     def _keeps_surfaces(self) -> bool:
         array = self.plan.scene.array
         size = _ENTRY_BYTES * len(array) * sum(len(box.surface[0]) for box in self.boxes)
-        return size <= MOST_BYTES and not self.near_obstacle(array.nodes.positions.reshape(-1, 3))
+        return size <= MOST_BYTES
 
     def _radiation_of_transducers(self) -> Radiation:
         """Simulate the radiation of all transducers, each of unit strength.
@@ -351,12 +344,12 @@ class BoxSimulation(Simulation):
 
             @torch.no_grad()  # holds in one thread only
             def alone(run: int) -> tuple[SteadyState, float]:
-                begin, field = time.perf_counter(), self.boxes[0].driving(*drives[run])
+                begin, force = time.perf_counter(), self.boxes[0].driving(*drives[run])
 
                 def observe(phasors: torch.Tensor) -> list[torch.Tensor]:
                     return [value[:, 0] for value in observed(phasors[:, None], slice(run, run + 1))]
 
-                steady = bodies[0].answer(field, self.plan.tolerance, observe, floors[run])
+                steady = bodies[0].answer(force, self.plan.tolerance, observe, floors[run])
                 return steady, time.perf_counter() - begin
 
             states = spread(alone, range(len(drives)), self._kernel.at_once(self.assemblies[0].grid.shape))
@@ -406,24 +399,24 @@ class _Scatterer:
         return self.echo is not None and bool(self.echo.rest)
 
     def answer(
-        self, field: torch.Tensor, tolerance: float, observe: Observe, floors: Sequence[float] = (0.0,)
+        self, force: torch.Tensor, tolerance: float, observe: Observe, floors: Sequence[float] = (0.0,)
     ) -> SteadyState:
-        """Simulate the answer to an incident field (n,) until all that is observed has converged."""
+        """Simulate the answer to forces (h,) until all that is observed has converged."""
         box, cells, plan = self.transform.box, self.transform.cells, self.simulation.plan
-        forces = box.sources(field)
-        if not forces.force.any():  # obstacles of air, or drives that cancel
+        sources = box.sources(force)
+        if not sources.force.any():  # obstacles of air, or drives that cancel
             return SteadyState(torch.zeros(len(cells), **COMPLEX), 0, 0.0, True)
         echo = None if self.comes_back_later else self.echo
 
         def echoed(phasors: torch.Tensor) -> Sources:
             assert echo
-            return box.sources(field + echo.field(self.outgoing(phasors[:, None]))[:, 0])
+            return box.sources(force + box.forces(echo.field(self.outgoing(phasors[:, None]))[:, 0]))
 
         settings = tolerance, plan.max_periods, observe, self.stepped, floors, echoed if echo else None
-        return run_to_steady_state(box.assembly, self.simulation._kernel, forces, cells, *settings)
+        return run_to_steady_state(box.assembly, self.simulation._kernel, sources, cells, *settings)
 
     def answers(self, incoming: torch.Tensor, tolerances: Sequence[float]) -> list[SteadyState]:
-        """Simulate the answers to incident fields (n, R) until their amplitudes have converged."""
+        """Simulate the answers to forces (h, R) until their amplitudes have converged."""
 
         def observe(phasors: torch.Tensor) -> list[torch.Tensor]:
             return [self.outgoing(phasors)]
@@ -441,16 +434,19 @@ class _Scatterer:
         return self.transform.amplitudes(phasors)
 
     def incoming(self, other: _Scatterer, outgoing: torch.Tensor) -> torch.Tensor | None:
-        """Return the field (n, R) that a Huygens surface radiates to this box, its own by mirrors only."""
+        """Return the forces (h, R) of what a Huygens surface radiates to this box, its own by mirrors."""
         box, here = other.transform.box, self.transform.box
         if other is self and not self.comes_back_later:
             return None
         images = box.echoes if other is self else self.simulation.images_towards(here, box)
         coupling = self.simulation.coupling(here, box, images)
         if not coupling.pairs:
-            return box.radiated(outgoing, here.driven, coupling.rest)
-        field = coupling.field(outgoing)
-        return field + box.radiated(outgoing, here.driven, coupling.rest) if coupling.rest else field
+            field = box.radiated(outgoing, here.driven, coupling.rest)
+        else:
+            field = coupling.field(outgoing)
+            if coupling.rest:
+                field = field + box.radiated(outgoing, here.driven, coupling.rest)
+        return torch.stack([here.forces(each) for each in field.mT], dim=1)
 
 
 def _images(box: ScatteredField, symmetry: Symmetry) -> Index:

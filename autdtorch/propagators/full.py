@@ -49,10 +49,6 @@ class DomainSimulation(Simulation):
         """Return nothing: reflectors of a domain absorb nothing."""
         return []
 
-    def near_obstacle(self, points: torch.Tensor) -> bool:
-        """Return whether the interpolation kernel of any point (N, 3) has heterogeneous cells."""
-        return self.assemblies[0].touches_heterogeneous(points)
-
     def _in_enclosed_cells(self, points: torch.Tensor) -> torch.Tensor:
         enclosed = self.assemblies[0].is_enclosed(points.reshape(-1, 3), self.plan.region.walls)
         return torch.from_numpy(enclosed).reshape(points.shape[:-1])

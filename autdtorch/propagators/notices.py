@@ -12,7 +12,7 @@ from autdtorch.fdtd.thin_walls import warn_of_thin_walls
 from autdtorch.fdtd.turning import axes_along, flat_faces
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.scene_region import warn_of_ending_walls, warn_of_near_points
-from autdtorch.propagators.simulation import PressureMap, Run, Simulation
+from autdtorch.propagators.simulation import Run, Simulation
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.text import counted
 from autdtorch.utils.units import warn_user
@@ -57,16 +57,6 @@ class Notices:
                 )
                 text += " %.2g mm, may count as closed)"
                 self._once("cavity", text, _in_mm(enclosed[0]), more, 1e3 * self._plan.spacing)
-
-    def of_sources(self, result: PressureMap) -> None:
-        """Log that a source is next to an obstacle, where runs began at the transducers."""
-        if result.runs and not result.from_points and "source" not in self._logged:
-            self._logged.add("source")
-            if self._simulation.near_obstacle(self._plan.scene.array.nodes.positions.flatten(0, 1)):
-                logger.warning(
-                    "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g"
-                    " mm", 1e3 * self._plan.source_clearance, 1e3 * self._plan.spacing,
-                )  # fmt: skip
 
     def of_faint_points(self, matrix: torch.Tensor, free: torch.Tensor) -> None:
         """Log that the matrix at control points is rounding, relative to free space: methods would use it."""

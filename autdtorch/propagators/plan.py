@@ -14,7 +14,6 @@ from autdtorch.fdtd.costs import Costs
 from autdtorch.fdtd.grid import MAX_CELLS, coarsest_spacing, require_spacing, second_spacing
 from autdtorch.fdtd.grid_errors import Law
 from autdtorch.fdtd.grouping import Grouping, choose_grids
-from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels.choice import available_kernel, precision_of
 from autdtorch.fdtd.placement import fitting_spacing
 from autdtorch.fdtd.reflection import require_domain, require_sharp, whole_region, with_images
@@ -167,11 +166,6 @@ class Plan:
             terms=max(points, 2 * len(array)),  # a disc takes twice the time of a point
             meshes=tuple(isinstance(shape, Mesh) for shape in region.shapes),
         )  # fmt: skip
-
-    @property
-    def source_clearance(self) -> float:
-        """Distance [m] from obstacles within which a source is less accurate."""
-        return self.spacing * interpolation_width(self.region.wavenumber * self.spacing) / 2
 
     def is_feasible(self) -> bool:
         """Return whether the machine can hold it."""

@@ -139,8 +139,7 @@ class SimulatedPropagator:
     ) -> torch.Tensor | tuple[torch.Tensor, float]:
         """Return the transfer matrix G, from one simulation for each transducer or each point (reciprocity).
 
-        Simulations start at the transducers if a point is next to an obstacle. Points or transducers in one
-        symmetry orbit of the scene on its grid share a simulation.
+        Points or transducers in one symmetry orbit of the scene on its grid share a simulation.
 
         Args:
             points: (P, 3) [m]; by default the scene's control points.
@@ -159,7 +158,6 @@ class SimulatedPropagator:
         places = self._places(points)
         results = self._results(places, with_error)
         result = results[0]
-        self._notices.of_sources(result)
         self._notices.of_cavities(places, result.matrix)
         if points is None:
             self._notices.of_faint_points(result.matrix, self._free(places))
@@ -230,7 +228,6 @@ class SimulatedPropagator:
         else:
             result = PressureMap(field.mT)
         warn_of_unsettled(result.runs, self.tolerance)
-        self._notices.of_sources(result)
         if not is_picture:
             self._notices.of_cavities(points, result.matrix)
         return field.reshape(*drive.shape[:-1], *grid)

@@ -156,10 +156,6 @@ class Simulation(ABC):
         """The assembled grids."""
 
     @abstractmethod
-    def near_obstacle(self, points: torch.Tensor) -> bool:
-        """Return whether the interpolation kernel of any point (N, 3) has heterogeneous cells."""
-
-    @abstractmethod
     def _in_enclosed_cells(self, points: torch.Tensor) -> torch.Tensor:
         """Return which points (..., 3) are in cells of air that rigid obstacles enclose."""
 
@@ -242,8 +238,6 @@ class Simulation(ABC):
     def orbits(self, points: torch.Tensor) -> Orbits:
         """Return the fewest runs for a transfer matrix: from transducers or, by reciprocity, from points."""
         forward = self._orbits_of_transducers(points)
-        if self.near_obstacle(points):
-            return forward  # only these are accurate there
         backward = orbits_of_points(points, self.symmetries)
         fewer = (backward.runs, len(points)) < (forward.runs, len(self.plan.scene.array))
         return backward if fewer else forward

@@ -295,21 +295,7 @@ def test_pilot_grids_are_not_logged(caplog):
     scene = small_scene((BESIDE_ARRAY,))
     points = torch.cat((scene.control_points, scene.control_points - 0.5e-3))  # more than transducers
     simulated(dataclasses.replace(scene, control_points=points), "box", None, tolerance=0.5)
-    assert not messages(caplog, "coarse") + messages(caplog, "of an obstacle")
-
-
-@pytest.mark.parametrize("method", ["box", "full"])
-def test_a_source_beside_an_obstacle_is_logged_once(method, caplog):
-    propagator = simulated(small_scene((BESIDE_ARRAY,)), method, 1.4e-3, tolerance=0.5)
-    points = propagator.scene.control_points
-    propagator.transfer_matrix()
-    assert not messages(caplog, "of an obstacle")  # the runs begin at the three points
-    for turn in (1, 1j, -1):
-        propagator.field(turn * DRIVE, points)
-    everywhere = torch.cat((points, points - 0.5e-3))
-    propagator.transfer_matrix(everywhere, return_error=True)
-    assert len(propagator.runs) > 3 + 3
-    assert len(messages(caplog, "of an obstacle")) == 1
+    assert not messages(caplog, "coarse")
 
 
 @pytest.mark.parametrize("method", ["box", "full"])

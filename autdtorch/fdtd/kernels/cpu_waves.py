@@ -199,17 +199,16 @@ def superposition(
     sources: Tensor | Discs,
     amplitude: Tensor,
     wavenumber: complex,
-    nearest: float = 0.0,
     dtype: torch.dtype = torch.float64,
 ) -> Tensor:
     """Return R fields (P, R) complex128 [Pa] of N sources: sums of amplitude e^{i k r} / r.
 
-    Amplitudes are complex (N, R) [Pa m], `wavenumber` is k + i alpha [rad/m] and `nearest` the lower limit of
-    the distance to points [m]. Either points or sources may be discs: the mean pressure over a disc, or the
-    field of one. float32 takes half the time at an error of 3e-7 per wave. Threads do not change the result.
+    Amplitudes are complex (N, R) [Pa m], and `wavenumber` is k + i alpha [rad/m]. Either points or sources
+    may be discs: the mean pressure over a disc, or the field of one. float32 takes half the time at an error
+    of 3e-7 per wave. Threads do not change the result.
     """
     number = np.float32 if dtype == torch.float32 else np.float64
-    wave = _wave(wavenumber, nearest)
+    wave = _wave(wavenumber)
     parts = (amplitude.real, amplitude.imag)
     strength = np.stack([np.ascontiguousarray(part.numpy().astype(number).T) for part in parts])
     discs = isinstance(points, Discs), isinstance(sources, Discs)
@@ -246,7 +245,7 @@ def wave_matrix(
     matrix = np.zeros((columns, blocks.shape[1] // LANES, LANES), np.complex128)
     column = np.arange(len(amplitude)) % columns
     rows, strength = _rows(sources), amplitude.numpy()
-    wave, disc = _wave(wavenumber, 0.0), disc_numbers(sources, wavenumber, np.float64)
+    wave, disc = _wave(wavenumber), disc_numbers(sources, wavenumber, np.float64)
     _spread(
         lambda ends: _write_matrix(
             blocks, *ends, rows, column, strength, wave, disc, _room(np.float64), matrix
@@ -262,10 +261,10 @@ def _spread(function: Callable[[tuple[int, int]], None], units: int, pairs: int)
     spread(function, even_parts(units, max(1, min(units, 1 + pairs // _PAIRS))))
 
 
-def _wave(wavenumber: complex, nearest: float) -> tuple[float, float, float]:
+def _wave(wavenumber: complex) -> tuple[float, float, float]:
     """Return turns and halvings of a wave per metre, and the lower limit of the distance [m]."""
     wavenumber = complex(wavenumber)
-    return wavenumber.real / (2 * math.pi), wavenumber.imag / math.log(2), max(nearest, LENGTH_TOLERANCE)
+    return wavenumber.real / (2 * math.pi), wavenumber.imag / math.log(2), LENGTH_TOLERANCE
 
 
 def _rows(places: Tensor | Discs) -> AnyArray:

@@ -71,7 +71,7 @@ class BodyWaves:
 
             @torch.no_grad()
             def run(waves: list[int]) -> SteadyState:
-                forces = box.sources((incoming[:, waves] / size[waves]).sum(dim=1))
+                forces = box.sources(box.forces((incoming[:, waves] / size[waves]).sum(dim=1)))
                 settings = (
                     plan.tolerance,
                     plan.max_periods,

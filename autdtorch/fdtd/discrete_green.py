@@ -1,0 +1,69 @@
+"""The discrete Green's function: the field on the grid, in air, of a source that lies on one cell.
+
+It solves sum_j g_j (u_j - u) + L u = -4 pi L' / (2 k h) at the cell of the source, and 0 at all others, with
+the stencil's symbol L and its slope L' at k h (`stencil.py`). At one and two cells it differs from e^{ikr} /
+r by 1 %; from five cells on, only by the dispersion of the grid. So a cube of cells suffices. At its faces
+u - e^{ikh} u_before is that of the exact field, which leaves no resonance. By symmetry, the cells
+x >= y >= z >= 0 are the unknowns.
+"""
+
+from __future__ import annotations
+
+import itertools
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from autdtorch.fdtd.interpolation import GridShape, Interpolation
+from autdtorch.fdtd.stencil import OFFSETS, Stencil, places_of
+from autdtorch.utils.array_types import ComplexArray, Index
+
+_REACH = 12
+"""Cells from the source to the faces of the cube. With 18, the field at 8 cells changes by less than 1e-4
+from 6 cells per wavelength on."""
+
+
+@lru_cache(maxsize=64)
+def discrete_green(stencil: Stencil) -> ComplexArray:
+    """Return the field [1 / h] at cells (x, y, z) from the source, each of 0 to `_REACH`."""
+    axis = range(_REACH + 1)
+    cells = np.array([(x, y, z) for x, y, z in itertools.product(axis, repeat=3) if x >= y >= z])
+    number = np.zeros((_REACH + 1,) * 3, np.int64)
+    for order in itertools.permutations(range(3)):
+        number[tuple(cells[:, order].T)] = np.arange(len(cells))
+    wavenumber = complex(stencil.kappa, stencil.eta)
+    on_face = cells[:, 0] == _REACH
+    inner, face, before = np.flatnonzero(~on_face), np.flatnonzero(on_face), cells[on_face] - (1, 0, 0)
+    turn = np.exp(1j * wavenumber)
+
+    def exact(cells: Index) -> ComplexArray:
+        distance = np.linalg.norm(cells, axis=1)
+        return np.asarray(np.exp(1j * wavenumber * distance) / distance, np.complex128)
+
+    system, field = np.zeros((len(cells), len(cells)), np.complex128), np.zeros(len(cells), np.complex128)
+    for offset, weight in zip(OFFSETS, stencil.weights, strict=True):
+        np.add.at(system, (inner, number[tuple(abs(cells[inner] + offset).T)]), weight)
+    system[inner, inner] += complex(stencil.symbol, stencil.loss) - stencil.total
+    field[0] = -2 * np.pi * stencil.slope / wavenumber
+    system[face, face] = 1
+    system[face, number[tuple(before.T)]] -= turn
+    field[face] = exact(cells[face]) - turn * exact(before)
+    return np.asarray(np.linalg.solve(system, field)[number], np.complex128)
+
+
+def field_of_kernel(
+    kernels: Interpolation, number: int, cells: Index, shape: GridShape, stencil: Stencil
+) -> tuple[NDArray[np.bool_], ComplexArray]:
+    """Return the mask (n,) of the cells (n, 3) near a source between cells, and its field [1 / h] there (m,).
+
+    The source is spread over the cells of a kernel, which has a number; without any it has no field.
+    """
+    loud = kernels.weight[number] != 0
+    places, weight = places_of(kernels.index[number, loud], shape), kernels.weight[number, loud]
+    if not len(weight):
+        return np.ones(len(cells), bool), np.zeros(len(cells), np.complex128)
+    low, high = places.max(axis=0) - _REACH, places.min(axis=0) + _REACH
+    near = np.asarray(((cells >= low) & (cells <= high)).all(axis=1))
+    x, y, z = np.moveaxis(abs(cells[near, None] - places), -1, 0)
+    return near, np.asarray(discrete_green(stencil)[x, y, z] @ weight)
