@@ -125,19 +125,20 @@ class Extrapolation:
     def __init__(self, most: int, single: bool = False) -> None:
         """Start an empty sequence, whose values are stored in double or in `single` precision."""
         self._precision = np.complex64 if single else np.complex128
-        self._values: deque[NDArray[Any]] = deque(maxlen=most)
+        self._most, self._count = most, 0
+        self._values: NDArray[Any] = np.zeros((0, 0), self._precision)  # in turn (most, k)
         self._last = np.zeros(0, np.complex128)
         self._steps: deque[Phasors] = deque(maxlen=most - 1)
         self._product = np.zeros((0, 0), np.complex128)
 
     def __len__(self) -> int:
         """Return the number of stored values."""
-        return len(self._values)
+        return min(self._count, self._most)
 
     def append(self, value: Phasors) -> None:
         """Append the next value (k,)."""
         before, self._last = self._last, value[:: -(-len(value) // _MOST_FITTED)].copy()
-        if self._values:
+        if self._count:
             step = self._last - before
             self._steps.append(step)
             old = self._product[-len(self._steps) + 1 :, -len(self._steps) + 1 :]
@@ -145,19 +146,22 @@ class Extrapolation:
             self._product[:-1, :-1] = old if len(self._steps) > 1 else 0
             self._product[:, -1] = [np.vdot(other, step) for other in self._steps]
             self._product[-1] = self._product[:, -1].conj()
-        self._values.append(value.astype(self._precision))
+        else:
+            self._values = np.empty((self._most, len(value)), self._precision)
+        self._values[self._count % self._most] = value
+        self._count += 1
 
     def limit(self) -> Phasors:
         """Return the estimated limit (k,), or the last value while there are too few."""
         count = len(self._steps)
         size = float(np.trace(self._product).real) / max(count, 1)
         if count < 2 or not (math.isfinite(size) and size > 0):
-            return self._values[-1].astype(np.complex128)
+            return np.asarray(self._values[(self._count - 1) % self._most], np.complex128)
         mean = np.linalg.solve(self._product + _ROUNDING * size * np.eye(count), np.ones(count))
         mean /= mean.sum()
-        total = np.zeros(len(self._values[-1]), np.complex128)
-        for share, value in zip(mean, itertools.islice(self._values, 1, None), strict=True):
-            total += share * value
+        total = np.zeros(self._values.shape[1], np.complex128)
+        for place, share in enumerate(mean, self._count - count):
+            total += share * self._values[place % self._most]
         return total
 
 

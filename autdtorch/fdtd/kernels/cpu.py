@@ -129,10 +129,11 @@ def _finish_chunk(c, q, medium, cells, losses, outermost, sources, row, sound_ha
     for n in range(loss_starts[c], loss_starts[c + 1]):
         q[lossy[n]] += change[n]
     driven, force = sources
-    for s in range(len(row)):
-        force_of_signal, signal = force[s], row[s]
-        for n in range(driven_starts[c], driven_starts[c + 1]):
-            q[driven[n]] += force_of_signal[n] * signal
+    for n in range(driven_starts[c], driven_starts[c + 1]):
+        pressure = q[driven[n]]
+        for s in range(len(row)):
+            pressure += force[s, n] * row[s]
+        q[driven[n]] = pressure
     for n in range(hard_starts[c], hard_starts[c + 1]):
         q[sound_hard[n]] = 0
 
@@ -182,13 +183,15 @@ def _advance(  # type: ignore[no-untyped-def]
 
     A step has two phases with a task for each chunk, sweep it and finish it. One is before these if cells are
     lossy, and one after if interfaces pass through the boundary layers. The first records the step before.
+    Chunks at both ends, whose planes are in the boundary layers, are done first: they take longest.
     """
     chunks, steps, read = len(medium[0]) - 1, len(signal), recorded.shape[1]
     swept = 1 if len(losses[0]) else 0  # the phase of the sweep
     kinds = swept + (3 if len(columns[0][0]) else 2)
     for _ in range((kinds * steps + 1) * chunks):
         task = add_to_counter(counters, _CLAIMED, 1)
-        phase, c = task // chunks, task % chunks
+        phase, place = task // chunks, task % chunks
+        c = chunks - 1 - place // 2 if place % 2 else place // 2
         if phase > kinds * steps:
             break
         _wait_for(counters, phase * chunks)
@@ -327,7 +330,7 @@ class CpuKernel:
         shape, cuts = state.now.shape, _cuts(state.now.shape)
         plane = shape[1] * shape[2]
         dtype = c.heterogeneous_weight.numpy().dtype.type
-        recorded = torch.empty((len(signal), len(receivers.index)), dtype=signal.dtype, device="cpu")
+        recorded = np.empty((len(signal), len(receivers.index)), dtype)  # in large pages, unlike PyTorch's
         medium = (
             cuts,
             np.searchsorted(c.heterogeneous_index.numpy(), plane * np.arange(shape[0] + 1)),
@@ -356,13 +359,13 @@ class CpuKernel:
             (_unsigned(sources.index), sources.force.mT.contiguous().numpy()),
             (_unsigned(receivers.index.mT), receivers.weight.mT.contiguous().numpy()),
             signal.contiguous().numpy(),
-            recorded.numpy(),
+            recorded,
             np.zeros(_COUNTERS, np.int64),
         )
         self._work(lambda: _advance(*arguments), len(cuts) - 1)
         memory.give_back()
         now, before = (state.now, state.before) if len(signal) % 2 == 0 else (state.before, state.now)
-        return WaveState(now, before, state.memory), recorded
+        return WaveState(now, before, state.memory), torch.from_numpy(recorded)
 
     def compiled_ahead(self, c: Coefficients) -> AbstractContextManager[None]:
         """Compile `advance` and the sums over sources in other processes while others are compiled here."""

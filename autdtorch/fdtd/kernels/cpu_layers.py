@@ -220,14 +220,20 @@ def absorb_x(q, i, shape, memory, u, profile):  # type: ignore[no-untyped-def]
     outer = (side * (cells + one) + depth - one) * plane
     inner, shift, out = outer + plane, (side * cells + depth - one) * plane, i * plane
     # Each half cell is advanced with the first of its two planes.
-    if side or depth == one:
-        _half_cell(psi, outer, u, here, outside, plane, decay[two * depth - two], gain[two * depth - two])
-    if not side or depth == cells:
+    if side and depth == cells:
         _half_cell(psi, inner, u, inside, here, plane, decay[two * depth], gain[two * depth])
+    if not side and depth == one:
+        _half_cell(psi, outer, u, here, outside, plane, decay[0], gain[0])
+    first, second = (outer, inner) if side else (inner, outer)
+    ahead, behind = (here, outside) if side else (inside, here)
+    half = two * depth - two if side else two * depth
+    b_half, a_half, sign = decay[half], gain[half], decay.dtype.type(-1 if side else 1)
     b, a = decay[two * depth - one], gain[two * depth - one]
     for k in range(plane):
-        slope = psi[inner + k] - psi[outer + k]
-        second = (u[inside + k] - u[here + k]) - (u[here + k] - u[outside + k])
-        moved = b * zeta[shift + k] + a * (second + slope)
+        advanced = b_half * psi[first + k] + a_half * (u[ahead + k] - u[behind + k])
+        psi[first + k] = advanced
+        slope = sign * (advanced - psi[second + k])
+        bend = (u[inside + k] - u[here + k]) - (u[here + k] - u[outside + k])
+        moved = b * zeta[shift + k] + a * (bend + slope)
         zeta[shift + k] = moved
         q[out + k] += slope + moved

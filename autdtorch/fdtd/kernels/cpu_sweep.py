@@ -9,7 +9,8 @@ pressure gives two planes, A and B, and the new pressure is
 The last A is added when plane i + 2 reads it. The boundary layers across y and z stretch T_y and T_z:
 `cpu_layers.py` adds the resulting terms to A and B, and the terms of the layers across x to new_i.
 
-Cells inside rigid bodies are skipped: A is zero there, and the pressure stays as it is.
+Cells inside rigid bodies are skipped. A is anything there: it counts in cells of the planes beside that are
+inside or at the surface, whose pressure nobody reads or is set to zero.
 
 All arrays are flat with unsigned indices: array views cost numba more than a short row, and possibly negative
 indices a test. Loops run over whole planes, or all rows of a layer, as if they were one row. The values that
@@ -101,7 +102,6 @@ def sweep_planes(  # type: ignore[no-untyped-def]
                     p, i * plane + at, end - at, nz, q, old, back + at, across, here + at, behind + at,
                     weights,
                 )  # fmt: skip
-                across[here + end : here + ahead] = 0
                 at = ahead
         else:
             for k in range(plane):
