@@ -3,7 +3,7 @@ from .analytic.green import green
 from .hardware.devices.openmpd import OpenMPDBoard
 from .io.array_file import load_array
 from .io.calibration_file import load_calibration, save_calibration
-from .io.drive_file import load_drive, save_drive
+from .io.drive_file import load_drive, load_sequence, save_drive, save_sequence
 from .io.field_file import save_field
 from .io.picture_file import load_picture, save_picture
 from .io.readings_file import load_readings, save_readings
@@ -27,7 +27,7 @@ from .methods.functions import (
 from .methods.gabs import GABS
 from .methods.gradient import GradientAscent
 from .methods.holography.holography import Holography, holography
-from .methods.holography.sequence import drive_sequence
+from .methods.holography.sequence import drive_sequence, sequence_along
 from .methods.identify import Identify
 from .methods.lssg import LSS, LSSG
 from .methods.prior import Prior
@@ -151,6 +151,7 @@ __all__ = [
     "load_readings",
     "load_results",
     "load_scene",
+    "load_sequence",
     "load_state",
     "lss",
     "lssg",
@@ -176,7 +177,9 @@ __all__ = [
     "save_picture",
     "save_readings",
     "save_scene",
+    "save_sequence",
     "save_state",
+    "sequence_along",
     "sphere_points",
     "true_pressure",
     "view3d",

@@ -53,6 +53,7 @@ NOT_CALLED_BY_USERS = {
     *("CallableFrames.wait", "FolderFrames.wait", "ThermalCamera.deviation", "ThermalCamera.read_pulse"),
     "uvc_frames",
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
+    *("LimitedLink.play_sequence", "Link.play_sequence"),  # plays until it is stopped
     *("Device.pack", "lock_log", "open_autd3"),  # the one only makes a context, the other asks the network
 }
 
@@ -116,6 +117,12 @@ def array_file(folder: Path) -> Path:
 
 def drive_file(folder: Path) -> Path:
     return written(folder, "drive.csv", "phase [rad],amplitude\n0,1\n1,0.5\n")
+
+
+def sequence_file(folder: Path) -> Path:
+    array = at.TransducerArray.grid((2, 2), 10e-3, (0, 0, 0), (0, 0, 1))
+    at.save_sequence(folder / "sequence.npz", at.modulated(DRIVE, 200.0), array)
+    return folder / "sequence.npz"
 
 
 def readings_file(folder: Path) -> Path:
@@ -315,6 +322,7 @@ ARGUMENTS: dict[str, Any] = {
     "seconds": 10.0,
     "seconds_in_a_row": 5.0,
     "sensor": Silent(),
+    "sequence": at.Sequence(torch.stack([DRIVE, DRIVE]), 50.0),
     "settings": {"a": 1},
     "shape": (2, 2),
     "size": (4e-3, 4e-3, 4e-3),
@@ -377,6 +385,11 @@ OTHERS: dict[str, Any] = {
     "SeenPoints.points": [1],
     "Sequence.drives": torch.stack([DRIVE, DRIVE]),
     "modulated.frequency": 200.0,
+    "sequence_along.frequency": 10.0,
+    "sequence_along.path": [[22e-3, 7e-3, 14e-3], [20e-3, 16e-3, 12e-3]],
+    "sequence_along.targets": [1.0],
+    "save_sequence.array": at.TransducerArray.grid((2, 2), 10e-3, (0, 0, 0), (0, 0, 1)),
+    "load_sequence.path": Made(sequence_file),
     "Readings.drives": torch.stack([DRIVE, DRIVE]),
     "Readings.pressure": [[1.0, 2.0], [3.0, 4.0]],
     "Readings.phase": [[0.1, 0.2], [0.3, 0.4]],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from autdtorch.scene.drive import (
     phases_of,
     validate_drive,
 )
+from autdtorch.scene.sequence import Sequence
 from autdtorch.utils.array_types import AnyArray, Array
 from autdtorch.utils.files import read_arrays, write_arrays
 from autdtorch.utils.units import warn_user, warned_within
@@ -32,6 +34,8 @@ _LEVEL_COLUMNS = {f"{name} {column}": "" for name, device in DEVICES.items() for
 _PLAIN_COLUMNS = {OFFSET: "rad", "phase": "rad", "amplitude": ""}
 _NUMBERING = {"frame": "", "unit": "", "transducer": ""}
 _COLUMNS = _NUMBERING | PLACE_COLUMNS | NORMAL_COLUMNS | SIZE_COLUMNS | _PLAIN_COLUMNS | _LEVEL_COLUMNS
+_COMMENT = "sequence: rate {rate!r} Hz, loop {loop}"
+_TIMING = re.compile(r"#\s*sequence: rate (?P<rate>[\d.e+-]+) Hz, loop (?P<loop>True|False)\s*$")
 _TURN = 2 * math.pi + 1e-6  # [rad], with room for rounding
 
 
@@ -63,21 +67,81 @@ def save_drive(
         ValueError: another suffix or device, not a drive of the array, or an M that is not a multiple of the
             transducers of a unit.
     """
-    path = path_of("path", path, suffixes=_FORMATS)
     require_kind("array", array, TransducerArray)
     checked = validate_drive(drive, len(array)).detach().cpu()
     if checked.ndim not in (1, 2) or 0 in checked.shape:
         accepted = f"must be ({len(array)},), or (T, {len(array)}) for T frames"
         raise ValueError(f"drive: shape {tuple(checked.shape)}; {accepted}")
+    _save(path, checked, array, device)
+
+
+def save_sequence(
+    path: str | os.PathLike[str], sequence: Sequence, array: TransducerArray, device: str | None = None
+) -> None:
+    """Write a sequence as `save_drive` writes frames, with its rate and whether it loops.
+
+    `.csv` has them in a comment, `.npz` in the arrays rate and loop. `load_drive` reads the frames alone.
+
+    Args:
+        path: of the file, which is replaced; the suffix, `.csv` or `.npz`, decides the format.
+        sequence: of frames (T, M).
+        array: the M transducers.
+        device: a name in `hardware.DEVICES`, such as "autd3", or None.
+
+    Raises:
+        ValueError: another suffix or device, or a sequence for another array.
+    """
+    require_kind("sequence", sequence, Sequence)
+    require_kind("array", array, TransducerArray)
+    frames = validate_drive(sequence.drives, len(array), "sequence.drives")
+    _save(path, frames, array, device, {"rate": sequence.rate, "loop": sequence.loop})
+
+
+def load_sequence(path: str | os.PathLike[str]) -> Sequence:
+    """Read a sequence that `save_sequence` wrote, levels as the device plays them.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: another suffix, or a file without frames, rate or loop. The message names the file.
+    """
+    path = path_of("path", path, suffixes=_FORMATS)
+    drives = load_drive(path)
+    if drives.ndim != 2:
+        raise ValueError(f"{path}: a single drive; must have frames (T, M)")
+    timing = _timing_in_comment(path) if path.suffix.lower() == ".csv" else read_arrays(path)
+    if missing := [name for name in ("rate", "loop") if name not in timing]:
+        raise ValueError(f"{path}: no {' and '.join(missing)}; must be written by save_sequence")
+    with within(path):
+        return Sequence(drives, timing["rate"].tolist(), timing["loop"].tolist())
+
+
+def _timing_in_comment(path: Path) -> dict[str, AnyArray]:
+    """Return rate and loop of the comment that `save_sequence` writes at the top of a table."""
+    with path.open(encoding="utf-8-sig") as lines:
+        match = _TIMING.match(next(lines, ""))
+    return (
+        {"rate": np.array(float(match["rate"])), "loop": np.array(match["loop"] == "True")} if match else {}
+    )
+
+
+def _save(
+    path: str | os.PathLike[str],
+    frames: torch.Tensor,
+    array: TransducerArray,
+    device: str | None,
+    timing: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a drive (M,) or frames (T, M), perhaps with rate and loop."""
+    path = path_of("path", path, suffixes=_FORMATS)
     if device is None:
-        columns, arrays = _plain(checked, array)
+        columns, arrays = _plain(frames, array)
     else:
         require_one_of("device", device, DEVICES)
-        columns, arrays = _levelled(checked, device)
+        columns, arrays = _levelled(frames, device)
     if path.suffix.lower() == ".csv":
-        write_table(path, columns)
+        write_table(path, columns, [_COMMENT.format(**timing)] if timing else [])
     else:
-        write_arrays(path, arrays)
+        write_arrays(path, arrays | dict(timing or {}))
 
 
 def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:

@@ -76,6 +76,65 @@ def test_a_modulated_sequence_has_whole_laps_and_periods():
     assert at.modulated(lap, 25.0).rate == 500  # the first multiple with 20 frames a period
 
 
+ARRAY = at.TransducerArray.grid((3, 1), 10e-3, (0, 0, 0), (0, 0, 1))
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+def test_a_sequence_comes_back_from_its_file(suffix, tmp_path):
+    sequence = at.Sequence(at.modulated(DRIVE, 30.0).drives, 1 / 3, loop=False)
+    at.save_sequence(tmp_path / f"sequence{suffix}", sequence, ARRAY)
+    loaded = at.load_sequence(tmp_path / f"sequence{suffix}")
+    assert (loaded.rate, loaded.loop) == (1 / 3, False)
+    # phases and amplitudes in text leave rounding
+    torch.testing.assert_close(loaded.drives, sequence.drives, rtol=0, atol=1e-14)
+    assert torch.equal(at.load_drive(tmp_path / f"sequence{suffix}"), loaded.drives)
+    assert at.load_array(tmp_path / f"sequence{suffix}").positions.shape == (3, 3)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+def test_a_file_for_a_device_has_its_levels(suffix, tmp_path):
+    array = at.TransducerArray.autd3((0, 0, 0), (0, 0, 1))
+    sequence = at.modulated(torch.full((249,), 0.6 - 0.8j, dtype=torch.complex128), 200.0)
+    at.save_sequence(tmp_path / f"sequence{suffix}", sequence, array, device="autd3")
+    loaded = at.load_sequence(tmp_path / f"sequence{suffix}")
+    assert (loaded.rate, loaded.loop) == (4000, True)
+    assert torch.equal(loaded.drives, at.hardware.AUTD3.quantised(sequence.drives))
+
+
+def test_a_sequence_along_a_path_plays_its_points():
+    air = at.Medium(1.2, 343.0)
+    array = at.TransducerArray.grid((6, 6), 10e-3, (0, 0, 0), (0, 0, 1))
+    circle = at.circle_points((0, 0, 0.1), 5e-3, 20, (0, 0, 1))
+    propagator = at.make_propagator(at.Scene(array, air, 40e3, circle))
+    sequence = at.sequence_along(propagator, circle, 10.0)
+    assert (len(sequence), sequence.rate, sequence.loop) == (20, 200, True)
+    matrix = propagator.transfer_matrix()
+    level = (matrix * sequence.drives).sum(dim=1).abs()
+    assert level.tolist() == pytest.approx([float(matrix.abs().sum(dim=1).min())] * 20, rel=1e-9)
+    both = at.sequence_along(propagator, torch.stack([circle, circle.roll(10, 0)], 1), 10.0, [2.0, 1.0])
+    reached = (matrix * both.drives).sum(dim=1).abs() / (matrix.roll(10, 0) * both.drives).sum(dim=1).abs()
+    assert reached.tolist() == pytest.approx([2.0] * 20, rel=0.05)  # weights settle
+    with pytest.raises(ValueError, match=r"path: shape \(2,\); must be \(T, 3\) or \(T, P, 3\)"):
+        at.sequence_along(propagator, [1.0, 2.0], 10.0)
+
+
+def test_files_of_other_things_are_refused(tmp_path):
+    other = at.TransducerArray.grid((6, 6), 10e-3, (0, 0, 0), (0, 0, 1))
+    with pytest.raises(ValueError, match=r"sequence.drives: shape \(20, 3\); must be \(..., 36\)"):
+        at.save_sequence(tmp_path / "sequence.npz", at.modulated(DRIVE, 30.0), other)
+    for suffix in (".csv", ".npz"):
+        at.save_drive(tmp_path / f"drive{suffix}", DRIVE, ARRAY)
+        with pytest.raises(ValueError, match=f"drive{suffix}: a single drive; must have frames"):
+            at.load_sequence(tmp_path / f"drive{suffix}")
+        at.save_drive(tmp_path / f"frames{suffix}", DRIVE[None], ARRAY)
+        with pytest.raises(
+            ValueError, match=f"frames{suffix}: no rate and loop; must be written by save_seq"
+        ):
+            at.load_sequence(tmp_path / f"frames{suffix}")
+    with pytest.raises(ValueError, match=r"path: .*; must end in one of .csv, .npz"):
+        at.load_sequence("sequence.txt")
+
+
 MISTAKES = [
     (lambda: at.Sequence(torch.zeros(0, 3, dtype=torch.complex128), 10.0), r"drives: shape \(0, 3\)"),
     (lambda: at.Sequence(DRIVE, 10.0), r"drives: shape \(3,\); must be \(T, M\)"),

@@ -19,13 +19,14 @@ so that a jump spreads over both its sides.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 
 from autdtorch.methods.holography.algorithms import DAMPING, TINY, UNREACHED
 from autdtorch.methods.holography.holography import checked_targets
+from autdtorch.scene.sequence import Sequence
 from autdtorch.utils.array_types import Array, ComplexArray
 from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import (
@@ -35,7 +36,13 @@ from autdtorch.utils.validation import (
     integer_at_least,
     invalid,
     positive,
+    real_tensor,
+    require_kind,
+    within,
 )
+
+if TYPE_CHECKING:
+    from autdtorch.propagators import Propagator
 
 _STARTS = 8  # Phases between the foci that are tried
 _SETTLED = 1e-9  # Change of all drives at which iterations end
@@ -95,6 +102,45 @@ def drive_sequence(
         level = np.abs(drives[:, None] @ rows.swapaxes(1, 2)).min(axis=(1, 2))
         drives = drives * (level.min() / np.maximum(level, TINY))[:, None]
     return torch.from_numpy(drives)
+
+
+def sequence_along(
+    propagator: Propagator,
+    path: ArrayLike,
+    frequency: float,
+    targets: ArrayLike | None = None,
+    phase_step: float = math.pi,
+    loop: bool = True,
+    even: bool = True,
+) -> Sequence:
+    """Return a sequence that moves foci along a path, one frame for each of its points.
+
+    The rate is the number of points times `frequency`.
+
+    Args:
+        propagator: of the scene, with its obstacles.
+        path: (T, 3) for one focus, or (T, P, 3) for P foci [m], as of `circle_points` or `polyline_points`.
+        frequency: laps per second [Hz], > 0.
+        targets: wanted pressures (T, P) or (P,), relative to each other; None for 1 everywhere.
+        phase_step: largest change of a phase from one frame to the next [rad], > 0.
+        loop: whether the path begins again after its last point.
+        even: whether all frames have one level; see `drive_sequence`.
+
+    Raises:
+        ValueError: an argument out of range, or as for `drive_sequence`.
+    """
+    from autdtorch.propagators import Propagator  # takes a second
+
+    require_kind("propagator", propagator, Propagator)
+    frequency, loop = positive("frequency", frequency, "Hz"), boolean("loop", loop)
+    places = real_tensor("path", path, "m").detach().cpu()
+    places = places[:, None] if places.ndim == 2 else places
+    if places.ndim != 3 or places.shape[-1] != 3 or places.numel() == 0:
+        raise ValueError(f"path: shape {tuple(places.shape)}; must be (T, 3) or (T, P, 3) with T, P >= 1")
+    with within("path"):
+        rows = propagator.transfer_matrix(places.reshape(-1, 3))
+    matrix = rows.reshape(*places.shape[:2], -1)
+    return Sequence(drive_sequence(matrix, targets, phase_step, loop, even), len(places) * frequency, loop)
 
 
 def _starts(rows: ComplexArray, closed: bool) -> ComplexArray:
