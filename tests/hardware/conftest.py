@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import signal
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,6 +57,29 @@ class Trial:
     ) -> hw.HardwareObjective:
         limited = hw.LimitedLink(link, hw.Limits(1.0)) if isinstance(link, hw.Link) else link
         return hw.HardwareObjective(self.scene, limited, sensor, self.log, settings)
+
+
+@pytest.fixture
+def stray_signals_do_no_harm() -> Iterator[None]:
+    before = signal.signal(signal.SIGTERM, lambda *_: None)
+    yield
+    signal.signal(signal.SIGTERM, before)
+
+
+@pytest.fixture
+def signalled_all_the_time(stray_signals_do_no_harm: None) -> Callable[[], AbstractContextManager[None]]:
+    """SIGTERM every few ms, from without: a thread would send it only where it has the interpreter."""
+
+    @contextmanager
+    def signalled() -> Iterator[None]:
+        sender = subprocess.Popen(["sh", "-c", "while kill -TERM $PPID; do sleep 0.002; done"])
+        try:
+            yield
+        finally:
+            sender.kill()
+            sender.wait()
+
+    return signalled
 
 
 @pytest.fixture(scope="session")

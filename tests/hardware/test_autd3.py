@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import signal
-import subprocess
 import threading
 
 import pytest
@@ -61,24 +60,6 @@ class Noting:
         await self.client.close()
 
 
-@pytest.fixture
-def stray_signals_do_no_harm():
-    before = signal.signal(signal.SIGTERM, lambda *_: None)
-    yield
-    signal.signal(signal.SIGTERM, before)
-
-
-@contextlib.contextmanager
-def signalled_all_the_time():
-    """SIGTERM every few ms, from without: a thread would send it only where it has the interpreter."""
-    sender = subprocess.Popen(["sh", "-c", "while kill -TERM $PPID; do sleep 0.002; done"])
-    try:
-        yield
-    finally:
-        sender.kill()
-        sender.wait()
-
-
 class Mute:
     """A client whose boards never answer."""
 
@@ -121,8 +102,7 @@ class TestWithTheKit:
                 limited.require_on()
 
     @pytest.mark.timeout(120)
-    @pytest.mark.usefixtures("stray_signals_do_no_harm")
-    def test_signals_at_any_moment_leave_the_boards_off(self, kit, monkeypatch):
+    def test_signals_at_any_moment_leave_the_boards_off(self, kit, monkeypatch, signalled_all_the_time):
         drive, boards = random_drive(249), kit.UdpEmulator(1)
         with open_autd3(1, network=boards.option(), settle=0) as link:
             link._port._client = client = Noting(link._port._client, monkeypatch)

@@ -1,5 +1,6 @@
 """Sequences on devices: every frame, in order and in time; refused where a device cannot play them."""
 
+import contextlib
 import math
 import signal
 import threading
@@ -207,6 +208,18 @@ def test_a_signal_ends_a_loop_with_the_outputs_off(trial, number):
     finally:
         signal.signal(number, before)
     assert not bench.emitted().any()
+
+
+@pytest.mark.timeout(120)
+def test_signals_at_any_moment_leave_the_outputs_off(trial, signalled_all_the_time):
+    loop, bench = Sequence(frames_of(5, COUNT), 5000.0), trial.bench(hw.OPENMPD)
+    emitted = []
+    with trial.link(bench, hw.OPENMPD) as link, signalled_all_the_time():
+        for _ in range(100):
+            with contextlib.suppress(hw.Signalled), hw.ended_by_signals():
+                link.play_sequence(loop)
+            emitted.append(bool(bench.emitted().any()))
+    assert emitted == [False] * 100
 
 
 @pytest.mark.parametrize("fault", FAULTS)
