@@ -1,8 +1,10 @@
-"""Free-space fields of an AUTD3 against the emulator of its SDK.
+"""Free-space fields and sequences of an AUTD3 against the emulator of its SDK.
 
 Needs `pip install 'autdtorch[crosscheck]'`. The emulator has two fields. "RMS" is a sum of point sources
 without directivity or absorption, with the phases and pulse widths of the emulated firmware. "Instant" is the
-pressure over time, of square waves filtered by a model of the transducer.
+pressure over time, of square waves filtered by a model of the transducer. Of sequences, phases and pulse
+widths of every period are compared with the frames. Their phases swing: where one passes 0 downwards twice,
+the emulator 0.12.0 smooths in the wrong direction.
 """
 
 import cmath
@@ -23,8 +25,10 @@ from shared.scenes import relative_error
 
 import autdtorch as at
 from autdtorch.hardware import AUTD3
+from autdtorch.hardware.devices.autd3 import autd3_sequence
 from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.scene.arrays import TRANSDUCER_RADIUS
+from autdtorch.scene.sequence import Sequence
 
 DOCUMENT = "benchmarks.md"
 PACKAGES = ("autd3-emulator", "autd3-pattern")
@@ -51,6 +55,8 @@ PERIODS = 120
 FULL_PULSE = 512
 """Counts of a pulse width in a period; half of them give full drive."""
 
+_FRAMES, _RATES, _LAPS, _MODULATION = 100, (500.0, 1000.0, 4000.0, 40_000.0), 3, 200.0  # of sequences; Hz
+
 
 OPTIONS = {"--resolution": {"type": float, "default": 1.0, "help": "of the plane [mm]"}}
 
@@ -65,6 +71,7 @@ def main(page: Page, resolution: float) -> None:
         table(("theirs", "ours", "relative difference", "what explains it"), lines),
         f"Transducer positions agree within {1e9 * largest_shift():.0f} nm. The emulator's instant field is "
         f"{abs(factor):.4f} times ours and {late:.1f} degrees late, by its model of a transducer.",
+        sequences(),
     )
 
 
@@ -165,6 +172,49 @@ def random_drive(transducers: int) -> torch.Tensor:
     """Return random amplitudes and phases (M,)."""
     amplitude, phase = torch.rand((2, transducers), generator=torch.Generator().manual_seed(0)).double()
     return at.drive_from_phases(2 * math.pi * phase, amplitude)
+
+
+def sequences() -> str:
+    """Return how the emulator plays a moving focus at several rates, and a modulated one."""
+    drive, turn = (
+        random_drive(249),
+        2 * math.pi * torch.arange(_FRAMES, dtype=torch.float64)[:, None] / _FRAMES,
+    )
+    swinging = drive * torch.polar(torch.ones_like(turn), drive.abs() * turn.sin())
+    wrong = sum(wrong_levels(Sequence(swinging, rate)) for rate in _RATES)
+    modulated = at.modulated(drive / drive.abs(), _MODULATION)
+    widths = played_sequence(modulated, _LAPS)[1]
+    ticks = round(FREQUENCY / modulated.rate)
+    power = (np.sin(np.pi * widths[:, ticks - 1 :: ticks] / FULL_PULSE) ** 2).mean(axis=0)
+    number = np.arange(len(power))
+    deviation = np.abs(power - (1 + np.sin(2 * np.pi * number / len(modulated))) / 2).max()
+    frequency = np.abs(np.fft.rfft(power - power.mean())).argmax() * modulated.rate / len(power)
+    rates = ", ".join(f"{rate:g}" for rate in _RATES)
+    return (
+        f"Sequences of {_FRAMES} frames at {rates} frames/s: {wrong} levels differ at the end of their frames. "
+        f"Amplitude modulation of {_MODULATION:g} Hz: {frequency:g} Hz, and the radiation pressure within "
+        f"{100 * deviation:.1f} % of its largest."
+    )
+
+
+def played_sequence(sequence: Sequence, laps: int) -> list[NDArray[np.int64]]:
+    """Return phases and pulse widths (M, ticks) of the emulator, from the first frame of a sequence on."""
+    held = AUTD3.held(sequence.drives, sequence.rate, sequence.loop)
+    assert held is not None
+    recorder = Recorder(Geometry([Autd3()]), 0)
+    recorder.send(autd3_sequence(held, 1))
+    recorder.tick(Duration.from_nanos(round(1e9 * laps * sequence.duration)))
+    record = recorder.into_record()
+    return [part.to_numpy().astype(np.int64) for part in (record.phase(), record.pulse_width())]
+
+
+def wrong_levels(sequence: Sequence) -> int:
+    """Return the number of levels that the emulator does not emit at the end of their frames."""
+    ticks = round(FREQUENCY / sequence.rate)
+    phases, widths = (part[:, ticks - 1 :: ticks] for part in played_sequence(sequence, _LAPS))
+    phase, intensity = (level.T.repeat(1, _LAPS).numpy() for level in AUTD3.levels(sequence.drives))
+    pulses = FULL_PULSE * np.arcsin(intensity / 255) / np.pi
+    return int((phases != phase).sum() + (np.abs(widths - pulses) > 1).sum())
 
 
 def rows(grid: Grid) -> tuple[list[list[str]], complex]:
