@@ -38,6 +38,7 @@ from .methods.solution import Solution
 from .methods.state_file import load_state, save_state
 from .objectives.bound import focus_bound
 from .objectives.goals import Goal, MeanPressure, TargetPressures, WeakestFocus
+from .objectives.haptics import HapticMetrics, haptic_metrics
 from .objectives.metrics import FocusMetrics, focus_metrics
 from .objectives.objective import Objective, SimulatedObjective, weakest_focus
 from .objectives.perturbations import CameraNoise, Drift, FailedTransducers, Noise, Quantised, true_pressure
@@ -46,6 +47,7 @@ from .objectives.readings import Readings
 from .plot.calibration_figure import plot_calibration
 from .plot.costs import plot_pareto, plot_scaling
 from .plot.explore import explore
+from .plot.haptics_figure import plot_haptics
 from .plot.pressure_maps import plot_plane, plot_planes
 from .plot.scene_figure import plot_scene
 from .plot.trials import plot_convergence, plot_poses, plot_trials
@@ -62,7 +64,7 @@ from .scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
 from .scene.porous import porous
 from .scene.reflectors import Reflector
 from .scene.scene import OverlapWarning, ScaleWarning, Scene
-from .scene.sequence import Sequence, modulated
+from .scene.sequence import Sequence, modulated, silenced
 from .study.results_file import load_results
 from .study.sweeps import Sweep, collect_results
 
@@ -84,6 +86,7 @@ __all__ = [
     "FocusProblem",
     "Goal",
     "GradientAscent",
+    "HapticMetrics",
     "Holography",
     "Identify",
     "MeanPressure",
@@ -141,6 +144,7 @@ __all__ = [
     "gabs",
     "gradient_ascent",
     "green",
+    "haptic_metrics",
     "hardware",
     "holography",
     "identify",
@@ -160,6 +164,7 @@ __all__ = [
     "phases_of",
     "plot_calibration",
     "plot_convergence",
+    "plot_haptics",
     "plot_pareto",
     "plot_plane",
     "plot_planes",
@@ -180,6 +185,7 @@ __all__ = [
     "save_sequence",
     "save_state",
     "sequence_along",
+    "silenced",
     "sphere_points",
     "true_pressure",
     "view3d",

@@ -45,7 +45,17 @@ METHODS = ("BayesOpt", "GABS", "GradientAscent", "Holography", "Identify", "LSS"
 
 #: Results, parts of drivers, and calls that need a device.
 NOT_CALLED_BY_USERS = {
-    *("Estimate", "Evaluation", "EvaluationLog", "FocusMetrics", "Preflight", "Run", "Solution", "Sweep"),
+    *(
+        "Estimate",
+        "Evaluation",
+        "EvaluationLog",
+        "FocusMetrics",
+        "HapticMetrics",
+        "Preflight",
+        "Run",
+        "Solution",
+        "Sweep",
+    ),
     *("Adapter", "Device", "Dialect", "Obstacle", "OpenMPDBoard"),
     *("Calibration", "Picture", "TMatrixPropagator", "TMatrix", "SimulatedPropagator"),
     "UsbtmcPort",
@@ -123,6 +133,11 @@ def sequence_file(folder: Path) -> Path:
     array = at.TransducerArray.grid((2, 2), 10e-3, (0, 0, 0), (0, 0, 1))
     at.save_sequence(folder / "sequence.npz", at.modulated(DRIVE, 200.0), array)
     return folder / "sequence.npz"
+
+
+def haptics() -> at.HapticMetrics:
+    sequence = at.modulated(DRIVE, 200.0)
+    return at.haptic_metrics(at.make_propagator(AIR_ALONE), sequence, AIR_ALONE.control_points)
 
 
 def readings_file(folder: Path) -> Path:
@@ -388,6 +403,8 @@ OTHERS: dict[str, Any] = {
     "sequence_along.frequency": 10.0,
     "sequence_along.path": [[22e-3, 7e-3, 14e-3], [20e-3, 16e-3, 12e-3]],
     "sequence_along.targets": [1.0],
+    "haptic_metrics.path": None,
+    "plot_haptics.metrics": Made(lambda _: haptics()),
     "save_sequence.array": at.TransducerArray.grid((2, 2), 10e-3, (0, 0, 0), (0, 0, 1)),
     "load_sequence.path": Made(sequence_file),
     "Readings.drives": torch.stack([DRIVE, DRIVE]),

@@ -16,9 +16,11 @@ from autdtorch.utils.validation import (
     ArrayLike,
     boolean,
     invalid,
+    not_negative,
     number_between,
     positive,
     real_tensor,
+    require_kind,
     require_one_of,
 )
 
@@ -28,6 +30,7 @@ LONGEST = 100_000
 """Number of frames up to which `modulated` looks for a period, and `at_rate` resamples."""
 
 _SAMPLES = 20  # of a period of "sine" or "square" at least, where the rate is not stated
+_PARTS = 10  # of a frame, by `silenced`
 _ROUNDING = 1e-9  # relative difference of rates that are taken as equal
 
 
@@ -165,6 +168,41 @@ def modulated(
     return Sequence(
         sequence.drives[number % len(sequence)] * amplitude[:, None], sequence.rate, sequence.loop
     )
+
+
+def silenced(sequence: Sequence, phase_time: float = 1e-3, amplitude_time: float = 0.25e-3) -> Sequence:
+    """Return a sequence as a device plays it that changes phases and amplitudes evenly over some time.
+
+    AUTD3 does so by default, by its silencer of fixed completion time. A phase turns the shorter way, from
+    the moment at which its frame begins; a time above that of a frame is shortened to it. Each frame becomes
+    ten, each for the middle of its time.
+
+    Args:
+        sequence: of frames.
+        phase_time: in which phases change [s], >= 0.
+        amplitude_time: in which amplitudes change [s], >= 0.
+
+    Raises:
+        ValueError: an argument out of range.
+    """
+    require_kind("sequence", sequence, Sequence)
+    frame = 1 / sequence.rate
+    middles = (torch.arange(_PARTS, **REAL) + 0.5) / _PARTS
+    shares = []
+    for name, time in (("phase_time", phase_time), ("amplitude_time", amplitude_time)):
+        time = min(not_negative(name, time, "s"), frame)
+        shares.append((middles * frame / time).clamp_max(1) if time else torch.ones_like(middles))
+    drives = sequence.drives[:, None]
+    before = drives.roll(1, 0)
+    if not sequence.loop:
+        before[0] = drives[0]
+    phase, amplitude = (share[:, None] for share in shares)
+    size = before.abs() + amplitude * (drives.abs() - before.abs())
+    # a silent transducer has the phase of its other frame
+    first = torch.where(before == 0, drives, before)
+    last = torch.where(drives == 0, before, drives)
+    turned = torch.polar(size, first.angle() + phase * (last * first.conj()).angle())
+    return Sequence(turned.flatten(0, 1), _PARTS * sequence.rate, sequence.loop)
 
 
 def _samples(waveform: object) -> torch.Tensor | None:
