@@ -286,7 +286,7 @@ def lives(command, folder):
 
     if problem := rendering_problem():
         pytest.skip(problem)
-    words = [*shlex.split(command.text), "explore.browser=false"]
+    words = [*shlex.split(command.text), "explore.browser=false", COARSE]
     pipe = {"stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen(words, cwd=folder, env=environment(folder), **pipe) as live:
         try:
