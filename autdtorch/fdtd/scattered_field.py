@@ -154,8 +154,9 @@ class ScatteredField:
         inner = self.assembly.interpolation(self._on_axes(nodes[within]))
         read = np.concatenate((surface, inner.index.ravel()))
         cells = distinct_cells(read, math.prod(self.assembly.grid.shape))
-        picked = Interpolation(surface[:, None], np.ones((len(surface), 1))).matrix(cells)
-        return NearToFar(self, targets, far, within, cells, outward @ picked, inner.matrix(cells))
+        if len(cells) > len(surface):
+            outward = outward @ Interpolation(surface[:, None], np.ones((len(surface), 1))).matrix(cells)
+        return NearToFar(self, targets, far, within, cells, outward, inner.matrix(cells))
 
     def radiated(
         self, amplitude: Tensor, points: Tensor | Discs, images: Sequence[Image] | None = None

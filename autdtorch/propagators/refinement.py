@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from autdtorch.fdtd.grid import coarsest_spacing
 from autdtorch.fdtd.region import Region
 from autdtorch.propagators.plan import Plan
-from autdtorch.propagators.simulated import SimulatedPropagator
+from autdtorch.propagators.simulated import SimulatedPropagator, simulation_of
 from autdtorch.propagators.simulation import Simulation
 from autdtorch.propagators.store import Store
 from autdtorch.utils.validation import invalid
@@ -126,7 +126,8 @@ def _chosen(pilot: Plan, plan: Plan, budget: Budget | None, store: Store) -> Sim
             shown = 1e3 * plan.spacing, error, tolerance
             logger.warning("time or memory end at %.3g mm: estimated error %.2g, tolerance %g", *shown)
             return propagator
-        plan, others = finer, [*others, propagator.simulation]
+        # the store has its matrix: a simulation without grids, whose memory is given back
+        plan, others = finer, [*others, simulation_of(plan, store)]
 
 
 def _warn_of_shape(region: Region, shape: float, error: float, tolerance: float) -> None:

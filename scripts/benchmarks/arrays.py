@@ -4,8 +4,8 @@ A plane has 101 x 101 points, 150 mm in front of 256 transducers. Errors of disc
 integral, at random points at least a wavelength from the rim, relative to the field at each point. Bodies
 are rigid and tilted, in front of a SonicSurface of discs, and simulated to 2 % by `tolerance` in a process
 each. Four foci are in the shadow 0.1 m behind a plate, and beside a cube, which hides half of the array.
-True errors are against a finer grid, extrapolated by the square of the spacing. Takes about 5 minutes on 2
-idle cores, most of it for these.
+True errors are against a finer grid, extrapolated by the square of the spacing. Takes about 10 minutes
+on 2 idle cores, most of it for these.
 """
 
 import math
@@ -26,7 +26,7 @@ AIR, FREQUENCY = at.Medium(1.2, 343.0), 40e3
 UP = (0.0, 0.0, 1.0)
 TILT = (0.2, 0.3, 0.1)
 THICKNESS = 3e-3
-SIDES = {"plate": (0.1, 0.2, 0.4), "cube": (0.05, 0.1)}  # [m]
+SIDES = {"plate": (0.1, 0.2, 0.3, 0.4), "cube": (0.05, 0.1, 0.3)}  # [m]
 ASIDE, ABOVE = 10e-3, 40e-3  # least distances of a cube from the array's axis and its plane [m]
 TOLERANCE = 0.02
 FINER = 0.75
