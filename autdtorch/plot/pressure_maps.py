@@ -135,7 +135,7 @@ def plot_planes(
     Of a single scene, all arguments may leave out its name: ``plot_planes({"a": p, "b": q}, plane)``.
 
     All maps of a scene share one colour scale, of the pressures outside the `obstacles`; cells inside these
-    are grey. Without `obstacles` nothing is masked.
+    are grey. Without `obstacles` nothing is masked. With `vmax` one colour bar is for all scenes.
 
     Args:
         pressure: by scene and method, complex pressure or its magnitude (Nu, Nv) [Pa]. Methods may differ
@@ -197,6 +197,12 @@ def _rows_of_maps(
     axes = figure.subplots(
         len(heights), len(widths), squeeze=False, height_ratios=heights, width_ratios=widths
     )
+    bars = axes[-1]
+    if vmax is not None:
+        bars = [figure.add_subplot(axes[-1, 0].get_gridspec()[-1, :])]
+        for ax in axes[-1]:
+            ax.remove()
+    shown: list[tuple[QuadMesh, Collection[Array], float]] = []
     for column, size, width, (scene, maps) in zip(axes.T, sizes, widths, pressure.items(), strict=True):
         bodies = () if obstacles is None else members(f"obstacles[{scene!r}]", obstacles[scene], Obstacle)
         walls = () if reflectors is None else members(f"reflectors[{scene!r}]", reflectors[scene], Reflector)
@@ -221,9 +227,14 @@ def _rows_of_maps(
                 ax.set_ylabel("")
                 ax.tick_params(labelleft=False)
         column[0].set_title(wrapped(readable(scene), width), weight="bold")
-        beyond = _beyond(magnitudes.values(), limits)
-        bar = figure.colorbar(mesh, cax=column[-1], orientation="horizontal", extend=beyond)
-        _label_bar(bar, limits, "|p|", "Pa", width)
+        shown.append((mesh, magnitudes.values(), width))
+    if vmax is not None:
+        every = [magnitude for _, magnitudes, _ in shown for magnitude in magnitudes]
+        shown = [(shown[0][0], every, sum(widths))]
+    for bar, (mesh, values, width) in zip(bars, shown, strict=True):
+        beyond = _beyond(values, mesh.get_clim())
+        drawn = figure.colorbar(mesh, cax=bar, orientation="horizontal", extend=beyond)
+        _label_bar(drawn, mesh.get_clim(), "|p|", "Pa", width)
     for ax, name in zip(axes[:-1, 0], names, strict=True):
         _name_row(ax, name)
     return figure

@@ -208,6 +208,14 @@ OPENMPD = ("hardware=openmpd", "hardware.limits.amplitude=1", "hardware.transduc
             "hardware.sensor.path: None; must be the folder",
         ),
         (
+            (*EMULATED, "hardware/sensor=camera", "hardware.sensor.path=frames"),
+            "hardware.sensor.path: 'frames'; must be null, as of an emulated camera",
+        ),
+        (
+            (*EMULATED, "hardware/sensor=camera", "hardware.sensor.scale=0.1"),
+            "hardware.sensor.scale: 0.1; must be 0.01, as",
+        ),
+        (
             (*EMULATED, "hardware/sensor=camera", "hardware.sensor.screen.heating=-1"),
             "Screen.heating: -1",
         ),

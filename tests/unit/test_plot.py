@@ -165,8 +165,8 @@ def test_the_ends_of_the_colours_the_reference_and_the_axes_can_be_chosen() -> N
     maps = {"a": {"gabs": pressure}, "b": {"gabs": 3 * pressure}}
     figure = plot_planes(maps, dict.fromkeys(maps, PLANE), vmax=4.0)
     assert [mesh_of(ax).get_clim() for ax in figure.axes[:2]] == [(0, 4), (0, 4)]
-    # An arrow at the end of the bar of b: some of its pressures are beyond.
-    assert [ax._colorbar.extend for ax in figure.axes[2:]] == ["neither", "max"]
+    # One bar for both, with an arrow at its end: some pressures of b are beyond.
+    assert [ax._colorbar.extend for ax in figure.axes[2:]] == ["max"]
 
 
 def test_planes_of_a_scene_share_their_colour_scale() -> None:

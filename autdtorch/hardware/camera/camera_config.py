@@ -15,6 +15,15 @@ from autdtorch.hardware.sensors.sensor import PulsedSensor, SensorConfig, Setup
 from autdtorch.utils.validation import invalid, require_known, require_one_of, within
 
 _KINDS = ("folder", "uvc")
+_EMULATED = {
+    "frames": "folder",
+    "path": None,
+    "number": 0,
+    "scale": 0.01,
+    "zero": -273.15,
+    "rate": None,
+    "corners": None,
+}
 _NEEDED = {
     "corners": "the pixels [column, row] of the corners of the scene's observation plane",
     "path": "the folder into which the camera's program writes",
@@ -52,6 +61,10 @@ class CameraConfig(SensorConfig):
         with within("hardware.sensor.screen"):
             Screen(**self.screen)
         if emulated:
+            for key, value in _EMULATED.items():
+                if (setting := getattr(self, key)) != value:
+                    accepted = f"must be {'null' if value is None else value}, as of an emulated camera"
+                    raise invalid(f"hardware.sensor.{key}", setting, accepted)
             return
         for key, wanted in (("corners", True), ("path", self.frames == "folder")):
             if wanted and getattr(self, key) is None:
@@ -103,5 +116,7 @@ class CameraConfig(SensorConfig):
             )
             with contextlib.closing(emulated):
                 sleep = bench.bus.sleep
-                source = FolderFrames(folder, 0.01, -273.15, delete=True, clock=emulated.clock, sleep=sleep)
+                source = FolderFrames(
+                    folder, self.scale, self.zero, delete=True, clock=emulated.clock, sleep=sleep
+                )
                 yield source, emulated.corners.round(1)
