@@ -26,11 +26,11 @@ from autdtorch.cli.settings import (
     section_of,
     solver_of,
 )
-from autdtorch.io.drive_file import load_drive, save_drive
+from autdtorch.io.drive_file import load_sequence, save_sequence
 from autdtorch.io.path_section import path_points
-from autdtorch.methods.holography.sequence import drive_sequence
+from autdtorch.methods.holography.sequence import sequence_along
 from autdtorch.objectives.objective import SimulatedObjective
-from autdtorch.propagators import make_propagator
+from autdtorch.propagators import Propagator, make_propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.scene.sequence import Sequence, modulated
 from autdtorch.utils.digest import digest_of
@@ -62,30 +62,32 @@ def play(settings: dict[str, Any], modules: list[Any], output: Any) -> None:
     seconds = None if section["seconds"] is None else positive("play.seconds", section["seconds"], "s")
     folder = Path("outputs") / f"play_{HydraConfig.get().runtime.choices['scene']}"
     folder = folder_of("output", output) if is_given("output") else folder
-    solver = solver_of(settings)
-    sequence = _sequence(section, section_of(settings, "path"), scene, bench, solver)
+    propagator = make_propagator(scene, **solver_of(settings))
+    sequence = _sequence(section, section_of(settings, "path"), scene, bench, propagator)
+    if not (sequence.loop or is_given("play.seconds")):
+        seconds = None  # all frames once
     if bench.is_emulated:
-        propagator = make_propagator(scene, **solver)
         bench.emulate(SimulatedObjective(scene, propagator), propagator)
     folder.mkdir(parents=True, exist_ok=True)
-    save_drive(folder / "sequence.npz", sequence.drives, scene.array)
+    save_sequence(folder / "sequence.npz", sequence, scene.array)
     playback = _played(bench, sequence, seconds, folder / "play.jsonl")
     print(f"{playback}\nThe sequence is in {shlex.quote(os.path.relpath(folder / 'sequence.npz'))}")
 
 
 def _sequence(
-    section: dict[str, Any], path: dict[str, Any], scene: Scene, bench: Bench, solver: dict[str, Any]
+    section: dict[str, Any], path: dict[str, Any], scene: Scene, bench: Bench, propagator: Propagator
 ) -> Sequence:
     """Return the sequence of a file, or that of a focus on the path."""
     rate = positive("play.rate", section["rate"], "Hz")
-    bench.device.require_rate(rate)
     if (file := given_file("play.sequence", section["sequence"])) is not None:
         with within("play.sequence"):
-            sequence = Sequence(load_drive(file), rate)
+            sequence = load_sequence(file)
+        if is_given("play.rate"):
+            sequence = sequence.at_rate(rate)
     else:
+        bench.device.require_rate(rate)
         points = path_points("path", path, scene, rate)
-        matrix = make_propagator(scene, **solver).transfer_matrix(points)
-        sequence = Sequence(drive_sequence(matrix[:, None], closed=path.get("closed", True)), rate)
+        sequence = sequence_along(propagator, points, rate / len(points), loop=path.get("closed", True))
     if (modulation := section["modulation"]) is None:
         return sequence
     if not isinstance(modulation, dict):

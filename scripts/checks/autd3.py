@@ -191,8 +191,7 @@ def sequences() -> str:
     frequency = np.abs(np.fft.rfft(power - power.mean())).argmax() * modulated.rate / len(power)
     rates = ", ".join(f"{rate:g}" for rate in _RATES)
     return (
-        f"Sequences of {_FRAMES} frames at {rates} frames/s: {wrong} levels differ "
-        "at the end of their frames. "
+        f"Sequences of {_FRAMES} frames at {rates} frames/s: {wrong} levels differ at the end of a frame. "
         f"Amplitude modulation of {_MODULATION:g} Hz: {frequency:g} Hz, and the radiation pressure within "
         f"{100 * deviation:.1f} % of its largest."
     )

@@ -397,7 +397,7 @@ def test_help_tells_what_there_is_with_the_defaults(run, tmp_path, capsys):
     text = capsys.readouterr().out
     assert "autdtorch experiment=paper" in text
     assert f"scene: {', '.join(CONFIG_NAMES['scene'])}" in text
-    assert len(text.splitlines()) <= 45
+    assert len(text.splitlines()) <= 48
     rows = re.findall(r"^  ([a-z_.]+) +\S.* \[(.*)\]$", text, re.MULTILINE)
     assert len(rows) >= 8
     config = OmegaConf.create(composed())

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 import autdtorch as at
-from autdtorch.io.drive_file import load_drive
 from autdtorch.io.path_section import path_points
 from autdtorch.utils.array_types import REAL
 
@@ -37,8 +36,9 @@ def entries(folder):
 def test_a_focus_on_a_circle_is_played_and_noted(command, run, tmp_path, capsys):
     assert run(*command, "path.frequency=50", "path.radius=4e-3") == 0
     assert capsys.readouterr().out.startswith("50 frames in 0.05")
-    drives = load_drive(tmp_path / "out/sequence.npz")
-    assert drives.shape == (20, 9)
+    sequence = at.load_sequence(tmp_path / "out/sequence.npz")
+    drives = sequence.drives
+    assert (drives.shape, sequence.rate, sequence.loop) == ((20, 9), 1000.0, True)
     scene = at.load_scene(tmp_path / "ours/scene/two.yaml")
     points = at.circle_points((80e-3, 0, 0), 4e-3, 20, (1, 0, 0))
     matrix = at.make_propagator(scene).transfer_matrix(points)
@@ -49,13 +49,19 @@ def test_a_focus_on_a_circle_is_played_and_noted(command, run, tmp_path, capsys)
     first, second = entries(tmp_path)
     assert (first["played"]["frames"], first["frames"], first["rate [Hz]"]) == (50, 20, 1000.0)
     assert (second["played"]["frames"], second["frames"], second["rate [Hz]"]) == (100, 40, 2000.0)
+    assert run(*command, "play.sequence=out/sequence.npz", "play.rate=500") == 0
+    assert (entries(tmp_path)[2]["frames"], entries(tmp_path)[2]["rate [Hz]"]) == (10, 500.0)
 
 
-@pytest.mark.parametrize("path", ["line", "points"])
-def test_other_paths_are_played(command, run, tmp_path, path):
-    corners = ("path.positions=[[0.08,0,0],[0.08,0.01,0],[0.08,0,0.01]]",) if path == "points" else ()
-    assert run(*command, f"path={path}", *corners) == 0
+def test_a_line_is_played(command, run, tmp_path):
+    assert run(*command, "path=line") == 0
     assert entries(tmp_path)[0]["frames"] == 100
+
+
+def test_lines_that_end_are_played_once(command, run, tmp_path):
+    corners = "path.positions=[[0.08,0,0],[0.08,0.01,0],[0.08,0,0.01]]"
+    assert run(*command[:-1], "path=points", corners, "path.closed=false", "path.frequency=20") == 0
+    assert entries(tmp_path)[0]["played"]["frames"] == 50
 
 
 def test_a_line_goes_there_and_back_around_the_control_points(tmp_path, write):
