@@ -36,7 +36,7 @@ _LONGEST_SETTLE = 60.0  # [s]
 _ATTEMPTS = 10  # to switch off, each after a signal
 _FINEST = 2.0**-14  # resolution of the search; two levels of a device here are further apart
 
-_Transducers: TypeAlias = collections.abc.Sequence[int] | torch.Tensor | None
+_Transducers: TypeAlias = collections.abc.Sequence[int] | torch.Tensor
 
 
 class OffError(LinkError):
@@ -46,7 +46,7 @@ class OffError(LinkError):
 class Wiring:
     """A device, and its transducer for each of a scene's (M,), int64; other transducers stay off."""
 
-    def __init__(self, device: Device, transducers: _Transducers = None) -> None:
+    def __init__(self, device: Device, transducers: _Transducers | None = None) -> None:
         """Wire a device; by default all its transducers in order."""
         require_device(device)
         self.device = device
@@ -136,7 +136,7 @@ class Link(contextlib.AbstractContextManager["Link"]):
         self,
         device: Device,
         port: Port,
-        transducers: _Transducers = None,
+        transducers: _Transducers | None = None,
         settle: float = SETTLE,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
@@ -311,7 +311,7 @@ class Link(contextlib.AbstractContextManager["Link"]):
 
 def open_link(
     device: Device,
-    transducers: _Transducers = None,
+    transducers: _Transducers | None = None,
     serial: str | None = None,
     backend: Any = None,
     settle: float = SETTLE,
@@ -340,7 +340,7 @@ def open_link(
 
 def open_autd3(
     boards: int = 1,
-    transducers: _Transducers = None,
+    transducers: _Transducers | None = None,
     network: Any = None,
     settle: float = SETTLE,
 ) -> Link:

@@ -20,6 +20,9 @@ from autdtorch.scene.geometry import plane_basis
 
 CALLS = public_calls()
 
+#: The call that sees all wrong values of a parameter; others of this name and annotation see a third of them.
+FIRST = {key: call.name for call in reversed(CALLS.values()) for key in call.parameters.items()}
+
 EXPECTED = {
     ("load_scene", "source", "a dict"),  # a scene without the keys that it needs
     ("view3d", "volume", "itself, with nan"),  # unknown values of a volume
@@ -110,7 +113,10 @@ def test_a_value_of_a_wrong_kind_is_refused_in_a_line_that_names_the_field(call,
     complaints = []
     for parameter, annotation in call.parameters.items():
         valid = call.argument(parameter, tmp_path)
-        for wrong in (*wrong_values(), *spoiled(valid)):
+        values = [*wrong_values(), *spoiled(valid)]
+        if FIRST[parameter, annotation] != call.name:
+            values = values[len(call.name) % 3 :: 3]
+        for wrong in values:
             if annotation == "Any" or (callable(valid) and callable(wrong.value)):
                 continue  # errors of a function show where it is called
             error = refusal(function, call.arguments(tmp_path, **{parameter: wrong.value}))
