@@ -75,7 +75,7 @@ class HapticMetrics:
         ]
         if self.ripple is not None and self.elsewhere is not None:
             parts.append(
-                f"ripple {100 * self.ripple.max():.2g} %, elsewhere up to {self.elsewhere.max():.4g} Pa"
+                f"ripple {100 * self.ripple.max():.1f} %, elsewhere up to {self.elsewhere.max():.4g} Pa"
             )
         return f"HapticMetrics({'; '.join(parts)})"
 

@@ -42,7 +42,7 @@ def plot_haptics(metrics: HapticMetrics) -> Figure:
             label = "focus" if metrics.foci.shape[1] == 1 else f"focus {number}"
             axes[2].plot(times, pressure, color=_COLOURS[number % len(_COLOURS)], label=label, linewidth=1.0)
         axes[2].plot(times, metrics.elsewhere.numpy(), color="0.5", label="elsewhere", linewidth=1.0)
-        ripple = f"ripple {100 * float(metrics.ripple.max()):.2g} %"
+        ripple = f"ripple {100 * float(metrics.ripple.max()):.1f} %"
         axes[2].set(xlabel="time [ms]", ylabel="pressure [Pa]", title=ripple, ylim=0)
         axes[2].legend(loc="best")
     return figure
