@@ -12,6 +12,7 @@ from autdtorch.utils.validation import require_kind
 
 _SIZE = (9.0, 2.8)  # of the figure [inch]
 _COLOURS = ("#0072B2", "#D55E00", "#009E73")  # of the points with the largest tactile part
+_ABOVE = 1.2  # of the pressures, up to which their axis extends, for the legend
 _BEYOND = 1.6  # of the tactile band, up to which lines of the spectrum are drawn
 
 
@@ -43,8 +44,9 @@ def plot_haptics(metrics: HapticMetrics) -> Figure:
             axes[2].plot(times, pressure, color=_COLOURS[number % len(_COLOURS)], label=label, linewidth=1.0)
         axes[2].plot(times, metrics.elsewhere.numpy(), color="0.5", label="elsewhere", linewidth=1.0)
         ripple = f"ripple {100 * float(metrics.ripple.max()):.1f} %"
-        axes[2].set(xlabel="time [ms]", ylabel="pressure [Pa]", title=ripple, ylim=0)
-        axes[2].legend(loc="best")
+        axes[2].set(xlabel="time [ms]", ylabel="pressure [Pa]", title=ripple)
+        axes[2].set_ylim(0, _ABOVE * axes[2].get_ylim()[1])
+        axes[2].legend(loc="upper center", ncols=2)
     return figure
 
 
