@@ -35,7 +35,7 @@ def entries(folder):
 
 def test_a_focus_on_a_circle_is_played_and_noted(command, run, tmp_path, capsys):
     assert run(*command, "path.frequency=50", "path.radius=4e-3") == 0
-    assert capsys.readouterr().out.startswith("50 frames in 0.05")
+    assert capsys.readouterr().out.startswith("50 frames in ")
     sequence = at.load_sequence(tmp_path / "out/sequence.npz")
     drives = sequence.drives
     assert (drives.shape, sequence.rate, sequence.loop) == ((20, 9), 1000.0, True)
