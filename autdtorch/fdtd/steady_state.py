@@ -210,6 +210,7 @@ def windows_of_run(
             part = slice(begin - first, end - first)
             total = total + fourier_sum(basis[:, part], recorded[part]).cpu()
             sums[end] = total
+        del recorded  # before the next one, as it may be most of a run's memory
         starts = range(-(-(first + 1) // shift) * shift - steps, first + 1, shift)
         whole = (start for start in starts if start >= recorded_from or not recorded_from)
         windows = [(start, (sums[start + steps] - sums.get(start, silence)).numpy()) for start in whole]
