@@ -4,9 +4,9 @@ The derivatives lambda of a loss by all forces come from an adjoint run of the s
 It is driven in the receivers' cells by the derivatives of the loss by their record, divided by the masses,
 and its pressures are multiplied by the masses:
 
-    dL / d force_is  = sum_t lambda_i(t) signal_s(t)
-    dL / d weight_ij = sum_t lambda_i(t) (p_j(t) - p_i(t))
-    dL / d loss_ij   = sum_t lambda_i(t) (p_j(t) - p_j(t - 1))
+    dL / d force_is  = sum_t lambda_i(t) signal_s(t).
+    dL / d weight_ij = sum_t lambda_i(t) (p_j(t) - p_i(t)).
+    dL / d loss_ij   = sum_t lambda_i(t) (p_j(t) - p_j(t - 1)).
     dL / d ground_i  = -sum_t lambda_i(t) p_i(t).
 
 All but the first sum need the run itself in reverse. Its state is stored at the beginning of segments, which

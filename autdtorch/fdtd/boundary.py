@@ -4,8 +4,8 @@ Along its axis a layer replaces the second difference d2 by g d(g d), with
 g = 1 / (1 + sigma / (alpha - i w)). In time this takes two memory variables (CPML of second order: Komatitsch
 & Martin 2007, Pasalic & McGarry 2010):
 
-    psi  <- b psi  + a (u[l+1] - u[l])                      between the cells
-    zeta <- b zeta + a (u[l+1] - 2 u[l] + u[l-1] + psi[l+1/2] - psi[l-1/2])        at the cells
+    psi  <- b psi  + a (u[l+1] - u[l])                      between the cells.
+    zeta <- b zeta + a (u[l+1] - 2 u[l] + u[l-1] + psi[l+1/2] - psi[l-1/2])        at the cells.
     d2 u <- d2 u + psi[l+1/2] - psi[l-1/2] + zeta.
 
 E_a u is the term that the layer adds to d2 u. In the 27-point sum, T_a + E_a replaces every sum T_a of the

@@ -1,14 +1,14 @@
 """Losses in the time step: damping that is exact at the drive's frequency and stable at all others.
 
-A cell of mass m with the damping coefficients g and c (`assembly/losses.py`), in air that absorbs by D a
-step, is stepped by
+A cell has the mass m and the damping coefficients g and c (`assembly/losses.py`), and air absorbs by D a
+step. Let s = p - p-. A step solves
 
-    m (p+ - 2 p + p-) + (m D + d) (p+ - p-) = C sum_j [ k_ij (p_j - p_i) + e_ij (s_j - s_i) ],    s = p - p-.
+    m (p+ - 2 p + p-) + (m D + d) (p+ - p-) = C sum_j [k_ij (p_j - p_i) + e_ij (s_j - s_i)].
 
-With the phase theta of a step at the drive's frequency, g is exact for d = g tan(theta / 2) / symbol, and c
-for e = c / sin(theta) with a stiffness k that is less by c tan(theta / 2). The damping e of the coupling is
-late by half a step. The scheme is stable for 0 <= k, 0 <= 2 d + e and C (k + 2 e) <= 4 m as forms: the
-second is what passive means, and the third limits the time step.
+The phase of a step at the drive's frequency is theta. Then g is exact for d = g tan(theta / 2) / symbol. For
+e = c / sin(theta), c is exact with a stiffness k that is less by c tan(theta / 2). The damping e of the
+coupling is late by half a step. The scheme is stable for 0 <= k, 0 <= 2 d + e and C (k + 2 e) <= 4 m as
+forms: the second is what passive means, and the third limits the time step.
 """
 
 from __future__ import annotations

@@ -60,8 +60,8 @@ def load_readings(
       a drive and pressures. Titles of the columns are as `phase 0 [deg]`, numbered from 0 or 1;
       `amplitude 0`, by default 1; `pressure 0 [kPa rms]`; `pressure phase 0 [rad]`. With `x [mm]`, `y [mm]`
       and `z [mm]`, each row has any point and its pressure. Empty cells and nan are gaps of the pressure.
-    - `.npz` of `save_readings`, or with the arrays `drives` or `phases` (R, M), perhaps `amplitudes` (R, M),
-      `pressure` (R, P), `phase` (R, P), `deviation` (R, P) [Pa peak] and `points` (P, 3) [m].
+    - `.npz` of `save_readings`, or with the arrays `drives` or `phases` (R, M) and `pressure` (R, P). Others
+      are optional: `amplitudes` (R, M), `phase` (R, P), `deviation` (R, P) [Pa peak] and `points` (P, 3) [m].
     - `.jsonl`: the log of a hardware trial, or the folder that holds it. Drives are those that the device
       played.
     - The folder `pictures` of a trial with a camera: a row for each evaluation, at places 2 mm apart, nearer

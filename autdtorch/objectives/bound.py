@@ -2,20 +2,20 @@
 
 **Relaxation.** Let foci reach at least t w_p, with w the pressures wanted relative to each other, and quiet
 points at most r t. Take any z > 0 of the M transducers, and any a, b >= 0 of the foci and the quiet points
-with sum a_p w_p^2 - r^2 sum b_k = 1. All drives |q_i| <= 1 have
+with sum a_p w_p^2 - r^2 sum b_k = 1. All drives |q_i| <= 1 satisfy two inequalities.
 
-    t^2 <= sum a_p |(G q)_p|^2 - sum b_k |(G q)_k|^2 <= lambda |z|^2
+    t^2 <= sum a_p |(G q)_p|^2 - sum b_k |(G q)_k|^2 <= lambda |z|^2.
 
-with lambda the largest eigenvalue of Z^-1 G^H D G Z^-1, Z = diag(z) and D = diag(a, -b). The minimum of the
-right side is the value of the semidefinite relaxation, whose dual this is. If the search ends a little above
-the minimum, the bound still holds.
+Here lambda is the largest eigenvalue of Z^-1 G^H D G Z^-1, Z = diag(z) and D = diag(a, -b). The minimum
+of the right side is the value of the semidefinite relaxation, whose dual this is. If the search ends a little
+above the minimum, the bound still holds.
 
 **Branch and bound**, for few foci. Let the phases of their pressures be within d_p of psi_p. Then
-Re(e^(-i psi_p) p_p) >= cos(d_p) |p_p|. With any a >= 0 all drives of amplitudes <= 1 have
+Re(e^(-i psi_p) p_p) >= cos(d_p) |p_p|. With any a >= 0 all drives of amplitudes <= 1 satisfy two more.
 
-    t sum a_p cos(d_p) <= Re sum a_p e^(-i psi_p) (G q)_p <= sum_m |sum_p a_p e^(-i psi_p) G_pm|
+    t sum a_p cos(d_p) <= Re sum a_p e^(-i psi_p) (G q)_p <= sum_m |sum_p a_p e^(-i psi_p) G_pm|.
 
-where t is the least |p_p|, of rows over the wanted pressures. Boxes that together contain all phases bound t
+Here t is the least |p_p|, of rows over the wanted pressures. Boxes that together contain all phases bound t
 by the largest of their right sides. The drive with the phases of the last sum attains a level; boxes within a
 tolerance of the highest one are not divided, nor are small ones: where terms of the sum vanish, that drive is
 not the best one, and its level stays below.

@@ -72,8 +72,8 @@ def differentiable_field(
         complex128 (..., P) [Pa].
 
     Raises:
-        ValueError: an argument has another shape or is out of range, maps are given in a scene with
-            obstacles or reflectors, a reflector is neither rigid nor soft or not along an axis, or a
+        ValueError: an argument has another shape or is out of range, or maps are given in a scene with
+            obstacles or reflectors. A reflector is neither rigid nor soft, or not along an axis. A
             differentiated obstacle reaches into the boundary layers.
     """
     require_kind("scene", scene, Scene)

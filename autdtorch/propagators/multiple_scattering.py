@@ -1,8 +1,8 @@
 """Multiple scattering between bodies apart, each a linear map from incoming to outgoing waves.
 
-With maps T_i, incident waves d_i and the waves S_ij b_j that body j sends to body i, the outgoing waves are
-b_i = T_i (d_i + sum_j S_ij b_j) (Waterman and Truell 1961, doi:10.1063/1.1703737). Matrices are solved for;
-maps that cost a run are iterated. A pass of the iteration adds one scattering order, and the orders are
+Body i has the map T_i and the incident waves d_i, and body j sends it the waves S_ij b_j. The outgoing waves
+are b_i = T_i (d_i + sum_j S_ij b_j) (Waterman and Truell 1961, doi:10.1063/1.1703737). Matrices are solved
+for; maps that cost a run are iterated. A pass of the iteration adds one scattering order, and the orders are
 combined by the least residual (`extrapolated`); weakly coupled bodies need three or four passes. Later passes
 contribute little, and are simulated to looser tolerances.
 """

@@ -119,8 +119,8 @@ class EvenWaves(NamedTuple):
     """The mean of e^{ikR} / R over a disc as outgoing waves: e^{ikr} / r sum_n c_n H_n P_2n(cos t).
 
     The angle from the normal is t. With v = 1 / r^2, waves follow from the two before, degree by degree:
-    H_(n+1) = (alpha v - beta) H_n - gamma H_(n-1) and P_2(n+1) = (A cos^2 t - B) P_2n - C P_2(n-1), from
-    H_(-1) = -1 - i / kr and H_0 = P_0 = 1.
+    H_(n+1) = (alpha v - beta) H_n - gamma H_(n-1) and P_2(n+1) = (A cos^2 t - B) P_2n - C P_2(n-1). They
+    begin with H_(-1) = -1 - i / kr and H_0 = P_0 = 1.
     """
 
     first: ComplexArray  # c_0 of discs of several radii (R,)

@@ -1,12 +1,12 @@
 """Surfaces that react locally: their admittance as mass and damping of the elements they cut.
 
-A surface of admittance Y, as a ratio to air, takes the flow Y p. In the equation of a cell, divided by -i w,
-it adds
+A surface of admittance Y, as a ratio to air, takes the flow Y p. The equation of a cell, divided by -i w,
+gets a term.
 
-    i slope / 2 sum_j T_ij p_j,    T_ij = integral of Y N_i N_j over the surface,
+    i slope / 2 sum_j T_ij p_j,    T_ij = integral of Y N_i N_j over the surface.
 
-with the trilinear functions N of the vertices, and the slope of the stencil's symbol, by which the discrete
-flow of a wave differs from the true one. The real part of Y damps, a negative imaginary one (a spring) adds
+The N are the trilinear functions of the vertices. By the slope of the stencil's symbol, the discrete flow of
+a wave differs from the true one. The real part of Y damps, a negative imaginary one (a spring) adds
 mass, and a positive one (a mass) adds stiffness against silence: all are positive forms.
 """
 

@@ -1,11 +1,11 @@
 """Losses of elements: the imaginary parts of coupling and mass at the drive's frequency.
 
 With e^{-i w t}, a fluid that absorbs has a complex density and bulk modulus, and a surface that reacts
-locally an admittance. The equation of a cell is then
+locally an admittance. In the equation of a cell, m and B are then complex.
 
-    symbol m_i p_i + sum_j B_ij (p_j - p_i) = 0,    m and B complex,
+    symbol m_i p_i + sum_j B_ij (p_j - p_i) = 0.
 
-and the power it absorbs is the form g_i |p_i|^2 + sum_j c_ij |p_i - p_j|^2 / 2 with the damping
+The power it absorbs is the form g_i |p_i|^2 + sum_j c_ij |p_i - p_j|^2 / 2 with the damping
 coefficients g = symbol Im m and c = -Im B. Passive means that this form is never negative. `damping.py` turns
 it into terms of the time step.
 
