@@ -208,7 +208,7 @@ class ScatteredField:
         grid = self.assembly.grid
         cells = torch.from_numpy(grid.to_cells(self._on_axes(points)))
         first, last = torch.tensor([grid.first, grid.last], dtype=torch.int64, device="cpu").unbind()
-        rim = torch.as_tensor(_BESIDE - margin / grid.spacing)[..., None]
+        rim = torch.as_tensor(_BESIDE - margin / grid.spacing, device="cpu")[..., None]
         return ((cells > first + rim) & (cells < last - 1 - rim)).all(dim=-1)
 
     def _in_box(self, apertures: Apertures) -> Tensor:
