@@ -64,12 +64,12 @@ class _Autd3(Device):
         ticks = _CLOCK / rate
         if abs(ticks - round(ticks)) > _ROUNDING * ticks:
             near = f"{_CLOCK / math.ceil(ticks):.7g} or {_CLOCK / math.floor(ticks):.7g}"
-            accepted = f"must be {_CLOCK:g} over a whole number for {self.name}, such as {near} by at_rate"
+            accepted = f"must be {_CLOCK:g} over a whole number for {self.name}, such as {near}"
             raise invalid("rate", rate, accepted, "Hz")
 
     def held(self, drives: torch.Tensor, rate: float, loop: bool) -> HeldSequence:
-        patterns, factors = _modulated(drives)
-        _require_room(len(patterns), _MOST_PATTERNS, "frames, unless only the amplitude of all changes")
+        patterns, factors = _factorised(drives, loop)
+        _require_room(len(patterns), _MOST_PATTERNS, "frames, apart from factors of all amplitudes")
         _require_room(len(factors), _MOST_FACTORS, "frames in which only the amplitude of all changes")
         levels = (255 * factors).round().to(torch.uint8).numpy()
         return HeldSequence(_two(self.frames(patterns)), _two(levels), round(_CLOCK / rate), loop)
@@ -117,17 +117,22 @@ class _Autd3Firmware:
         return torch.tensor(played, **COMPLEX)
 
 
-def _modulated(drives: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return drives (1, N) and factors (T,) from 0 to 1 whose products are drives (T, N).
+def _factorised(drives: torch.Tensor, loop: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return drives (P, N) and factors (T,) from 0 to 1 whose products, P again and again, are drives (T, N).
 
-    If there are none, return the drives themselves and a factor of 1.
+    P is 1, or, for a loop that exceeds the memory, the least possible. Otherwise return the drives themselves
+    and a factor of 1.
     """
-    loudest = drives[drives.abs().square().sum(dim=1).argmax()]
-    power = torch.vdot(loudest, loudest).real
-    factors = (drives @ loudest.conj()).real / power if power > 0 else torch.ones(len(drives), **REAL)
-    factors = factors.clamp(0, 1)
-    if (drives - factors[:, None] * loudest).abs().max() <= _SAME:
-        return loudest[None], factors
+    frames = len(drives)
+    most = _MOST_PATTERNS if loop and frames > _MOST_PATTERNS else 1
+    for count in (count for count in range(1, most + 1) if frames % count == 0):
+        laps = drives.reshape(-1, count, drives.shape[1])
+        power = laps.abs().square().sum(dim=2)
+        loudest = laps[power.argmax(dim=0), torch.arange(count, device="cpu")]
+        dots = (laps * loudest.conj()).sum(dim=2).real
+        factors = (dots / power.amax(dim=0).clamp_min(torch.finfo(power.dtype).tiny)).clamp(0, 1)
+        if (laps - factors[..., None] * loudest).abs().max() <= _SAME:
+            return loudest, factors.flatten()
     return drives, torch.ones(1, **REAL)
 
 
