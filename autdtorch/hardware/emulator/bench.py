@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import ClassVar
 
+import numpy as np
 import torch
 from usb.backend import IBackend
 from usb.core import USBError, USBTimeoutError
@@ -21,7 +22,7 @@ from autdtorch.hardware.devices.device import Device, Firmware
 from autdtorch.hardware.link import Wiring
 from autdtorch.hardware.transport.port import Port
 from autdtorch.scene.drive import amplitudes_of, phases_of
-from autdtorch.utils.array_types import REAL
+from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.hints import renamed_keywords
 from autdtorch.utils.validation import complex_tensor, indices, integers
 
@@ -269,6 +270,7 @@ class EmulatedBench:
         bus: backend for pyusb; empty if the device is not on USB, and takes its frames by `receive`.
         firmware: emulated firmware behind the chip; of the first of several boards.
         transfer_matrix: (P, M) [Pa], complex128.
+        frame_shape: number of chips, and of bytes of a frame for each.
     """
 
     @renamed_keywords(dead="failed")
@@ -299,6 +301,8 @@ class EmulatedBench:
         if silent := integers("failed", failed, 0, "must be indices of transducers"):
             self._working[indices("failed", silent, len(self._transducers))] = 0
         each = device.transducers // len(device.serials)
+        silence = device.frame(torch.zeros(device.transducers, **COMPLEX))
+        self.frame_shape = len(device.serials), len(silence) // len(device.serials)
         self._firmwares = [device.firmware(each) for _ in device.serials]
         self.firmware = self._firmwares[0]
         self.bus = EmulatedBus(
@@ -341,7 +345,12 @@ class BenchPort(Port):
         self._bench, self._show = bench, show
 
     def write(self, data: bytes) -> None:
-        """Have the device take a frame; show it in hexadecimal, with amplitudes and phases [deg]."""
+        """Have the device take frames; show each in hexadecimal, with amplitudes and phases [deg]."""
+        chips, size = self._bench.frame_shape
+        for frame in np.frombuffer(data, np.uint8).reshape(chips, -1, size).swapaxes(0, 1):
+            self._take(frame.tobytes())
+
+    def _take(self, data: bytes) -> None:
         self._bench.receive(data)
         if self._show is None:
             return
