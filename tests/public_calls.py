@@ -63,7 +63,7 @@ NOT_CALLED_BY_USERS = {
     *("CallableFrames.wait", "FolderFrames.wait", "ThermalCamera.deviation", "ThermalCamera.read_pulse"),
     "uvc_frames",
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
-    *("LimitedLink.play_sequence", "Link.play_sequence"),  # plays until it is stopped
+    *("LimitedLink.play_sequence", "Link.play_sequence", "Link.play_prepared"),  # until they are stopped
     *("Device.pack", "lock_log", "open_autd3"),  # the one only makes a context, the other asks the network
 }
 

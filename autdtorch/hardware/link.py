@@ -7,7 +7,7 @@ import collections.abc
 import contextlib
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, TypeAlias
 
 import torch
@@ -15,8 +15,15 @@ import torch
 from autdtorch.hardware.devices import require_device
 from autdtorch.hardware.devices.autd3 import AUTD3
 from autdtorch.hardware.devices.device import Device
-from autdtorch.hardware.streaming import Playback, frames_within, outlast, require_sequence, stream
-from autdtorch.hardware.transport.port import LinkError, MemoryPort, Port, closed_on_error
+from autdtorch.hardware.streaming import (
+    Playback,
+    PreparedSequence,
+    frames_within,
+    outlast,
+    require_sequence,
+    stream,
+)
+from autdtorch.hardware.transport.port import HeldSequence, LinkError, MemoryPort, Port, closed_on_error
 from autdtorch.scene.drive import AMPLITUDE_TOLERANCE, validate_drive, validate_single_drive
 from autdtorch.scene.sequence import Sequence
 from autdtorch.utils.array_types import COMPLEX, REAL
@@ -183,7 +190,7 @@ class Link(contextlib.AbstractContextManager["Link"]):
         frame = self.wiring.frame(drive)
         with self._lock:
             self._require_open()
-            self._end_sequence()
+            self.end_sequence()
             self._send(frame)
 
     def wait_for_sound(self) -> None:
@@ -199,23 +206,51 @@ class Link(contextlib.AbstractContextManager["Link"]):
 
         Args:
             sequence: frames of drives (T, M).
-            seconds: time to play [s], > 0; by default all frames once, or a loop without end.
+            seconds: time to play [s], less the rest of a frame; by default all frames once, or a loop
+                without end.
 
         Raises:
             ValueError: no sequence, another number of transducers, a rate that the device does not have, more
-                frames than fit in its memory, or `seconds` beyond the end of a sequence that does not loop.
+                frames than fit in its memory, or `seconds` below one frame, or beyond the end of a sequence
+                that does not loop.
             LinkError: the link is closed, the device does not take the bytes, or the computer is too slow.
         """
+        with self.turn() as ended:
+            return self.play_prepared(self.prepare_sequence(sequence, seconds), ended)
+
+    @contextlib.contextmanager
+    def turn(self) -> Iterator[Callable[[], bool]]:
+        """End the sequence that plays, if any, and have the outputs off at the end of the block.
+
+        It gives a function that returns whether the turn has ended: by `off`, a drive, or another sequence.
+        The outputs are left to these then.
+        """
+        with self._lock:
+            self._require_open()
+            turn = self.end_sequence()
+        try:
+            yield lambda: self._turn is not turn
+        finally:
+            with self._lock:
+                if self._turn is turn:
+                    self.off()
+
+    def prepare_sequence(self, sequence: Sequence, seconds: float | None = None) -> PreparedSequence:
+        """Return a sequence in the bytes of the device, which may take seconds; errors as `play_sequence`."""
         require_sequence(sequence, len(self.transducers))
         device, rate = self.device, sequence.rate
         device.require_rate(rate)
         count = frames_within(sequence, seconds)
         drives = self.wiring.of_device(sequence.drives)
         held = device.held(drives, rate, sequence.loop)
+        if held is not None and isinstance(self._port, MemoryPort):
+            return PreparedSequence(held, rate, count)
         frames = device.frames(drives).reshape(len(drives), len(device.serials), -1)
+        return PreparedSequence(frames, rate, count)
 
-        def ended() -> bool:
-            return self._turn is not turn
+    def play_prepared(self, prepared: PreparedSequence, ended: Callable[[], bool]) -> Playback:
+        """Play a prepared sequence, or until its `turn` has ended; return its times."""
+        content, rate, count = prepared.content, prepared.rate, prepared.count
 
         def send(chunk: bytes) -> bool:
             with self._lock:
@@ -224,25 +259,22 @@ class Link(contextlib.AbstractContextManager["Link"]):
                 self._port.write(chunk)
                 return True
 
-        with self._lock:
-            self._require_open()
-            turn = self._end_sequence()
-        try:
+        if isinstance(content, HeldSequence):
             with self._lock:
-                if by_itself := held is not None and isinstance(self._port, MemoryPort) and not ended():
-                    self._port.hold(held)
-            if by_itself:
-                return outlast(rate, count, ended)
-            return stream(send, frames, rate, count, ended, device.wire_time(frames[0].tobytes()))
-        finally:
-            with self._lock:
-                if not ended():
-                    self.off()
+                if isinstance(self._port, MemoryPort) and not ended():
+                    self._port.hold(content)
+            return outlast(rate, count, ended)
+        return stream(send, content, rate, count, ended, self.device.wire_time(content[0].tobytes()))
+
+    def end_sequence(self) -> object:
+        """End the sequence that plays or is prepared, if any, and return the turn of what follows."""
+        self._turn = object()
+        return self._turn
 
     def off(self) -> None:
         """Switch all outputs of the device off, after a recovery of the port if need be."""
         with self._lock:
-            self._end_sequence()
+            self.end_sequence()
             if not self._open:  # pyusb would open it once more
                 return
             try:
@@ -285,11 +317,6 @@ class Link(contextlib.AbstractContextManager["Link"]):
         for _ in range(2):
             self._send(silence)
         self._port.flush()
-
-    def _end_sequence(self) -> object:
-        """End the sequence that plays, if any, and return the turn of what follows."""
-        self._turn = object()
-        return self._turn
 
     def _require_open(self) -> None:
         if not self._open:

@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -28,7 +28,7 @@ from autdtorch.hardware.sensors.sensor import (
     checked_reading,
     require_sensor,
 )
-from autdtorch.hardware.streaming import Playback, frames_within, require_sequence
+from autdtorch.hardware.streaming import Playback, PreparedSequence, require_sequence
 from autdtorch.scene.sequence import Sequence
 from autdtorch.utils.process import send_again
 from autdtorch.utils.validation import (
@@ -223,20 +223,28 @@ class LimitedLink:
 
         Args:
             sequence: frames of drives (T, M), scaled as in `play`.
-            seconds: time to play [s], > 0; by default all frames once, or a loop without end.
+            seconds: time to play [s], as of `Link.play_sequence`.
 
         Raises:
             LimitError: the time limit of the outputs is reached, before or meanwhile.
             ValueError: as of `Link.play_sequence`, or a duration above `seconds_in_a_row`.
             LinkError: the device does not take the bytes, or the computer is too slow.
         """
-        require_sequence(sequence, len(self.link.transducers))
-        asked = replace(sequence, drives=self._scale.frames_asked(sequence.drives))
-        wanted = frames_within(sequence, seconds) / sequence.rate
-        most = self.limits.seconds_in_a_row
-        if most < wanted < math.inf:
-            raise invalid("seconds", wanted, f"must be at most {most:g}, the limit in a row", "s")
         self.off()
+        with self.link.turn() as ended:  # `off` ends it from here on
+            require_sequence(sequence, len(self.link.transducers))
+            asked = replace(sequence, drives=self._scale.frames_asked(sequence.drives))
+            prepared = self.link.prepare_sequence(asked, seconds)
+            wanted = min(prepared.count / sequence.rate, math.inf if seconds is None else seconds)
+            most = self.limits.seconds_in_a_row
+            if most < wanted < math.inf:
+                raise invalid("seconds", wanted, f"must be at most {most:g}, the limit in a row", "s")
+            return self._play_prepared(prepared, wanted, ended)
+
+    def _play_prepared(
+        self, prepared: PreparedSequence, wanted: float, ended: Callable[[], bool]
+    ) -> Playback:
+        """Play a sequence of the link for the time `wanted` [s], after a rest."""
         self._rest_now()
         left = self._seconds_left()
         if left < wanted < math.inf:
@@ -245,7 +253,7 @@ class LimitedLink:
             self._raise_failure()
             self._start_timer(left)
         try:
-            playback = self.link.play_sequence(asked, seconds)
+            playback = self.link.play_prepared(prepared, ended)
             if playback.seconds < wanted - _GRACE and time.monotonic() >= self._on_until:
                 self.require_on()
             return playback
@@ -333,6 +341,7 @@ class LimitedLink:
         """Switch all outputs off, and begin the rest of the duty cycle."""
         with self._lock:
             if self._on_since is None:
+                self.link.end_sequence()  # one that is prepared, or rests before it
                 return
             if self._timer is not None:
                 self._timer.cancel()

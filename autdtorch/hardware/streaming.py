@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from autdtorch.hardware.transport.port import LinkError
+from autdtorch.hardware.transport.port import HeldSequence, LinkError
 from autdtorch.scene.sequence import Sequence
 from autdtorch.utils.array_types import Bytes
 from autdtorch.utils.validation import invalid, positive
@@ -18,6 +18,8 @@ LATE = 1e-3
 _AHEAD = 0.5e-3  # frames due within this time are sent together [s]: a transfer takes as long as many frames
 _MOST_TOGETHER = 32  # as many messages as the buffer of an OpenMPD holds
 _LONGEST_DELAY = 1.0  # [s]; the computer has slept, or the device does not take the rate
+_MOST_FRAMES = 2.0**53  # up to here floats count one by one
+_ROUNDING = 1e-9  # relative error of a time that is a whole number of frames
 _NAP = 20e-3  # longest time until the end of a sequence is seen [s]
 
 
@@ -46,6 +48,21 @@ class Playback:
         return f"{played}, {self.late} late (the latest by {1e3 * self.latest:.2f} ms)"
 
 
+@dataclass(frozen=True)
+class PreparedSequence:
+    """A sequence in the bytes of a device.
+
+    Attributes:
+        content: frames (T, C, B) to stream, for C chips with B bytes each, or what the device holds.
+        rate: frames per second [Hz].
+        count: number of frames to play, counted again in each lap; may be infinite.
+    """
+
+    content: Bytes | HeldSequence
+    rate: float
+    count: float
+
+
 def require_sequence(sequence: object, transducers: int) -> None:
     """Refuse what is no sequence for so many transducers."""
     if not isinstance(sequence, Sequence):
@@ -56,13 +73,15 @@ def require_sequence(sequence: object, transducers: int) -> None:
 
 
 def frames_within(sequence: Sequence, seconds: float | None) -> float:
-    """Return the number of frames that play within some `seconds`; infinite for a loop without end.
+    """Return the number of whole frames within some `seconds`; infinite for a loop without end.
 
-    `ValueError` unless `seconds` are > 0, and within a sequence that does not loop.
+    `ValueError` unless `seconds` are at least one frame, and within a sequence that does not loop.
     """
     if seconds is None:
         return math.inf if sequence.loop else len(sequence)
-    count = max(1, round(positive("seconds", seconds, "s") * sequence.rate))
+    count = math.floor(min(positive("seconds", seconds, "s") * sequence.rate * (1 + _ROUNDING), _MOST_FRAMES))
+    if count == 0:
+        raise invalid("seconds", seconds, f"must be at least {1 / sequence.rate:g}, one frame", "s")
     if count > len(sequence) and not sequence.loop:
         accepted = f"must be at most {sequence.duration:g}, the duration of a sequence that does not loop"
         raise invalid("seconds", seconds, accepted, "s")

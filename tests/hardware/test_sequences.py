@@ -5,6 +5,7 @@ import math
 import signal
 import threading
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -191,6 +192,56 @@ def test_another_thread_ends_a_loop(trial, how):
         assert bench.drive().any() == (how == "another drive")
 
 
+@pytest.mark.parametrize("how", ["off", "off of the link", "limit"])
+def test_a_sequence_ends_though_its_end_comes_while_it_is_prepared(trial, how, monkeypatch):
+    def slow(device, drives):
+        ends[how]()
+        return real(device, drives)
+
+    real = type(hw.OPENMPD).frames
+    monkeypatch.setattr(type(hw.OPENMPD), "frames", slow)
+    limits = {"seconds_in_a_row": 0.05} if how == "limit" else {}
+    with trial.limited(hw.OPENMPD, **limits) as (bench, link):
+        ends = {"off": link.off, "off of the link": link.link.off, "limit": lambda: time.sleep(0.1)}
+        watchdog = threading.Timer(10, link.link.off)
+        watchdog.start()
+        with pytest.raises(hw.LimitError) if how == "limit" else contextlib.nullcontext():
+            link.play_sequence(Sequence(frames_of(5, COUNT), 1000.0))
+        assert watchdog.is_alive()
+        watchdog.cancel()
+        assert not bench.emitted().any()
+
+
+def test_a_mistake_ends_the_sequence_of_another_thread_with_the_outputs_off(trial):
+    bench = trial.bench(hw.OPENMPD)
+    with trial.link(bench, hw.OPENMPD) as link:
+        thread = threading.Thread(target=link.play_sequence, args=(Sequence(SMALL, 1000.0),))
+        thread.start()
+        while not bench.emitted().any():
+            time.sleep(1e-3)
+        with pytest.raises(ValueError, match="rate"):
+            link.play_sequence(Sequence(SMALL, 20e3))
+        thread.join()
+        assert not bench.emitted().any()
+
+
+def test_seconds_at_the_limit_are_played_at_any_rate(trial):
+    with trial.limited(hw.OPENMPD, seconds_in_a_row=0.05) as (_, link):
+        assert link.play_sequence(Sequence(SMALL, 1150.0), 0.05).frames <= 57  # 57.5 frames
+        assert link.play_sequence(Sequence(SMALL, 100.0), 0.03).frames == 3  # 100 * 0.03 rounds down
+
+
+def test_a_port_that_shows_frames_shows_each(trial):
+    shown, sequence = [], Sequence(frames_of(40, COUNT), 9000.0, loop=False)
+    for device in (hw.AUTD3, hw.OPENMPD):
+        bench = trial.bench(device)
+        with hw.Link(device, BenchPort(bench, shown.append), range(COUNT), 0, bench.bus.sleep) as link:
+            rate = 8000.0 if device == hw.AUTD3 else 9000.0
+            shown.clear()
+            link.play_sequence(Sequence(sequence.drives, rate, loop=False))
+        assert len(shown) == 40 + 2 + 2  # off at the end of the sequence, and of the link
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_a_loop_with_the_outputs_off(trial, number):
     before = signal.signal(number, signal.default_int_handler)
@@ -365,6 +416,12 @@ MISTAKES = [
     (hw.OPENMPD, lambda: Sequence(SMALL, 10.0), {"seconds": 0}, "seconds: 0 s; must be finite and > 0"),
     (hw.OPENMPD, lambda: Sequence(SMALL, 10.0), {"seconds": -1.0}, "seconds: -1.0 s; must be finite and > 0"),
     (hw.OPENMPD, lambda: Sequence(SMALL, 10.0), {"seconds": math.nan}, "seconds: nan s"),
+    (
+        hw.OPENMPD,
+        lambda: Sequence(SMALL, 0.1),
+        {"seconds": 1.0},
+        "seconds: 1.0 s; must be at least 10, one frame",
+    ),
     (hw.OPENMPD, lambda: Sequence(SMALL, 10.0), {"seconds": "5"}, "seconds: '5'"),
     (
         hw.OPENMPD,
@@ -424,6 +481,23 @@ def test_what_autd3_holds_emits_the_frames(factors, seed):
     levels = held.frames.reshape(len(held.frames), 2, 249).astype(float)
     patterns = levels[:, 1] / 255 * np.exp(2j * math.pi * levels[:, 0] / 256)
     number = np.arange(len(factors))
+    emitted = patterns[number % len(patterns)] * (held.modulation[number % len(held.modulation), None] / 255)
+    # Half a level of phase, and of both amplitudes.
+    assert np.abs(emitted - drives.numpy()).max() <= math.pi / 256 + 1 / 255
+
+
+@given(st.integers(3, 40), st.integers(1200, 3000), st.integers(0, 9))
+@settings(max_examples=20)
+def test_autd3_holds_a_loop_of_moving_frames_times_factors(laps, rest, seed):
+    lap, count = frames_of(rest // laps, 16, seed), rest // laps * laps
+    number = torch.arange(count)
+    factors = (0.6 + 0.4 * torch.cos(2 * math.pi * number.double() / count))[:, None]
+    drives = factors * lap[number % len(lap)]
+    device = replace(hw.AUTD3, board=16)
+    held = device.held(drives, 4000.0, True)
+    assert len(held.frames) <= max(len(lap), 2)
+    levels = held.frames.reshape(len(held.frames), 2, 16).astype(float)
+    patterns = levels[:, 1] / 255 * np.exp(2j * math.pi * levels[:, 0] / 256)
     emitted = patterns[number % len(patterns)] * (held.modulation[number % len(held.modulation), None] / 255)
     # Half a level of phase, and of both amplitudes.
     assert np.abs(emitted - drives.numpy()).max() <= math.pi / 256 + 1 / 255
