@@ -256,6 +256,25 @@ def test_two_close_foci_on_a_circle_keep_the_level_that_each_frame_could_have(ra
     assert even.min() > 0.94 * bounds.min()  # 0.97 and 0.99
 
 
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_limit_below_the_steps_of_a_lap_costs_as_little_as_it_must(closed):
+    """A focus on a circle needs steps of `most`; half of them are 89 % of the level."""
+    matrix = circling(20)[:, :1]
+    alone = matrix.abs().sum(dim=2)[:, 0]
+    most = float(steps(drive_sequence(matrix, closed=True), closed=True).max())
+    for part, least in ((0.98, 0.99), (0.5, 0.8)):  # 1.0 and 0.89 were measured
+        drives = drive_sequence(matrix, phase_step=part * most, closed=closed)
+        assert steps(drives, closed).max() <= part * most + 1e-9
+        assert pressures(matrix, drives).min() > least * alone.min()
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_single_frame_has_no_step_to_limit(closed):
+    matrix = circling(60)[:1]
+    wide = drive_sequence(matrix, closed=closed)
+    assert torch.equal(drive_sequence(matrix, phase_step=1e-3, closed=closed), wide)
+
+
 def test_a_jump_of_a_phase_spreads_over_both_its_sides():
     """One transducer must turn by pi between frames 10 and 11; in steps of 0.5, it begins before."""
     jump = torch.where(torch.arange(21) > 10, -1.0, 1.0).to(torch.complex128)

@@ -12,8 +12,7 @@ With the pressures p_t = G_t q_t and weights w of the foci, the sum of w |p| ove
 Weights grow where a focus is weak. The phases of the foci decide how smooth the drives are. Each focus begins
 with phases that keep its back-propagated drive most alike from frame to frame; the difference after a closed
 lap is spread over the lap. Constant phases between the foci remain, of which several are tried. The first
-drives are half-way between those that follow the wanted ones and those that precede them, within the limit,
-so that a jump spreads over both its sides.
+drives differ least from those wanted, within the limit, so that a jump spreads over both its sides.
 """
 
 from __future__ import annotations
@@ -95,8 +94,8 @@ def drive_sequence(
         frame, point = torch.nonzero(reached == 0)[0].tolist()
         raise ValueError(f"G[{frame}, {point}]: 0 Pa of all transducers; every focus must be reached")
     rows = (matrix.to(torch.complex128) / (reached.max() * wanted[..., None])).numpy()
-    steps = _Steps(limit, closed)
-    starts = _best(rows, steps.between(_starts(rows, closed)), steps, even, min(_TRIAL, iterations))
+    steps = _Steps(limit if len(rows) > 1 else math.pi, closed)  # a single frame has no neighbours
+    starts = _best(rows, steps.nearest(_starts(rows, closed)), steps, even, min(_TRIAL, iterations))
     drives = _best(rows, starts, steps, even, iterations)[:, 0]
     if even:
         level = np.abs(drives[:, None] @ rows.swapaxes(1, 2)).min(axis=(1, 2))
@@ -193,32 +192,29 @@ class _Steps(NamedTuple):
     limit: float
     closed: bool
 
-    def between(self, wanted: ComplexArray) -> ComplexArray:
-        """Return drives (T, S, M) half-way between those that lag behind wanted ones and those that lead.
+    def nearest(self, wanted: ComplexArray) -> ComplexArray:
+        """Return the drives (T, S, M) whose largest phase difference from wanted ones is the least.
 
-        Where both turn around the circle differently, the lagging ones.
+        Phases are half-way between the highest that stay below those wanted and the lowest that stay above,
+        within the limit. On a closed path they turn around the circle as often as the limit allows.
         """
-        lagging, leading = self.following(wanted), self.following(wanted[::-1])[::-1]
-        turns = _turns(leading) - _turns(lagging)  # [0] is from the last frame to the first
-        gap = np.angle(leading[0] * lagging[0].conj()) + np.concatenate([0 * turns[:1], turns[1:]]).cumsum(0)
-        alike = np.abs(gap).max(axis=0) < 2 * math.pi
+        turns = np.angle(np.roll(wanted, -1, axis=0) * wanted.conj())  # [-1] is from the last frame to the first
+        phases = np.angle(wanted[:1]) + np.concatenate([0 * turns[:1], turns[:-1].cumsum(axis=0)])
+        frames = len(wanted)
         if self.closed:
-            alike &= np.abs(turns.sum(axis=0)) < 1
-        return lagging * np.exp(0.5j * np.where(alike, gap, 0))
-
-    def following(self, wanted: ComplexArray) -> ComplexArray:
-        """Return drives (T, S, M), each as near to the wanted one as the limit to the frame before allows.
-
-        On a closed path they come back to the first frame in time, by one limit for each step that is left.
-        """
-        drives = wanted / np.maximum(np.abs(wanted), TINY)
-        for frame in range(1, len(drives)):
-            before, left = drives[frame - 1], self.limit * (len(drives) - frame)
-            step = np.angle(wanted[frame] * before.conj()).clip(-self.limit, self.limit)
-            if self.closed and left < math.pi:
-                away = np.angle(before * drives[0].conj())
-                step = (away + step).clip(-left, left) - away
-            drives[frame] = before * np.exp(1j * step)
+            lap = turns.sum(axis=0)
+            most = 2 * math.pi * (frames * self.limit // (2 * math.pi))
+            excess = lap - lap.clip(-most, most)
+            phases -= excess * (np.arange(frames) / frames)[:, None, None]
+            lap -= excess
+            phases = np.concatenate([phases - lap, phases, phases + lap])
+        ramp = self.limit * np.arange(len(phases))[:, None, None]
+        below = np.minimum.accumulate(phases - ramp) + ramp
+        below = np.minimum.accumulate((below + ramp)[::-1])[::-1] - ramp
+        above = np.maximum.accumulate(phases + ramp) - ramp
+        above = np.maximum.accumulate((above - ramp)[::-1])[::-1] + ramp
+        middle = (below + above) / 2
+        drives: ComplexArray = np.exp(1j * (middle[frames : 2 * frames] if self.closed else middle))
         return drives
 
     def nearer(self, drives: ComplexArray, wanted: ComplexArray) -> ComplexArray:
@@ -237,8 +233,3 @@ class _Steps(NamedTuple):
             drives[apart] = middle * np.exp(1j * step.clip(-room, room))
         return drives
 
-
-def _turns(drives: ComplexArray) -> Array:
-    """Return the changes of phases (T, ...) [rad] of drives (T, ...) from the frame before."""
-    turns: Array = np.angle(drives * np.roll(drives, 1, axis=0).conj())
-    return turns
