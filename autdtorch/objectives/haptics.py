@@ -17,6 +17,8 @@ import torch
 
 from autdtorch.scene.sequence import Sequence
 from autdtorch.utils.array_types import REAL
+from autdtorch.utils.process import require_memory
+from autdtorch.utils.text import counted
 from autdtorch.utils.validation import (
     ArrayLike,
     number_between,
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
 TACTILE_BAND = 5.0, 500.0
 """TACTILE_BAND: frequencies [Hz] of the part of the radiation pressure that `HapticMetrics.tactile` sums."""
 
+_LINE_BYTES = 24  # of the spectrum at a point, with intermediate results
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class HapticMetrics:
@@ -41,8 +45,10 @@ class HapticMetrics:
         pressure: peak amplitudes at the points while each frame plays (T, P) [Pa].
         radiation: radiation pressure there (T, P) [Pa].
         times: at which the frames begin (T,) [s].
-        frequencies: of the spectrum (N,) [Hz], multiples of 1 / duration from 0 to half the rate.
-        spectrum: amplitudes of the radiation pressure (N, P) [Pa], the first of which is the mean.
+        frequencies: of the spectrum (N,) [Hz], multiples of 1 / duration to half the rate, or to 500 Hz
+            if that is more.
+        spectrum: amplitudes of the radiation pressure (N, P) [Pa], the first of which is the mean. A frame
+            holds until the next one, which adds frequencies above half the rate.
         tactile: root mean square of the part from 5 to 500 Hz (P,) [Pa].
         foci: peak amplitudes at the foci of each frame (T, F) [Pa]; None without a path.
         elsewhere: largest amplitude of each frame (T,) [Pa] at points a wavelength or more from its foci;
@@ -69,7 +75,7 @@ class HapticMetrics:
     def __repr__(self) -> str:
         """Return the largest values, with units."""
         parts = [
-            f"{len(self.times)} frames, {self.pressure.shape[1]} points",
+            f"{counted(len(self.times), 'frame')}, {counted(self.pressure.shape[1], 'point')}",
             f"up to {self.pressure.max():.4g} Pa, radiation pressure {self.radiation.max():.4g} Pa",
             f"5 to 500 Hz up to {self.tactile.max():.4g} Pa rms",
         ]
@@ -97,8 +103,8 @@ def haptic_metrics(
         propagator: of the scene.
         sequence: of drives of its array. Its duration is taken as one period.
         points: (P, 3) [m].
-        path: foci (T, 3) or (T, F, 3) [m]. If the sequence has a multiple of T frames, each focus stays for
-            as many.
+        path: foci (T, 3) or (T, F, 3) [m] of all laps of the sequence. If it has a multiple of T frames, each
+            focus stays for as many.
         reflection: R, 0 to 1.
 
     Raises:
@@ -119,10 +125,9 @@ def haptic_metrics(
     medium = scene.medium
     factor = (1 + reflection**2) / (2 * medium.density * medium.sound_speed**2)
     radiation = factor * pressure.square()
-    spectrum = torch.fft.rfft(radiation, dim=0).abs() * (2 / len(sequence))
-    spectrum[0] /= 2
-    if len(sequence) % 2 == 0:
-        spectrum[-1] /= 2
+    lines = max(1, len(sequence) // 2, round(TACTILE_BAND[1] * sequence.duration))
+    require_memory("points", tuple(places.shape), _LINE_BYTES * lines * len(places))
+    spectrum = _held_spectrum(radiation, lines)
     frequencies = torch.arange(len(spectrum), **REAL) / sequence.duration
     # rounding of a duration must not move a line out of the band
     band = (frequencies >= TACTILE_BAND[0] * (1 - 1e-9)) & (frequencies <= TACTILE_BAND[1] * (1 + 1e-9))
@@ -144,6 +149,16 @@ def haptic_metrics(
         at_foci,
         elsewhere,
     )
+
+
+def _held_spectrum(values: torch.Tensor, lines: int) -> torch.Tensor:
+    """Return amplitudes (1 + lines, P) of the Fourier series of values (T, P) that are held for 1/T each."""
+    count, number = len(values), torch.arange(lines + 1, device="cpu")
+    alias = torch.minimum(number % count, -number % count)
+    held = torch.sinc(number.double() / count).abs() * (2 / count)
+    held[0] = 1 / count
+    spectrum: torch.Tensor = torch.fft.rfft(values, dim=0).abs()[alias] * held[:, None]
+    return spectrum
 
 
 def _foci(path: ArrayLike, frames: int) -> torch.Tensor:

@@ -19,23 +19,36 @@ def test_modulated_radiation_pressure_of_a_focus_is_one_line():
     sequence = at.modulated(matrix.conj() / matrix.abs(), 200.0)
     metrics = at.haptic_metrics(PROPAGATOR, sequence, [CENTER], reflection=0.5)
     most = 1.25 * float(matrix.abs().sum()) ** 2 / (2 * 1.2 * 343.0**2)
-    # (1 + sin) / 2 of the most: mean and amplitude are half of it
+    # (1 + sin) / 2 of the most: mean and amplitude are half of it; each of 20 frames is held
+    held = math.sin(math.pi / 20) / (math.pi / 20)
     assert metrics.spectrum[0, 0] == pytest.approx(most / 2, rel=1e-12)
     line = metrics.frequencies.tolist().index(pytest.approx(200.0))
-    assert metrics.spectrum[line, 0] == pytest.approx(most / 2, rel=1e-12)
-    assert metrics.tactile[0] == pytest.approx(most / 2 / math.sqrt(2), rel=1e-12)  # 400 Hz and more: none
+    assert metrics.spectrum[line, 0] == pytest.approx(held * most / 2, rel=1e-12)
+    # 400 Hz and more: none
+    assert metrics.tactile[0] == pytest.approx(held * most / 2 / math.sqrt(2), rel=1e-12)
     assert metrics.foci is metrics.elsewhere is metrics.ripple is None
 
 
-def test_the_spectrum_has_the_power_of_the_time_signal():
-    sequence = at.sequence_along(PROPAGATOR, CIRCLE, 10.0)
-    metrics = at.haptic_metrics(PROPAGATOR, sequence, CIRCLE[:2])
-    mean, lines, last = metrics.spectrum[0], metrics.spectrum[1:-1], metrics.spectrum[-1]
-    power = mean.square() + lines.square().sum(dim=0) / 2 + last.square()
-    torch.testing.assert_close(power, metrics.radiation.square().mean(dim=0), rtol=1e-12, atol=0)
-    # a focus that passes 10 times a second: all but the mean is from 10 to 200 Hz, the last line apart
-    rest = (power - mean.square() - last.square() / 2).sqrt()
-    torch.testing.assert_close(metrics.tactile, rest, rtol=1e-12, atol=0)
+def test_two_frames_are_a_square_wave():
+    """Its amplitudes are 4 / (pi n) of half the difference, for odd n, also above half the rate."""
+    drives = torch.stack([torch.ones(64), torch.zeros(64)]).to(torch.complex128)
+    metrics = at.haptic_metrics(PROPAGATOR, at.Sequence(drives, 200.0), [CENTER])
+    half = metrics.radiation[0, 0] / 2
+    odd = 4 / math.pi, 4 / (3 * math.pi), 4 / (5 * math.pi)
+    expected = half * torch.tensor([1, odd[0], 0, odd[1], 0, odd[2]], dtype=torch.float64)
+    assert metrics.frequencies.tolist() == pytest.approx([0, 100, 200, 300, 400, 500])
+    torch.testing.assert_close(metrics.spectrum[:, 0], expected, rtol=1e-12, atol=1e-12 * float(half))
+    assert metrics.tactile[0] == pytest.approx(float((expected[1:].square().sum() / 2).sqrt()), rel=1e-12)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 7, 8])
+def test_the_spectrum_has_the_power_of_the_time_signal(frames):
+    drives = torch.rand(frames, 64, generator=torch.Generator().manual_seed(frames)).to(torch.complex128)
+    metrics = at.haptic_metrics(PROPAGATOR, at.Sequence(drives, frames * 5.0), CIRCLE[:2])
+    assert metrics.frequencies[1] == pytest.approx(5.0)
+    power = metrics.spectrum[0].square() + metrics.tactile.square()
+    # steps of (frames * 5) Hz leave 1 / (pi^2 n) of their power above 500 Hz, n = 500 / (5 frames)
+    torch.testing.assert_close(power, metrics.radiation.square().mean(dim=0), rtol=0.02, atol=0)
 
 
 def test_foci_of_a_path_have_ripple_and_side_maxima():
@@ -74,6 +87,8 @@ def test_the_figure_has_time_spectrum_and_foci():
     )
     assert [len(figure.axes) for figure in (with_path, without)] == [3, 2]
     assert {line.get_label() for line in with_path.axes[2].lines} == {"focus", "elsewhere"}
+    for axes in (*with_path.axes[::2], without.axes[0]):
+        assert axes.lines[0].get_xdata()[-1] == pytest.approx(100.0)  # ms, the end of the last frame
 
 
 @pytest.mark.parametrize(

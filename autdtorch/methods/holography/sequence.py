@@ -198,7 +198,8 @@ class _Steps(NamedTuple):
         Phases are half-way between the highest that stay below those wanted and the lowest that stay above,
         within the limit. On a closed path they turn around the circle as often as the limit allows.
         """
-        turns = np.angle(np.roll(wanted, -1, axis=0) * wanted.conj())  # [-1] is from the last frame to the first
+        # [-1] is from the last frame to the first
+        turns = np.angle(np.roll(wanted, -1, axis=0) * wanted.conj())
         phases = np.angle(wanted[:1]) + np.concatenate([0 * turns[:1], turns[:-1].cumsum(axis=0)])
         frames = len(wanted)
         if self.closed:
@@ -232,4 +233,3 @@ class _Steps(NamedTuple):
             step = np.angle(wanted[apart] * middle.conj())
             drives[apart] = middle * np.exp(1j * step.clip(-room, room))
         return drives
-
