@@ -37,6 +37,7 @@ from autdtorch.utils.digest import digest_of
 from autdtorch.utils.validation import invalid, positive, require_known, within
 
 _EFFECTIVE = re.compile(r"\+*(scene|modules|solver|path|play|hardware|output|hydra)\b")
+_EFFECTIVE_WITH_FILE = re.compile(r"(?!\+*path\b)")
 _KEYS = ("rate", "modulation", "sequence", "seconds")
 _MODULATION = ("frequency", "depth", "waveform", "rate")
 
@@ -80,6 +81,7 @@ def _sequence(
     """Return the sequence of a file, or that of a focus on the path."""
     rate = positive("play.rate", section["rate"], "Hz")
     if (file := given_file("play.sequence", section["sequence"])) is not None:
+        require_effective("a file of play.sequence", _EFFECTIVE_WITH_FILE, "path or play.sequence")
         with within("play.sequence"):
             sequence = load_sequence(file)
         if is_given("play.rate"):

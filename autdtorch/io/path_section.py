@@ -9,6 +9,7 @@ import torch
 
 from autdtorch.scene.geometry import circle_points, plane_basis, polyline_points
 from autdtorch.scene.scene import Scene
+from autdtorch.scene.sequence import LONGEST
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import (
     boolean,
@@ -43,9 +44,9 @@ def path_points(where: str, section: Mapping[str, Any], scene: Scene, rate: floa
     keys, points = _KINDS[str(kind)]
     require_known(where, section, ("type", "frequency", *keys))
     frequency = positive(f"{where}.frequency", section.get("frequency"), "Hz")
-    if frequency > rate / 2:
-        most = f"must be at most {rate / 2:g}, for two points a lap"
-        raise invalid(f"{where}.frequency", frequency, most, "Hz")
+    if not rate / LONGEST <= frequency <= rate / 2:
+        accepted = f"must be in {rate / LONGEST:g} to {rate / 2:g}, for {LONGEST} to 2 points a lap"
+        raise invalid(f"{where}.frequency", frequency, accepted, "Hz")
     with within(where):
         return points(scene, round(rate / frequency), *(section.get(key) for key in keys))
 

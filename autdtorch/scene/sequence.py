@@ -27,7 +27,7 @@ from autdtorch.utils.validation import (
 Waveform: TypeAlias = Literal["sine", "square"]
 
 LONGEST = 100_000
-"""Number of frames up to which `modulated` looks for a period, and `at_rate` resamples."""
+"""Most frames of `modulated` and `at_rate`, and most points of a path of a config."""
 
 _SAMPLES = 20  # of a period of "sine" or "square" at least, where the rate is not stated
 _PARTS = 10  # of a frame, by `silenced`

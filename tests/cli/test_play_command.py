@@ -103,7 +103,11 @@ MISTAKES = [
     (["play.rate=0"], "play.rate: 0 Hz; must be finite and > 0"),
     (["play.seconds=-1"], "play.seconds: -1 s; must be finite and > 0"),
     (["play.seconds=90"], "seconds: 90.0 s; must be at most 60, the limit in a row"),
-    (["path.frequency=600"], "path.frequency: 600.0 Hz; must be at most 500, for two points a lap"),
+    (
+        ["path.frequency=600"],
+        "path.frequency: 600.0 Hz; must be in 0.01 to 500, for 100000 to 2 points a lap",
+    ),
+    (["path.frequency=1e-6"], "path.frequency: 1e-06 Hz; must be in 0.01 to 500"),
     (["path.radius=-1"], "path: radius: -1 m; must be finite and > 0"),
     (["path=points"], "path: positions: None; must be given, as [[0, 0, 0.1], [0, 0.01, 0.1]]"),
     (["path=ellipse"], "path: 'ellipse'; must be one of circle, line, points"),
@@ -111,6 +115,10 @@ MISTAKES = [
     (["play.modulation={frequency: 200, dept: 1}"], "play.modulation: unknown key 'dept'"),
     (["play.modulation={depth: 1}"], "play.modulation: frequency: None"),
     (["play.sequence=none.npz"], "none.npz"),
+    (
+        ["play.sequence=one.npz", "path.radius=1e-3"],
+        "path.radius=1e-3: has no effect on a file of play.sequence",
+    ),
     (["play.tempo=3"], "play.tempo: unknown key"),
     (["trials=3"], "trials=3: has no effect on play"),
     (["method=gabs"], "method=gabs: has no effect on play"),
