@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from autdtorch.fdtd.discrete_green import field_of_kernel
+from autdtorch.fdtd.discrete_green import field_of_kernels
 from autdtorch.fdtd.face_nodes import FaceNodes
 from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Sources
@@ -117,32 +117,36 @@ class ScatteredField:
         """Return the forces (h,) of the incident field of sources with strengths (N,) [Pa m]."""
         driven, near = self.driven, self._in_box(sources)
         field = self.incident(driven, sources.chosen(~near), strength[~near])
-        some = sources.chosen(near)
-        nodes, amplitude = some.positions.flatten(0, 1), (strength[near, None] * some.weights).flatten()
-        inside = self.inside(nodes)
-        field += self.incident(driven, Apertures.of_points(nodes[~inside]), amplitude[~inside])
-        if not inside.any():
+        if not near.any():
             return self.forces(field)
-        on_grid, more = self._driving_on_grid(nodes[inside], amplitude[inside], driven)
+        on_grid, more = self._driving_on_grid(sources.chosen(near), strength[near], driven)
         return self.forces(field + on_grid) + more
 
-    def _driving_on_grid(self, nodes: Tensor, amplitude: Tensor, driven: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the incident field (n,) of nodes (P, 3) in the box, and forces (h,) beyond those it causes.
+    def _driving_on_grid(self, sources: Apertures, strength: Tensor, driven: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the incident field (n,) of sources in the box, and forces (h,) beyond those it causes.
 
-        The nodes are spread over cells. Those of another mass than air's take another force.
+        Nodes in the box are spread over cells. Those of another mass than air's take another force.
         """
         grid, cells = self.assembly.grid, self.assembly.heterogeneous
-        kernels = self.assembly.interpolation(self._on_axes(nodes))
+        nodes, shares = sources.positions, strength[:, None] * sources.weights
+        inside = self.inside(nodes)
+        kernels = self.assembly.interpolation(self._on_axes(nodes[inside]))
+        owner = inside.nonzero()[:, 0].numpy()
         field, force = torch.zeros(len(driven), **COMPLEX), torch.zeros(len(cells.index), **COMPLEX)
         places = places_of(self._driven[0], grid.shape)
-        for number, (node, value) in enumerate(zip(nodes, amplitude, strict=True)):
-            wave = self.incident(driven, Apertures.of_points(node[None]), value[None])
-            reached, near = field_of_kernel(kernels, number, places, grid.shape, self.assembly.stencil)
-            wave[reached] = value * torch.from_numpy(near / grid.spacing)
-            field += wave
-        index, source = self.assembly.forces(kernels, amplitude)
+        for number, within in enumerate(inside):
+            rows, source = owner == number, slice(number, number + 1)
+            weight = sources.weights[within, None].numpy() * kernels.weight[rows]
+            spread = Interpolation(kernels.index[rows], weight)
+            near, wave = field_of_kernels(spread, places, grid.shape, self.assembly.stencil)
+            field[~near] += self.incident(driven[~near], sources.chosen(source), strength[source])
+            field[near] += strength[number] * torch.from_numpy(wave / grid.spacing)
+            if not within.all():
+                outside = Apertures.of_points(nodes[number, ~within])
+                field[near] += self.incident(driven[near], outside, shares[number, ~within])
+        index, source_force = self.assembly.forces(kernels, shares[inside])
         shared, ours, theirs = np.intersect1d(cells.index, index, assume_unique=True, return_indices=True)
-        force[ours] = torch.from_numpy(1 / cells.mass_of(shared) - 1) * source[theirs]
+        force[ours] = torch.from_numpy(1 / cells.mass_of(shared) - 1) * source_force[theirs]
         return field, force
 
     def near_to_far(self, targets: Apertures) -> NearToFar:
