@@ -103,8 +103,8 @@ def haptic_metrics(
         propagator: of the scene.
         sequence: of drives of its array. Its duration is taken as one period.
         points: (P, 3) [m].
-        path: foci (T, 3) or (T, F, 3) [m] of all laps of the sequence. If it has a multiple of T frames, each
-            focus stays for as many.
+        path: foci (T, 3) or (T, F, 3) [m]. If the sequence has a multiple of T frames, each focus stays for
+            as many. A sequence of two laps, as `modulated` may return, needs `path.repeat(2, 1)`.
         reflection: R, 0 to 1.
 
     Raises:

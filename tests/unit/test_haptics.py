@@ -63,6 +63,13 @@ def test_foci_of_a_path_have_ripple_and_side_maxima():
     assert "ripple" in repr(metrics)
 
 
+def test_modulation_of_two_laps_is_the_ripple_of_foci_that_are_named_twice():
+    sequence = at.modulated(at.sequence_along(PROPAGATOR, CIRCLE, 10.0), 25.0, depth=0.19, waveform="square")
+    metrics = at.haptic_metrics(PROPAGATOR, sequence, CIRCLE[:1], CIRCLE.repeat(2, 1))
+    assert sequence.duration == pytest.approx(0.2)
+    assert float(metrics.ripple) == pytest.approx((1 - 0.9) / (1 + 0.9), rel=1e-9)  # root of 1 - 0.19
+
+
 def test_the_silencer_turns_phases_and_amplitudes_over_its_times():
     drives = torch.tensor([[1.0], [0.5j], [0.0]], dtype=torch.complex128)
     played = at.silenced(at.Sequence(drives, 500.0, loop=False))  # 2 ms a frame, in parts of 0.2 ms
