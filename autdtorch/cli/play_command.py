@@ -83,7 +83,7 @@ def _sequence(
     if (file := given_file("play.sequence", section["sequence"])) is not None:
         require_effective("a file of play.sequence", _EFFECTIVE_WITH_FILE, "path or play.sequence")
         with within("play.sequence"):
-            sequence = load_sequence(file)
+            sequence = load_sequence(file, rate if is_given("play.rate") else None)
         if is_given("play.rate"):
             sequence = sequence.at_rate(rate)
     else:
@@ -96,7 +96,9 @@ def _sequence(
         raise invalid("play.modulation", modulation, "must be a mapping, such as {frequency: 200}")
     require_known("play.modulation", modulation, _MODULATION)
     with within("play.modulation"):
-        return modulated(sequence, **{"frequency": None, "rate": None, **modulation})
+        sequence = modulated(sequence, **{"frequency": None, "rate": None, **modulation})
+        bench.device.require_rate(sequence.rate)
+    return sequence
 
 
 def _played(bench: Bench, sequence: Sequence, seconds: float | None, log: Path) -> hardware.Playback:

@@ -27,7 +27,15 @@ from autdtorch.scene.sequence import Sequence
 from autdtorch.utils.array_types import AnyArray, Array
 from autdtorch.utils.files import read_arrays, write_arrays
 from autdtorch.utils.units import warn_user, warned_within
-from autdtorch.utils.validation import ArrayLike, path_of, real_tensor, require_kind, require_one_of, within
+from autdtorch.utils.validation import (
+    ArrayLike,
+    path_of,
+    positive,
+    real_tensor,
+    require_kind,
+    require_one_of,
+    within,
+)
 
 _FORMATS = (".csv", ".npz")
 _LEVEL_COLUMNS = {f"{name} {column}": "" for name, device in DEVICES.items() for column in device.columns}
@@ -97,20 +105,30 @@ def save_sequence(
     _save(path, frames, array, device, {"rate": sequence.rate, "loop": sequence.loop})
 
 
-def load_sequence(path: str | os.PathLike[str]) -> Sequence:
-    """Read a sequence that `save_sequence` wrote, levels as the device plays them.
+def load_sequence(path: str | os.PathLike[str], rate: float | None = None) -> Sequence:
+    """Read a sequence that `save_sequence` wrote, or frames; levels as the device plays them.
+
+    Args:
+        path: of a file of `save_sequence`, or of frames as `load_drive` reads them, `.csv` or `.npz`.
+        rate: frames per second of a file that has no rate [Hz], whose frames become a loop.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: another suffix, or a file without frames, rate or loop. The message names the file.
+        ValueError: another suffix, or a file without frames, rate or loop; the message names the file. Or a
+            rate <= 0.
     """
     path = path_of("path", path, suffixes=_FORMATS)
+    usual = None if rate is None else positive("rate", rate, "Hz")
     drives = load_drive(path)
     if drives.ndim != 2:
         raise ValueError(f"{path}: a single drive; must have frames (T, M)")
     timing = _timing_in_comment(path) if path.suffix.lower() == ".csv" else read_arrays(path)
+    if usual is not None and "rate" not in timing:
+        return Sequence(drives, usual)
     if missing := [name for name in ("rate", "loop") if name not in timing]:
-        raise ValueError(f"{path}: no {' and '.join(missing)}; must be written by save_sequence")
+        raise ValueError(
+            f"{path}: no {' and '.join(missing)}; must be written by save_sequence, or rate given"
+        )
     with within(path):
         return Sequence(drives, timing["rate"].tolist(), timing["loop"].tolist())
 

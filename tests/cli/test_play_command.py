@@ -23,9 +23,11 @@ BENCH = ("hardware=emulated", "hardware.device=openmpd", "hardware.limits.amplit
 
 
 @pytest.fixture
-def command(write):
-    """The words of the command in the scene above."""
+def command(write, tmp_path):
+    """The words of the command in the scene above, beside which is a file of frames."""
     write("ours/scene/two.yaml", SCENE)
+    scene = at.load_scene(tmp_path / "ours/scene/two.yaml")
+    at.save_drive(tmp_path / "ours/frames.npz", torch.ones(5, 9).cdouble(), scene.array)
     return ("play", "--config-dir", "ours", "scene=two", *BENCH, "play.seconds=0.05")
 
 
@@ -51,6 +53,12 @@ def test_a_focus_on_a_circle_is_played_and_noted(command, run, tmp_path, capsys)
     assert (second["played"]["frames"], second["frames"], second["rate [Hz]"]) == (100, 40, 2000.0)
     assert run(*command, "play.sequence=out/sequence.npz", "play.rate=500") == 0
     assert (entries(tmp_path)[2]["frames"], entries(tmp_path)[2]["rate [Hz]"]) == (10, 500.0)
+
+
+def test_frames_without_a_rate_are_played_at_that_of_the_command(command, run, tmp_path):
+    assert run(*command, "play.sequence=ours/frames.npz", "play.rate=200") == 0
+    (entry,) = entries(tmp_path)
+    assert (entry["frames"], entry["rate [Hz]"], entry["played"]["frames"]) == (5, 200.0, 10)
 
 
 def test_a_line_is_played(command, run, tmp_path):
@@ -119,6 +127,11 @@ MISTAKES = [
         ["play.sequence=one.npz", "path.radius=1e-3"],
         "path.radius=1e-3: has no effect on a file of play.sequence",
     ),
+    (
+        ["play.sequence=ours/frames.npz"],
+        "frames.npz: no rate and loop; must be written by save_sequence, or rate given",
+    ),
+    (["play.modulation={frequency: 600}"], "play.modulation: rate: 12000.0 Hz; must be at most 1e+04"),
     (["play.tempo=3"], "play.tempo: unknown key"),
     (["trials=3"], "trials=3: has no effect on play"),
     (["method=gabs"], "method=gabs: has no effect on play"),
