@@ -385,6 +385,20 @@ class TestOnAutd3:
         pulses = 512 * np.arcsin(levels[1] / 255) / math.pi
         assert np.abs(widths[:, ends] - pulses).max() <= 1  # counts of 512
 
+    def test_the_emulated_boards_emit_laps_of_a_path_times_factors(self):
+        start, frame = frames_of(1, 249)[0], torch.arange(1220)[:, None]
+        swing = torch.sin(math.pi * frame.double() / 10)
+        factor = 0.6 + 0.4 * torch.cos(2 * math.pi * frame.double() / 61)  # 61 frames, in laps of 20
+        sequence = Sequence(factor * torch.polar(start.abs().expand(1220, -1), start.angle() + swing), 4000.0)
+        phases, widths = self.recorded(sequence, 1)
+        phase, intensity = (level.T.numpy() for level in hw.AUTD3.levels(sequence.drives))
+        assert np.array_equal(phases[:, 9::10][intensity > 0], phase[intensity > 0])
+        emitted = np.sin(math.pi * widths[:, 9::10] / 512)
+        # Half a level of factor and of intensity, and of 512 pulse widths.
+        assert (
+            np.abs(emitted - factor.T.numpy() * start.abs()[:, None].numpy()).max() < 1 / 255 + math.pi / 512
+        )
+
     def test_amplitude_modulation_has_its_frequency_and_depth_within_a_hundredth(self):
         sequence = modulated(torch.ones(249).cdouble(), 200.0)
         widths = self.recorded(sequence, 8)[1]
