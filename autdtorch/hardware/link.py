@@ -168,7 +168,7 @@ class Link(contextlib.AbstractContextManager["Link"]):
         self.device, self._port, self._sleep = device, port, sleep
         self._lock = threading.RLock()
         self._open = True
-        self._turn = object()  # of what plays; a sequence plays as long as it is its own
+        self._turn: object | None = None  # of the sequence that plays or is prepared
         with closed_on_error(port.close):
             self.off()
             self.wiring = Wiring(device, transducers)
@@ -190,7 +190,7 @@ class Link(contextlib.AbstractContextManager["Link"]):
         frame = self.wiring.frame(drive)
         with self._lock:
             self._require_open()
-            self.end_sequence()
+            self._turn = None
             self._send(frame)
 
     def wait_for_sound(self) -> None:
@@ -220,14 +220,15 @@ class Link(contextlib.AbstractContextManager["Link"]):
 
     @contextlib.contextmanager
     def turn(self) -> Iterator[Callable[[], bool]]:
-        """End the sequence that plays, if any, and have the outputs off at the end of the block.
+        """End an earlier sequence, and have the outputs off at the end of the block.
 
         It gives a function that returns whether the turn has ended: by `off`, a drive, or another sequence.
         The outputs are left to these then.
         """
         with self._lock:
             self._require_open()
-            turn = self.end_sequence()
+            self.end_sequence()
+            turn = self._turn = object()
         try:
             yield lambda: self._turn is not turn
         finally:
@@ -266,15 +267,16 @@ class Link(contextlib.AbstractContextManager["Link"]):
             return outlast(rate, count, ended)
         return stream(send, content, rate, count, ended, self.device.wire_time(content[0].tobytes()))
 
-    def end_sequence(self) -> object:
-        """End the sequence that plays or is prepared, if any, and return the turn of what follows."""
-        self._turn = object()
-        return self._turn
+    def end_sequence(self) -> None:
+        """Switch the outputs off if a sequence plays or is prepared, which ends it."""
+        with self._lock:
+            if self._turn is not None:
+                self.off()
 
     def off(self) -> None:
         """Switch all outputs of the device off, after a recovery of the port if need be."""
         with self._lock:
-            self.end_sequence()
+            self._turn = None
             if not self._open:  # pyusb would open it once more
                 return
             try:

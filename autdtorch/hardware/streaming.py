@@ -16,7 +16,7 @@ from autdtorch.utils.validation import invalid, positive
 LATE = 1e-3
 
 _AHEAD = 0.5e-3  # frames due within this time are sent together [s]: a transfer takes as long as many frames
-_MOST_TOGETHER = 32  # as many messages as the buffer of an OpenMPD holds
+_MOST_TOGETHER = 28  # as many messages as the buffer of an OpenMPD holds
 _LONGEST_DELAY = 1.0  # [s]; the computer has slept, or the device does not take the rate
 _MOST_FRAMES = 2.0**53  # up to here floats count one by one
 _ROUNDING = 1e-9  # relative error of a time that is a whole number of frames

@@ -225,6 +225,17 @@ def test_a_mistake_ends_the_sequence_of_another_thread_with_the_outputs_off(tria
         assert not bench.emitted().any()
 
 
+def test_off_of_a_limited_link_ends_a_sequence_that_another_thread_plays_without_limits(trial):
+    with trial.limited(hw.OPENMPD) as (bench, link):
+        thread = threading.Thread(target=link.link.play_sequence, args=(Sequence(SMALL, 1000.0),))
+        thread.start()
+        while not bench.emitted().any():
+            time.sleep(1e-3)
+        link.off()
+        assert not bench.emitted().any()
+        thread.join()
+
+
 def test_seconds_at_the_limit_are_played_at_any_rate(trial):
     with trial.limited(hw.OPENMPD, seconds_in_a_row=0.05) as (_, link):
         assert link.play_sequence(Sequence(SMALL, 1150.0), 0.05).frames <= 57  # 57.5 frames
