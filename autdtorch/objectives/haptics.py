@@ -95,9 +95,9 @@ def haptic_metrics(
 ) -> HapticMetrics:
     """Compute the field of a sequence at points, such as those of a palm or of the plane of the foci.
 
-    The radiation pressure on a surface that the wave meets head-on is (1 + R^2) |p|^2 / (2 rho c^2), with the
-    peak amplitude p of the incident wave and the reflection factor R of the surface, nearly 1 for skin. The
-    surface itself is not in the field: add it to the obstacles if its echo counts.
+    The radiation pressure on a surface that the wave meets head-on is (1 + R^2) |p|^2 / (2 rho c^2). There p
+    is the peak amplitude of the incident wave, and R the reflection factor of the surface, nearly 1 for skin.
+    The surface itself is not in the field: add it to the obstacles if its echo counts.
 
     Args:
         propagator: of the scene.

@@ -20,9 +20,9 @@ _BEYOND = 1.6  # of the tactile band, up to which lines of the spectrum are draw
 def plot_haptics(metrics: HapticMetrics) -> Figure:
     """Plot the field of a sequence.
 
-    On the left the radiation pressure over time, in the middle its spectrum without the mean, at the point
-    with the largest part from 5 to 500 Hz, the band that is shaded. On the right the pressure at the foci,
-    and the largest elsewhere, if the metrics have a path.
+    The left panel shows the radiation pressure over time, the middle one its spectrum without the mean. Both
+    are at the point with the largest part from 5 to 500 Hz, the shaded band. With a path, the right panel
+    shows the pressure at the foci and the largest elsewhere.
 
     Args:
         metrics: of `haptic_metrics`.
@@ -52,7 +52,7 @@ def plot_haptics(metrics: HapticMetrics) -> Figure:
 def _draw_frames(
     ax: Axes, metrics: HapticMetrics, values: torch.Tensor, color: str, label: str | None = None
 ) -> None:
-    """Draw values (T,), each from the time of its frame to that of the next one."""
+    """Draw values (T,), each from its frame to the next one."""
     times = torch.cat([metrics.times, 1 / metrics.frequencies[1:2]])
     held = torch.cat([values, values[-1:]])
     ax.step((1e3 * times).numpy(), held.numpy(), where="post", color=color, label=label, linewidth=1.0)

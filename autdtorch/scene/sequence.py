@@ -38,7 +38,7 @@ _ROUNDING = 1e-9  # relative difference of rates that are taken as equal
 class Sequence:
     """Drives that follow each other at a constant rate.
 
-    A frame plays from its time until that of the next one. `len(sequence)` is the number of frames T.
+    A frame plays until the next one begins. `len(sequence)` is the number of frames T.
 
     Attributes:
         drives: q = a e^{-i phi} of the frames (T, M), |q| <= 1; T, M >= 1.
