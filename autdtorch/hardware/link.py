@@ -237,7 +237,12 @@ class Link(contextlib.AbstractContextManager["Link"]):
                     self.off()
 
     def prepare_sequence(self, sequence: Sequence, seconds: float | None = None) -> PreparedSequence:
-        """Return a sequence in the bytes of the device, which may take seconds; errors as `play_sequence`."""
+        """Return a sequence as bytes of the device, which may take long; errors as of `play_sequence`.
+
+        Args:
+            sequence: frames of drives (T, M).
+            seconds: time to play [s]; see `play_sequence`.
+        """
         require_sequence(sequence, len(self.transducers))
         device, rate = self.device, sequence.rate
         device.require_rate(rate)

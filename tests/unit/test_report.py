@@ -300,7 +300,7 @@ def test_methods_may_differ_between_scenes_and_claims_without_data_are_no_table(
 
 def test_matrices_that_were_kept_are_no_runs_and_not_exact(tmp_path):
     solver = {"method": "full", "spacing": 2.8e-3, "tolerance": 0.05, "cache": tmp_path / "kept"}
-    for runs in ("4", "0, kept on disk"):
+    for runs in ("3", "0, kept on disk"):  # one for each focus
         scenes = {"cube": scene(None, (CUBE,))}
         results = run_study(scenes, {"gabs": METHODS["gabs"]}, tmp_path / runs, solver=solver)
         assert simulation_rows(results)[1][4] == runs
