@@ -38,11 +38,6 @@ def discrete_green(stencil: Stencil) -> ComplexArray:
     on_face = cells[:, 0] == _REACH
     inner, face, before = np.flatnonzero(~on_face), np.flatnonzero(on_face), cells[on_face] - (1, 0, 0)
     turn = np.exp(1j * wavenumber)
-
-    def exact(cells: Index) -> ComplexArray:
-        distance = np.linalg.norm(cells, axis=1)
-        return np.asarray(np.exp(1j * wavenumber * distance) / distance, np.complex128)
-
     system, field = np.zeros((len(cells), len(cells)), np.complex128), np.zeros(len(cells), np.complex128)
     for offset, weight in zip(OFFSETS, stencil.weights, strict=True):
         np.add.at(system, (inner, number[tuple(abs(cells[inner] + offset).T)]), weight)
@@ -50,7 +45,7 @@ def discrete_green(stencil: Stencil) -> ComplexArray:
     field[0] = -2 * np.pi * stencil.slope / wavenumber
     system[face, face] = 1
     system[face, number[tuple(before.T)]] -= turn
-    field[face] = exact(cells[face]) - turn * exact(before)
+    field[face] = _exact(stencil, cells[face]) - turn * _exact(stencil, before)
     return np.asarray(np.linalg.solve(system, field)[number], np.complex128)
 
 
@@ -79,9 +74,15 @@ def field_of_kernels(
 def _green_around(stencil: Stencil, *reach: int) -> ComplexArray:
     """Return the field [1 / h] at cells up to `reach` from the source on both sides, exact far from it."""
     offsets = np.abs(np.moveaxis(np.indices([2 * each + 1 for each in reach]), 0, -1) - np.array(reach))
-    distance = np.linalg.norm(offsets, axis=-1)
     beside = (offsets <= _REACH).all(axis=-1)
-    distance[beside] = 1  # replaced below
-    field = np.exp(1j * complex(stencil.kappa, stencil.eta) * distance) / distance
+    field = np.empty(beside.shape, np.complex128)
     field[beside] = discrete_green(stencil)[tuple(offsets[beside].T)]
-    return np.asarray(field, np.complex128)
+    field[~beside] = _exact(stencil, offsets[~beside])
+    return field
+
+
+def _exact(stencil: Stencil, cells: Index) -> ComplexArray:
+    """Return e^{ikr} / r [1 / h] at cells (n, 3) from the source."""
+    distance = np.linalg.norm(cells, axis=1)
+    wave: ComplexArray = np.exp(1j * complex(stencil.kappa, stencil.eta) * distance) / distance
+    return wave

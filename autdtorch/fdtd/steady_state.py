@@ -78,10 +78,10 @@ def run_to_steady_state(
     more. `stepped` is called with the number of periods after each block. With an `echo`, the sources follow
     the phasors: see `windows_of_run`.
     """
-    earliest, block = fewest_periods(assembly.grid.arrival), block_of(assembly.steps_per_period)[1]
+    earliest, (steps, block) = fewest_periods(assembly.grid.arrival), block_of(assembly.steps_per_period)
     if echo:
         earliest += block  # the first answer to an echo is a block late
-    kept, (steps, _) = phasors_kept(len(cells)), block_of(assembly.steps_per_period)
+    kept = phasors_kept(len(cells))
     sequence = Extrapolation(kept, single=assembly.dtype == torch.float32)
     values: deque[Sequence[Tensor]] = deque(maxlen=_JUDGED)
     first_judged = min(earliest, max_periods) - (_JUDGED - 1) * block

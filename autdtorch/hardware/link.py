@@ -71,8 +71,7 @@ class Wiring:
         return self.device.quantised(self.of_device(single))[self.transducers]
 
     def of_device(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return the drive (..., N) of all the device's transducers for a `drive` (..., M)."""
-        drive = validate_drive(drive, len(self.transducers))
+        """Return the drive (..., N) of all the device's transducers for a checked `drive` (..., M)."""
         everyone = torch.zeros((*drive.shape[:-1], self.device.transducers), **COMPLEX)
         everyone[..., self.transducers] = drive
         return everyone
@@ -102,8 +101,8 @@ class AmplitudeScale:
         return self.frames_asked(validate_single_drive(drive, len(self._most)))
 
     def frames_asked(self, drives: torch.Tensor) -> torch.Tensor:
-        """Return the drives to ask of the device, in the device's scale, for a trial's `drives` (..., M)."""
-        wanted = self.largest * validate_drive(drives, len(self._most))
+        """Return the drives to ask of the device, in its scale, for a trial's checked `drives` (..., M)."""
+        wanted = self.largest * drives
         return torch.polar(wanted.abs().minimum(self._most), wanted.angle())
 
     def quantised(self, drive: torch.Tensor) -> torch.Tensor:

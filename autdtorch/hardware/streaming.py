@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from autdtorch.hardware.transport.port import HeldSequence, LinkError
 from autdtorch.scene.sequence import Sequence
 from autdtorch.utils.array_types import Bytes
-from autdtorch.utils.validation import invalid, positive
+from autdtorch.utils.validation import invalid, positive, require_kind
 
 #: Delay from which a frame counts as late [s].
 LATE = 1e-3
@@ -63,10 +63,9 @@ class PreparedSequence:
     count: float
 
 
-def require_sequence(sequence: object, transducers: int) -> None:
+def require_sequence(sequence: Sequence, transducers: int) -> None:
     """Refuse what is no sequence for so many transducers."""
-    if not isinstance(sequence, Sequence):
-        raise invalid("sequence", sequence, "must be a Sequence, as Sequence(drives, rate) makes it")
+    require_kind("sequence", sequence, Sequence)
     if sequence.transducers != transducers:
         accepted = f"must be {transducers}, as many as the link has"
         raise ValueError(f"sequence: {sequence.transducers} transducers; {accepted}")

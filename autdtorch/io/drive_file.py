@@ -119,10 +119,13 @@ def load_sequence(path: str | os.PathLike[str], rate: float | None = None) -> Se
     """
     path = path_of("path", path, suffixes=_FORMATS)
     usual = None if rate is None else positive("rate", rate, "Hz")
-    drives = load_drive(path)
+    if path.suffix.lower() == ".csv":
+        drives, timing = _from_csv(path), _timing_in_comment(path)
+    else:
+        timing = read_arrays(path)
+        drives = _from_arrays(path, timing)
     if drives.ndim != 2:
         raise ValueError(f"{path}: a single drive; must have frames (T, M)")
-    timing = _timing_in_comment(path) if path.suffix.lower() == ".csv" else read_arrays(path)
     if usual is not None and "rate" not in timing:
         return Sequence(drives, usual)
     if missing := [name for name in ("rate", "loop") if name not in timing]:
@@ -188,7 +191,11 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
         return _from_csv(path)
     if path.suffix.lower() in (".gz", ".xml"):
         return _from_ultraino(path)
-    arrays = read_arrays(path)
+    return _from_arrays(path, read_arrays(path))
+
+
+def _from_arrays(path: Path, arrays: Mapping[str, AnyArray]) -> torch.Tensor:
+    """Return the drive or the frames of the arrays of a file."""
     if "device" in arrays:
         name = str(arrays["device"])
         require_one_of(f"{path}: device", name, DEVICES)

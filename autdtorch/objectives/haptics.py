@@ -9,12 +9,12 @@ doi:10.1109/TOH.2021.3125843).
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 
+from autdtorch.scene.geometry import path_foci
 from autdtorch.scene.sequence import Sequence
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.process import require_memory
@@ -23,7 +23,6 @@ from autdtorch.utils.validation import (
     ArrayLike,
     number_between,
     points_tensor,
-    real_tensor,
     require_kind,
     within,
 )
@@ -137,7 +136,7 @@ def haptic_metrics(
             rows = propagator.transfer_matrix(foci.reshape(-1, 3)).cpu().reshape(*foci.shape[:2], -1)
         repeats = len(sequence) // len(foci)
         at_foci = (rows.repeat_interleave(repeats, 0) @ sequence.drives[..., None])[..., 0].abs()
-        away = torch.cdist(foci, places).amin(dim=1) >= 2 * math.pi / scene.wavenumber
+        away = torch.cdist(foci, places).amin(dim=1) >= scene.wavelength
         elsewhere = (pressure * away.repeat_interleave(repeats, 0)).amax(dim=1)
     return HapticMetrics(
         pressure,
@@ -163,9 +162,8 @@ def _held_spectrum(values: torch.Tensor, lines: int) -> torch.Tensor:
 
 def _foci(path: ArrayLike, frames: int) -> torch.Tensor:
     """Return the foci (T, F, 3) of a path, after checking that the frames are a multiple of T."""
-    foci = real_tensor("path", path, "m").detach().cpu()
-    foci = foci[:, None] if foci.ndim == 2 else foci
-    if foci.ndim != 3 or foci.shape[-1] != 3 or foci.numel() == 0 or frames % len(foci):
+    foci = path_foci(path)
+    if frames % len(foci):
         accepted = f"must be (T, 3) or (T, F, 3) of which {frames} frames are a multiple"
         raise ValueError(f"path: shape {tuple(foci.shape)}; {accepted}")
     return foci

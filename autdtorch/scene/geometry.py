@@ -182,6 +182,18 @@ def polyline_points(corners: ArrayLike, count: int, closed: bool = True) -> torc
     return torch.lerp(places[line], places[line + 1], part.clamp(max=1)[:, None])
 
 
+def path_foci(path: ArrayLike) -> torch.Tensor:
+    """Return the foci (T, P, 3) [m] of a path (T, 3) of one focus, or (T, P, 3) of P; T, P >= 1.
+
+    `ValueError` for not finite numbers or another shape.
+    """
+    places = real_tensor("path", path, "m").detach().cpu()
+    foci = places[:, None] if places.ndim == 2 else places
+    if foci.ndim != 3 or foci.shape[-1] != 3 or foci.numel() == 0:
+        raise ValueError(f"path: shape {tuple(places.shape)}; must be (T, 3) or (T, P, 3) with T, P >= 1")
+    return foci
+
+
 def sphere_points(center: ArrayLike, radius: float, count: int) -> torch.Tensor:
     """Return evenly spread points on a sphere: a Fibonacci lattice.
 

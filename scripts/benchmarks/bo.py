@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
-from shared.document import printed, table
+from shared.document import printed, quartiles, table
 from shared.scenes import PAPER, objective_of, paper_scene
 from shared.timing import timed
 
@@ -60,9 +60,3 @@ def noise_rows(objectives: Mapping[str, at.SimulatedObjective], trials: int) -> 
                 drive = at.run(method, at.Noise(objective, 20.0), trials).drive
                 row.append(quartiles(at.true_pressure(objective, drive).amin(dim=1) / best))
         yield row
-
-
-def quartiles(share: torch.Tensor) -> str:
-    """Format median and quartiles."""
-    low, middle, high = share.quantile(torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)).tolist()
-    return f"{middle:.3f} ({low:.3f} to {high:.3f})"

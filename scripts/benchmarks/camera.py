@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from shared.document import Page, printed, table
+from shared.document import Page, printed, quartiles, table
 from shared.heated_screen import WAVELENGTH, HeatedScreen, focused_drive, magnitudes, pinhole
 
 import autdtorch as at
@@ -139,7 +139,7 @@ def main(page: Page, seeds: int) -> None:
 
     rows = printed(summary(pressure, gathered(Case(pressure=pressure))) for pressure in PRESSURES)
     marks = registration_errors(seeds)
-    print("registration [mm]", quartiles(marks))
+    print("registration [mm]", quartiles(marks, ".2g"))
     figure = style.new_figure(7.2, 2.6)
     series = {
         "thickness of the screen [µm]": [(each, Case(thickness=1e-6 * each)) for each in THICKNESSES],
@@ -171,7 +171,7 @@ def main(page: Page, seeds: int) -> None:
             rows,
         ),
         "Last four columns: rms errors over stated ones. Registered by nine foci of 2 kPa, places are "
-        f"{quartiles(marks)} mm off.",
+        f"{quartiles(marks, '.2g')} mm off.",
     )
 
 
@@ -181,17 +181,11 @@ def summary(pressure: float, errors: dict[str, np.ndarray]) -> list[str]:
     stated = f"{100 * np.median(errors['stated']):.2g}"
     return [
         f"{1e-3 * pressure:g} kPa",
-        quartiles(100 * np.abs(errors["focus"])),
+        quartiles(100 * np.abs(errors["focus"]), ".2g"),
         stated,
-        quartiles(errors["place"]),
+        quartiles(errors["place"], ".2g"),
         *ratios,
     ]
-
-
-def quartiles(values: np.ndarray) -> str:
-    """Format the median and the quartiles."""
-    low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
-    return f"{middle:.2g} ({low:.2g} to {high:.2g})"
 
 
 def registration_errors(seeds: int) -> np.ndarray:

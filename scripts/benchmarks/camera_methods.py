@@ -17,7 +17,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import torch
-from shared.document import Page, printed, table
+from shared.document import Page, printed, quartiles, table
 from shared.scenes import PAPER, paper_scene
 
 import autdtorch as at
@@ -78,12 +78,6 @@ def blocks_of(seeds: int) -> list[range]:
 def summary(pressure: torch.Tensor) -> list[str]:
     """Return the cells of a row for pressures (2, T) [Pa] by microphones and by camera."""
     return [str(pressure.shape[1]), *map(quartiles, (*(1e-3 * pressure), pressure[1] / pressure[0]))]
-
-
-def quartiles(values: torch.Tensor) -> str:
-    """Format the median and the quartiles."""
-    low, middle, high = values.quantile(values.new_tensor([0.25, 0.5, 0.75])).tolist()
-    return f"{middle:.3f} ({low:.3f} to {high:.3f})"
 
 
 def weakest_foci(method: str, scene: str, trials: range, logs: Path) -> torch.Tensor:

@@ -11,8 +11,8 @@ import time
 from collections.abc import Iterator
 
 import torch
-from benchmarks.bo import FOCI, quartiles
-from shared.document import printed, table
+from benchmarks.bo import FOCI
+from shared.document import printed, quartiles, table
 from shared.scenes import autd3_array, paper_scene, with_array
 from shared.timing import timed
 

@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shlex
+import statistics
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -99,6 +100,12 @@ def spread(values: Any, digits: int = 2, middle: Callable[[Any], Any] | None = N
         return f"{values.item():.{digits}f}"
     center = middle(values) if middle else values.mean()
     return f"{center:.{digits}f} ({values.min():.{digits}f} to {values.max():.{digits}f})"
+
+
+def quartiles(values: Any, form: str = ".3f") -> str:
+    """Format the median and the quartiles of an array or a tensor, each number in a `form`."""
+    low, middle, high = statistics.quantiles(values.tolist(), n=4, method="inclusive")
+    return f"{middle:{form}} ({low:{form}} to {high:{form}})"
 
 
 def _rounded(row: dict[str, object]) -> dict[str, object]:

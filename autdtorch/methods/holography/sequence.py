@@ -25,6 +25,7 @@ import torch
 
 from autdtorch.methods.holography.algorithms import DAMPING, TINY, UNREACHED
 from autdtorch.methods.holography.holography import checked_targets
+from autdtorch.scene.geometry import path_foci
 from autdtorch.scene.sequence import Sequence
 from autdtorch.utils.array_types import Array, ComplexArray
 from autdtorch.utils.process import one_library_thread
@@ -35,7 +36,6 @@ from autdtorch.utils.validation import (
     integer_at_least,
     invalid,
     positive,
-    real_tensor,
     require_kind,
     within,
 )
@@ -132,14 +132,11 @@ def sequence_along(
 
     require_kind("propagator", propagator, Propagator)
     frequency, loop = positive("frequency", frequency, "Hz"), boolean("loop", loop)
-    places = real_tensor("path", path, "m").detach().cpu()
-    places = places[:, None] if places.ndim == 2 else places
-    if places.ndim != 3 or places.shape[-1] != 3 or places.numel() == 0:
-        raise ValueError(f"path: shape {tuple(places.shape)}; must be (T, 3) or (T, P, 3) with T, P >= 1")
+    foci = path_foci(path)
     with within("path"):
-        rows = propagator.transfer_matrix(places.reshape(-1, 3))
-    matrix = rows.reshape(*places.shape[:2], -1)
-    return Sequence(drive_sequence(matrix, targets, phase_step, loop, even), len(places) * frequency, loop)
+        rows = propagator.transfer_matrix(foci.reshape(-1, 3))
+    matrix = rows.reshape(*foci.shape[:2], -1)
+    return Sequence(drive_sequence(matrix, targets, phase_step, loop, even), len(foci) * frequency, loop)
 
 
 def _starts(rows: ComplexArray, closed: bool) -> ComplexArray:
