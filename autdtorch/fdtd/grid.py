@@ -13,7 +13,8 @@ from torch import Tensor
 
 from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.placement import grid_offset
-from autdtorch.fdtd.region import Region, Shape, bounds
+from autdtorch.fdtd.region import Region
+from autdtorch.fdtd.shapes import bounds
 from autdtorch.fdtd.stencil import places_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.process import cached_property
@@ -156,10 +157,10 @@ def domain_extent(region: Region, spacing: float) -> Extent:
     return Extent(*region.domain, margin, thinner=0, crossings=2 if region.bodies else 1)
 
 
-def bodies_extent(shapes: Sequence[Shape], wavelength: float) -> Extent:
-    """Return the extent of one or more shapes and the air around them in a box, at a wavelength [m]."""
-    lower, upper = bounds(shapes)
-    thinner = _THINNER if (upper - lower).max() <= _SMALL_BODIES * wavelength else 0
+def bodies_extent(region: Region) -> Extent:
+    """Return the extent of the region's bodies and the air around them in a box."""
+    lower, upper = bounds(region.shapes)
+    thinner = _THINNER if (upper - lower).max() <= _SMALL_BODIES * region.wavelength else 0
     return Extent(lower.tolist(), upper.tolist(), AROUND, thinner, crossings=1)
 
 
@@ -170,7 +171,7 @@ def make_grid(region: Region, spacing: float) -> Grid:
 
 def make_box(region: Region, spacing: float) -> Grid:
     """Return a grid over the region's bodies and `AROUND` cells of air around them, whatever its domain."""
-    return _covering(region.unbounded, spacing, bodies_extent(region.shapes, region.wavelength))
+    return _covering(region.unbounded, spacing, bodies_extent(region))
 
 
 def require_spacing(region: Region, spacing: float) -> None:

@@ -9,7 +9,7 @@ import functools
 import logging
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations, permutations
 
 import numpy as np
@@ -22,13 +22,13 @@ from autdtorch.fdtd.grid import (
     crossing_time,
     domain_extent,
 )
-from autdtorch.fdtd.reflection import can_hold, near_mirrors, whole_region, with_images
-from autdtorch.fdtd.region import Body, Region, bounds
+from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil
-from autdtorch.fdtd.turning import FlatFaces, axes_along, flat_faces, is_tilted, turned_shape
+from autdtorch.fdtd.turning import axes_along, is_tilted
 from autdtorch.utils.array_types import Array
+from autdtorch.utils.process import cached_property
 
 logger = logging.getLogger(__name__)
 
@@ -44,19 +44,57 @@ _LARGE, _FLAT = 250_000, 0.5
 _LAYER, _BOX_RUN, _PAIR = 4.0, 2_000_000, 1.0
 
 
-@dataclass(frozen=True)
-class GridCost:
-    """The cells per axis of a grid, without and with its boundary layers, and the fewest steps of a run."""
+@dataclass(frozen=True, eq=False)
+class PlannedGrid:
+    """A grid of some bodies of a region, and the fewest steps of a run on it.
 
-    interior: tuple[int, int, int]
-    shape: tuple[int, int, int]
-    steps: int
+    Attributes:
+        group: ascending indices of these bodies.
+        mirrors: ascending indices of the mirrors next to them, whose images the grid holds.
+        part: the region of these bodies and images alone.
+        axes: of the grid, one a row (3, 3).
+        extent: along these axes.
+        aligned: whether every face is parallel to the axes.
+        spacing: edge of a cell [m].
+        steps_per_period: the fewest.
+    """
+
+    group: tuple[int, ...]
+    mirrors: tuple[int, ...]
+    part: Region = field(compare=False)
+    axes: Array
+    extent: Extent
+    aligned: bool
+    spacing: float
     steps_per_period: float
+
+    @cached_property
+    def interior(self) -> tuple[int, int, int]:
+        """Cells per axis inside the boundary layer."""
+        return self.extent.interior(self.spacing)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Cells per axis, boundary layers included."""
+        rim = self.extent.layer_cells(self.kappa) + 1
+        x, y, z = (length + 2 * rim for length in self.interior)
+        return x, y, z
 
     @property
     def cells(self) -> int:
         """Number of cells, boundary layers included."""
         return math.prod(self.shape)
+
+    @property
+    def kappa(self) -> float:
+        """Wavenumber in air times spacing [rad]."""
+        return self.part.wavenumber * self.spacing
+
+    @property
+    def steps(self) -> int:
+        """The fewest steps of a run."""
+        periods = fewest_periods(self.extent.crossings * crossing_time(self.interior, self.kappa))
+        return math.ceil(periods * self.steps_per_period)
 
     @property
     def scattering(self) -> int:
@@ -73,42 +111,41 @@ class GridCost:
         """Time of the steps of a run."""
         return self.steps * (_LAYER * self.cells + (1 - _LAYER) * math.prod(self.interior))
 
+    @property
+    def is_possible(self) -> bool:
+        """True if it can hold the images in its mirrors."""
+        return self.part.can_hold(self.mirrors)
+
+    @property
+    def middle(self) -> Array:
+        """Its centre (3,) [m], in the coordinates of the scene."""
+        return np.asarray((np.array(self.extent.lower) + self.extent.upper) / 2 @ self.axes)
+
+    @property
+    def half(self) -> Array:
+        """Half of the lengths of the edges around its bodies (3,) [m]."""
+        return np.asarray(np.subtract(self.extent.upper, self.extent.lower) / 2)
+
+    def reach(self, directions: Array) -> Array:
+        """Return how far its interior reaches from its centre along directions (n, 3) [m], at most."""
+        around = (self.extent.margin + 1) * self.spacing  # one for the offset
+        return np.asarray(np.abs(directions @ self.axes.T) @ (self.half + around))
+
     def _inner(self, cells: int) -> int:
         return math.prod(max(0, length - cells) for length in self.interior)
 
 
-def grid_cost(region: Region, extent: Extent, spacing: float) -> GridCost:
-    """Return the cost of a grid of `spacing` [m] over an extent of a region."""
-    finest, coarsest = (
-        region.wavelength / cells for cells in (MAX_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH)
-    )
-    spacing = max(finest, min(spacing, coarsest))  # others are refused later
-    kappa = region.wavenumber * spacing
-    interior = x, y, z = extent.interior(spacing)
-    rim = extent.layer_cells(kappa) + 1
-    stencil = tuned_stencil(kappa, region.attenuation * spacing)
-    periods = fewest_periods(extent.crossings * crossing_time(interior, kappa))
-    fastest = max(region.sound_speeds.values()) / region.fluid.phase_speed
-    steps_per_period = fewest_steps(stencil, stencil.largest_symbol * fastest**2)
-    shape = x + 2 * rim, y + 2 * rim, z + 2 * rim
-    return GridCost(interior, shape, math.ceil(periods * steps_per_period), steps_per_period)
-
-
 @dataclass(frozen=True, eq=False)
 class Grouping:
-    """Grids with the ascending indices of the obstacles on each, their axes, and the expected passes.
+    """Grids, and the expected passes of the iteration between them."""
 
-    Axes are rows of matrices (3, 3). Passes are those of the iteration between boxes. Grids are aligned if
-    every face is parallel to the axes of its grid. A grid holds the images of its obstacles in its `mirrors`,
-    ascending indices of those next to them.
-    """
+    grids: tuple[PlannedGrid, ...] = ()
+    passes: int = 1
 
-    groups: tuple[tuple[int, ...], ...]
-    axes: tuple[Array, ...]
-    grids: tuple[GridCost, ...]
-    passes: int
-    aligned: bool
-    mirrors: tuple[tuple[int, ...], ...] = ()
+    @property
+    def aligned(self) -> bool:
+        """True if every face is parallel to the axes of its grid."""
+        return all(grid.aligned for grid in self.grids)
 
     @property
     def cells(self) -> int:
@@ -130,19 +167,17 @@ def choose_grids(
     region: Region, method: str, spacing: float, tolerance: float, runs: int
 ) -> tuple[str, Grouping]:
     """Return the method and its grids; for "auto" the cheapest of "box" and "full" that is accurate."""
-    if method in ("box", "tmatrix"):
-        return method, cheapest_boxes(region, spacing, tolerance, runs)
     walls = any(body.continued for body in region.bodies)
-    if method == "auto" and region.mirrors and not walls:
+    if method in ("box", "tmatrix") or (method == "auto" and region.mirrors and not walls):
         return "box", cheapest_boxes(region, spacing, tolerance, runs)
-    domain = _grids(region, spacing, [_Outline.of_domain(region, spacing)])
+    domain = Grouping((domain_grid(region, spacing),))
     if method == "full":
         return method, domain
     boxes = cheapest_boxes(region, spacing, tolerance, runs)
     gain = runs * domain.grids[0].work / boxes.box_cost(runs)
     first, last = region.domain
     outside = any((np.less(one.lower, first) | np.greater(one.upper, last)).any() for one in region.shapes)
-    tilted = any(map(is_tilted, boxes.axes))
+    tilted = any(is_tilted(grid.axes) for grid in boxes.grids)
     method, grouping = ("full", domain) if walls or not (outside or tilted or gain > 1) else ("box", boxes)
     logger.debug(
         "method auto: %s; full would take %.2g times as long as box (walls through the boundary layer: %s,"
@@ -153,8 +188,7 @@ def choose_grids(
 
 def one_box(region: Region, spacing: float) -> Grouping:
     """Return one box of `spacing` [m] for all obstacles."""
-    surfaces = list(map(flat_faces, region.shapes))
-    return _grids(region, spacing, [_Outline.around(region, range(len(surfaces)), surfaces, spacing)])
+    return Grouping((box_grid(region, range(len(region.bodies)), spacing),))
 
 
 def cheapest_boxes(region: Region, spacing: float, tolerance: float, runs: int) -> Grouping:
@@ -162,102 +196,70 @@ def cheapest_boxes(region: Region, spacing: float, tolerance: float, runs: int) 
 
     The interiors of boxes, with the air around their obstacles, do not overlap.
     """
-    choices = [
-        _grids(region, spacing, boxes, passes) for boxes, passes in _partitions(region, spacing, tolerance)
-    ]
-    possible = [choice for choice in choices if all(can_hold(region, near) for near in choice.mirrors)]
+    choices = list(_partitions(region, spacing, tolerance))
+    possible = [choice for choice in choices if all(grid.is_possible for grid in choice.grids)]
     return min(possible or choices, key=lambda grouping: grouping.box_cost(runs))
 
 
-def _partitions(region: Region, spacing: float, tolerance: float) -> Iterator[tuple[Sequence[_Outline], int]]:
-    """Yield one box and those apart, with the passes of the iteration between them."""
-    surfaces = list(map(flat_faces, region.shapes))
-    numbers = range(len(surfaces))
-    yield [_Outline.around(region, numbers, surfaces, spacing)], 1
-    if len(surfaces) > _MOST_OBSTACLES:
+def _partitions(region: Region, spacing: float, tolerance: float) -> Iterator[Grouping]:
+    """Yield one box, and those apart."""
+    yield one_box(region, spacing)
+    if len(region.bodies) > _MOST_OBSTACLES:
         return
-    boxes = [_Outline.around(region, [index], surfaces, spacing) for index in numbers]
+    boxes = [box_grid(region, [index], spacing) for index in range(len(region.bodies))]
     while len(boxes) > 1:
-        gaps = _gaps(boxes, spacing)
+        gaps = _gaps(boxes)
         if gaps.min() > 0 and (passes := _expected_passes(boxes, tolerance)) <= MOST_PASSES:
-            yield list(boxes), passes
+            yield Grouping(tuple(boxes), passes)
         first, second = sorted(map(int, np.unravel_index(gaps.argmin(), gaps.shape)))
         both = sorted((*boxes[first].group, *boxes.pop(second).group))
-        boxes[first] = _Outline.around(region, both, surfaces, spacing)
+        boxes[first] = box_grid(region, both, spacing)
 
 
-@dataclass(frozen=True)
-class _Outline:
-    """The obstacles of a box, its axes, one a row (3, 3), and its extent along them.
+def box_grid(region: Region, group: Sequence[int], spacing: float) -> PlannedGrid:
+    """Return the box of a group of bodies, of `spacing` [m], turned along their faces.
 
-    It is aligned if every face of its obstacles is parallel to them. It holds their images in its `mirrors`.
+    It is not turned where its corners would reach a mirror whose image no grid can hold.
     """
+    turned = _box_along(region, group, spacing, along_faces=True)
+    if turned.is_possible:
+        return turned
+    straight = _box_along(region, group, spacing, along_faces=False)
+    return straight if straight.is_possible else turned
 
-    group: tuple[int, ...]
-    axes: Array
-    extent: Extent
-    aligned: bool
-    mirrors: tuple[int, ...] = ()
 
-    @classmethod
-    def around(
-        cls, region: Region, group: Sequence[int], surfaces: Sequence[FlatFaces], spacing: float
-    ) -> _Outline:
-        """Return the outline of the box of a group, turned along its faces.
+def _box_along(region: Region, group: Sequence[int], spacing: float, along_faces: bool) -> PlannedGrid:
+    near: tuple[int, ...] | None = None
+    reached: tuple[int, ...] = ()
+    while reached != near:  # the box with images in these mirrors may reach others
+        near, part = reached, region.part(group, reached)
+        axes = axes_along([body.faces for body in part.bodies]) if along_faces else np.eye(3)
+        extent = bodies_extent(part.turned(axes))
+        reached = region.mirrors_near(extent.lower, extent.upper, axes, spacing)
+    aligned = all(body.faces.all_aligned(axes) for body in part.bodies)
+    if turns := _turns_to_flat(extent.interior(spacing)):
+        axes = np.roll(axes, turns, axis=0)
+        roll = functools.partial(np.roll, shift=turns)
+        extent = replace(extent, lower=roll(extent.lower), upper=roll(extent.upper))
+    return PlannedGrid(tuple(group), near, part, axes, extent, aligned, *_steps(region, spacing))
 
-        It is not turned where its corners would reach a mirror whose image no grid can hold.
-        """
-        turned = cls._along(region, group, surfaces, spacing, along_faces=True)
-        if can_hold(region, turned.mirrors):
-            return turned
-        straight = cls._along(region, group, surfaces, spacing, along_faces=False)
-        return straight if can_hold(region, straight.mirrors) else turned
 
-    @classmethod
-    def _along(
-        cls,
-        region: Region,
-        group: Sequence[int],
-        surfaces: Sequence[FlatFaces],
-        spacing: float,
-        along_faces: bool,
-    ) -> _Outline:
-        bodies: Sequence[Body] = [region.bodies[index] for index in group]
-        faces = [surfaces[index] for index in group]
-        reached: tuple[int, ...] = ()
-        near: tuple[int, ...] | None = None
-        while reached != near:  # the box with images in these mirrors may reach others
-            near, held = reached, bodies
-            if near:
-                held = with_images(bodies, [region.mirrors[number] for number in near])
-                faces = [flat_faces(body.shape) for body in held]
-            axes = axes_along(faces) if along_faces else np.eye(3)
-            shapes = [turned_shape(body.shape, axes) for body in held]
-            reached = near_mirrors(region, *bounds(shapes), axes, spacing)
-        aligned = all(each.all_aligned(axes) for each in faces)
-        extent = bodies_extent(shapes, region.wavelength)
-        if turns := _turns_to_flat(extent.interior(spacing)):
-            axes = np.roll(axes, turns, axis=0)
-            roll = functools.partial(np.roll, shift=turns)
-            extent = replace(extent, lower=roll(extent.lower), upper=roll(extent.upper))
-        return cls(tuple(group), axes, extent, aligned, reached)
+def domain_grid(region: Region, spacing: float) -> PlannedGrid:
+    """Return the grid of the whole domain, of `spacing` [m], which follows the axes of the scene."""
+    whole, axes, group = region.whole, np.eye(3), tuple(range(len(region.bodies)))
+    aligned = bool(group) and all(body.faces.all_aligned(axes) for body in region.bodies)
+    extent = domain_extent(whole, spacing)
+    return PlannedGrid(group, (), whole, axes, extent, aligned, *_steps(region, spacing))
 
-    @classmethod
-    def of_domain(cls, region: Region, spacing: float) -> _Outline:
-        """Return the outline of the whole domain, which follows the axes of the scene."""
-        axes, shapes = np.eye(3), region.shapes
-        aligned = bool(shapes) and all(flat_faces(shape).all_aligned(axes) for shape in shapes)
-        return cls(tuple(range(len(shapes))), axes, domain_extent(whole_region(region), spacing), aligned)
 
-    @property
-    def middle(self) -> Array:
-        """Its centre (3,) [m], in the coordinates of the scene."""
-        return np.asarray((np.array(self.extent.lower) + self.extent.upper) / 2 @ self.axes)
-
-    @property
-    def half(self) -> Array:
-        """Half of the lengths of its edges (3,) [m]."""
-        return np.asarray(np.subtract(self.extent.upper, self.extent.lower) / 2)
+def _steps(region: Region, spacing: float) -> tuple[float, float]:
+    """Return a spacing [m] within the accepted ones, and the fewest steps in a period; others are refused."""
+    limits = MAX_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH
+    finest, coarsest = (region.wavelength / cells for cells in limits)
+    spacing = max(finest, min(spacing, coarsest))
+    stencil = tuned_stencil(region.wavenumber * spacing, region.attenuation * spacing)
+    fastest = max(region.sound_speeds.values()) / region.fluid.phase_speed
+    return spacing, fewest_steps(stencil, stencil.largest_symbol * fastest**2)
 
 
 def _turns_to_flat(interior: tuple[int, int, int]) -> int:
@@ -268,27 +270,17 @@ def _turns_to_flat(interior: tuple[int, int, int]) -> int:
     return -interior.index(shortest) % 3
 
 
-def _grids(region: Region, spacing: float, boxes: Sequence[_Outline], passes: int = 1) -> Grouping:
-    grids = tuple(grid_cost(region, box.extent, spacing) for box in boxes)
-    groups, axes = tuple(box.group for box in boxes), tuple(box.axes for box in boxes)
-    mirrors = tuple(box.mirrors for box in boxes)
-    return Grouping(groups, axes, grids, passes, all(box.aligned for box in boxes), mirrors)
-
-
-def _gaps(boxes: Sequence[_Outline], spacing: float) -> Array:
+def _gaps(boxes: Sequence[PlannedGrid]) -> Array:
     """Distances (B, B) [m] of boxes' interiors, along the axis where it is largest; infinite to itself."""
     gaps = np.full((len(boxes), len(boxes)), math.inf)
     for (i, one), (j, other) in combinations(enumerate(boxes), 2):
         axes = np.concatenate((one.axes, other.axes))
-        reach = sum(
-            np.abs(axes @ box.axes.T) @ (box.half + (box.extent.margin + 1) * spacing)  # one: for the offset
-            for box in (one, other)
-        )
-        gaps[i, j] = gaps[j, i] = (np.abs(axes @ (one.middle - other.middle)) - reach).max()
+        apart = np.abs(axes @ (one.middle - other.middle)) - (one.reach(axes) + other.reach(axes))
+        gaps[i, j] = gaps[j, i] = apart.max()
     return gaps
 
 
-def _expected_passes(boxes: Sequence[_Outline], tolerance: float) -> int:
+def _expected_passes(boxes: Sequence[PlannedGrid], tolerance: float) -> int:
     """Expected passes: a large body of radius a scatters a / 2d of an incident field to a distance d."""
     middle = np.array([box.middle for box in boxes])
     radius = np.array([np.linalg.norm(box.half) for box in boxes])

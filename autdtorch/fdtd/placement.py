@@ -14,7 +14,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from autdtorch.fdtd.region import Region, Shape
+from autdtorch.fdtd.region import Region
+from autdtorch.fdtd.shapes import Shape
 from autdtorch.fdtd.turning import ALIGNED, slender_faces
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.spatial import doubled_normals

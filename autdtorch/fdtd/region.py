@@ -1,18 +1,30 @@
-"""The region that is simulated: a fluid, bodies in it, and the frequency of the drive."""
+"""The region that is simulated: a fluid, bodies and mirrors in it, and the frequency of the drive.
+
+With their images in the mirrors, bodies are in free space. A body next to a rigid or soft mirror, on it or
+cut by it, shares a grid with its image.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol, Self
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import NamedTuple, Self
 
 import numpy as np
-from torch import Tensor
+import torch
 
+from autdtorch.fdtd.shapes import Shape, is_turned, turned_shape, with_image
+from autdtorch.fdtd.turning import FlatFaces, flat_faces, slender_faces
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.images import Mirror
-from autdtorch.utils.validation import Vector
+from autdtorch.utils.images import Image, Mirror, images_of
+from autdtorch.utils.process import cached_property
+from autdtorch.utils.validation import Vector, invalid
+
+CLEARANCE = 4.5
+"""Distance [cells] of a mirror from the box around bodies up to which they share a grid with their images.
+The Huygens surface is up to 4 cells from the bodies, and must not meet its own image."""
 
 
 class Fluid(NamedTuple):
@@ -40,30 +52,6 @@ class Fluid(NamedTuple):
         return self.sound_speed.real if self.sound_speed.imag == 0 else 1 / (1 / self.sound_speed).real
 
 
-class Shape(Protocol):
-    """A shape that a grid can represent."""
-
-    @property
-    def lower(self) -> Vector:
-        """Corner of the bounding box with the smallest coordinates (3,) [m]."""
-
-    @property
-    def upper(self) -> Vector:
-        """Corner of the bounding box with the largest coordinates (3,) [m]."""
-
-    def signed_distance(self, points: Tensor, /) -> Tensor:
-        """Return the distance (...) [m] of points (..., 3) to the surface, negative inside."""
-
-    def surface(self) -> tuple[Tensor, Tensor]:
-        """Return vertices (V, 3) [m] and triangles (F, 3), counter-clockwise as seen from outside."""
-
-
-def bounds(shapes: Sequence[Shape]) -> tuple[Array, Array]:
-    """Return the lower and upper corner (3,) [m] of the bounding box of shapes."""
-    lower = np.array([shape.lower for shape in shapes], np.float64).min(axis=0)
-    return lower, np.array([shape.upper for shape in shapes], np.float64).max(axis=0)
-
-
 @dataclass(frozen=True)
 class Body:
     """A shape of one material."""
@@ -75,6 +63,19 @@ class Body:
     rigid_error: float = 0.0  # relative difference of the field in front of it, of a body taken as rigid
     # impedance of its surface, locally reacting, as a ratio to air (density times sound speed); None if rigid
     impedance: complex | None = None
+    # number of the obstacle that it is, or is an image of
+    number: int = field(default=0, compare=False)
+
+    @cached_property
+    def faces(self) -> FlatFaces:
+        """Its flat faces."""
+        return flat_faces(self.shape)
+
+    def is_along(self, axes: Array, spacing: float) -> bool:
+        """Return whether its faces follow `axes`, one a row (3, 3), or it is slender on cells [m]."""
+        if self.faces.all_aligned(axes):
+            return True
+        return slender_faces(self.shape.surface()[0].numpy() @ axes.T / spacing) is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,3 +128,90 @@ class Region:
         fluids = {f"obstacle {index}": body.fluid for index, body in enumerate(self.bodies)}
         everywhere = {"the medium": self.fluid} | fluids
         return {where: fluid.phase_speed for where, fluid in everywhere.items() if fluid}
+
+    def turned(self, axes: Array) -> Self:
+        """Return the region in the coordinates of other axes, one a row (3, 3); its domain is infinite."""
+        if not is_turned(axes):
+            return self
+        bodies = tuple(replace(body, shape=turned_shape(body.shape, axes)) for body in self.bodies)
+        return replace(self.unbounded, bodies=bodies, sources=self.sources @ axes.T)
+
+    def part(self, group: Sequence[int], near: Sequence[int]) -> Self:
+        """Return the region with a group of its bodies alone, and their images in mirrors near them."""
+        bodies = tuple(self.bodies[index] for index in group)
+        return replace(self, bodies=_with_images(bodies, [self.mirrors[number] for number in near]))
+
+    @property
+    def whole(self) -> Self:
+        """The region with its images: the bodies in front of all mirrors and behind, in free space.
+
+        The domain is cut at each mirror, and joined with its image.
+        """
+        if not self.mirrors:
+            return self
+        lower, upper = (np.array(corner) for corner in self.domain)
+        sources = torch.from_numpy(self.sources)
+        for mirror in self.mirrors:
+            axis = int(np.abs(mirror.normal).argmax())
+            plane = mirror.point[axis]
+            half = upper[axis] - plane if mirror.normal[axis] > 0 else plane - lower[axis]
+            lower[axis], upper[axis] = plane - half, plane + half
+            sources = torch.cat([sources, mirror.image.of(sources)])
+        (x, y, z), (u, v, w) = lower.tolist(), upper.tolist()
+        bodies, domain = _with_images(self.bodies, self.mirrors), ((x, y, z), (u, v, w))
+        return replace(self, bodies=bodies, domain=domain, sources=sources.numpy(), mirrors=())
+
+    def mirrors_near(
+        self, lower: Sequence[float], upper: Sequence[float], axes: Array, spacing: float
+    ) -> tuple[int, ...]:
+        """Return the mirrors next to a box along `axes`, with corners (3,) [m] in their coordinates."""
+        beside = CLEARANCE * spacing
+        ends = np.stack([np.array(lower) - beside, np.array(upper) + beside])
+        corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3) @ axes
+        heights = [mirror.height(torch.from_numpy(corners)).min() for mirror in self.mirrors]
+        return tuple(number for number, height in enumerate(heights) if height < 0)
+
+    def can_hold(self, near: Sequence[int]) -> bool:
+        """Return whether a grid can hold the images in some mirrors: rigid or soft, none facing another."""
+        mirrors = [self.mirrors[number] for number in near]
+        facing = any(one.is_parallel(other) for one, other in combinations(mirrors, 2))
+        return not facing and all(mirror.reflection in (1, -1) for mirror in mirrors)
+
+    def require_held(self, near: Sequence[int], spacing: float) -> None:
+        """Refuse mirrors next to bodies whose images no grid can hold; see `can_hold`."""
+        if self.can_hold(near):
+            return
+        beside = f"{1e3 * CLEARANCE * spacing:.3g} mm"
+        for number in near:
+            if self.mirrors[number].reflection not in (1, -1):
+                accepted = f"must be 1 or -1 where an obstacle is within {beside}; or move the obstacle"
+                raise invalid(f"reflectors[{number}].reflection", self.mirrors[number].reflection, accepted)
+        accepted = f"must be {beside} or more from one of reflectors {[*near]}, of which two face each other"
+        raise invalid("obstacles", "one grid next to both", accepted)
+
+    def require_domain(self, name: str = "method", value: str = "full") -> None:
+        """Refuse mirrors that a grid of the domain cannot have; the message names what asks for it."""
+        for number, mirror in enumerate(self.mirrors):
+            if np.abs(mirror.normal).max() < 1 or mirror.reflection not in (1, -1):
+                plane = f"reflector {number}, of normal {mirror.normal} and reflection {mirror.reflection}"
+                accepted = "it must be along an axis, and its reflection 1 or -1; take box"
+                raise invalid(name, value, f"cannot have {plane}: {accepted}")
+            if any(mirror.is_parallel(other) for other in self.mirrors[:number]):
+                raise invalid(name, value, f"cannot have parallel reflectors, such as {number}; take box")
+
+    def other_images(self, near: Sequence[int], images: Sequence[Image]) -> tuple[Image, ...]:
+        """Return the images that a grid does not hold: one for each of its copies in all other mirrors."""
+        if not near:
+            return tuple(images)
+        held = [self.mirrors[number] for number in near]
+        size = float(np.linalg.norm(np.subtract(*self.domain)))
+        return images_of(self.mirrors, complex(self.wavenumber, self.attenuation), size, held)
+
+
+def _with_images(bodies: tuple[Body, ...], mirrors: Sequence[Mirror]) -> tuple[Body, ...]:
+    """Return bodies with their images in mirrors; a body on or across a mirror is one with its image."""
+    for mirror in mirrors:
+        bodies = tuple(
+            replace(body, shape=shape) for body in bodies for shape in with_image(body.shape, mirror)
+        )
+    return bodies

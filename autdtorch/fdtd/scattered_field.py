@@ -26,10 +26,9 @@ from autdtorch.fdtd.discrete_green import field_of_kernels
 from autdtorch.fdtd.face_nodes import FaceNodes
 from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Sources
-from autdtorch.fdtd.region import Shape
+from autdtorch.fdtd.shapes import Shape, turned_shape
 from autdtorch.fdtd.stencil import flat_offsets, places_of
 from autdtorch.fdtd.stepping import Assembly
-from autdtorch.fdtd.turning import turned_shape
 from autdtorch.utils.apertures import Apertures, Discs, image_of
 from autdtorch.utils.array_types import COMPLEX, Array, Index
 from autdtorch.utils.distinct import distinct_cells, places_among

@@ -26,7 +26,8 @@ from autdtorch.fdtd.damping import at_time_step, fewest_stable_steps
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.interpolation import Interpolation, average_nodes, exclude_cells, interpolate_points
 from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, WaveState, uniform_state
-from autdtorch.fdtd.region import Region, Shape
+from autdtorch.fdtd.region import Region
+from autdtorch.fdtd.shapes import Shape
 from autdtorch.fdtd.stability import whole_steps
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
 from autdtorch.utils.array_types import REAL, Index

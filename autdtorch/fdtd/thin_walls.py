@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from autdtorch.fdtd.region import Region, Shape
-from autdtorch.fdtd.turning import is_along
+from autdtorch.fdtd.region import Region
+from autdtorch.fdtd.shapes import Shape
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.spatial import doubled_normals, extents, mean_thickness
 from autdtorch.utils.validation import Vector
@@ -78,7 +78,7 @@ def warn_of_thin_walls(region: Region, spacing: float, grids: Iterable[tuple[Ite
         for number in numbers:
             body = region.bodies[number]
             ratio = 0.0 if body.fluid is None else body.fluid.inertia / region.fluid.inertia
-            if 1 / _ALIKE < ratio < _ALIKE or is_along(body.shape, axes, spacing):
+            if 1 / _ALIKE < ratio < _ALIKE or body.is_along(axes, spacing):
                 continue
             if (wall := thin_wall(body.shape, spacing)) is not None:
                 thickness, place = wall

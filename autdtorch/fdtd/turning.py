@@ -7,20 +7,14 @@ as one aligned with the axes of the scene.
 from __future__ import annotations
 
 import itertools
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from autdtorch.fdtd.region import Region, Shape
+from autdtorch.fdtd.shapes import Shape
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.process import cached_property
 from autdtorch.utils.spatial import doubled_normals
-from autdtorch.utils.validation import Vector
 
 ALIGNED = 1 - 1e-9  # Smallest cosine between the normal of a face and an axis that is parallel to it
 _PERPENDICULAR = 4e-5  # Largest cosine between perpendicular normals; the same angle
@@ -29,84 +23,11 @@ _WORTHWHILE = 0.4
 _AXES_DECIMALS = 12  # Decimals of normals: rounding of positions must not turn the grid
 _DECIMALS = 6  # Normals that agree to so many decimals are equal: files hold single precision
 _ALL = 1 - 1e-6  # Aligned share of a surface from which all of it is aligned, apart from slivers
-_SAGITTA = 1.5  # Growth of a bounding box, relative to the distance of triangles from a curved surface
-
-
-class Bounded(ABC):
-    """A shape that computes both corners of its bounding box together."""
-
-    @property
-    def lower(self) -> Vector:
-        """Corner of the bounding box with the smallest coordinates (3,) [m]."""
-        return self._bounds[0]
-
-    @property
-    def upper(self) -> Vector:
-        """Corner of the bounding box with the largest coordinates (3,) [m]."""
-        return self._bounds[1]
-
-    @property
-    @abstractmethod
-    def _bounds(self) -> tuple[Vector, Vector]:
-        """The lower and the upper corner."""
-
-
-@dataclass(frozen=True, eq=False)
-class Turned(Bounded):
-    """A shape in the coordinates of other axes, or its image in a mirror."""
-
-    shape: Shape
-    axes: Array  # the axes, one a row, in the coordinates of the shape (3, 3)
-    offset: Array = field(default_factory=lambda: np.zeros(3))  # place of the origin (3,) [m]
-
-    def signed_distance(self, points: Tensor, /) -> Tensor:
-        """Return the distance (...) [m] of points (..., 3) to the surface, negative inside."""
-        return self.shape.signed_distance(
-            (points - torch.from_numpy(self.offset)) @ torch.from_numpy(self.axes)
-        )
-
-    def surface(self) -> tuple[Tensor, Tensor]:
-        """Return vertices (V, 3) [m] and triangles (F, 3), counter-clockwise as seen from outside."""
-        vertices, triangles = self.shape.surface()
-        if np.linalg.det(self.axes) < 0:  # an image turns the other way
-            triangles = triangles.flip(1)
-        return vertices @ torch.from_numpy(self.axes.T) + torch.from_numpy(self.offset), triangles
-
-    @cached_property
-    def _bounds(self) -> tuple[Vector, Vector]:
-        if (np.abs(self.axes).max(axis=1) == 1).all():
-            corners = np.array([self.shape.lower, self.shape.upper]) @ self.axes.T + self.offset
-            (x, y, z), (u, v, w) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
-            return (x, y, z), (u, v, w)
-        vertices, triangles = self.surface()
-        middle = self.signed_distance(vertices[triangles].mean(dim=1))
-        beyond = _SAGITTA * float(middle.abs().max())
-        x, y, z = (vertices.amin(dim=0) - beyond).tolist()
-        u, v, w = (vertices.amax(dim=0) + beyond).tolist()
-        return (x, y, z), (u, v, w)
-
-
-def is_turned(axes: Array) -> bool:
-    """Return whether axes, one a row (3, 3), differ from those of the scene."""
-    return bool((axes != np.eye(3)).any())
 
 
 def is_tilted(axes: Array) -> bool:
     """Return whether axes, one a row (3, 3), are not those of the scene in any order."""
     return bool((np.abs(axes).max(axis=1) < 1).any())
-
-
-def turned_shape(shape: Shape, axes: Array) -> Shape:
-    """Return a shape in the coordinates of other axes, one a row (3, 3)."""
-    return Turned(shape, axes) if is_turned(axes) else shape
-
-
-def turned(region: Region, axes: Array) -> Region:
-    """Return a region in the coordinates of other axes, one a row (3, 3); its domain is infinite."""
-    if not is_turned(axes):
-        return region
-    bodies = tuple(replace(body, shape=turned_shape(body.shape, axes)) for body in region.bodies)
-    return replace(region.unbounded, bodies=bodies, sources=region.sources @ axes.T)
 
 
 class FlatFaces(NamedTuple):
@@ -210,10 +131,3 @@ def slender_faces(corners: Array) -> list[Array] | None:
         return None
     steps = radius * _SCALE * np.concatenate((-_STEPS, _STEPS))
     return [np.array([low, high]) if one == axis else middle[one] + steps for one in range(3)]
-
-
-def is_along(shape: Shape, axes: Array, spacing: float) -> bool:
-    """Return whether a shape has flat faces along `axes`, one a row (3, 3), or is slender on cells [m]."""
-    if flat_faces(shape).all_aligned(axes):
-        return True
-    return slender_faces(shape.surface()[0].numpy() @ axes.T / spacing) is not None

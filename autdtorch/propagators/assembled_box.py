@@ -12,7 +12,6 @@ import torch
 from autdtorch.fdtd.grid import Grid, make_box
 from autdtorch.fdtd.region import Body, Region
 from autdtorch.fdtd.stepping import Assembly, assemble_on
-from autdtorch.fdtd.turning import turned
 from autdtorch.propagators.store import BODIES, key_of
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.moving import is_movable, shifted
@@ -41,7 +40,7 @@ def assembled_box(
 
     It is assembled with its first cell at the origin: for a body that moves it is the same, to the last bit.
     """
-    part = turned(region, axes)
+    part = region.turned(axes)
     grid = make_box(part, spacing)
     if not all(isinstance(shape, Obstacle) and is_movable(shape) for shape in region.shapes):
         return assemble_on(grid, part, dtype, time_step)
@@ -51,7 +50,7 @@ def assembled_box(
     def assembled() -> _AssembledBox:
         everywhere, nowhere = ((-math.inf,) * 3, (math.inf,) * 3), np.zeros((0, 3))
         still = Region(region.fluid, region.attenuation, region.frequency, bodies, everywhere, nowhere)
-        return _AssembledBox(assemble_on(here, turned(still, axes), dtype, time_step))
+        return _AssembledBox(assemble_on(here, still.turned(axes), dtype, time_step))
 
     medium = region.fluid, region.attenuation, region.frequency
     key = key_of("box", bodies, axes, here, *medium, str(dtype), time_step)

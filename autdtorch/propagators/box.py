@@ -26,7 +26,6 @@ from autdtorch.fdtd.absorption import absorption
 from autdtorch.fdtd.coupling import Coupling, coupling_of
 from autdtorch.fdtd.grouping import one_box
 from autdtorch.fdtd.kernels.contract import Sources
-from autdtorch.fdtd.reflection import other_images
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
 from autdtorch.fdtd.steady_state import MOST_JUDGED, SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly
@@ -133,14 +132,13 @@ class BoxSimulation(Simulation):
         """The assembled boxes."""
         plan = self.plan
         plan.require_feasible()
-        boxes, grouping = [], plan.grouping
-        for group, axes, near in zip(grouping.groups, grouping.axes, grouping.mirrors, strict=True):
-            part = self.plan.part(group, near)
-            if is_tilted(axes):
-                logger.debug("the grid around obstacles %s is turned along their faces", list(group))
-            assembly = assembled_box(part, axes, plan.spacing, plan.dtype, plan.time_step)
-            images = other_images(plan.region, near, plan.scene.images)
-            boxes.append(ScatteredField(assembly, plan.scene.complex_wavenumber, axes, images, near))
+        boxes, wavenumber = [], plan.scene.complex_wavenumber
+        for grid in plan.grouping.grids:
+            if is_tilted(grid.axes):
+                logger.debug("the grid around obstacles %s is turned along their faces", list(grid.group))
+            assembly = assembled_box(grid.part, grid.axes, plan.spacing, plan.dtype, plan.time_step)
+            images = plan.region.other_images(grid.mirrors, plan.scene.images)
+            boxes.append(ScatteredField(assembly, wavenumber, grid.axes, images, grid.mirrors))
         return boxes
 
     def _mirrors(self, numbers: Iterable[int]) -> list[Mirror]:
@@ -176,16 +174,15 @@ class BoxSimulation(Simulation):
     @property
     def held_mirrors(self) -> Sequence[Mirror]:
         """The mirrors next to bodies."""
-        return self._mirrors(sorted({number for near in self.plan.grouping.mirrors for number in near}))
+        return self._mirrors(sorted({number for grid in self.plan.grouping.grids for number in grid.mirrors}))
 
     @cached_property
     def absorptions(self) -> Sequence[AbsorbingCells]:
         """The cells of each box that absorb."""
         result = []
-        for box, group in zip(self.boxes, self.plan.grouping.groups, strict=True):
-            form = absorption(box.assembly, self.plan.part(group, box.mirrors), box.axes)
-            places, mirrors = box.positions(form.cells), self._mirrors(box.mirrors)
-            result.append(AbsorbingCells.of(form, places, self.plan.region, group, mirrors))
+        for box, grid in zip(self.boxes, self.plan.grouping.grids, strict=True):
+            form = absorption(box.assembly, grid.part, box.axes)
+            result.append(AbsorbingCells.of(form, box.positions(form.cells), grid.part, box.mirrors))
         return result
 
     def radiators(self, drive: torch.Tensor) -> list[Radiators]:

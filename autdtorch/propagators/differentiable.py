@@ -10,7 +10,6 @@ from autdtorch.fdtd.adjoint import recorded
 from autdtorch.fdtd.grid import make_grid, require_fine, warn_if_coarse
 from autdtorch.fdtd.kernels.choice import available_kernel, make_kernel, precision_of
 from autdtorch.fdtd.material_gradients import cells_of_maps, cells_of_obstacles, domain_cells
-from autdtorch.fdtd.reflection import require_domain, whole_region, with_images
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import block_of, fewest_periods
 from autdtorch.fdtd.stepping import drive_dft, drive_signal
@@ -85,9 +84,9 @@ def differentiable_field(
     given = _material("density", density, scene), _material("sound_speed", sound_speed, scene)
     region, given_speed = region_of(scene), given[1]
     if region.mirrors:
-        require_domain(region, "scene", scene.name)
+        region.require_domain("scene", scene.name)
+        region = region.whole
         given = _of_images(given[0], region), _of_images(given[1], region)
-        region = whole_region(region)
     grid = make_grid(region, positive("spacing", spacing, "m"))
     speeds = region.sound_speeds
     if given_speed is not None:
@@ -140,11 +139,8 @@ def cell_centers(scene: Scene, spacing: float = 1e-3) -> torch.Tensor:
 
 
 def _of_images(values: torch.Tensor | None, region: Region) -> torch.Tensor | None:
-    """Return values (K,) of bodies for these and their images, as `whole_region` has them."""
-    if values is None:
-        return None
-    copies = [len(with_images([body], region.mirrors)) for body in region.bodies]
-    return values.repeat_interleave(torch.tensor(copies, dtype=torch.int64, device="cpu"))
+    """Return values (K,) of obstacles for these and their images, as a region has them."""
+    return None if values is None else values[[body.number for body in region.bodies]]
 
 
 def _material(name: str, given: ArrayLike | None, scene: Scene) -> torch.Tensor | None:

@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from autdtorch.fdtd.grid import domain_extent
-from autdtorch.fdtd.grouping import grid_cost
+from autdtorch.fdtd.grouping import domain_grid
 from autdtorch.fdtd.kernels.choice import make_kernel
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stepping import assemble, drive_signal
@@ -122,5 +121,5 @@ def _rate(kernel: str, dtype: torch.dtype, cells: int) -> float:
         state, recorded = stepper.advance(state, assembly.coefficients, sources, receivers, signal)
         recorded.cpu()  # waits for a GPU
         spent = min(spent, time.perf_counter() - begin)
-    grid = grid_cost(region, domain_extent(region, _AIR_SPACING), _AIR_SPACING)
+    grid = domain_grid(region, _AIR_SPACING)
     return grid.work / grid.steps * _MEASURED_STEPS / spent

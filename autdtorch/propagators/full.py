@@ -10,7 +10,6 @@ import numpy as np
 import torch
 
 from autdtorch.fdtd.absorption import absorption
-from autdtorch.fdtd.reflection import whole_region
 from autdtorch.fdtd.steady_state import MOST_JUDGED, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble
 from autdtorch.propagators.absorbed_power import Radiators
@@ -30,7 +29,7 @@ class DomainSimulation(Simulation):
         """The assembled grid of the domain."""
         plan = self.plan
         plan.require_feasible()
-        return (assemble(whole_region(plan.region), plan.spacing, plan.dtype, plan.time_step),)
+        return (assemble(plan.region.whole, plan.spacing, plan.dtype, plan.time_step),)
 
     @property
     def held_mirrors(self) -> Sequence[Mirror]:
@@ -41,9 +40,9 @@ class DomainSimulation(Simulation):
     def absorptions(self) -> Sequence[AbsorbingCells]:
         """The cells of the domain that absorb."""
         (assembly,), region = self.assemblies, self.plan.region
-        form = absorption(assembly, whole_region(region))
+        form = absorption(assembly, region.whole)
         places = torch.from_numpy(assembly.grid.centers_of(form.cells))
-        return [AbsorbingCells.of(form, places, region, range(len(region.bodies)), region.mirrors)]
+        return [AbsorbingCells.of(form, places, region.whole, region.mirrors)]
 
     def radiators(self, drive: torch.Tensor) -> list[Radiators]:
         """Return nothing: reflectors of a domain absorb nothing."""

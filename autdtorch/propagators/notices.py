@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import torch
 
 from autdtorch.fdtd.grid import warn_if_coarse
 from autdtorch.fdtd.thin_walls import warn_of_thin_walls
-from autdtorch.fdtd.turning import axes_along, flat_faces
+from autdtorch.fdtd.turning import axes_along
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.scene_region import warn_of_ending_walls, warn_of_near_points
 from autdtorch.propagators.simulation import Run, Simulation
@@ -87,9 +87,9 @@ def warn_of_scene(plan: Plan) -> None:
     scene, region, spacing = plan.scene, plan.region, plan.spacing
     warn_if_coarse(region.sound_speeds, scene.frequency, spacing)
     warn_of_ending_walls(scene)
-    grids: Iterable[tuple[Sequence[int], Array]] = zip(plan.grouping.groups, plan.grouping.axes, strict=True)
+    grids: list[tuple[Sequence[int], Array]] = [(grid.group, grid.axes) for grid in plan.grouping.grids]
     if plan.method == "tmatrix":  # each body has a grid along its faces
-        grids = [([number], axes_along([flat_faces(shape)])) for number, shape in enumerate(region.shapes)]
+        grids = [([body.number], axes_along([body.faces])) for body in region.bodies]
     warn_of_thin_walls(region, spacing, grids)
     warn_of_near_points(scene, "array.positions", scene.array.positions, spacing)
     warn_of_near_points(scene, "control_points", scene.control_points, spacing)

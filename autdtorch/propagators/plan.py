@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Self
 
@@ -16,9 +15,7 @@ from autdtorch.fdtd.grid_errors import Law
 from autdtorch.fdtd.grouping import Grouping, choose_grids
 from autdtorch.fdtd.kernels.choice import available_kernel, precision_of
 from autdtorch.fdtd.placement import fitting_spacing
-from autdtorch.fdtd.reflection import require_domain, require_sharp, whole_region, with_images
 from autdtorch.fdtd.region import Region
-from autdtorch.fdtd.turning import turned
 from autdtorch.propagators.free_space import PAIR_BYTES
 from autdtorch.propagators.scene_region import region_of, with_rigid
 from autdtorch.propagators.store import key_of
@@ -79,15 +76,8 @@ class Plan:
 
     def fitting(self, spacing: float, coarsest: float = math.inf) -> float:
         """Return the spacing [m] near one, not above a limit, with which flat faces fall best."""
-        grouping = self.grouping
-        grids = zip(grouping.groups, grouping.mirrors, grouping.axes, strict=True)
-        regions = [turned(self.part(group, near).unbounded, axes) for group, near, axes in grids]
+        regions = [grid.part.unbounded.turned(grid.axes) for grid in self.grouping.grids]
         return fitting_spacing(regions, spacing, coarsest)
-
-    def part(self, group: Sequence[int], near: Sequence[int]) -> Region:
-        """Return the region with a group of its bodies alone, and their images in mirrors near them."""
-        mirrors = [self.region.mirrors[number] for number in near]
-        return replace(self.region, bodies=with_images([self.region.bodies[one] for one in group], mirrors))
 
     def of(self, scene: Scene) -> Self:
         """Return a plan of a changed scene with these settings, which takes the same bodies as rigid."""
@@ -157,7 +147,7 @@ class Plan:
     def _costs(self) -> Costs:
         array, points, region = self.scene.array, len(self.scene.control_points), self.region
         if self.method == "full":
-            region = whole_region(region)
+            region = region.whole
         in_boxes = self.method != "full"
         nodes = 1 if in_boxes else len(apertures_of(array, self.scene.wavenumber).weights)
         return Costs(
@@ -187,9 +177,9 @@ class Plan:
                 )
         require_spacing(self.region, self.spacing)
         if self.method == "full":
-            require_domain(self.region)
-        for near in self.grouping.mirrors:
-            require_sharp(self.region, near, self.spacing)
+            self.region.require_domain()
+        for grid in self.grouping.grids:
+            self.region.require_held(grid.mirrors, self.spacing)
 
 
 def plan(
@@ -223,7 +213,7 @@ def plan(
     if method == "auto" and not scene.obstacles:
         logger.debug("method auto: free_space (no obstacles)")
         method = "free_space"
-    runs, grouping = min(len(scene.control_points), len(scene.array)), Grouping((), (), (), 0, aligned=False)
+    runs, grouping = min(len(scene.control_points), len(scene.array)), Grouping()
     if method != "free_space":
         require_spacing(region, spacing)
         by_waves, (chosen, grouping) = None, choose_grids(region, method, spacing, tolerance, runs)

@@ -10,7 +10,8 @@ from typing import cast
 import numpy as np
 import torch
 
-from autdtorch.fdtd.region import Body, Fluid, Region, Shape
+from autdtorch.fdtd.region import Body, Fluid, Region
+from autdtorch.fdtd.shapes import Shape
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.spatial import mean_thickness
@@ -27,10 +28,10 @@ _NEAR_RIGID = 1.4
 def region_of(scene: Scene) -> Region:
     """Return the region of a scene; parallel walls across it continue through the boundary layers."""
     bodies = []
-    for one, (_, continued) in zip(scene.obstacles, _walls(scene), strict=True):
-        material = one.fluid_at(scene.frequency)
+    for number, (obstacle, (_, continued)) in enumerate(zip(scene.obstacles, _walls(scene), strict=True)):
+        material = obstacle.fluid_at(scene.frequency)
         fluid = None if material is None else Fluid(*material)
-        bodies.append(Body(one, fluid, continued, one.uncertainty, impedance=one.impedance))
+        bodies.append(Body(obstacle, fluid, continued, obstacle.uncertainty, 0.0, obstacle.impedance, number))
     medium, positions = scene.medium, np.asarray(scene.array.positions.numpy())
     air = Fluid(medium.density, medium.sound_speed)
     return Region(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, Self, TypeVar, cast
@@ -15,7 +15,6 @@ import torch
 from autdtorch.fdtd.absorption import Absorption
 from autdtorch.fdtd.grouping import USUAL_PERIODS
 from autdtorch.fdtd.kernels.choice import make_kernel
-from autdtorch.fdtd.reflection import with_images
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import SILENCE, SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly
@@ -121,17 +120,9 @@ class AbsorbingCells(NamedTuple):
     share: float
 
     @classmethod
-    def of(
-        cls,
-        form: Absorption,
-        places: torch.Tensor,
-        region: Region,
-        group: Iterable[int],
-        mirrors: Sequence[Mirror],
-    ) -> Self:
-        """Return the cells of a grid of a group of a region's bodies and their images in mirrors."""
-        owners = [number for number in group for _ in with_images([region.bodies[number]], mirrors)]
-        return cls(form, places, owners, 0.5 ** len(mirrors))
+    def of(cls, form: Absorption, places: torch.Tensor, region: Region, mirrors: Sequence[object]) -> Self:
+        """Return the cells of a grid of a region, in which bodies are with their images in some mirrors."""
+        return cls(form, places, [body.number for body in region.bodies], 0.5 ** len(mirrors))
 
 
 class Simulation(ABC):
@@ -245,7 +236,7 @@ class Simulation(ABC):
     @cached_property
     def symmetries(self) -> list[Symmetry]:
         """Symmetries of the scene on its grid."""
-        axes = self.plan.grouping.axes[0]
+        axes = self.plan.grouping.grids[0].axes
         every = symmetries(self.assemblies, axes, self.transducers)
         return [each for each in every if each.keeps(self.plan.region.mirrors)]
 

@@ -20,7 +20,6 @@ from tqdm import tqdm
 
 from autdtorch.fdtd.kernels.contract import Receivers, Sources, WaveState
 from autdtorch.fdtd.kernels.cpu import CpuKernel
-from autdtorch.fdtd.reflection import whole_region
 from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, assemble, drive_dft, drive_signal
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.utils.array_types import Array
@@ -107,7 +106,7 @@ class Outcome:
 def run_trial(trial: Trial) -> Outcome:
     """Step the scene of a trial, driven and free."""
     try:
-        assembly = assemble(whole_region(region_of(trial.scene)), trial.spacing, trial.dtype)
+        assembly = assemble(region_of(trial.scene).whole, trial.spacing, trial.dtype)
     except Exception as error:  # counts as a failure: all scenes are valid
         infinite = dict.fromkeys(LARGEST_RISE, math.inf)
         return Outcome(trial, infinite, infinite, False, math.inf, f"assembling: {error!r}")

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 from autdtorch.fdtd.grid import MIN_CELLS_PER_WAVELENGTH, make_grid
-from autdtorch.fdtd.reflection import whole_region
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
@@ -93,7 +92,7 @@ def draw_trial(seed: int, number: int, long_share: float = LONG_SHARE) -> Trial:
 
 def _refused(scene: Scene, spacing: float) -> bool:
     """Return whether an obstacle is too slow for the spacing, or a wall that reacts: all errors here."""
-    region = whole_region(region_of(scene))
+    region = region_of(scene).whole
     for wall in (body for body in region.bodies if body.continued):
         if wall.impedance is not None or (wall.fluid is not None and wall.fluid.density.imag):
             return True

@@ -273,16 +273,16 @@ def test_obstacles_share_a_box_where_that_is_cheaper():
     near = Sphere((NEAR[0], NEAR[1], NEAR[2] + 9e-3), 3e-3, rigid=True)
     scene = far_apart(Sphere(NEAR, 4e-3, rigid=True), Sphere(FAR, 4e-3, rigid=True), near)
     grouping = cheapest(scene, 1e-3)
-    assert sorted(grouping.groups) == [(0, 2), (1,)]
+    assert sorted(grid.group for grid in grouping.grids) == [(0, 2), (1,)]
     assert grouping.box_cost(1) < one_box(region_of(scene), 1e-3).box_cost(1)
     # on coarse cells boundary layers fill each box: one is cheaper
-    assert len(cheapest(scene, 2.8e-3).groups) == 1
+    assert len(cheapest(scene, 2.8e-3).grids) == 1
     # Steps alone would favour two boxes, 0.8 to 1; the sums between them take as long once more.
-    assert [len(cheapest(cubes(36e-3, gap), 2e-3).groups) for gap in (180e-3, 360e-3)] == [1, 2]
+    assert [len(cheapest(cubes(36e-3, gap), 2e-3).grids) for gap in (180e-3, 360e-3)] == [1, 2]
     # Multiple reflections between them would need too many passes.
     plate = Box((12e-3, 32e-3, 32e-3), (2e-3, 50e-3, 50e-3), rigid=True)
     other = dataclasses.replace(plate, center=(42e-3, 32e-3, 32e-3))
-    assert len(cheapest(far_apart(plate, other), 1e-3).groups) == 1
+    assert len(cheapest(far_apart(plate, other), 1e-3).grids) == 1
 
 
 def cheapest(scene, spacing):

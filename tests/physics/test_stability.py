@@ -25,7 +25,6 @@ from autdtorch.fdtd.assembly.heterogeneous import heterogeneous_cells
 from autdtorch.fdtd.grid import make_grid
 from autdtorch.fdtd.kernels.contract import uniform_state
 from autdtorch.fdtd.kernels.cpu import CpuKernel
-from autdtorch.fdtd.reflection import whole_region
 from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
 from autdtorch.fdtd.stepping import assemble, drive_dft, drive_signal
@@ -160,7 +159,7 @@ def assert_not_negative(matrix, largest):
 @pytest.mark.parametrize("number", SCENES)
 def test_energy_is_symmetric_positive_and_bounded(number):
     trial = draw_trial(0, number, long_share=1.0)
-    region = whole_region(region_of(trial.scene))
+    region = region_of(trial.scene).whole
     grid = make_grid(region, trial.spacing)
     stencil = tuned_stencil(grid.kappa)
     elements = elements_of(region, grid, stencil)
@@ -305,7 +304,7 @@ def test_a_given_time_step_is_kept_below_the_limit():
 
 def test_many_steps_in_a_period_take_double_precision():
     """In single precision free air grows by 4e2 in 20 periods of 6000 steps, and does not in double."""
-    region = whole_region(region_of(small_scene(())))
+    region = region_of(small_scene(())).whole
     dtypes = [
         assemble(region, 2e-3, torch.float32, 1 / (count * region.frequency)).dtype for count in (100, 6000)
     ]

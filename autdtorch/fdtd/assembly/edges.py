@@ -15,7 +15,7 @@ import torch
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from autdtorch.fdtd.region import Shape
+from autdtorch.fdtd.shapes import Shape
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.spatial import doubled_normals, sides_of
 

@@ -24,7 +24,8 @@ from autdtorch.fdtd.assembly.losses import GROUND, with_losses
 from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, quadratic, roughness
 from autdtorch.fdtd.assembly.unions import Union, unions_of
 from autdtorch.fdtd.grid import Grid
-from autdtorch.fdtd.region import Region, bounds
+from autdtorch.fdtd.region import Region
+from autdtorch.fdtd.shapes import bounds
 from autdtorch.fdtd.stencil import Stencil, places_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.process import spread

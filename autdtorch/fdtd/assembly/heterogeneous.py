@@ -28,7 +28,7 @@ from autdtorch.fdtd.assembly.element import (
 )
 from autdtorch.fdtd.assembly.elements import Elements
 from autdtorch.fdtd.assembly.losses import COUPLING, GROUND, MASS, condensed_loss
-from autdtorch.fdtd.region import Shape
+from autdtorch.fdtd.shapes import Shape
 from autdtorch.fdtd.stencil import Stencil, flat_offsets, places_of
 from autdtorch.utils.array_types import AnyArray, Array, Index
 from autdtorch.utils.distinct import distinct_cells, distinct_rows, places_among

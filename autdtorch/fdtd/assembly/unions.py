@@ -11,10 +11,11 @@ import torch
 from autdtorch.fdtd.assembly.element import Materials
 from autdtorch.fdtd.assembly.materials import Kind, materials_of
 from autdtorch.fdtd.grid import Grid
-from autdtorch.fdtd.region import Body, Region, Shape, bounds
+from autdtorch.fdtd.region import Body, Region
+from autdtorch.fdtd.shapes import Shape, bounds
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.thin_walls import thickened
-from autdtorch.fdtd.turning import is_along, slender_faces
+from autdtorch.fdtd.turning import slender_faces
 from autdtorch.utils.array_types import Array, Index
 
 # Distance by which bodies are grown, so that touching bodies leave no film of air between them
@@ -97,7 +98,7 @@ def unions_of(region: Region, grid: Grid, stencil: Stencil) -> tuple[list[Union]
         kind = Kind(body.fluid, body.impedance)
         if kind not in kinds:
             kinds.append(kind)
-        aligned = is_along(body.shape, np.eye(3), grid.spacing)
+        aligned = body.is_along(np.eye(3), grid.spacing)
         union = Union(
             (body.shape,),
             kinds.index(kind),

@@ -45,7 +45,7 @@ class BodyWaves:
     @cached_property
     def axes(self) -> torch.Tensor:
         """The axes of the grid, along which waves are taken: the columns of a matrix (3, 3)."""
-        return torch.from_numpy(self._grouping.axes[0]).mT.contiguous()
+        return torch.from_numpy(self._grouping.grids[0].axes).mT.contiguous()
 
     @cached_property
     def runs(self) -> list[list[int]]:
