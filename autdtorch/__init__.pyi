@@ -55,6 +55,7 @@ from .plot.view3d import animate3d, view3d
 from .propagators import SteadyStateWarning, cell_centers, differentiable_field, make_propagator, volume_field
 from .propagators.estimate import Estimate, estimate
 from .propagators.nearby import NearbyPoses
+from .propagators.tmatrix.force import force_matrices, radiation_force, radiation_torque
 from .propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
 from .scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
 from .scene.drive import amplitudes_of, drive_from_phases, focus_phases, phases_of
@@ -141,6 +142,7 @@ __all__ = [
     "focus_bound",
     "focus_metrics",
     "focus_phases",
+    "force_matrices",
     "gabs",
     "gradient_ascent",
     "green",
@@ -174,6 +176,8 @@ __all__ = [
     "plot_trials",
     "polyline_points",
     "porous",
+    "radiation_force",
+    "radiation_torque",
     "random_search",
     "run",
     "save_calibration",

@@ -71,15 +71,18 @@ NOT_CALLED_BY_USERS = {
 #: Methods that the driver calls, and that authors of methods implement.
 INSIDE_METHODS = {"advance", "begin", "check", "most_at_once", "most_evaluations", "numbers_kept"}
 INSIDE_METHODS |= {
+    "by_poses",
     "by_waves",
     "checked",
     "coarser",
     "for_scene",
     "forward",
+    "images_around",
     "levels",
     "recorded",
     "require_fit",
     "slope",
+    "together_on",
 }
 INSIDE_METHODS |= {"at", "farthest", "near", "section", "wanted", "write_file"}
 
@@ -476,6 +479,10 @@ OTHERS: dict[str, Any] = {
     "plot_poses.places": [0.0, 1.0],
     "plot_poses.bounds": [3.0, 3.0],
     "TMatrixCluster.bodies": Made(lambda _: [operator()]),
+    **{
+        f"{name}.bodies": Made(lambda _: at.make_propagator(BALL, "tmatrix"))
+        for name in ("force_matrices", "radiation_force", "radiation_torque")
+    },
     "save_field.points": GRID,
     "save_field.pressure": torch.ones(2, 3, 4, dtype=torch.complex128),
     "weakest_focus.pressure": torch.ones(2, 3),

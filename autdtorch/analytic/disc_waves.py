@@ -88,6 +88,10 @@ class MeanWaves(NamedTuple):
         place = torch.cat([target for _, target, _ in self.means]).argsort()
         return turned(torch.cat(parts, dim=-1)[..., place], self.maps)
 
+    def driven(self, drive: torch.Tensor) -> torch.Tensor:
+        """Return the sums (..., R, N) of the means with the weights (..., R, M) of their discs."""
+        return self._replace(waves=drive @ self.waves).matrix
+
     def weighted(self, weights: torch.Tensor) -> torch.Tensor:
         """Return the sums (..., P, M) of the means with weights (..., P, N)."""
         before = turned(weights, [each.mT for each in self.maps])

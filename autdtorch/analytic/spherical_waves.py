@@ -197,7 +197,7 @@ def _slopes(
     waves = outgoing_waves(degree + 1, wavenumber, offsets, conjugate)
     up, down, along = (
         (factor[:, 0] * waves[:, place[:, 0]] + factor[:, 1] * waves[:, place[:, 1]]) * wavenumber
-        for place, factor in _ladder(degree)
+        for place, factor in ladder(degree)
     )
     if conjugate:  # d/dx - i d/dy of Y_lm^* are neighbours of m + 1
         up, down = down, up
@@ -205,7 +205,7 @@ def _slopes(
 
 
 @functools.lru_cache(8)
-def _ladder(degree: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
+def ladder(degree: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
     """Return the places (N, 2) of neighbours and their factors, for d/dx + i d/dy, d/dx - i d/dy and d/dz.
 
     Martin, Multiple Scattering (2006), section 3.7. Factors over k.

@@ -19,7 +19,7 @@ from autdtorch.analytic.wave_frames import translation
 from autdtorch.propagators.multiple_scattering import solved
 from autdtorch.scene.arrays import TransducerArray, apertures_of, complex_strengths_of, radii_of
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.images import Image, distinct
+from autdtorch.utils.images import NO_MIRRORS, Image, distinct
 from autdtorch.utils.process import require_memory
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
@@ -88,6 +88,49 @@ def joined(bodies: Sequence[TMatrix], images: Sequence[Image]) -> torch.Tensor:
     return solved(maps, _between(bodies, images), torch.split(torch.eye(sum(sizes), **COMPLEX), sizes))
 
 
+def waves_of_body(
+    bodies: Sequence[TMatrix],
+    number: int,
+    array: TransducerArray,
+    images: Sequence[Image],
+    drive: torch.Tensor | None = None,
+    together: tuple[torch.Tensor, torch.Tensor] | None = None,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the coefficients (..., n, R) [Pa] of all regular waves on a body and of its outgoing waves.
+
+    The array, its images and all other bodies send the regular ones. R drives are (..., R, M), or one of each
+    transducer alone. `together` maps the array's waves on all bodies to both, if it is known.
+    """
+    each = [IncomingWaves.of(body, array, images) for body in bodies]
+    incident = [waves.matrix if drive is None else waves.driven(drive).mT for waves in each]
+    if together is not None:
+        regular, outgoing = (part @ torch.cat(incident, dim=-2) for part in together)
+        return regular, outgoing
+    between, sizes = _between(bodies, images), [len(body.matrix) for body in bodies]
+    scattered = torch.split(solved([body.matrix for body in bodies], between, incident), sizes, dim=-2)
+    return incident[number] + _echoes(between[number], scattered), scattered[number]
+
+
+def joined_on(
+    bodies: Sequence[TMatrix], number: int, every: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the maps (n, N) from the array's waves on all bodies to the regular and outgoing waves of one.
+
+    `every` is what `joined` returns.
+    """
+    sizes = [len(body.matrix) for body in bodies]
+    parts = torch.split(every, sizes)
+    direct = torch.split(torch.eye(len(every), **COMPLEX), sizes)[number]
+    return direct + _echoes(_between(bodies, NO_MIRRORS)[number], parts), parts[number]
+
+
+def _echoes(between: Sequence[torch.Tensor | None], scattered: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Return the regular waves on a body that the outgoing waves of all bodies bring to it."""
+    pairs = zip(between, scattered, strict=True)
+    parts = [part @ waves for part, waves in pairs if part is not None]
+    return torch.stack(parts).sum(dim=0) if parts else torch.zeros((), **COMPLEX)
+
+
 def waves_at(bodies: Sequence[TMatrix], points: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:
     """Return the outgoing waves (..., P, N) of all bodies and their images at points (..., P, 3) [m].
 
@@ -150,6 +193,12 @@ class IncomingWaves:
         each = [(index, weight, _dense(waves).mT) for index, weight, waves in self.parts]
         return self._summed(each)
 
+    def driven(self, drive: torch.Tensor) -> torch.Tensor:
+        """Return the coefficients (..., R, N) [Pa] under drives (..., R, M)."""
+        strong = self.strengths * drive
+        each = [weight * _driven(waves, strong[..., index]) for index, weight, waves in self.parts]
+        return torch.stack(each).sum(dim=0)
+
     def weighted(self, weights: torch.Tensor) -> torch.Tensor:
         """Return the sums (..., P, M) of the coefficients with weights (..., P, N)."""
         each = [
@@ -167,6 +216,10 @@ class IncomingWaves:
 
 def _dense(waves: MeanWaves | torch.Tensor) -> torch.Tensor:
     return waves.matrix if isinstance(waves, MeanWaves) else waves
+
+
+def _driven(waves: MeanWaves | torch.Tensor, drive: torch.Tensor) -> torch.Tensor:
+    return waves.driven(drive) if isinstance(waves, MeanWaves) else drive @ waves
 
 
 def _alike(array: TransducerArray) -> list[torch.Tensor]:

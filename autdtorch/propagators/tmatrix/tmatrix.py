@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -22,7 +22,7 @@ from autdtorch.fdtd.kernels.choice import available_kernel
 from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.propagators.store import store_in
 from autdtorch.propagators.tmatrix.body import Solver, placed
-from autdtorch.propagators.tmatrix.scattering import joined, scattered_field
+from autdtorch.propagators.tmatrix.scattering import joined, joined_on, scattered_field
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import composed_rotation
 from autdtorch.scene.medium import Medium
@@ -32,7 +32,7 @@ from autdtorch.scene.scene import require_in_front
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.files import read_arrays, write_arrays
 from autdtorch.utils.hints import renamed_keywords
-from autdtorch.utils.images import NO_MIRRORS, images_of
+from autdtorch.utils.images import NO_MIRRORS, Image, images_of
 from autdtorch.utils.process import cached_property, one_library_thread, spread
 from autdtorch.utils.units import turn_tensor, warn_user
 from autdtorch.utils.validation import (
@@ -333,28 +333,54 @@ class TMatrixCluster:
         every = _broadcast("points", of_points, f" beside poses {self.poses}", self.poses, grid[:-1])
         for name, places in (("points", targets.detach()), ("array.positions", array.positions)):
             require_in_front(self.reflectors, name, places.reshape(-1, 3))
-        everything = torch.cat(
-            [targets.detach(), array.positions, *(body.center.reshape(-1, 3) for body in self.bodies)]
-        )
-        size = float((everything.amax(dim=0) - everything.amin(dim=0)).norm().detach())
-        mirrors = [reflector.mirror for reflector in self.reflectors]
-        images = images_of(mirrors, self.bodies[0].wavenumber, size)
-        together = None if self._before is None else self._before._joined
+        images = self.images_around(torch.cat([targets.detach(), array.positions]))
         direct = free_space_matrix(targets, array, self.bodies[0].wavenumber, images).reshape(*grid, -1)
         if not self.poses:
-            scattered = scattered_field(self.bodies, array, targets, images, together)
+            scattered = scattered_field(self.bodies, array, targets, images, self.together)
             return direct + scattered.reshape(direct.shape)
         sets = targets.reshape(*grid, 3).expand(*every, -1, -1).reshape(-1, grid[-1], 3)
-        bodies = [body._in_poses(every) for body in self.bodies]
+
+        def of_poses(bodies: Sequence[TMatrix], part: slice) -> torch.Tensor:
+            return scattered_field(bodies, array, sets[part], images, self.together)
+
+        scattered = self.by_poses(every, len(array), len(images) > 1, of_poses)
+        return direct + scattered.reshape(*every, *direct.shape[-2:])
+
+    @property
+    def together(self) -> torch.Tensor | None:
+        """The map (N, N) from regular waves on all bodies to all outgoing ones, if they have moved as one."""
+        return None if self._before is None else self._before._joined
+
+    def together_on(self, number: int) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """Return the maps (n, N) of `joined_on` for a body, if all have moved as one."""
+        still = self._before
+        return None if still is None else joined_on(still.bodies, number, still._joined)
+
+    def images_around(self, places: torch.Tensor) -> tuple[Image, ...]:
+        """Return the images of the space, as they are needed between the bodies and places (n, 3) [m]."""
+        everything = torch.cat([places, *(body.center.reshape(-1, 3) for body in self.bodies)])
+        size = float((everything.amax(dim=0) - everything.amin(dim=0)).norm().detach())
+        return images_of([each.mirror for each in self.reflectors], self.bodies[0].wavenumber, size)
+
+    def by_poses(
+        self,
+        poses: Sequence[int],
+        columns: int,
+        echoes: bool,
+        work: Callable[[Sequence[TMatrix], slice], torch.Tensor],
+    ) -> torch.Tensor:
+        """Return what `work` does for the bodies in each of the poses (...), flat, a few poses at a time.
+
+        It has so many columns of waves, and `echoes` if the bodies' waves come back to them.
+        """
+        bodies = [body._in_poses(poses) for body in self.bodies]
         waves = sum(len(body.matrix) for body in bodies)
-        coupled = together is None and (len(bodies) > 1 or len(images) > 1)
-        count = 1 + _AT_ONCE // (waves * max(len(array), waves if coupled else 1))
+        coupled = self.together is None and (len(bodies) > 1 or echoes)
+        count = 1 + _AT_ONCE // (waves * max(columns, waves if coupled else 1))
         gradients = torch.is_grad_enabled()
 
-        def of_poses(first: int) -> torch.Tensor:
+        def part(first: int) -> torch.Tensor:
             with torch.set_grad_enabled(gradients):  # which holds in one thread only
-                some = [body._some(first, count) for body in bodies]
-                return scattered_field(some, array, sets[first : first + count], images, together)
+                return work([body._some(first, count) for body in bodies], slice(first, first + count))
 
-        parts = spread(of_poses, range(0, len(sets), count))
-        return direct + torch.cat(parts).reshape(*every, *direct.shape[-2:])
+        return torch.cat(spread(part, range(0, math.prod(poses), count)))

@@ -1,0 +1,188 @@
+"""The radiation force and torque on bodies with known T-matrices.
+
+Let d be the coefficients of the regular waves that come in on a body and b = T d those of its outgoing waves.
+Far away, both are waves towards the body, d / 2, and away from it, d / 2 + b. The force is the momentum that
+the former bring less what the latter take away,
+
+    F = -1 / (2 rho w^2) Re (d + b)^H P b,   P = -i grad / k,
+
+and, with L = -i r x grad for k P, the torque. Sums over neighbouring degrees and orders (Silva 2011,
+doi:10.1121/1.3652894; Gong and Baudoin 2021, doi:10.1121/10.0005491), they are exact for the linear field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import torch
+
+from autdtorch.analytic.momentum import angular_momentum, linear_momentum
+from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
+from autdtorch.propagators.tmatrix.scattering import waves_of_body
+from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.drive import validate_drive
+from autdtorch.scene.medium import Medium
+from autdtorch.scene.scene import require_in_front
+from autdtorch.utils.images import Image
+from autdtorch.utils.process import one_library_thread
+from autdtorch.utils.validation import ArrayLike, integer_at_least, invalid, require_kind
+
+Momentum = Callable[[torch.Tensor], torch.Tensor]
+"""Momentum: maps coefficients of waves (..., N, R) to those of their momentum (3, ..., N, R)."""
+
+
+def radiation_force(
+    bodies: TMatrixPropagator | TMatrixCluster | TMatrix,
+    drive: ArrayLike,
+    body: int = 0,
+    *,
+    array: TransducerArray | None = None,
+    medium: Medium | None = None,
+) -> torch.Tensor:
+    """Return the mean radiation force [N] on a body, among others and before reflectors.
+
+    Exact for the linear field and its T-matrix, for bodies that absorb, too. Gradients by the drive and by
+    poses pass. Streaming of the air is not included. In air that absorbs, it is the force that the waves at
+    the body exert in air that does not.
+
+    Args:
+        bodies: a propagator of method "tmatrix", or bodies in any poses, with an array and a medium.
+        drive: (..., M) complex, |q| <= 1. With bodies in many poses, leading dimensions are broadcast.
+        body: its index in `TMatrixPropagator.bodies.bodies`, or `TMatrixCluster.bodies`.
+        array: that drives the bodies; a propagator has its own.
+        medium: around the bodies; a propagator has its own.
+
+    Returns:
+        float64 (..., 3) along the axes of the scene.
+
+    Raises:
+        ValueError: an argument of another kind, shape or range.
+    """
+    return _Driven.of(bodies, body, array, medium).sums(linear_momentum, drive)
+
+
+def radiation_torque(
+    bodies: TMatrixPropagator | TMatrixCluster | TMatrix,
+    drive: ArrayLike,
+    body: int = 0,
+    *,
+    array: TransducerArray | None = None,
+    medium: Medium | None = None,
+) -> torch.Tensor:
+    """Return the mean radiation torque (..., 3) [N m] on a body about its centre; see `radiation_force`.
+
+    The centre is that of its circumscribed sphere, `TMatrix.center`. About another point, add the
+    cross product of the centre's offset from it and the force.
+    """
+    return _Driven.of(bodies, body, array, medium).sums(angular_momentum, drive)
+
+
+def force_matrices(
+    bodies: TMatrixPropagator | TMatrixCluster | TMatrix,
+    body: int = 0,
+    *,
+    array: TransducerArray | None = None,
+    medium: Medium | None = None,
+) -> torch.Tensor:
+    """Return Hermitian A (..., 3, M, M) [N], complex128: the force on a body is q^H A q.
+
+    Leading dimensions are those of the poses. Arguments and errors are those of `radiation_force`.
+    """
+    return _Driven.of(bodies, body, array, medium).matrices(linear_momentum)
+
+
+@dataclass(frozen=True)
+class _Driven:
+    """A body among others that an array drives; `scale` is 1 / (2 rho w^2)."""
+
+    cluster: TMatrixCluster
+    number: int
+    array: TransducerArray
+    images: Sequence[Image]
+    scale: float
+
+    @classmethod
+    def of(
+        cls,
+        bodies: TMatrixPropagator | TMatrixCluster | TMatrix,
+        number: int,
+        array: TransducerArray | None,
+        medium: Medium | None,
+    ) -> Self:
+        if isinstance(bodies, TMatrixPropagator):
+            for name, value in (("array", array), ("medium", medium)):
+                if value is not None:
+                    raise invalid(name, value, "must be left out: the propagator's scene has it")
+            scene = bodies.scene
+            cluster, array, medium, images = bodies.bodies, scene.array, scene.medium, scene.images
+        else:
+            cluster = TMatrixCluster([bodies]) if isinstance(bodies, TMatrix) else bodies
+            require_kind("bodies", cluster, TMatrixCluster)
+            require_kind("array", array, TransducerArray)
+            require_kind("medium", medium, Medium)
+            assert array is not None
+            assert medium is not None
+            require_in_front(cluster.reflectors, "array.positions", array.positions)
+            images = cluster.images_around(array.positions)
+        number, count = integer_at_least("body", number, 0), len(cluster.bodies)
+        if number >= count:
+            raise invalid("body", number, f"must be in 0 to {count - 1}")
+        frequency = cluster.bodies[number].wavenumber.real * medium.sound_speed
+        return cls(cluster, number, array, images, 1 / (2 * medium.density * frequency**2))
+
+    @one_library_thread()
+    def sums(self, momentum: Momentum, drive: ArrayLike) -> torch.Tensor:
+        """Return what a body takes up of a momentum (..., 3) under drives (..., M)."""
+        drive, together = validate_drive(drive, len(self.array)).cpu(), self.cluster.together_on(self.number)
+
+        def of_drives(bodies: Sequence[TMatrix], drives: torch.Tensor) -> torch.Tensor:  # (..., R, M)
+            regular, outgoing = waves_of_body(bodies, self.number, self.array, self.images, drives, together)
+            taken = -(momentum(regular + outgoing).conj() * outgoing).sum(dim=-2).real
+            return (self._to_scene(bodies, momentum) @ taken.movedim(0, -2)).mT
+
+        if not self.cluster.poses:
+            flat = drive.reshape(-1, drive.shape[-1])
+            return of_drives(self.cluster.bodies, flat).reshape(*drive.shape[:-1], 3)
+        try:
+            every = np.broadcast_shapes(self.cluster.poses, drive.shape[:-1])
+        except ValueError:
+            beside = f"beside poses {self.cluster.poses}; leading dimensions must broadcast"
+            raise ValueError(f"drive: shape {tuple(drive.shape)} {beside}") from None
+        flat = drive.expand(*every, -1).reshape(-1, 1, drive.shape[-1])
+        forces = self.cluster.by_poses(
+            every,
+            len(self.array),
+            len(self.images) > 1,
+            lambda bodies, part: of_drives(bodies, flat[part]),
+        )
+        return forces.reshape(*every, 3)
+
+    @one_library_thread()
+    def matrices(self, momentum: Momentum) -> torch.Tensor:
+        """Return the Hermitian matrices (..., 3, M, M) of `sums`."""
+        together = self.cluster.together_on(self.number)
+
+        def of_units(bodies: Sequence[TMatrix], _: slice = slice(None)) -> torch.Tensor:
+            regular, outgoing = waves_of_body(bodies, self.number, self.array, self.images, together=together)
+            taken = -(momentum(regular + outgoing).mH @ outgoing).movedim(0, -3)
+            scene = self._to_scene(bodies, momentum).to(taken.dtype)
+            turned = torch.einsum("...ij,...jmn->...imn", scene, (taken + taken.mH) / 2)
+            return turned
+
+        poses = self.cluster.poses
+        if not poses:
+            return of_units(self.cluster.bodies)
+        matrices = self.cluster.by_poses(poses, len(self.array), len(self.images) > 1, of_units)
+        return matrices.reshape(*poses, *matrices.shape[-3:])
+
+    def _to_scene(self, bodies: Sequence[TMatrix], momentum: Momentum) -> torch.Tensor:
+        """Return the map (..., 3, 3) from momentum along a body's axes to that in the scene [SI]."""
+        body = bodies[self.number]
+        if momentum is linear_momentum:
+            return self.scale * body.axes
+        handedness: torch.Tensor = torch.linalg.det(body.axes)[..., None, None]
+        return self.scale / body.wavenumber.real * handedness * body.axes

@@ -1,0 +1,272 @@
+"""Radiation force and torque: against series of spheres, and integrals of the stress around bodies."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from small_scenes import assert_slopes, relative_error
+
+import autdtorch as at
+from autdtorch.propagators.tmatrix.scattering import scattered_waves, waves_at
+from autdtorch.utils.images import NO_MIRRORS
+
+AIR = at.Medium(density=1.2, sound_speed=340.0)
+FREQUENCY = 40e3
+WAVENUMBER = 2 * math.pi * FREQUENCY / AIR.sound_speed
+ARRAY = at.TransducerArray.grid((2, 3), 10e-3, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius=0)
+DRIVE = torch.polar(torch.linspace(0.4, 1, 6).double(), 1.3 * torch.arange(6).double() ** 2)
+MATERIALS = {
+    "rigid": {"rigid": True},
+    "EPS": {"density": 29.0, "sound_speed": 900.0},
+    "water": {"density": 1000.0, "sound_speed": 1480.0},
+    "absorbing": {"density": 5.0, "sound_speed": 600.0, "absorption": 300.0},
+}
+
+
+def sphere(center: tuple[float, float, float], radius: float, material: str = "rigid", error: float = 1e-8):
+    return at.TMatrix.of(at.Sphere(center, radius, **MATERIALS[material]), AIR, FREQUENCY, error=error)
+
+
+def with_slopes(
+    field: Callable[[torch.Tensor], torch.Tensor], points: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The field (P,) at points (P, 3), and its gradient (P, 3)."""
+    points = points.clone().requires_grad_(True)
+    values = field(points)
+    parts = [
+        torch.autograd.grad(each.sum(), points, retain_graph=True)[0] for each in (values.real, values.imag)
+    ]
+    return values.detach(), torch.complex(*parts)
+
+
+def by_surface(
+    bodies: at.TMatrix | at.TMatrixCluster,
+    drive: torch.Tensor,
+    center: torch.Tensor,
+    radius: float,
+    array: at.TransducerArray = ARRAY,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Force and torque about the centre, from the field and its gradient on a sphere around it."""
+    heights, weights = np.polynomial.legendre.leggauss(20)
+    turns = 2 * math.pi * np.arange(40) / 40
+    across = np.sqrt(1 - heights**2)[:, None]
+    normals = [across * np.cos(turns), across * np.sin(turns), heights[:, None] + 0 * turns]
+    normals = torch.from_numpy(np.stack(normals, axis=-1).reshape(-1, 3))
+    areas = torch.from_numpy(np.repeat(weights, 40)) * radius**2 * 2 * math.pi / 40
+    pressure, slopes = with_slopes(
+        lambda points: bodies.transfer_matrix(array, points) @ drive, center + radius * normals
+    )
+    density, speed = AIR.density, AIR.sound_speed
+    velocity = slopes / (2j * math.pi * FREQUENCY * density)
+    energy = pressure.abs() ** 2 / (4 * density * speed**2) - density / 4 * velocity.abs().square().sum(dim=1)
+    normal = (velocity * normals).sum(dim=1)
+    flux = energy[:, None] * normals + density / 2 * (velocity * normal.conj()[:, None]).real
+    force = -areas[:, None] * flux
+    return force.sum(dim=0), radius * torch.linalg.cross(normals, force).sum(dim=0)
+
+
+def far_away(*directions: tuple[float, float, float]) -> at.TransducerArray:
+    """Transducers so far away that each sends a plane wave of 1 Pa to the origin."""
+    distance = 1e6
+    places = -distance * torch.tensor(directions).double()
+    return at.TransducerArray(places, [0.0, 0.0, 1.0], source_strength=distance, radius=0)
+
+
+def energy_density() -> float:
+    """The mean energy density [J/m^3] of a plane wave of 1 Pa."""
+    return 1 / (2 * AIR.density * AIR.sound_speed**2)
+
+
+SIZES = (0.05, 0.3, 1.0, 2.5, 8.0)
+ALONG_Z = (0.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("material", ["rigid", "EPS", "water", "absorbing"])
+def test_the_force_of_plane_and_standing_waves_is_the_series(material):
+    """Hasegawa and Yosioka (1969), and Hasegawa (1979): radiation force functions of a sphere."""
+    for size in SIZES:
+        radius = size / WAVENUMBER
+        body = sphere((0.0, 0.0, 0.0), radius, material)
+        coefficient = body.matrix.diagonal().numpy()[[n * n for n in range(body.degree + 1)]]
+        real, imag, n = coefficient.real, coefficient.imag, np.arange(body.degree)
+        products = real[:-1] * real[1:] + imag[:-1] * imag[1:]
+        plane = -4 / size**2 * ((n + 1) * (real[:-1] + real[1:] + 2 * products)).sum()
+        pairs = imag[:-1] * (1 + 2 * real[1:]) - imag[1:] * (1 + 2 * real[:-1])
+        standing = 2 / size**2 * ((n + 1) * (-1) ** (n + 1) * pairs).sum()
+        array, scale = far_away(ALONG_Z, (0.0, 0.0, -1.0)), math.pi * radius**2 * energy_density()
+        drives = torch.tensor([[1, 0], [np.exp(0.4j) / 2, np.exp(-0.4j) / 2]])  # the second: cos(kz + 0.4)
+        force = at.radiation_force(body, drives, array=array, medium=AIR)
+        assert force[0, 2].item() == pytest.approx(scale * plane, rel=1e-6)
+        assert force[1, 2].item() == pytest.approx(scale * standing * math.sin(0.8), rel=1e-6)
+        assert force[:, :2].abs().max() < 1e-6 * force.norm()  # rounding of places 1e6 m away
+
+
+@pytest.mark.parametrize("material", ["rigid", "EPS", "water"])
+def test_the_force_on_a_small_sphere_tends_to_gorkovs(material):
+    """Gor'kov (1962): 4 pi k a^3 E (f_1 / 3 + f_2 / 2) sin 2 kz, E = |p|^2 / (4 rho c^2)."""
+    density, speed = (MATERIALS[material].get(name, math.inf) for name in ("density", "sound_speed"))
+    ratio = density / AIR.density
+    first = 1 - 1 / (ratio * (speed / AIR.sound_speed) ** 2)
+    second = 1.0 if math.isinf(ratio) else 2 * (ratio - 1) / (2 * ratio + 1)
+    array, errors = far_away(ALONG_Z, (0.0, 0.0, -1.0)), []
+    for size in (0.05, 0.1, 0.2):
+        body = sphere((0.0, 0.0, 0.0), size / WAVENUMBER, material)
+        drive = torch.tensor([np.exp(0.4j), np.exp(-0.4j)]) / 2
+        force = at.radiation_force(body, drive, array=array, medium=AIR)[2].item()
+        small = 2 * math.pi * size**3 / WAVENUMBER**2 * energy_density() * (first / 3 + second / 2)
+        errors.append(abs(force / (small * math.sin(0.8)) - 1))
+    assert errors[-1] < 0.1
+    slopes = np.diff(np.log2(errors))
+    assert slopes == pytest.approx([2, 2], abs=0.2)  # the next powers of ka
+
+
+def test_a_body_takes_up_the_stress_around_it():
+    """Off axis, beside another sphere, before a plane, of discs: 1e-8 is left of the waves by default."""
+    body = sphere((30e-3, 4e-3, -3e-3), 5e-3, "absorbing")
+    other = sphere((36e-3, -7e-3, 2e-3), 6e-3)
+    wall = at.Reflector((42.5e-3, 0, 0), (-1.0, 0.0, 0.0))
+    discs = replace(ARRAY, radius=4.5e-3)
+    for bodies, array in (
+        (body, ARRAY),
+        (at.TMatrixCluster([body, other]), ARRAY),
+        (at.TMatrixCluster([body, other], [wall]), discs),
+    ):
+        expected, torque = by_surface(bodies, DRIVE, body.center, 5.5e-3, array)
+        setting = {"array": array, "medium": AIR}
+        # places of images agree to fewer digits than those of waves
+        assert relative_error(at.radiation_force(bodies, DRIVE, **setting), expected) < 1e-5
+        assert relative_error(at.radiation_torque(bodies, DRIVE, **setting), torque) < 1e-5
+
+
+@pytest.fixture(scope="module")
+def cube() -> at.TMatrix:
+    box = at.Box(center=(30e-3, 2e-3, -1e-3), size=(6e-3, 6e-3, 4e-3), rigid=True)
+    return at.TMatrix.of(box, AIR, FREQUENCY, spacing=1.5e-3, error=1e-2)
+
+
+def test_a_turned_body_takes_up_the_stress_around_it(cube):
+    turned = cube.moved((1e-3, 0, 0), (0.4, 0.2, -0.5))
+    expected, torque = by_surface(turned, DRIVE, turned.center, 7e-3)
+    # waves of the array above the degree of T, left out up to 1e-3
+    assert relative_error(at.radiation_force(turned, DRIVE, array=ARRAY, medium=AIR), expected) < 2e-3
+    assert relative_error(at.radiation_torque(turned, DRIVE, array=ARRAY, medium=AIR), torque) < 2e-3
+    assert torque.norm() > 1e-4 * expected.norm() / WAVENUMBER  # a box does turn
+
+
+def test_torque_does_not_depend_on_the_handedness_of_axes():
+    body = sphere((30e-3, 4e-3, -3e-3), 5e-3, "absorbing")
+    mirrored = replace(body, axes=body.axes * torch.tensor([1.0, -1.0, 1.0]).double())
+    torques = [at.radiation_torque(each, DRIVE, array=ARRAY, medium=AIR) for each in (body, mirrored)]
+    assert relative_error(*torques) < 1e-9
+
+
+def test_all_momentum_is_that_of_the_far_field():
+    """Forces on spheres and point sources add up to what the far field carries away."""
+    bodies = [sphere((30e-3, 4e-3, -3e-3), 5e-3, "EPS"), sphere((36e-3, -7e-3, 2e-3), 6e-3)]
+    cluster, strength, far = at.TMatrixCluster(bodies), ARRAY.source_strength * DRIVE, 1e6
+    on_bodies = sum(at.radiation_force(cluster, DRIVE, each, array=ARRAY, medium=AIR) for each in range(2))
+    outgoing = scattered_waves(bodies, ARRAY, NO_MIRRORS)[0] @ DRIVE
+    on_sources = torch.zeros(3, dtype=torch.float64)
+    for index, place in enumerate(ARRAY.positions):
+        others = torch.arange(6) != index
+
+        def regular(point: torch.Tensor, others: torch.Tensor = others) -> torch.Tensor:
+            distance = (point - ARRAY.positions[others]).norm(dim=1)
+            free = (torch.exp(1j * WAVENUMBER * distance) / distance) @ strength[others]
+            return free + waves_at(bodies, point, NO_MIRRORS) @ outgoing
+
+        _, slope = with_slopes(regular, place[None])
+        omega = 2 * math.pi * FREQUENCY
+        on_sources += 2 * math.pi / (AIR.density * omega**2) * (strength[index] * slope[0].conj()).real
+    heights, weights = np.polynomial.legendre.leggauss(40)
+    turns, across = 2 * math.pi * np.arange(80) / 80, np.sqrt(1 - heights**2)[:, None]
+    normals = np.stack(
+        [across * np.cos(turns), across * np.sin(turns), heights[:, None] + 0 * turns], axis=-1
+    )
+    normals = torch.from_numpy(normals.reshape(-1, 3))
+    field = far * cluster.transfer_matrix(ARRAY, far * normals) @ DRIVE
+    areas = torch.from_numpy(np.repeat(weights, 80)) * 2 * math.pi / 80
+    flux = (areas * field.abs().square()) @ normals * energy_density()
+    assert relative_error(on_bodies + on_sources, -flux) < 1e-6
+    assert on_sources.norm() > 0.1 * on_bodies.norm()
+
+
+def test_a_propagator_and_bodies_give_the_forces_of_hermitian_matrices():
+    spheres = [
+        at.Sphere((30e-3, 4e-3, -3e-3), 5e-3, rigid=True),
+        at.Sphere((36e-3, -7e-3, 2e-3), 6e-3, **MATERIALS["EPS"]),
+    ]
+    panel = at.Reflector.behind(ARRAY)
+    scene = at.Scene(ARRAY, AIR, FREQUENCY, [(60e-3, 0, 0)], spheres, reflectors=[panel])
+    propagator = at.make_propagator(scene, "tmatrix")
+    drives = torch.stack([DRIVE, DRIVE.conj(), 0 * DRIVE])
+    for body in range(2):
+        force = at.radiation_force(propagator, drives, body)
+        matrices = at.force_matrices(propagator, body)
+        assert matrices.shape == (3, 6, 6)
+        assert torch.equal(matrices, matrices.mH)
+        products = torch.einsum("rm,imn,rn->ri", drives.conj(), matrices, drives)
+        assert relative_error(products, force) < 1e-9
+        assert not force[2].any()
+        alone = at.radiation_force(propagator.bodies, DRIVE, body, array=ARRAY, medium=AIR)
+        assert relative_error(force[0], alone) < 1e-9
+
+
+def test_many_poses_at_once_are_each_on_its_own(cube):
+    offsets = torch.tensor([[0.0, 0, 0], [1e-3, -2e-3, 0], [0, 0, 1e-3]])
+    other = cube.moved((0, 25e-3, 0))
+    setting = {"array": ARRAY, "medium": AIR}
+    drives = torch.stack([DRIVE, DRIVE.conj()])[:, None]
+    cluster = at.TMatrixCluster([cube.moved(offsets, (0.1, 0.2, 0.3)), other])
+    as_one = at.TMatrixCluster([cube, other]).moved(offsets, (0.1, 0.2, 0.3))
+    for many in (cluster, as_one):
+        force = at.radiation_force(many, drives, 1, **setting)
+        torque, matrices = at.radiation_torque(many, DRIVE, **setting), at.force_matrices(many, 1, **setting)
+        assert force.shape == (2, 3, 3)
+        for number in range(3):
+            pair = [each._in_poses((3,))._some(number, 1) for each in many.bodies]
+            pair = at.TMatrixCluster([replace(e, center=e.center[0], axes=e.axes[0]) for e in pair])
+            for row, drive in enumerate(drives[:, 0]):
+                alone = at.radiation_force(pair, drive, 1, **setting)
+                assert relative_error(force[row, number], alone) < 1e-9
+            assert relative_error(matrices[number], at.force_matrices(pair, 1, **setting)) < 1e-9
+            assert relative_error(torque[number], at.radiation_torque(pair, DRIVE, **setting)) < 1e-9
+
+
+def test_gradients_by_pose_and_drive_are_those_of_finite_differences(cube):
+    other = cube.moved((0, 25e-3, 0))
+    setting = {"array": replace(ARRAY, radius=4.5e-3), "medium": AIR}
+
+    def push(pose: torch.Tensor) -> torch.Tensor:
+        cluster = at.TMatrixCluster([cube.moved(pose[:3], pose[3:]), other])
+        return (
+            1e9 * at.radiation_force(cluster, DRIVE, 0, **setting) @ torch.tensor([1.0, 2.0, -1.0]).double()
+        )
+
+    pose = torch.tensor([1e-3, 0.5e-3, -1e-3, 0.2, 0.1, -0.3], dtype=torch.float64)
+    assert_slopes(push, pose, steps=[1e-6] * 3 + [1e-4] * 3)
+    drive = DRIVE.clone().requires_grad_(True)
+    cluster = at.TMatrixCluster([cube, other])
+    (slope,) = torch.autograd.grad(at.radiation_force(cluster, drive, **setting)[0], drive)
+    assert relative_error(slope, 2 * at.force_matrices(cluster, **setting)[0] @ DRIVE) < 1e-9
+
+
+def test_bad_input_is_named():
+    body = sphere((30e-3, 4e-3, -3e-3), 5e-3)
+    setting = {"array": ARRAY, "medium": AIR}
+    with pytest.raises(ValueError, match=r"body: 1; must be in 0 to 0"):
+        at.radiation_force(body, DRIVE, 1, **setting)
+    with pytest.raises(ValueError, match="array: None; must be a TransducerArray"):
+        at.radiation_force(body, DRIVE, medium=AIR)
+    with pytest.raises(ValueError, match=r"drive: shape \(2, 6\) beside poses \(3,\); leading dimensions"):
+        at.radiation_force(body.moved(torch.zeros(3, 3)), torch.stack([DRIVE, DRIVE]), **setting)
+    with pytest.raises(ValueError, match=r"drive: shape \(5,\); must be \(\.\.\., 6\)"):
+        at.radiation_torque(body, DRIVE[:5], **setting)
+    scene = at.Scene(ARRAY, AIR, FREQUENCY, [(60e-3, 0, 0)], [at.Sphere((30e-3, 0, 0), 5e-3, rigid=True)])
+    with pytest.raises(ValueError, match=r"medium: .*; must be left out"):
+        at.force_matrices(at.make_propagator(scene, "tmatrix"), medium=AIR)
+    with pytest.raises(ValueError, match=r"bodies: .*; must be"):
+        at.radiation_force(at.make_propagator(scene, "free_space"), DRIVE)
