@@ -13,7 +13,7 @@ from small_scenes import CUBE, NO_RECEIVERS, NO_SOURCES, all_tensors, assembled_
 from autdtorch.analytic.discs import waves_of
 from autdtorch.analytic.green import green
 from autdtorch.fdtd.kernels.contract import uniform_state
-from autdtorch.fdtd.kernels.cpu import CpuKernel, _alike, _cuts
+from autdtorch.fdtd.kernels.cpu import CpuKernel, _alike, _cuts, _strips
 from autdtorch.fdtd.kernels.cpu_intrinsics import ALIKE
 from autdtorch.fdtd.kernels.cpu_waves import superposition, wave_matrix
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
@@ -81,6 +81,16 @@ def test_chunks_of_planes_are_the_whole(chunks, lossy, monkeypatch):
         assert all(map(torch.equal, all_tensors(*again), all_tensors(*parts)))
 
 
+@pytest.mark.parametrize("lossy", [False, True])
+def test_strips_of_rows_change_no_bit(lossy, monkeypatch):
+    whole = advance(CpuKernel(), torch.float32, 41, lossy)
+    _, ny, nz = whole[0].now.shape
+    monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._STRIP_CELLS", ny * nz // 3)
+    assert len(_strips(whole[0].now.shape, scene_parts(torch.float32)[0].grid.layer_cells)) > 2
+    strips = advance(CpuKernel(), torch.float32, 41, lossy)
+    assert all(map(torch.equal, all_tensors(*strips), all_tensors(*whole)))
+
+
 def test_no_cell_reads_those_inside_rigid_bodies(monkeypatch):
     """The kernel skips them: what they hold at the beginning changes nothing."""
     monkeypatch.setattr("autdtorch.fdtd.stepping._FEWEST_IDLE", 1)
@@ -103,6 +113,8 @@ def test_no_cell_reads_those_inside_rigid_bodies(monkeypatch):
         return all_tensors(state, recorded)
 
     whole = stepped(replace(c, idle=c.idle[:0]), 0)
+    assert all(map(torch.equal, stepped(c, math.nan), whole))
+    monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._STRIP_CELLS", 1)
     assert all(map(torch.equal, stepped(c, math.nan), whole))
 
 

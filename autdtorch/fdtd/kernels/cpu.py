@@ -16,6 +16,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from typing import Any
 
 import numpy as np
 import torch
@@ -50,6 +51,7 @@ from autdtorch.utils.process import spread, thread_count
 _CHUNK_CELLS, _CHUNK_PLANES = 200_000, 32
 _FLAT_CELLS, _FLAT_PLANES = 500_000, 12  # The same for two chunks of large planes
 _GROUP_CELLS = 3000  # Cells of the layers across an axis that are computed at once
+_STRIP_CELLS = 50_000  # Cells of a strip, from twice as many on: a core's cache holds its planes and their sums
 # Shares of the processors' time that workers got: below the first a single worker continues, above the second
 # several again
 _CROWDED, _FREE = 0.75, 0.9
@@ -84,16 +86,16 @@ def _record(p, receivers, first, last, out):  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _sweep_chunk(c, p, q, medium, layers, cells, room):  # type: ignore[no-untyped-def]
     cuts, starts = medium[0], medium[1]
-    y, e_y, z, e_z, yz, e_yz, a, b, across, outermost = room
+    group, y, e_y, z, e_z, yz, e_yz, a, b, across, outermost = room
     terms = (y[c], e_y[c]), (z[c], e_z[c]), (yz[c], e_yz[c])
-    room_of_chunk = across[c], outermost[c], terms, (a[c], b[c])
+    room_of_chunk = across[c], outermost[c], terms, (a[c], b[c]), group
     psi_x, zeta_x, psi_y, zeta_y, psi_z, zeta_z, psi_yz, zeta_yz = layers
     memory = (psi_y, zeta_y), (psi_z, zeta_z), (psi_yz, zeta_yz)
     first, last = np.uint64(cuts[c]), np.uint64(cuts[c + 1])
     shape, weights, profile, profiles = medium[4:7], medium[7:12], medium[12:14], medium[14:17]
-    idle = medium[17:19]
+    idle, strips = medium[17:19], medium[19]
     sweep_planes(
-        p, q, first, last, shape, weights, (psi_x, zeta_x), profile, memory, profiles, cells, starts,
+        p, q, first, last, strips, shape, weights, (psi_x, zeta_x), profile, memory, profiles, cells, starts,
         idle, room_of_chunk,
     )  # fmt: skip
 
@@ -230,14 +232,22 @@ def _group(shape: torch.Size, layer_cells: int) -> int:
     return max(1, _GROUP_CELLS // (2 * (layer_cells + 2) * max(ny, nz)))
 
 
-def _room(chunks: int, shape: torch.Size, layer_cells: int, dtype: type) -> tuple[AnyArray, ...]:
-    """Return the workspace of the chunks during a step, see `sweep_planes`."""
+def _strips(shape: torch.Size, layer_cells: int) -> NDArray[np.uint64]:
+    """Return the first rows of the strips of a plane, each wider than a layer, and one past the last."""
+    _, ny, nz = shape
+    count = max(1, min(ny * nz // _STRIP_CELLS, ny // (2 * layer_cells + 4)))
+    return np.linspace(0, ny, count + 1).astype(np.uint64)
+
+
+def _room(cuts: Index, shape: torch.Size, layer_cells: int, dtype: type) -> tuple[Any, ...]:
+    """Return planes whose layers are computed at once, and the workspace of the chunks; see `sweep_planes`."""
     _, ny, nz = shape
     lanes, group = 2 * (layer_cells + 2), _group(shape, layer_cells)
-    terms = (group * lanes * nz, group * ny * lanes, group * lanes * lanes)
-    ends = (ny * lanes, ny * lanes)
-    sizes = (*np.repeat(terms, 2), *ends, *(planes * ny * nz for planes in (3, 2)))
-    return tuple(np.zeros((chunks, size), dtype) for size in sizes)
+    stored = group if len(_strips(shape, layer_cells)) == 2 else int(np.diff(cuts).max())
+    sizes = (lanes * nz, ny * lanes, lanes * lanes)
+    terms = (planes * size for size in sizes for planes in (group, stored))
+    parts = (*terms, ny * lanes, ny * lanes, 3 * ny * nz, 2 * ny * nz)
+    return np.uint64(group), *(np.zeros((len(cuts) - 1, size), dtype) for size in parts)
 
 
 def _idle(runs: AnyArray, shape: torch.Size) -> tuple[AnyArray, AnyArray]:
@@ -265,7 +275,7 @@ def _heterogeneous_cells(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, 
     scale = np.zeros_like(weight, shape=len(index))
     scale[np.searchsorted(index, c.layer_index.numpy())] = c.layer_scale.numpy()
     new, swept = np.empty_like(scale), np.empty_like(scale)
-    alike = _alike(index, kind, scale)
+    kind, alike = (part.astype(np.int32) for part in (kind, _alike(index, kind, scale)))  # half the traffic
     return index, kind, weight.reshape(-1), row_offsets(shape), scale, air, alike, new, swept
 
 
@@ -342,6 +352,7 @@ class CpuKernel:
             c.layer_gain.numpy(),
             *plane_profiles(c, shape, _group(shape, c.layer_cells)),
             *_idle(c.idle.numpy(), shape),
+            _strips(shape, c.layer_cells),
         )
         memory = FlatMemory(state.memory)
         arguments = (
@@ -351,7 +362,7 @@ class CpuKernel:
             tuple(part.reshape(-1) for part in memory.arrays),
             _heterogeneous_cells(c, shape),
             _losses(c, plane, cuts, dtype),
-            _room(len(cuts) - 1, shape, c.layer_cells, dtype),
+            _room(cuts, shape, c.layer_cells, dtype),
             (_columns(c, c.columns), _columns(c, c.crossed), c.crossing.numpy()),
             tuple((psi.numpy(), zeta.numpy()) for psi, zeta in state.memory[4:]),
             _unsigned(c.sound_hard_index),

@@ -131,8 +131,8 @@ def _copy_ends(p, first, rows, nz, reach, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def stretch_planes(p, i, planes, shape, cells, memory, terms, profiles):  # type: ignore[no-untyped-def]
-    """Compute E_y p, E_z p and E_y E_z p of some planes from i on, in the layers."""
+def stretch_planes(p, i, planes, shape, cells, memory, terms, place, profiles):  # type: ignore[no-untyped-def]
+    """Compute E_y p, E_z p and E_y E_z p of some planes from i on, in the layers; write from `place` on."""
     _, ny, nz = shape
     (psi_y, zeta_y), (psi_z, zeta_z), (psi_yz, zeta_yz) = memory
     (y, e_y), (z, e_z), (yz, e_yz) = terms
@@ -141,22 +141,24 @@ def stretch_planes(p, i, planes, shape, cells, memory, terms, profiles):  # type
     reach = cells + two
     lanes = two * reach
     _copy_rows(p, i, planes, ny, nz, reach, y)
-    first, size = i * lanes * nz, planes * lanes * nz - two * nz
-    stretch(y, zero, nz, psi_y, first, zeta_y, first + nz, e_y, nz, size, across_y, zero)
+    first, out, size = i * lanes * nz, place * lanes * nz + nz, planes * lanes * nz - two * nz
+    stretch(y, zero, nz, psi_y, first, zeta_y, first + nz, e_y, out, size, across_y, zero)
     _copy_ends(p, i * ny, planes * ny, nz, reach, z)
-    first, size = i * ny * lanes, planes * ny * lanes - two
-    stretch(z, zero, one, psi_z, first, zeta_z, first + one, e_z, one, size, across_z, zero)
-    _copy_rows(e_z, zero, planes, ny, lanes, reach, yz)
+    first, out, size = i * ny * lanes, place * ny * lanes + one, planes * ny * lanes - two
+    stretch(z, zero, one, psi_z, first, zeta_z, first + one, e_z, out, size, across_z, zero)
+    _copy_rows(e_z, place, planes, ny, lanes, reach, yz)
     first, size = i * lanes * lanes, planes * lanes * lanes - two * lanes
-    stretch(yz, zero, lanes, psi_yz, first, zeta_yz, first + lanes, e_yz, lanes, size, across_yz, zero)
+    out = (place * lanes + one) * lanes
+    stretch(yz, zero, lanes, psi_yz, first, zeta_yz, first + lanes, e_yz, out, size, across_yz, zero)
 
 
 @njit(**INNER)
-def _add_to_ends(u, at, shape, cells, ends):  # type: ignore[no-untyped-def]
-    """Add the cells of lanes to the plane of u that begins at `at`."""
+def _add_to_ends(u, at, rows, shape, cells, ends):  # type: ignore[no-untyped-def]
+    """Add the cells of lanes to some rows of the plane of u that begins at `at`."""
     _, ny, nz = shape
+    first, last = rows
     one, reach, fours = _U(1), cells + _U(2), cells - cells % _U(4)
-    for j in range(one, ny - one):
+    for j in range(max(first, one), min(last, ny - one)):
         low, high = at + j * nz + one, at + (j + one) * nz - reach + one
         lane = j * (reach + reach) + one
         for k in range(_U(0), fours, _U(4)):
@@ -168,8 +170,11 @@ def _add_to_ends(u, at, shape, cells, ends):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def add_terms(q, at, across, here, place, shape, cells, terms, ends, weights):  # type: ignore[no-untyped-def]
-    """Add the terms of a plane to its A, in `across` from `here` on, and to its B, in q from `at` on."""
+def add_terms(q, at, across, here, place, rows, shape, cells, terms, ends, weights):  # type: ignore[no-untyped-def]
+    """Add the terms of rows of a plane to its A, in `across` from `here` on, and to its B, in q from `at` on.
+
+    The `rows` from the first to one past the last contain a layer across y as a whole or not at all.
+    """
     _, ny, nz = shape
     (_, e_y), (_, e_z), (_, e_yz) = terms
     a, b = ends
@@ -177,7 +182,8 @@ def add_terms(q, at, across, here, place, shape, cells, terms, ends, weights):  
     one, two = _U(1), _U(2)
     reach = cells + two
     lanes = two * reach
-    for side in range(two):
+    first_side, sides = _U(0) if rows[0] == 0 else one, two if rows[1] == ny else one
+    for side in range(first_side, sides):
         e = (place * lanes + side * reach) * nz
         o = (ny - reach) * side * nz
         for k in range(nz, (cells + one) * nz):
@@ -185,18 +191,18 @@ def add_terms(q, at, across, here, place, shape, cells, terms, ends, weights):  
             across[here + o + k] += edge * middle + corner * beside
             q[at + o + k] += face * middle + edge * beside
     e = place * ny * lanes
-    for k in range(lanes, (ny - one) * lanes):
+    for k in range(max(rows[0], one) * lanes, min(rows[1], ny - one) * lanes):
         middle, beside = e_z[e + k], e_z[e + k - lanes] + e_z[e + k + lanes]
         a[k] = edge * middle + corner * beside
         b[k] = face * middle + edge * beside
-    for side in range(two):
+    for side in range(first_side, sides):
         e = (place * lanes + side * reach) * lanes
         o = (ny - reach) * side * lanes
         for k in range(lanes, (cells + one) * lanes):
             a[o + k] += corner * e_yz[e + k]
             b[o + k] += edge * e_yz[e + k]
-    _add_to_ends(across, here, shape, cells, a)
-    _add_to_ends(q, at, shape, cells, b)
+    _add_to_ends(across, here, rows, shape, cells, a)
+    _add_to_ends(q, at, rows, shape, cells, b)
 
 
 @njit(**INNER)
@@ -206,30 +212,32 @@ def _half_cell(psi, at, u, ahead, here, n, decay, gain):  # type: ignore[no-unty
 
 
 @njit(**INNER)
-def absorb_x(q, i, shape, memory, u, profile):  # type: ignore[no-untyped-def]
-    """Add the term of the layer across x to plane i; `u` holds A of the planes around."""
+def absorb_x(q, i, rows, shape, memory, u, profile):  # type: ignore[no-untyped-def]
+    """Add the term of the layer across x to rows of plane i; `u` holds A of the planes around."""
     nx, ny, nz = shape
     psi, zeta = memory
     decay, gain = profile
     one, two, three = _U(1), _U(2), _U(3)
     cells, plane = _U(len(decay) // 2), ny * nz
+    start, n = rows[0] * nz, (rows[1] - rows[0]) * nz
     side = one if two * i > nx else _U(0)
     depth = nx - one - i if side else i
     here, low, high = i % three * plane, (i + two) % three * plane, (i + one) % three * plane
+    here, low, high = here + start, low + start, high + start
     outside, inside = (high, low) if side else (low, high)
-    outer = (side * (cells + one) + depth - one) * plane
-    inner, shift, out = outer + plane, (side * cells + depth - one) * plane, i * plane
+    outer = (side * (cells + one) + depth - one) * plane + start
+    inner, shift, out = outer + plane, (side * cells + depth - one) * plane + start, i * plane + start
     # Each half cell is advanced with the first of its two planes.
     if side and depth == cells:
-        _half_cell(psi, inner, u, inside, here, plane, decay[two * depth], gain[two * depth])
+        _half_cell(psi, inner, u, inside, here, n, decay[two * depth], gain[two * depth])
     if not side and depth == one:
-        _half_cell(psi, outer, u, here, outside, plane, decay[0], gain[0])
+        _half_cell(psi, outer, u, here, outside, n, decay[0], gain[0])
     first, second = (outer, inner) if side else (inner, outer)
     ahead, behind = (here, outside) if side else (inside, here)
     half = two * depth - two if side else two * depth
     b_half, a_half, sign = decay[half], gain[half], decay.dtype.type(-1 if side else 1)
     b, a = decay[two * depth - one], gain[two * depth - one]
-    for k in range(plane):
+    for k in range(n):
         advanced = b_half * psi[first + k] + a_half * (u[ahead + k] - u[behind + k])
         psi[first + k] = advanced
         slope = sign * (advanced - psi[second + k])

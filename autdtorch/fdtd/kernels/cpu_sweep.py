@@ -6,8 +6,10 @@ pressure gives two planes, A and B, and the new pressure is
     A = face p + edge (T_y + T_z) p + corner T_y T_z p,    B = center p + face (T_y + T_z) p + edge T_y T_z p,
     new_i = B_i + A_(i-1) + A_(i+1) - keep before_i.
 
-The last A is added when plane i + 2 reads it. The boundary layers across y and z stretch T_y and T_z:
-`cpu_layers.py` adds the resulting terms to A and B, and the terms of the layers across x to new_i.
+The last A is added when plane i + 2 reads it. Large planes are cut in strips of rows, each of which is swept
+through all planes, so that the cache holds A and what plane i + 2 completes. The boundary layers across y and
+z stretch T_y and T_z: `cpu_layers.py` adds the resulting terms to A and B, and the terms of the layers across
+x to new_i.
 
 Cells inside rigid bodies are skipped. A is anything there: it counts in cells of the planes beside that are
 inside or at the surface, whose pressure nobody reads or is set to zero.
@@ -68,55 +70,73 @@ def _heterogeneous(p, q, cells, first, last, keep):  # type: ignore[no-untyped-d
 
 
 @njit(**INNER)
-def _silence_row_ends(u, base, shape):  # type: ignore[no-untyped-def]
+def _silence_row_ends(u, base, rows, shape):  # type: ignore[no-untyped-def]
     _, ny, nz = shape
-    for j in range(ny):
+    for j in range(rows[0], rows[1]):
         u[base + j * nz] = 0
         u[base + (j + _U(1)) * nz - _U(1)] = 0
 
 
 @njit(**INNER)
-def sweep_planes(  # type: ignore[no-untyped-def]
-    p, q, first, last, shape, weights, x_layer, x_profile, layers, profiles, cells, starts, idle, room
+def _sweep_strip(  # type: ignore[no-untyped-def]
+    p, q, first, last, rows, shape, weights, x_layer, x_profile, layers, profiles, cells, starts, idle, room
 ):
-    """Step planes first .. last - 1 as if others were zero; `room` then holds A for the neighbours."""
+    """Step some rows of planes; those of the first strip also compute what all strips need."""
     nx, ny, nz = shape
-    across, outermost, terms, ends = room
+    across, outermost, terms, ends, group = room
     one, two, three = _U(1), _U(2), _U(3)
     depth, plane = _U(len(x_profile[0]) // 2), ny * nz
-    group = _U(len(terms[0][0])) // (two * (depth + two) * nz)
-    across[:] = 0
-    outermost[:] = 0
-    inside, n = nz + one, plane - nz - nz - two
+    stored = _U(len(terms[0][1])) // (two * (depth + two) * nz)
+    start, stop = rows[0] * nz, rows[1] * nz
+    low, high = max(start, nz + one), min(stop, plane - nz - one)
+    for k in range(start, stop):
+        across[(first + two) % three * plane + k] = 0
+        outermost[k] = outermost[plane + k] = 0
     for i in range(first, last + one):
         here, behind = i % three * plane, (i + two) % three * plane
         old, back = (q, (i - two) * plane) if i > first + one else (outermost, _U(0))
         if i < last:
-            _heterogeneous(p, q, cells, starts[i], starts[i + one], weights[4])
-            at = inside
+            if rows[0] == 0:
+                _heterogeneous(p, q, cells, starts[i], starts[i + one], weights[4])
+            at = low
             for run in range(idle[1][i], idle[1][i + one] + 1):  # one more: the cells behind the last run
-                end, ahead = inside + n, inside + n
+                end, ahead = high, high
                 if run < idle[1][i + one]:
-                    end, ahead = idle[0][run, 0], idle[0][run, 1]
+                    end = min(max(idle[0][run, 0], at), high)
+                    ahead = min(max(idle[0][run, 1], at), high)
                 _sweep(
                     p, i * plane + at, end - at, nz, q, old, back + at, across, here + at, behind + at,
                     weights,
                 )  # fmt: skip
                 at = ahead
         else:
-            for k in range(plane):
+            for k in range(start, stop):
                 old[back + k] += across[behind + k]
                 outermost[plane + k] = across[behind + k]
                 across[here + k] = 0
         if i < last and depth:
-            place = (i - first) % group
-            if place == 0:
-                stretch_planes(p, i, min(group, last - i), shape, depth, layers, terms, profiles)
-            add_terms(q, i * plane, across, here, place, shape, depth, terms, ends, weights)
+            place = (i - first) % stored
+            if rows[0] == 0 and (i - first) % group == 0:
+                planes = min(group, last - i)
+                stretch_planes(p, i, planes, shape, depth, layers, terms, place, profiles)
+            add_terms(q, i * plane, across, here, place, rows, shape, depth, terms, ends, weights)
         if i <= depth + one or i + depth + two >= nx:
-            _silence_row_ends(across, here, shape)
+            _silence_row_ends(across, here, rows, shape)
             if i > first and (i <= depth + one or i + depth >= nx):
-                absorb_x(q, i - one, shape, x_layer, across, x_profile)
+                absorb_x(q, i - one, rows, shape, x_layer, across, x_profile)
         if i > first + one:
-            _silence_row_ends(q, (i - two) * plane, shape)
-    _silence_row_ends(q, (last - one) * plane, shape)
+            _silence_row_ends(q, (i - two) * plane, rows, shape)
+    _silence_row_ends(q, (last - one) * plane, rows, shape)
+
+
+@njit(**INNER)
+def sweep_planes(  # type: ignore[no-untyped-def]
+    p, q, first, last, strips, shape, weights, x_layer, x_profile, layers, profiles, cells, starts, idle, room
+):
+    """Step planes first .. last - 1 as if others were zero; `room` then holds A for the neighbours."""
+    for strip in range(len(strips) - 1):
+        rows = strips[strip], strips[strip + 1]
+        _sweep_strip(
+            p, q, first, last, rows, shape, weights, x_layer, x_profile, layers, profiles, cells, starts,
+            idle, room,
+        )  # fmt: skip
