@@ -13,8 +13,9 @@ from small_scenes import CUBE, NO_RECEIVERS, NO_SOURCES, all_tensors, assembled_
 from autdtorch.analytic.discs import waves_of
 from autdtorch.analytic.green import green
 from autdtorch.fdtd.kernels.contract import uniform_state
-from autdtorch.fdtd.kernels.cpu import CpuKernel, _alike, _cuts, _strips
+from autdtorch.fdtd.kernels.cpu import CpuKernel, _alike, _cuts
 from autdtorch.fdtd.kernels.cpu_intrinsics import ALIKE
+from autdtorch.fdtd.kernels.cpu_sweep import strips_of
 from autdtorch.fdtd.kernels.cpu_waves import superposition, wave_matrix
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import assemble, drive_signal
@@ -85,8 +86,8 @@ def test_chunks_of_planes_are_the_whole(chunks, lossy, monkeypatch):
 def test_strips_of_rows_change_no_bit(lossy, monkeypatch):
     whole = advance(CpuKernel(), torch.float32, 41, lossy)
     _, ny, nz = whole[0].now.shape
-    monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._STRIP_CELLS", ny * nz // 3)
-    assert len(_strips(whole[0].now.shape, scene_parts(torch.float32)[0].grid.layer_cells)) > 2
+    monkeypatch.setattr("autdtorch.fdtd.kernels.cpu_sweep._STRIP_CELLS", ny * nz // 3)
+    assert len(strips_of(whole[0].now.shape, scene_parts(torch.float32)[0].grid.layer_cells)) > 2
     strips = advance(CpuKernel(), torch.float32, 41, lossy)
     assert all(map(torch.equal, all_tensors(*strips), all_tensors(*whole)))
 
@@ -114,7 +115,7 @@ def test_no_cell_reads_those_inside_rigid_bodies(monkeypatch):
 
     whole = stepped(replace(c, idle=c.idle[:0]), 0)
     assert all(map(torch.equal, stepped(c, math.nan), whole))
-    monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._STRIP_CELLS", 1)
+    monkeypatch.setattr("autdtorch.fdtd.kernels.cpu_sweep._STRIP_CELLS", 1)
     assert all(map(torch.equal, stepped(c, math.nan), whole))
 
 

@@ -16,7 +16,6 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from typing import Any
 
 import numpy as np
 import torch
@@ -41,7 +40,7 @@ from autdtorch.fdtd.kernels.cpu_intrinsics import (
     sum_of_rows,
 )
 from autdtorch.fdtd.kernels.cpu_layers import FlatMemory, plane_profiles, rows_profile, stretch
-from autdtorch.fdtd.kernels.cpu_sweep import sweep_planes
+from autdtorch.fdtd.kernels.cpu_sweep import planes_at_once, strips_of, sweep_planes, workspace
 from autdtorch.fdtd.kernels.cpu_waves import superposition
 from autdtorch.fdtd.stencil import OFFSETS
 from autdtorch.utils.array_types import COMPLEX, REAL, AnyArray, Index
@@ -50,8 +49,6 @@ from autdtorch.utils.process import spread, thread_count
 # Fewest cells and planes of a chunk, for which a second thread and the sums at its ends pay
 _CHUNK_CELLS, _CHUNK_PLANES = 200_000, 32
 _FLAT_CELLS, _FLAT_PLANES = 500_000, 12  # The same for two chunks of large planes
-_GROUP_CELLS = 3000  # Cells of the layers across an axis that are computed at once
-_STRIP_CELLS = 50_000  # Cells of a strip, from twice as many on: a core's cache holds its planes and their sums
 # Shares of the processors' time that workers got: below the first a single worker continues, above the second
 # several again
 _CROWDED, _FREE = 0.75, 0.9
@@ -226,30 +223,6 @@ def _cuts(shape: tuple[int, ...]) -> NDArray[np.int64]:
     return np.linspace(1, 1 + planes, chunks + 1).astype(np.int64)
 
 
-def _group(shape: torch.Size, layer_cells: int) -> int:
-    """Return the number of planes whose layers are computed at once: as many as the cache holds."""
-    _, ny, nz = shape
-    return max(1, _GROUP_CELLS // (2 * (layer_cells + 2) * max(ny, nz)))
-
-
-def _strips(shape: torch.Size, layer_cells: int) -> NDArray[np.uint64]:
-    """Return the first rows of the strips of a plane, each wider than a layer, and one past the last."""
-    _, ny, nz = shape
-    count = max(1, min(ny * nz // _STRIP_CELLS, ny // (2 * layer_cells + 4)))
-    return np.linspace(0, ny, count + 1).astype(np.uint64)
-
-
-def _room(cuts: Index, shape: torch.Size, layer_cells: int, dtype: type) -> tuple[Any, ...]:
-    """Return planes whose layers are computed at once, and the workspace of the chunks; see `sweep_planes`."""
-    _, ny, nz = shape
-    lanes, group = 2 * (layer_cells + 2), _group(shape, layer_cells)
-    stored = group if len(_strips(shape, layer_cells)) == 2 else int(np.diff(cuts).max())
-    sizes = (lanes * nz, ny * lanes, lanes * lanes)
-    terms = (planes * size for size in sizes for planes in (group, stored))
-    parts = (*terms, ny * lanes, ny * lanes, 3 * ny * nz, 2 * ny * nz)
-    return np.uint64(group), *(np.zeros((len(cuts) - 1, size), dtype) for size in parts)
-
-
 def _idle(runs: AnyArray, shape: torch.Size) -> tuple[AnyArray, AnyArray]:
     """Return idle runs (g, 2), by cells of their planes, and the number of the first run of each plane.
 
@@ -275,8 +248,8 @@ def _heterogeneous_cells(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, 
     scale = np.zeros_like(weight, shape=len(index))
     scale[np.searchsorted(index, c.layer_index.numpy())] = c.layer_scale.numpy()
     new, swept = np.empty_like(scale), np.empty_like(scale)
-    kind, alike = (part.astype(np.int32) for part in (kind, _alike(index, kind, scale)))  # half the traffic
-    return index, kind, weight.reshape(-1), row_offsets(shape), scale, air, alike, new, swept
+    row, alike = (part.astype(np.int32) for part in (kind, _alike(index, kind, scale)))  # half the traffic
+    return index, row, weight.reshape(-1), row_offsets(shape), scale, air, alike, new, swept
 
 
 def _alike(index: Index, kind: Index, scale: AnyArray) -> NDArray[np.int64]:
@@ -350,9 +323,9 @@ class CpuKernel:
             *(dtype(weight) for weight in (c.center, c.face, c.edge, c.corner, c.keep)),
             c.layer_decay.numpy(),
             c.layer_gain.numpy(),
-            *plane_profiles(c, shape, _group(shape, c.layer_cells)),
+            *plane_profiles(c, shape, planes_at_once(shape, c.layer_cells)),
             *_idle(c.idle.numpy(), shape),
-            _strips(shape, c.layer_cells),
+            strips_of(shape, c.layer_cells),
         )
         memory = FlatMemory(state.memory)
         arguments = (
@@ -362,7 +335,7 @@ class CpuKernel:
             tuple(part.reshape(-1) for part in memory.arrays),
             _heterogeneous_cells(c, shape),
             _losses(c, plane, cuts, dtype),
-            _room(cuts, shape, c.layer_cells, dtype),
+            workspace(cuts, shape, c.layer_cells, dtype),
             (_columns(c, c.columns), _columns(c, c.crossed), c.crossing.numpy()),
             tuple((psi.numpy(), zeta.numpy()) for psi, zeta in state.memory[4:]),
             _unsigned(c.sound_hard_index),

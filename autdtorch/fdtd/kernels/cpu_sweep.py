@@ -21,13 +21,20 @@ this mixes into the ring at both ends of each row are set to zero at the end.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import torch
 from numba import njit
+from numpy.typing import NDArray
 
 from autdtorch.fdtd.kernels.compiled import INNER
 from autdtorch.fdtd.kernels.cpu_intrinsics import ALIKE, sum_of_rows, sums_of_rows
 from autdtorch.fdtd.kernels.cpu_layers import absorb_x, add_terms, stretch_planes
+from autdtorch.utils.array_types import Index
 
+_GROUP_CELLS = 3000  # Cells of the layers across an axis that are computed at once
+_STRIP_CELLS = 50_000  # Cells of a strip of a plane of at least twice as many, for the cache
 _U = np.uint64
 
 
@@ -71,7 +78,7 @@ def _heterogeneous(p, q, cells, first, last, keep):  # type: ignore[no-untyped-d
 
 @njit(**INNER)
 def _silence_row_ends(u, base, rows, shape):  # type: ignore[no-untyped-def]
-    _, ny, nz = shape
+    _, _, nz = shape
     for j in range(rows[0], rows[1]):
         u[base + j * nz] = 0
         u[base + (j + _U(1)) * nz - _U(1)] = 0
@@ -140,3 +147,27 @@ def sweep_planes(  # type: ignore[no-untyped-def]
             p, q, first, last, rows, shape, weights, x_layer, x_profile, layers, profiles, cells, starts,
             idle, room,
         )  # fmt: skip
+
+
+def planes_at_once(shape: torch.Size, layer_cells: int) -> int:
+    """Return the number of planes whose layers are computed at once: as many as the cache holds."""
+    _, ny, nz = shape
+    return max(1, _GROUP_CELLS // (2 * (layer_cells + 2) * max(ny, nz)))
+
+
+def strips_of(shape: torch.Size, layer_cells: int) -> NDArray[np.uint64]:
+    """Return the first rows of the strips of a plane, each wider than a layer, and one past the last."""
+    _, ny, nz = shape
+    count = max(1, min(ny * nz // _STRIP_CELLS, ny // (2 * layer_cells + 4)))
+    return np.linspace(0, ny, count + 1).astype(np.uint64)
+
+
+def workspace(cuts: Index, shape: torch.Size, layer_cells: int, dtype: type) -> tuple[Any, ...]:
+    """Return planes whose layers are computed at once, and the workspace of the chunks."""
+    _, ny, nz = shape
+    lanes, group = 2 * (layer_cells + 2), planes_at_once(shape, layer_cells)
+    stored = group if len(strips_of(shape, layer_cells)) == 2 else int(np.diff(cuts).max())
+    sizes = (lanes * nz, ny * lanes, lanes * lanes)
+    terms = (planes * size for size in sizes for planes in (group, stored))
+    parts = (*terms, ny * lanes, ny * lanes, 3 * ny * nz, 2 * ny * nz)
+    return np.uint64(group), *(np.zeros((len(cuts) - 1, size), dtype) for size in parts)
