@@ -248,6 +248,10 @@ def test_gradients_by_pose_and_drive_are_those_of_finite_differences(cube):
 
     pose = torch.tensor([1e-3, 0.5e-3, -1e-3, 0.2, 0.1, -0.3], dtype=torch.float64)
     assert_slopes(push, pose, steps=[1e-6] * 3 + [1e-4] * 3)
+    change = torch.linspace(-1e-6, 1e-6, 6).double()
+    second = torch.autograd.functional.hvp(push, pose, change)[1]
+    ends = [torch.autograd.functional.jacobian(push, pose + sign * change) for sign in (0.5, -0.5)]
+    assert relative_error(second, ends[0] - ends[1]) < 1e-5  # rounding of the difference
     drive = DRIVE.clone().requires_grad_(True)
     cluster = at.TMatrixCluster([cube, other])
     (slope,) = torch.autograd.grad(at.radiation_force(cluster, drive, **setting)[0], drive)

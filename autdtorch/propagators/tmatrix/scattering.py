@@ -8,29 +8,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 
-from autdtorch.analytic.disc_waves import MeanWaves, powers_needed
 from autdtorch.analytic.spherical_waves import degrees, outgoing_waves
 from autdtorch.analytic.wave_frames import translation
 from autdtorch.propagators.multiple_scattering import solved
-from autdtorch.scene.arrays import TransducerArray, apertures_of, complex_strengths_of, radii_of
+from autdtorch.propagators.tmatrix.incoming import IncomingWaves, incoming_waves, offsets_of
+from autdtorch.scene.arrays import TransducerArray
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.images import NO_MIRRORS, Image, distinct
+from autdtorch.utils.images import NO_MIRRORS, Image
 from autdtorch.utils.process import require_memory
-from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 if TYPE_CHECKING:
     from autdtorch.propagators.tmatrix.tmatrix import TMatrix
 
 _AT_ONCE = 200_000
 """Waves at points that are computed at once: 3 MB, which fit into a cache."""
-
-_ALIKE = 4
-"""Discs of one radius and direction from which on their means are `MeanWaves`, and not those over nodes."""
 
 _ENTRY_BYTES = 48.0
 """Memory of a pair of waves in the system of equations [bytes]."""
@@ -101,10 +96,14 @@ def waves_of_body(
     The array, its images and all other bodies send the regular ones. R drives are (..., R, M), or one of each
     transducer alone. `together` maps the array's waves on all bodies to both, if it is known.
     """
-    each = [IncomingWaves.of(body, array, images) for body in bodies]
-    incident = [waves.matrix if drive is None else waves.driven(drive).mT for waves in each]
+    if drive is None:
+        incident = [IncomingWaves.of(body, array, images).matrix for body in bodies]
+    else:
+        incident = [incoming_waves(body, array, images, drive) for body in bodies]
     if together is not None:
-        regular, outgoing = (part @ torch.cat(incident, dim=-2) for part in together)
+        waves = torch.cat(incident, dim=-2).mT
+        flat = waves.reshape(-1, waves.shape[-1])  # one product for all poses
+        regular, outgoing = ((flat @ part.mT).reshape(*waves.shape[:-1], -1).mT for part in together)
         return regular, outgoing
     between, sizes = _between(bodies, images), [len(body.matrix) for body in bodies]
     scattered = torch.split(solved([body.matrix for body in bodies], between, incident), sizes, dim=-2)
@@ -139,7 +138,7 @@ def waves_at(bodies: Sequence[TMatrix], points: torch.Tensor, images: Sequence[I
     none = torch.zeros((), **COMPLEX)
     parts = []
     for body in bodies:
-        offsets = (_offsets(body, "points", image.of(points)) for image in images)
+        offsets = (offsets_of(body, "points", image.of(points)) for image in images)
         waves = [
             image.weight * outgoing_waves(body.degree, body.wavenumber, each)
             for image, each in zip(images, offsets, strict=True)
@@ -161,98 +160,6 @@ def scattered_waves(
     return [
         solved([_without_highest(body, fewer) for body in bodies], between, incident) for fewer in left_out
     ]
-
-
-@dataclass(frozen=True)
-class IncomingWaves:
-    """The coefficients of regular waves around a body, of unit drives of M transducers.
-
-    Attributes:
-        parts: for transducers alike and an image of them, their places in the array, and their waves: the
-            means over discs, or (..., M, N).
-        strengths: factors (M,) of all.
-    """
-
-    parts: list[tuple[torch.Tensor, complex, MeanWaves | torch.Tensor]]
-    strengths: torch.Tensor
-
-    @classmethod
-    def of(cls, body: TMatrix, array: TransducerArray, images: Sequence[Image]) -> IncomingWaves:
-        """Return the waves of an array around a body; one inside its sphere raises."""
-        _offsets(body, "array.positions", array.positions)
-        parts = [
-            (index, image.weight, _incoming_from(body, array, index, image))
-            for index in _alike(array)
-            for image in distinct(images, array.positions[index])
-        ]
-        return cls(parts, 4j * math.pi * body.wavenumber * complex_strengths_of(array))
-
-    @property
-    def matrix(self) -> torch.Tensor:
-        """The coefficients (..., N, M) [Pa]."""
-        each = [(index, weight, _dense(waves).mT) for index, weight, waves in self.parts]
-        return self._summed(each)
-
-    def driven(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return the coefficients (..., R, N) [Pa] under drives (..., R, M)."""
-        strong = self.strengths * drive
-        each = [weight * _driven(waves, strong[..., index]) for index, weight, waves in self.parts]
-        return torch.stack(each).sum(dim=0)
-
-    def weighted(self, weights: torch.Tensor) -> torch.Tensor:
-        """Return the sums (..., P, M) of the coefficients with weights (..., P, N)."""
-        each = [
-            (index, weight, waves.weighted(weights) if isinstance(waves, MeanWaves) else weights @ waves.mT)
-            for index, weight, waves in self.parts
-        ]
-        return self._summed(each)
-
-    def _summed(self, parts: Sequence[tuple[torch.Tensor, complex, torch.Tensor]]) -> torch.Tensor:
-        total = torch.zeros((*parts[0][2].shape[:-1], len(self.strengths)), **COMPLEX)
-        for index, weight, part in parts:
-            total = total.index_add(-1, index, weight * part)
-        return self.strengths * total
-
-
-def _dense(waves: MeanWaves | torch.Tensor) -> torch.Tensor:
-    return waves.matrix if isinstance(waves, MeanWaves) else waves
-
-
-def _driven(waves: MeanWaves | torch.Tensor, drive: torch.Tensor) -> torch.Tensor:
-    return waves.driven(drive) if isinstance(waves, MeanWaves) else drive @ waves
-
-
-def _alike(array: TransducerArray) -> list[torch.Tensor]:
-    """Return the indices (n,) of the transducers of each direction and radius; points are all alike."""
-    radii = radii_of(array)
-    if not radii.any():
-        return [torch.arange(len(array), dtype=torch.int64, device="cpu")]
-    kinds = torch.cat([array.normals, radii[:, None]], dim=1)
-    _, kind = torch.unique(kinds, dim=0, return_inverse=True)
-    return [torch.nonzero(kind == number)[:, 0] for number in range(int(kind.max()) + 1)]
-
-
-def _incoming_from(
-    body: TMatrix, array: TransducerArray, index: torch.Tensor, image: Image
-) -> MeanWaves | torch.Tensor:
-    """Return the waves around a body of images of transducers alike, by unit strengths over 4 pi i k."""
-    centers, radius = image.of(array.positions[index]), float(radii_of(array)[index[0]])
-    offsets = centers - body.center[..., None, :]
-    if radius and len(index) >= _ALIKE:
-        normal = image.matrix @ array.normals[index[0]]
-        nearest = float(offsets.detach().norm(dim=-1).min()) - radius
-        powers = powers_needed(body.degree, body.wavenumber, nearest, radius)
-        if powers is not None:
-            return MeanWaves.of(body.degree, body.wavenumber, offsets, normal, radius, body.axes, powers)
-    if not radius:
-        return outgoing_waves(body.degree, body.wavenumber, offsets @ body.axes, conjugate=True)
-    nodes = apertures_of(array, abs(body.wavenumber)).chosen(index)
-    _offsets(body, "array.positions", image.of(nodes.positions.reshape(-1, 3)))
-    means = []
-    for node in nodes.positions.unbind(dim=1):
-        each = (image.of(node) - body.center[..., None, :]) @ body.axes
-        means.append(outgoing_waves(body.degree, body.wavenumber, each, conjugate=True))
-    return torch.einsum("q...,q->...", torch.stack(means), nodes.weights.to(torch.complex128))
 
 
 def _between(bodies: Sequence[TMatrix], images: Sequence[Image]) -> list[list[torch.Tensor | None]]:
@@ -283,13 +190,3 @@ def _without_highest(body: TMatrix, fewer: int) -> torch.Tensor:
     """Return T (N, N) with 0 in place of its `fewer` highest degrees."""
     low = degrees(body.degree) <= body.degree - fewer
     return torch.where(low[:, None] & low, body.matrix, 0) if fewer else body.matrix
-
-
-def _offsets(body: TMatrix, name: str, positions: torch.Tensor) -> torch.Tensor:
-    """Return positions (..., P, 3) in the coordinates of a body, after checking that they are outside."""
-    offsets = positions - body.center[..., None, :]
-    nearest = float(torch.linalg.vector_norm(offsets.detach(), dim=-1).amin())
-    if nearest < body.radius - LENGTH_TOLERANCE:
-        accepted = f"must be at least {body.radius:.4g} m from the centre of the body"
-        raise ValueError(f"{name}: {nearest:.4g} m at the nearest; {accepted}")
-    return offsets @ body.axes

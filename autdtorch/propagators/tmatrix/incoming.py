@@ -1,0 +1,191 @@
+"""The regular waves of an array around a body, with their derivatives by the body's pose."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from autdtorch.analytic.disc_waves import MeanWaves, powers_needed
+from autdtorch.analytic.momentum import angular_momentum, linear_momentum
+from autdtorch.analytic.spherical_waves import outgoing_waves
+from autdtorch.scene.arrays import TransducerArray, apertures_of, complex_strengths_of, radii_of
+from autdtorch.utils.array_types import COMPLEX, REAL
+from autdtorch.utils.images import Image, distinct
+from autdtorch.utils.validation import LENGTH_TOLERANCE
+
+if TYPE_CHECKING:
+    from autdtorch.propagators.tmatrix.tmatrix import TMatrix
+
+_ALIKE = 4
+"""Discs of one radius and direction from which on their means are `MeanWaves`, and not those over nodes."""
+
+
+def incoming_waves(
+    body: TMatrix, array: TransducerArray, images: Sequence[Image], drive: torch.Tensor
+) -> torch.Tensor:
+    """Return the coefficients (..., N, R) [Pa] of regular waves around a body, under drives (..., R, M).
+
+    Gradients by the pose take sums over N waves, not over those of each transducer.
+    """
+    setting = replace(body, center=body.center.detach(), axes=body.axes.detach()), array, images, body.degree
+    waves: torch.Tensor = _Driven.apply(body.center, body.axes, drive, *setting)  # type: ignore[no-untyped-call]
+    return waves[..., : len(body.matrix)].mT
+
+
+class _Driven(torch.autograd.Function):
+    """Waves (..., R, K) with a degree more, whose gradient is left out.
+
+    A shift or a turn of the body changes the coefficients as the gradient, or x cross gradient, of the field.
+    """
+
+    @staticmethod
+    def forward(
+        center: torch.Tensor,
+        axes: torch.Tensor,
+        drive: torch.Tensor,
+        body: TMatrix,
+        array: TransducerArray,
+        images: Sequence[Image],
+        degree: int,
+    ) -> torch.Tensor:
+        return IncomingWaves.of(body, array, images, degree + 1).driven(drive.detach())
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: torch.Tensor) -> None:
+        center, axes, drive, *ctx.setting = inputs
+        ctx.save_for_backward(center, axes, drive, output)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        (center, axes, drive, waves), (body, array, images, degree) = ctx.saved_tensors, ctx.setting
+        if torch.is_grad_enabled():  # for derivatives of the gradient
+            waves = _Driven.apply(center, axes, drive, body, array, images, degree + 1)  # type: ignore[no-untyped-call]
+        by_place = by_turn = by_drive = None
+        count = (degree + 1) ** 2
+        weights = -1j * gradient[..., :count].mT
+
+        def weighed(slopes: torch.Tensor) -> torch.Tensor:  # (3, ..., K, R) to (..., 3, 1)
+            return (weights.conj() * slopes[..., :count, :]).sum(dim=(-2, -1)).real.movedim(0, -1)[..., None]
+
+        if ctx.needs_input_grad[0]:
+            by_place = (axes @ weighed(body.wavenumber * linear_momentum(waves.mT)))[..., 0]
+        if ctx.needs_input_grad[1]:
+            turn = weighed(angular_momentum(waves.mT)).mT.expand(*axes.shape)
+            by_turn = axes @ torch.linalg.cross(turn, torch.eye(3, **REAL).expand_as(turn)).mT / 2
+        if ctx.needs_input_grad[2]:
+            placed = replace(body, center=center, axes=axes)
+            each = IncomingWaves.of(placed, array, images, degree).matrix
+            by_drive = (gradient[..., :count] @ each.conj()).sum_to_size(drive.shape)
+        return by_place, by_turn, by_drive, None, None, None, None
+
+
+@dataclass(frozen=True)
+class IncomingWaves:
+    """The coefficients of regular waves around a body, of unit drives of M transducers.
+
+    Attributes:
+        parts: for transducers alike and an image of them, their places in the array, and their waves: the
+            means over discs, or (..., M, N).
+        strengths: factors (M,) of all.
+    """
+
+    parts: list[tuple[torch.Tensor, complex, MeanWaves | torch.Tensor]]
+    strengths: torch.Tensor
+
+    @classmethod
+    def of(
+        cls, body: TMatrix, array: TransducerArray, images: Sequence[Image], degree: int | None = None
+    ) -> IncomingWaves:
+        """Return the waves of an array around a body, by default up to its degree.
+
+        An array inside its sphere raises.
+        """
+        offsets_of(body, "array.positions", array.positions)
+        degree = body.degree if degree is None else degree
+        parts = [
+            (index, image.weight, _incoming_from(body, degree, array, index, image))
+            for index in _alike(array)
+            for image in distinct(images, array.positions[index])
+        ]
+        return cls(parts, 4j * math.pi * body.wavenumber * complex_strengths_of(array))
+
+    @property
+    def matrix(self) -> torch.Tensor:
+        """The coefficients (..., N, M) [Pa]."""
+        each = [(index, weight, _dense(waves).mT) for index, weight, waves in self.parts]
+        return self._summed(each)
+
+    def driven(self, drive: torch.Tensor) -> torch.Tensor:
+        """Return the coefficients (..., R, N) [Pa] under drives (..., R, M)."""
+        strong = self.strengths * drive
+        each = [weight * _driven(waves, strong[..., index]) for index, weight, waves in self.parts]
+        return torch.stack(each).sum(dim=0)
+
+    def weighted(self, weights: torch.Tensor) -> torch.Tensor:
+        """Return the sums (..., P, M) of the coefficients with weights (..., P, N)."""
+        each = [
+            (index, weight, waves.weighted(weights) if isinstance(waves, MeanWaves) else weights @ waves.mT)
+            for index, weight, waves in self.parts
+        ]
+        return self._summed(each)
+
+    def _summed(self, parts: Sequence[tuple[torch.Tensor, complex, torch.Tensor]]) -> torch.Tensor:
+        total = torch.zeros((*parts[0][2].shape[:-1], len(self.strengths)), **COMPLEX)
+        for index, weight, part in parts:
+            total = total.index_add(-1, index, weight * part)
+        return self.strengths * total
+
+
+def _dense(waves: MeanWaves | torch.Tensor) -> torch.Tensor:
+    return waves.matrix if isinstance(waves, MeanWaves) else waves
+
+
+def _driven(waves: MeanWaves | torch.Tensor, drive: torch.Tensor) -> torch.Tensor:
+    return waves.driven(drive) if isinstance(waves, MeanWaves) else drive @ waves
+
+
+def _alike(array: TransducerArray) -> list[torch.Tensor]:
+    """Return the indices (n,) of the transducers of each direction and radius; points are all alike."""
+    radii = radii_of(array)
+    if not radii.any():
+        return [torch.arange(len(array), dtype=torch.int64, device="cpu")]
+    kinds = torch.cat([array.normals, radii[:, None]], dim=1)
+    _, kind = torch.unique(kinds, dim=0, return_inverse=True)
+    return [torch.nonzero(kind == number)[:, 0] for number in range(int(kind.max()) + 1)]
+
+
+def _incoming_from(
+    body: TMatrix, degree: int, array: TransducerArray, index: torch.Tensor, image: Image
+) -> MeanWaves | torch.Tensor:
+    """Return the waves around a body of images of transducers alike, by unit strengths over 4 pi i k."""
+    centers, radius = image.of(array.positions[index]), float(radii_of(array)[index[0]])
+    offsets = centers - body.center[..., None, :]
+    if radius and len(index) >= _ALIKE:
+        normal = image.matrix @ array.normals[index[0]]
+        nearest = float(offsets.detach().norm(dim=-1).min()) - radius
+        powers = powers_needed(degree, body.wavenumber, nearest, radius)
+        if powers is not None:
+            return MeanWaves.of(degree, body.wavenumber, offsets, normal, radius, body.axes, powers)
+    if not radius:
+        return outgoing_waves(degree, body.wavenumber, offsets @ body.axes, conjugate=True)
+    nodes = apertures_of(array, abs(body.wavenumber)).chosen(index)
+    offsets_of(body, "array.positions", image.of(nodes.positions.reshape(-1, 3)))
+    means = []
+    for node in nodes.positions.unbind(dim=1):
+        each = (image.of(node) - body.center[..., None, :]) @ body.axes
+        means.append(outgoing_waves(degree, body.wavenumber, each, conjugate=True))
+    return torch.einsum("q...,q->...", torch.stack(means), nodes.weights.to(torch.complex128))
+
+
+def offsets_of(body: TMatrix, name: str, positions: torch.Tensor) -> torch.Tensor:
+    """Return positions (..., P, 3) in the coordinates of a body, after checking that they are outside."""
+    offsets = positions - body.center[..., None, :]
+    nearest = float(torch.linalg.vector_norm(offsets.detach(), dim=-1).amin())
+    if nearest < body.radius - LENGTH_TOLERANCE:
+        accepted = f"must be at least {body.radius:.4g} m from the centre of the body"
+        raise ValueError(f"{name}: {nearest:.4g} m at the nearest; {accepted}")
+    return offsets @ body.axes
