@@ -8,6 +8,7 @@ from .io.field_file import save_field
 from .io.picture_file import load_picture, save_picture
 from .io.readings_file import load_readings, save_readings
 from .io.scene_file import load_scene, save_scene
+from .methods.attainable import attainable
 from .methods.base import Method, State
 from .methods.bayes.focus_problem import FocusProblem
 from .methods.bayes.gaussian_process import PhasorKernel
@@ -37,6 +38,7 @@ from .methods.run import run
 from .methods.solution import Solution
 from .methods.state_file import load_state, save_state
 from .objectives.bound import focus_bound
+from .objectives.forces import ForceObjective, Levitate, Trap
 from .objectives.goals import Goal, MeanPressure, TargetPressures, WeakestFocus
 from .objectives.haptics import HapticMetrics, haptic_metrics
 from .objectives.metrics import FocusMetrics, focus_metrics
@@ -54,6 +56,7 @@ from .plot.trials import plot_convergence, plot_poses, plot_trials
 from .plot.view3d import animate3d, view3d
 from .propagators import SteadyStateWarning, cell_centers, differentiable_field, make_propagator, volume_field
 from .propagators.estimate import Estimate, estimate
+from .propagators.gorkov import gorkov
 from .propagators.nearby import NearbyPoses
 from .propagators.tmatrix.force import force_matrices, radiation_force, radiation_torque
 from .propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
@@ -62,6 +65,7 @@ from .scene.drive import amplitudes_of, drive_from_phases, focus_phases, phases_
 from .scene.geometry import Plane, circle_points, polyline_points, sphere_points
 from .scene.medium import Medium
 from .scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
+from .scene.particle import Particle
 from .scene.porous import porous
 from .scene.reflectors import Reflector
 from .scene.scene import OverlapWarning, ScaleWarning, Scene
@@ -85,11 +89,13 @@ __all__ = [
     "FailedTransducers",
     "FocusMetrics",
     "FocusProblem",
+    "ForceObjective",
     "Goal",
     "GradientAscent",
     "HapticMetrics",
     "Holography",
     "Identify",
+    "Levitate",
     "MeanPressure",
     "Medium",
     "Mesh",
@@ -100,6 +106,7 @@ __all__ = [
     "Obstacle",
     "OpenMPDBoard",
     "OverlapWarning",
+    "Particle",
     "PhasorKernel",
     "Plane",
     "Prior",
@@ -123,11 +130,13 @@ __all__ = [
     "TMatrixCluster",
     "TargetPressures",
     "TransducerArray",
+    "Trap",
     "VoxelMask",
     "WeakestFocus",
     "amplitudes_of",
     "analytic",
     "animate3d",
+    "attainable",
     "bayes_opt",
     "bo_foci",
     "calibrate",
@@ -144,6 +153,7 @@ __all__ = [
     "focus_phases",
     "force_matrices",
     "gabs",
+    "gorkov",
     "gradient_ascent",
     "green",
     "haptic_metrics",

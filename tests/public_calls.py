@@ -26,6 +26,7 @@ BALL = small_scene((at.Sphere((12e-3, 12e-3, 12e-3), radius=3e-3, rigid=True),))
 SCENE = replace(small_scene((CUBE,)), observation_plane=PLANE)
 MATRIX = torch.randn(3, 4, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
 DRIVE = torch.ones(4, dtype=torch.complex128)
+BEAD = at.Particle.of("EPS", 0.3e-3)
 GRID = np.stack(np.meshgrid(*(1e-3 * np.arange(count) for count in (2, 3, 4)), indexing="ij"), axis=-1)
 CHIP = (1, 2)
 SPOTS = np.stack(
@@ -85,6 +86,7 @@ INSIDE_METHODS |= {
     "together_on",
 }
 INSIDE_METHODS |= {"at", "farthest", "near", "section", "wanted", "write_file"}
+INSIDE_METHODS |= {"climbed", "rows", "weights"}
 
 
 class Made(NamedTuple):
@@ -199,6 +201,10 @@ def objective() -> at.SimulatedObjective:
     return at.SimulatedObjective(AIR_ALONE, at.make_propagator(AIR_ALONE))
 
 
+def force_objective() -> at.ForceObjective:
+    return at.ForceObjective(at.make_propagator(AIR_ALONE), at.Trap([(22e-3, 7e-3, 14e-3)], BEAD))
+
+
 def problem() -> at.Problem:
     return at.Problem.of(objective())
 
@@ -309,6 +315,7 @@ ARGUMENTS: dict[str, Any] = {
     "link": Made(lambda _: limited_link()),
     "log": Made(lambda folder: folder / "log.jsonl"),
     "mask": np.ones((2, 2, 2), bool),
+    "material": "EPS",
     "medium": AIR,
     "method": "box",
     "microphones": [hardware.Microphone(1, 0.01, 1.0)],
@@ -316,6 +323,7 @@ ARGUMENTS: dict[str, Any] = {
     "objective": Made(lambda _: objective()),
     "obstacles": (CUBE,),
     "off_screen": True,
+    "particle": BEAD,
     "path": Made(lambda folder: folder / "file.npz"),
     "phases": [0.0, 1.0, 2.0, 3.0],
     "picture": Made(lambda _: picture()),
@@ -364,6 +372,9 @@ ARGUMENTS: dict[str, Any] = {
 OTHERS: dict[str, Any] = {
     "SimulatedPropagator.field.drive": torch.stack([DRIVE, DRIVE]),
     "FailedTransducers.transducers": [1],
+    "ForceObjective.goal": at.Trap([(22e-3, 7e-3, 14e-3)], BEAD),
+    "Particle.radius": 3e-4,
+    "Particle.of.radius": 3e-4,
     "Drift.sensor": 0.1,
     "EmulatedScope.noise": 0.0,
     "CallableFrames.take": lambda: np.ones((4, 4)),
@@ -416,6 +427,7 @@ OTHERS: dict[str, Any] = {
     "Readings.of_rows.drives": torch.stack([DRIVE, DRIVE]),
     "Readings.of_rows.phase": [0.1, 0.2],
     "Contrast.points": [1],
+    **{f"{name}.__call__.pressure": torch.ones(240, dtype=torch.float64) for name in ("Levitate", "Trap")},
     "TargetPressures.targets": [1.0, 2.0, 3.0],
     "TargetPressures.__call__.pressure": [1.0, 2.0, 3.0],
     "PhasorKernel.mean.x": torch.ones(3, 2, dtype=torch.float64),
@@ -506,6 +518,7 @@ INSTANCES = {
     "Medium": Made(lambda _: AIR),
     "TMatrix": Made(lambda _: operator()),
     "TMatrixCluster": Made(lambda _: at.TMatrixCluster([operator()])),
+    "ForceObjective": Made(lambda _: force_objective()),
     "HeatInversion": Made(lambda _: heat_inversion()),
     "Picture": Made(lambda _: picture()),
     "OpenMPDBoard": Made(lambda folder: at.OpenMPDBoard.load(board_file(folder))),

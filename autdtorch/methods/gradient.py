@@ -15,6 +15,7 @@ import torch
 from autdtorch.methods.base import Method, Step, whole
 from autdtorch.methods.problem import Problem, known_matrix, starts_of
 from autdtorch.methods.seeds import generators_of, uniform
+from autdtorch.objectives.forces import ForceGoal
 from autdtorch.objectives.goals import scores_of, slope_of
 from autdtorch.objectives.objective import GoalFunction
 from autdtorch.utils.array_types import REAL
@@ -72,7 +73,10 @@ def random_drives(count: int, transducers: int, generator: torch.Generator) -> t
 @one_library_thread()
 def climb(goal: GoalFunction, matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor:
     """Return the highest drive (M,) of the climbs of a goal from drives (S, M), on one matrix (P, M)."""
-    drive = climbed(goal, matrix, drive, steps)
+    if isinstance(goal, ForceGoal):
+        drive = goal.climbed(matrix, drive, steps)
+    else:
+        drive = climbed(goal, matrix, drive, steps)
     return drive[scores_of(goal, _pressure(matrix, drive).abs()).argmax()]
 
 

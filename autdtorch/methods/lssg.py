@@ -174,5 +174,8 @@ def _focus_drives(problem: Problem) -> torch.Tensor:
     scene = problem.scene
     if scene is None:
         raise invalid("problem.scene", None, "must be a scene: the phases of the foci need its geometry")
+    if len(scene.control_points) != problem.foci:
+        accepted = f"must be the readings of the {len(scene.control_points)} control points"
+        raise invalid("problem.foci", problem.foci, accepted)
     phases = focus_phases(scene.array.positions, scene.control_points, scene.wavenumber)
     return drive_from_phases(phases + phase_offsets_of(scene.array))

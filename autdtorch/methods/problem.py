@@ -17,7 +17,7 @@ from autdtorch.objectives.objective import (
     validate_drives,
     validate_matrix,
 )
-from autdtorch.objectives.perturbations import deviation_of, quantised, simulated_matrix
+from autdtorch.objectives.perturbations import deviation_of, innermost, quantised, simulated_matrix
 from autdtorch.objectives.readings import Readings
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import (
@@ -105,13 +105,16 @@ class Problem:
 
         Args:
             objective: simulated or measured.
-            goal: function of pressures (..., P) [Pa] that gives the scores (...) to maximise.
+            goal: function of pressures (..., P) [Pa] that gives the scores (...) to maximise; that of the
+                objective in place of the default, where it has one.
             start: drive (M,) or (T, M) to start from, if any.
             readings: earlier ones, if any.
         """
         require_objective(objective)
         scene, matrix = objective.scene, simulated_matrix(objective)
-        counts = len(scene.array), len(scene.control_points)
+        if goal is WEAKEST_FOCUS:
+            goal = getattr(innermost(objective), "goal", goal)
+        counts = len(scene.array), len(scene.control_points if matrix is None else matrix)
         quantise = partial(quantised, objective)
         return cls(*counts, goal, scene, matrix, quantise, start, readings, deviation_of(objective))
 

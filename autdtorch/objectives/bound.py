@@ -34,7 +34,7 @@ from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import ArrayLike, complex_tensor
 
 #: Orders of Schatten norms that approach the largest eigenvalue, which has kinks at its minima.
-_ORDERS = (4, 32, 256, 2048, 16384)
+ORDERS = (4, 32, 256, 2048, 16384)
 
 #: Smallest weight, relative to its start: no step of the search may end where all weights are 0.
 _LEAST_WEIGHT = 1e-12
@@ -138,7 +138,7 @@ def level_bound(
     log_z, wide = (np.zeros(len(start)), 0.0) if norm else (np.log(start), _RANGE)
     limits += [(0, _MOST_PRICE)] * len(silent) + [(log - wide, log + wide) for log in log_z]
     x = np.concatenate([weights, np.full(len(silent), 1e-3), log_z])
-    for order in _ORDERS:
+    for order in ORDERS:
         x = scipy.optimize.minimize(
             _log_bound,
             x,
@@ -148,7 +148,8 @@ def level_bound(
             bounds=limits,
             options={"maxcor": 40, "maxiter": 2000, "ftol": 1e-14, "gtol": 1e-10},
         ).x
-    bound = alone.min() * math.exp(_certified(x, rows, importance)) * (1 + _MARGIN)
+    square = certified(x[len(rows) :], rows, _signed(x, rows, importance))
+    bound = alone.min() * math.sqrt(square) * (1 + _MARGIN)
     if norm:  # |z|^2 is the number of transducers
         bound /= math.sqrt(len(start))
     return bound, float(x[count : count + len(silent)].sum())
@@ -178,35 +179,66 @@ def contrast_bound(foci: ComplexArray, background: ComplexArray) -> float:
     return level * math.sqrt(len(background)) * (1 + _SINGULAR_MARGIN)
 
 
-def _certified(x: Array, rows: ComplexArray, importance: Array) -> float:
-    """Return the logarithm of the bound that x certifies, in spite of rounding; see `_log_bound`."""
-    split, bounds = len(rows), []
+def certified(log_z: Array, rows: ComplexArray, signed: Array) -> float:
+    """Return lambda |z|^2 of rows (N, M) with weights (N,) of either sign, in spite of rounding.
+
+    The dual of the relaxation: an upper bound on sum signed_n |(rows q)_n|^2 over all drives |q_i| <= 1. It
+    is 0 if the weights leave no drive above 0.
+    """
+    bounds = []
     for width in _RANGES:
-        log_z = x[split:].clip(x[split:].max() - width)
-        z, columns, signed = _dual(np.concatenate([x[:split], log_z]), rows, importance)
+        z = np.exp(log_z - log_z.max()).clip(math.exp(-width))
         # scaled before, as the SVD errs in proportion to its norm
-        scaled = np.sqrt(np.abs(signed))[:, None] * columns
+        scaled = np.sqrt(np.abs(signed))[:, None] * (rows / z)
         left, singular, _ = np.linalg.svd(scaled, full_matrices=False)
         signs = left.conj().T * np.sign(signed)
         largest = np.linalg.eigvalsh((singular[:, None] * signs @ left) * singular)[-1]
         rounding = _ROUNDING * len(rows) * (np.abs(scaled) ** 2).sum()
-        bounds.append(math.log(max(largest, 0.0) + rounding) / 2 + math.log(np.linalg.norm(z)))
-    return min(bounds)
+        bounds.append(max(largest + rounding, 0.0) * np.sum(z**2))
+    return float(min(bounds))
 
 
-def _dual(x: Array, rows: ComplexArray, importance: Array) -> tuple[Array, ComplexArray, Array]:
-    """Return z over its largest, the rows over it, and the signed weights of all points; see `_log_bound`."""
-    weights, prices, log_z = np.split(x, [len(importance), len(rows)])
+def log_dual(
+    log_z: Array, rows: ComplexArray, signed: Array, order: float, mixing: ComplexArray | None = None
+) -> tuple[float, Array, Array]:
+    """Return the logarithm of lambda |z|^2, and its derivatives by the weights and by log z.
+
+    The Schatten norm of this `order`, of the positive part, replaces the largest eigenvalue lambda.
+
+    Args:
+        log_z: of the transducers (M,).
+        rows: (N, M).
+        signed: their weights (N,), of either sign.
+        order: >= 2.
+        mixing: (N, n), if the rows are its product with `rows` (n, M).
+    """
     z = np.exp(log_z - log_z.max())
+    left, singular, right = np.linalg.svd(rows / z, full_matrices=False)
+    left = left if mixing is None else mixing @ left
+    values, vectors = np.linalg.eigh((singular[:, None] * (left.conj().T * signed) @ left) * singular)
+    if values[-1] <= 0:  # no level is left
+        return 2 * _NOTHING, np.zeros_like(signed), np.zeros_like(z)
+    positive = np.maximum(values, 0)
+    ratios = positive / positive[-1]
+    norm = np.linalg.norm(ratios, order)
+    # Derivative of the logarithm by the eigenvalues
+    growth = (ratios / norm) ** (order - 1) / (positive[-1] * norm)
+    at_points = np.abs((left * singular) @ vectors) ** 2 @ growth
+    at_transducers = np.abs(right.T @ vectors.conj()) ** 2 @ (growth * values)
+    log = float(np.log(positive[-1] * norm) + np.log(np.sum(z**2)))
+    return log, at_points, 2 * (z**2 / np.sum(z**2) - at_transducers)
+
+
+def _signed(x: Array, rows: ComplexArray, importance: Array) -> Array:
+    """Return the signed weights of all points; see `_log_bound`."""
+    weights, prices, _ = np.split(x, [len(importance), len(rows)])
     # with prices b, the weights are divided by their mean and multiplied by 1 + sum b
     factor = (1 + prices.sum()) / (weights @ importance)
-    return z, rows / z, np.concatenate((weights * factor, -prices))
+    return np.concatenate((weights * factor, -prices))
 
 
 def _log_bound(x: Array, rows: ComplexArray, importance: Array, order: float) -> tuple[float, Array]:
-    """Return the logarithm of the bound over the least of `alone`, and its gradient.
-
-    The Schatten norm of this `order`, of the positive part, replaces the largest eigenvalue.
+    """Return the logarithm of the bound over the least of `alone`, and its gradient; see `log_dual`.
 
     Args:
         x: the weights a over `importance`, up to a factor, b, then log z (P + K + M,).
@@ -214,26 +246,13 @@ def _log_bound(x: Array, rows: ComplexArray, importance: Array, order: float) ->
         importance: (min(alone) / alone)^2 (P,).
         order: >= 2.
     """
-    foci, (z, columns, signed) = len(importance), _dual(x, rows, importance)
+    foci = len(importance)
+    log, at_points, slope_log_z = log_dual(x[len(rows) :], rows, _signed(x, rows, importance), order)
     weights, all_prices = x[:foci], 1 + x[foci : len(rows)].sum()
     mean = weights @ importance
-    left, singular, right = np.linalg.svd(columns, full_matrices=False)
-    values, vectors = np.linalg.eigh((singular[:, None] * (left.conj().T * signed) @ left) * singular)
-    if values[-1] <= 0:  # no level is left
-        return _NOTHING, np.zeros_like(x)
-    positive = np.maximum(values, 0)
-    ratios = positive / positive[-1]
-    norm = np.linalg.norm(ratios, order)
-    log_bound = (np.log(positive[-1] * norm) + 2 * np.log(np.linalg.norm(z))) / 2
-
-    # Derivative of the logarithm by the eigenvalues
-    growth = (ratios / norm) ** (order - 1) / (positive[-1] * norm) / 2
-    at_points = np.abs((left * singular) @ vectors) ** 2 @ growth
-    at_transducers = np.abs(right.T @ vectors.conj()) ** 2 @ (growth * values)
     slope_weights = (at_points[:foci] - importance * (weights @ at_points[:foci]) / mean) * all_prices / mean
     slope_prices = weights @ at_points[:foci] / mean - at_points[foci:]
-    slope_log_z = z**2 / np.sum(z**2) - 2 * at_transducers
-    return float(log_bound), np.concatenate([slope_weights, slope_prices, slope_log_z])
+    return log / 2, np.concatenate([slope_weights, slope_prices, slope_log_z]) / 2
 
 
 class _Boxes(NamedTuple):

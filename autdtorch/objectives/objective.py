@@ -204,10 +204,10 @@ class SimulatedObjective:
             return torch.stack(rows).abs().cpu()
         # In parts, as large temporary arrays take most of the time
         parts = torch.split(drive, max(1, _PRODUCTS // self.transfer_matrix.numel()))
-        return torch.cat([_magnitudes(self.transfer_matrix, part) for part in parts])
+        return torch.cat([magnitudes(self.transfer_matrix, part) for part in parts])
 
 
-def _magnitudes(matrix: torch.Tensor, drive: torch.Tensor) -> torch.Tensor:
+def magnitudes(matrix: torch.Tensor, drive: torch.Tensor) -> torch.Tensor:
     """Return |G q| (B, P) of drives (B, M), with the same rounding for every row.
 
     A search through thousands of choices amplifies differences of rounding. BLAS rounds by the number of

@@ -274,9 +274,14 @@ def deviation_of(objective: Objective) -> Callable[[torch.Tensor], torch.Tensor]
 
 def simulated_matrix(objective: Objective) -> torch.Tensor | None:
     """Return the transfer matrix (P, M) [Pa] of the innermost objective, or None where it has none."""
+    return getattr(innermost(objective), "transfer_matrix", None)
+
+
+def innermost(objective: Objective) -> Objective:
+    """Return the objective that perturbations wrap."""
     while isinstance(objective, Perturbation):
         objective = objective.inner
-    return getattr(objective, "transfer_matrix", None)
+    return objective
 
 
 def random_rms(matrix: torch.Tensor) -> float:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from autdtorch.methods.functions import gabs, gradient_ascent
 from autdtorch.methods.gradient import climb, random_drives
-from autdtorch.objectives.bound import _certified, focus_bound
+from autdtorch.objectives.bound import certified, focus_bound
 from autdtorch.objectives.goals import WeakestFocus
 from autdtorch.objectives.quiet import QuietPoints
 
@@ -87,12 +87,9 @@ def test_rounding_takes_nothing_from_a_certificate(least):
     drives = np.stack([*first, -(rows[2, :2] @ first) / rows[2, 2]])
     drives = drives[:, np.abs(drives[2]) <= 1]  # the third point is at 0
     level = np.abs(rows[:2] @ drives).min(axis=0).max()
-    x = np.array([1.0, 1.0, 1e-3, 0.0, 0.0, least])
-    assert (
-        level
-        <= math.exp(_certified(x, rows, np.ones(2)))
-        < 1.1 * math.exp(_certified(x.clip(-6), rows, np.ones(2)))
-    )
+    log_z, signed = np.array([0.0, 0.0, least]), np.array([0.5005, 0.5005, -1e-3])
+    bound = math.sqrt(certified(log_z, rows, signed))
+    assert level <= bound < 1.1 * math.sqrt(certified(log_z.clip(-6), rows, signed))
 
 
 @pytest.mark.parametrize("ratio", [3.8e-11, 1e-6])

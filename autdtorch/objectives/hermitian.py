@@ -1,0 +1,132 @@
+"""Hermitian forms of the drive, such as forces and stiffnesses: certified bounds, and drives near them.
+
+J forms share N rows of a matrix R (N, M) with weights W (J, N) of either sign: q^H A_j q = sum_n W_jn |(R
+q)_n|^2. For any a >= 0 with sum a_j = 1 and any z > 0, all drives |q_i| <= 1 satisfy
+
+    min_j q^H A_j q <= q^H (sum a_j A_j) q <= lambda |z|^2,
+
+with the largest eigenvalue lambda of Z^-1 (sum a_j A_j) Z^-1, Z = diag(z). The minimum of the right side over
+a and z is the value of the semidefinite relaxation, as for foci (`bound`); any a and z certify a bound.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.optimize
+
+from autdtorch.objectives.bound import ORDERS, certified, log_dual
+from autdtorch.utils.array_types import Array, ComplexArray
+from autdtorch.utils.process import one_library_thread
+
+_LEAST_WEIGHT = 1e-12  # of a form, relative to its start
+_RANGE = 30.0  # of log z
+_RANK = 1e-13  # Singular value below which the search leaves a combination of rows out; certificates do not
+_MARGIN = 1e-12
+_SMOOTHING = (
+    1.0,
+    0.3,
+    0.1,
+    0.03,
+    0.01,
+    3e-3,
+    1e-3,
+    3e-4,
+)  # of the least form, relative to the mean size of all
+_START = 0.9  # largest amplitude of the start of an ascent
+_TINY = 1e-300
+
+
+@one_library_thread()
+def forms_bound(rows: ComplexArray, weights: Array) -> float:
+    """Return an upper bound on the least of J Hermitian forms over all drives of amplitudes <= 1.
+
+    Args:
+        rows: R (N, M).
+        weights: W (J, N); see above. For a lower bound on a single form, take minus the bound of -W.
+
+    Returns:
+        The bound, >= 0: without sound all forms are 0. Where it is 0, no drive makes all forms positive.
+    """
+    scale = float(np.abs(rows).max()) or 1.0
+    heard = np.abs(rows).max(axis=0) > 0
+    rows = rows[:, heard] / scale
+    if (np.abs(weights) @ (np.abs(rows) ** 2).sum(axis=1)).min() == 0:
+        return 0.0
+    mixing, basis = _factors(rows)
+    forms = len(weights)
+    start = np.log(np.linalg.norm(rows, axis=0)) / 2
+    x = np.concatenate([np.ones(forms), start])
+    limits = [(_LEAST_WEIGHT, None)] * forms + [(log - _RANGE, log + _RANGE) for log in start]
+
+    def log_bound(x: Array, order: float) -> tuple[float, Array]:
+        total = x[:forms].sum()
+        signed = x[:forms] @ weights / total
+        log, by_rows, by_log_z = log_dual(x[forms:], basis, signed, order, mixing)
+        by_forms = (weights @ by_rows - signed @ by_rows) / total
+        return log, np.concatenate([by_forms, by_log_z])
+
+    for order in ORDERS:
+        x = scipy.optimize.minimize(
+            log_bound,
+            x,
+            args=(order,),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=limits,
+            options={"maxcor": 40, "maxiter": 500, "ftol": 1e-12, "gtol": 1e-9},
+        ).x
+    signed = x[:forms] @ weights / x[:forms].sum()
+    return scale**2 * certified(x[forms:], rows, signed) * (1 + _MARGIN)
+
+
+@one_library_thread()
+def ascended(rows: ComplexArray, weights: Array, drive: ComplexArray, iterations: int = 300) -> ComplexArray:
+    """Return the drive (M,) at a local maximum of the least of J forms, from a drive (M,).
+
+    L-BFGS on the smooth least form, smoothed less and less. Drives are z sin|z| / |z|: no amplitude is above
+    1, and an amplitude of 1 is no end.
+
+    Args:
+        rows: R (N, M).
+        weights: W (J, N).
+        drive: the start.
+        iterations: most of each stage.
+    """
+    (mixing, basis), count = _factors(rows), len(drive)
+
+    def smooth(x: Array, temperature: float) -> tuple[float, Array]:
+        z = x[:count] + 1j * x[count:]
+        size = np.abs(z)
+        readings = mixing @ (basis @ (z * np.sinc(size / np.pi)))
+        forms = weights @ np.abs(readings) ** 2 / scale
+        shares = np.exp((forms.min() - forms) / temperature)
+        value = forms.min() - temperature * np.log(shares.sum())
+        slope = 2 / scale * ((shares / shares.sum()) @ weights * readings) @ mixing.conj() @ basis.conj()
+        turn = z / np.maximum(size, _TINY)
+        along = slope * turn.conj()
+        slope = turn * (along.real * np.cos(size) + 1j * along.imag * np.sinc(size / np.pi))
+        return -value, -np.concatenate([slope.real, slope.imag])
+
+    amplitude = np.abs(drive)
+    z = drive / np.maximum(amplitude, _TINY) * np.arcsin(np.minimum(amplitude, _START))
+    for smoothing in _SMOOTHING:
+        drive = z * np.sinc(np.abs(z) / np.pi)
+        scale = float(np.abs(weights @ np.abs(rows @ drive) ** 2).mean()) or 1.0
+        x = scipy.optimize.minimize(
+            smooth,
+            np.concatenate([z.real, z.imag]),
+            args=(smoothing,),
+            jac=True,
+            method="L-BFGS-B",
+            options={"maxcor": 20, "maxiter": iterations, "ftol": 1e-11, "gtol": 1e-9},
+        ).x
+        z = x[:count] + 1j * x[count:]
+    drive = z * np.sinc(np.abs(z) / np.pi)
+    return drive / max(float(np.abs(drive).max()), _TINY)
+
+
+def _factors(rows: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    """Return factors (N, n) and (n, M) of rows, of their numerical rank n."""
+    left, singular, right = np.linalg.svd(rows, full_matrices=False)
+    rank = singular > _RANK * singular[0]
+    return left[:, rank] * singular[rank], right[rank]

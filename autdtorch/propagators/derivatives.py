@@ -1,0 +1,102 @@
+"""Derivatives of the pressure at a point, by the regular waves of the field around it.
+
+In a ball without bodies and sources, the field is a sum of regular waves j_l(kr) Y_lm around its centre.
+Waves above a degree L hardly reach a sphere of k r below L, so that the pressures at nodes on the sphere give
+the others: the error falls faster than any power of L. No derivative is a difference of neighbouring values,
+whose errors a small step would magnify, and a propagator needs to know nothing but pressures.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from autdtorch.analytic.momentum import linear_momentum
+from autdtorch.analytic.spherical_waves import harmonics, regular_radial
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.array_types import COMPLEX
+from autdtorch.utils.validation import invalid
+
+DEGREE = 3
+"""DEGREE: largest degree that matters to third derivatives."""
+
+SIZE = 1.5
+"""SIZE: k r of the sphere; a larger one has smaller errors of rounding, and less room beside bodies."""
+
+_RINGS = 8  # of the sphere: waves of the degree 2 * 8 - 3 are the first to be taken for others, at 3e-11
+_COUNTS = [1, 3, 9, 27]
+
+
+class Derivatives(NamedTuple):
+    """The pressure and its derivatives at points, with leading dimensions of points, drives or transducers.
+
+    Attributes:
+        pressure: p (...) [Pa].
+        first: dp/dx_i (..., 3) [Pa/m].
+        second: (..., 3, 3) [Pa/m^2].
+        third: (..., 3, 3, 3) [Pa/m^3].
+    """
+
+    pressure: torch.Tensor
+    first: torch.Tensor
+    second: torch.Tensor
+    third: torch.Tensor
+
+
+def nodes_around(scene: Scene, points: torch.Tensor) -> torch.Tensor:
+    """Return the nodes (P, S, 3) [m] on spheres around points (P, 3), after checking that nothing is within.
+
+    Raises:
+        ValueError: an obstacle, a reflector or a transducer is nearer than the radius of the sphere, 1.5 / k.
+    """
+    radius = SIZE / scene.wavenumber
+    places = points.detach().cpu()
+    apart = torch.cdist(places, scene.array.nodes.positions.reshape(-1, 3)).amin(dim=1)
+    near = {"the array": apart <= radius}
+    for number, obstacle in enumerate(scene.obstacles):
+        near[f"obstacles[{number}]"] = obstacle.contains(places, margin=radius)
+    for number, reflector in enumerate(scene.reflectors):
+        near[f"reflectors[{number}]"] = reflector.mirror.height(places) <= radius
+    for name, wrong in near.items():
+        if wrong.any():
+            index = int(wrong.nonzero()[0])
+            accepted = f"must be at least {1e3 * radius:.2f} mm from {name}, as its derivatives are needed"
+            raise invalid(f"points[{index}]", tuple(places[index].tolist()), accepted, "m")
+    return points[:, None] + radius * _sphere()[0].to(points.device)
+
+
+def derivatives(pressure: torch.Tensor, wavenumber: complex) -> Derivatives:
+    """Return the derivatives at points from pressures (..., S) at the nodes around them."""
+    flat = pressure @ _from_nodes(wavenumber)
+    parts = torch.split(flat, _COUNTS, dim=-1)
+    shape = flat.shape[:-1]
+    return Derivatives(*(part.reshape(*shape, *[3] * order) for order, part in enumerate(parts)))
+
+
+@functools.lru_cache(1)
+def _sphere() -> tuple[torch.Tensor, torch.Tensor]:
+    """Return nodes (S, 3) on the unit sphere and weights (S,), exact up to the degree 2 * rings - 1."""
+    z, weight = np.polynomial.legendre.leggauss(_RINGS)
+    angle = math.pi / _RINGS * np.arange(2 * _RINGS)
+    across = np.sqrt(1 - z**2)[:, None]
+    nodes = np.stack(np.broadcast_arrays(across * np.cos(angle), across * np.sin(angle), z[:, None]), axis=-1)
+    weights = np.repeat(weight * math.pi / _RINGS, 2 * _RINGS)
+    return torch.from_numpy(nodes.reshape(-1, 3)), torch.from_numpy(weights)
+
+
+@functools.lru_cache(8)
+def _from_nodes(wavenumber: complex) -> torch.Tensor:
+    """Return the map (S, 40) from pressures at nodes to p and its first, second and third derivatives."""
+    nodes, weights = _sphere()
+    size = torch.tensor([[wavenumber * SIZE / wavenumber.real]], **COMPLEX)
+    waves = weights[:, None] * harmonics(DEGREE, nodes).conj() / regular_radial(DEGREE, size)
+    each, columns = torch.eye(waves.shape[1], **COMPLEX), []
+    for order in range(DEGREE + 1):
+        at_center = (1j * wavenumber) ** order / math.sqrt(4 * math.pi) * each[..., 0, :]
+        columns.append(at_center.reshape(-1, waves.shape[1]))
+        each = linear_momentum(each)  # -i grad / k
+    return waves @ torch.cat(columns).mT
