@@ -16,6 +16,7 @@ from typing import Any
 import hypothesis
 import pytest
 import torch
+from PIL import Image
 
 TESTS = Path(__file__).parent
 
@@ -52,6 +53,13 @@ def no_timer_left_running() -> Iterator[None]:
     for thread in threading.enumerate():
         if isinstance(thread, threading.Timer):
             thread.cancel()
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write figures as blank images: drawing one takes half a second."""
+    blank = Image.new("RGB", (2, 1))
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda _, file: blank.save(file, "png"))
 
 
 @pytest.fixture

@@ -29,8 +29,10 @@ def configs_parsed_once():
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch):
-    """Runs a command line in an empty folder; returns its exit status."""
+def run(tmp_path, monkeypatch, request):
+    """Runs a command line in an empty folder; returns its exit status. With `drawn`, figures are drawn."""
+    if "drawn" not in request.fixturenames:
+        request.getfixturevalue("undrawn")
     root, package = logging.getLogger(), logging.getLogger("autdtorch")
     handlers, levels = root.handlers[:], (root.level, package.level)
     monkeypatch.chdir(tmp_path)
@@ -54,6 +56,11 @@ def run(tmp_path, monkeypatch):
     root.handlers[:] = handlers
     root.setLevel(levels[0])
     package.setLevel(levels[1])
+
+
+@pytest.fixture
+def drawn():
+    """Has figures drawn."""
 
 
 @pytest.fixture

@@ -1,11 +1,12 @@
 """Matrices on disk: found again for the same simulation only, whole or not at all."""
 
+import contextlib
 import importlib
+import multiprocessing
 import os
-import subprocess
-import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,15 +25,34 @@ from autdtorch.utils.files import ABANDONED, PARTIAL
 SPACING = 2.5e-3
 UNEQUAL = 1 + np.eye(4)  # strengths or radii of four transducers, of which one differs
 
-WRITER = """
-import sys, time, numpy as np
-from pathlib import Path
-from autdtorch.propagators.store import Store
-cache, value = Store(Path(sys.argv[1])), float(sys.argv[2])
-Path(sys.argv[3]).touch()
-while True:
-    cache.save("shared", np.full(200_000, value), value)
-"""
+
+def write_for_ever(folder, value):
+    cache = Store(folder)
+    while True:
+        cache.save("shared", np.full(200_000, value), value)
+
+
+def write_until_half_done(folder, stopped):
+    Path.replace = lambda *_: (stopped.touch(), time.sleep(600))
+    write_for_ever(folder, 1.0)
+
+
+@contextlib.contextmanager
+def killed(*works):
+    """Do each work (function and arguments) in a process of its own; kill them at the end."""
+    context = multiprocessing.get_context("fork")
+    processes = [context.Process(target=function, args=arguments) for function, *arguments in works]
+    for process in processes:
+        process.start()
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.join()
+
+
+needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks here")
 
 
 def prepared(scene, folder, **settings):
@@ -220,41 +240,31 @@ def test_a_folder_that_cannot_be_used_costs_no_result(tmp_path):
     assert not list((tmp_path / "folder").glob(f"*{PARTIAL}"))
 
 
+@needs_fork
+@pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")
 def test_writers_that_run_together_and_are_killed(tmp_path):
     """Two processes write one matrix over and over, each with values of its own, until they are killed."""
-    folder, ready = tmp_path / "cache", [tmp_path / f"ready{number}" for number in range(2)]
-    writers = [
-        subprocess.Popen([sys.executable, "-c", WRITER, str(folder), str(number), str(flag)])
-        for number, flag in enumerate(ready)
-    ]
-    try:
-        wait_for(lambda: all(flag.exists() for flag in ready) and files(folder))
-        cache, seen = Store(folder), set()
-        end = time.monotonic() + 60
-        while len(seen) < 2 and time.monotonic() < end:
-            matrix, (number,) = cache.load("shared", (200_000,), 1)
-            assert (matrix == number).all()
-            seen.add(number)
-        assert len(seen) == 2
-    finally:
-        for writer in writers:
-            writer.kill()
-            writer.wait()
+    cache, seen = Store(tmp_path), set()
+
+    def both_are_seen():
+        matrix, (number,) = cache.load("shared", (200_000,), 1)
+        assert (matrix == number).all()
+        seen.add(number)
+        return len(seen) == 2
+
+    with killed(*((write_for_ever, tmp_path, number) for number in (0.0, 1.0))):
+        wait_for(lambda: files(tmp_path))
+        wait_for(both_are_seen)
     matrix, (number,) = cache.load("shared", (200_000,), 1)
     assert (matrix == number).all()
 
 
+@needs_fork
+@pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")
 def test_a_writer_killed_before_it_is_done_leaves_nothing_that_is_read(tmp_path):
     stopped = tmp_path / "stopped"
-    halfway = "import pathlib, time\ndef halt(*_): Path(sys.argv[3]).touch(); time.sleep(60)\n"
-    code = WRITER.replace("cache, value", f"{halfway}pathlib.Path.replace = halt\ncache, value", 1)
-    code = code.replace("Path(sys.argv[3]).touch()\nwhile", "while")
-    writer = subprocess.Popen([sys.executable, "-c", code, str(tmp_path), "1", str(stopped)])
-    try:
+    with killed((write_until_half_done, tmp_path, stopped)):
         wait_for(stopped.exists)
-    finally:
-        writer.kill()
-        writer.wait()
     cache = Store(tmp_path)
     (left,) = tmp_path.glob(f"*{PARTIAL}")
     assert cache.load("shared", (200_000,), 1) is None

@@ -14,8 +14,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from matplotlib.figure import Figure
-from PIL import Image
 from small_scenes import CUBE, small_scene
 
 import autdtorch.study.report.study_report
@@ -54,8 +52,7 @@ def quick(request, monkeypatch):
     """Skip 3D pictures, which have tests elsewhere, and in most tests leave the figures blank."""
     monkeypatch.setattr(autdtorch.study.report.study_report, "rendering_problem", lambda: "no driver")
     if "pictures" not in request.fixturenames:
-        blank = Image.new("RGB", (2, 1))
-        monkeypatch.setattr(Figure, "savefig", lambda _, path: blank.save(path))
+        request.getfixturevalue("undrawn")
 
 
 def studied(scenes, **settings):

@@ -2,14 +2,16 @@
 
 import functools
 import logging
+import multiprocessing
 import os
 import signal
+import time
 from unittest.mock import Mock
 
 import pytest
 import slow_study
 import torch
-from checks.kills import SUBJECTS, wait
+from checks.kills import SUBJECTS
 from filelock import FileLock
 from small_scenes import CUBE, small_scene
 
@@ -200,26 +202,33 @@ def test_a_link_to_a_file_is_used_as_the_file(tmp_path, warnings):
 STUDY = SUBJECTS["study"]
 
 
-@pytest.mark.skipif(os.name != "posix", reason="SIGKILL is of POSIX")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks here")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")
 def test_killed_again_and_again_a_study_ends_with_the_same_numbers(tmp_path, monkeypatch):
     folders = calm, killed = tmp_path / "calm", tmp_path / "killed"
     for folder in folders:
         folder.mkdir()
 
+    def run(folder):
+        monkeypatch.setattr("sys.argv", ["slow_study.py", str(folder / "out")])
+        slow_study.main()
+
     def finish(folder):
         with monkeypatch.context() as patched:
-            patched.setattr("sys.argv", ["slow_study.py", str(folder / "out")])
-            patched.setattr("autdtorch.study.run_study.BLOCK", 1)  # the study sets it, too
             patched.setattr("slow_study.time", Mock())
-            slow_study.main()
+            run(folder)
 
+    monkeypatch.setattr("autdtorch.study.run_study.BLOCK", 1)  # the study sets it, too
     finish(calm)
     undisturbed = STUDY.numbers(calm)
     for trials in (2, 8):  # in the midst of either scene
-        process = STUDY.start(killed)
-        wait(lambda trials=trials: STUDY.lines(killed) >= trials, process)
+        process = multiprocessing.get_context("fork").Process(target=run, args=(killed,))
+        process.start()
+        while process.is_alive() and STUDY.lines(killed) < trials:
+            time.sleep(0.01)
         process.kill()
-        assert process.wait() == -signal.SIGKILL
+        process.join()
+        assert process.exitcode == -signal.SIGKILL
     assert STUDY.lines(killed) < 12
     finish(killed)
     resumed = STUDY.numbers(killed)
