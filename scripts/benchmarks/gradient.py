@@ -8,23 +8,20 @@ process, which compiles the kernel first. Takes 5 minutes on 2 idle cores.
 from typing import NamedTuple
 
 import torch
-from shared.document import Page, printed, table
+from shared.document import printed
 from shared.scenes import paper_scene
 from shared.timing import in_new_process, peak_memory, timed
 
 import autdtorch as at
-
-DOCUMENT = "performance.md"
 
 STEPS_PER_PERIOD, PERIODS = 14, 72
 CASES = {"drive": "drive", "cubes": "drive, cubes' materials", "maps": "drive, maps of 100^3 cells"}
 OPTIONS = {"--cases": {"nargs": "+", "choices": CASES, "default": list(CASES), "help": "measured cases"}}
 
 
-def main(page: Page, cases: list[str]) -> None:
-    """Measure, and write the block."""
-    header = ["gradient by", "run without", "times that", "largest resident set"]
-    page.write(table(header, printed(map(row, cases))))
+def main(cases: list[str]) -> None:
+    """Measure and print: run without, times that with, largest resident set."""
+    printed(map(row, cases))
 
 
 def row(case: str) -> list[str]:

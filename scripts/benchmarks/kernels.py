@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import torch
 from numba import njit, prange
-from shared.document import Page, printed, table
+from shared.document import printed
 from shared.scenes import paper_scene
 from shared.timing import shortest, timed
 
@@ -22,7 +22,6 @@ from autdtorch.fdtd.stepping import Assembly, assemble, assemble_on
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.utils.process import spread
 
-DOCUMENT = "performance.md"
 OPTIONS = {"--seconds": {"type": float, "default": 0.4, "help": "of each repeat"}}
 
 SIDE = 112
@@ -32,14 +31,11 @@ REPEATS = 5
 """Repeats of each measurement; the fastest counts."""
 
 
-def main(page: Page, seconds: float) -> None:
-    """Measure, and write the block."""
-    large, small = (bandwidth(numbers, seconds) / 12e9 for numbers in (LARGE, SIDE**3))
-    page.write(
-        f"At 12 bytes a cell, the memory bandwidth (triad) allows {large:.2f} Gcell/s beyond the caches and "
-        f"{small:.2f} Gcell/s at {SIDE}^3.",
-        table(["kernel", "grid", "Gcell/s"], printed(rates(seconds))),
-    )
+def main(seconds: float) -> None:
+    """Measure and print."""
+    for numbers, where in ((LARGE, "beyond the caches"), (SIDE**3, f"at {SIDE}^3")):
+        print(f"memory (triad) allows {bandwidth(numbers, seconds) / 12e9:.2f} Gcell/s {where}")
+    printed(rates(seconds))
 
 
 def rates(seconds: float) -> Iterator[list[str]]:

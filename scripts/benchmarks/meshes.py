@@ -10,13 +10,11 @@ from collections.abc import Iterator
 
 import numpy as np
 import pyvista
-from shared.document import Page, percent, printed, table
+from shared.document import percent, printed
 from shared.scenes import relative_error, uncached
 from shared.timing import shortest
 
 import autdtorch as at
-
-DOCUMENT = "performance.md"
 
 AIR = at.Medium(1.2, 343.0)
 UP, PLACE = (0.0, 0.0, 1.0), (0.0, 0.0, 0.09)
@@ -27,9 +25,9 @@ FINGERS = ((-32, 45, 7.5), (-11, 58, 8), (10, 55, 8), (31, 42, 7))
 REPEATS = 3
 
 
-def main(page: Page) -> None:
-    """Measure, and write the block."""
-    page.write(table(["scene", "time"], printed(rows())))
+def main() -> None:
+    """Measure and print."""
+    printed(rows())
 
 
 def hand() -> at.Mesh:
