@@ -227,8 +227,8 @@ def test_workers_end_with_a_process_that_a_signal_ends(number):
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         worker = psutil.Process(int(process.stdout.readline()))
         process.send_signal(number)
-        assert process.wait(30) == -number
-    psutil.wait_procs([worker], timeout=30)
+        assert process.wait(120) == -number
+    psutil.wait_procs([worker], timeout=120)
     assert not worker.is_running()
 
 
@@ -243,6 +243,6 @@ def test_workers_end_with_a_sweep_that_a_signal_ends(tmp_path):
     wait(lambda: len(parent.children(recursive=True)) >= 2, sweep)
     workers = parent.children(recursive=True)
     sweep.send_signal(signal.SIGTERM)
-    assert sweep.wait(60) == -signal.SIGTERM
-    _, alive = psutil.wait_procs(workers, timeout=60)
+    assert sweep.wait(120) == -signal.SIGTERM
+    _, alive = psutil.wait_procs(workers, timeout=120)
     assert not alive

@@ -233,8 +233,8 @@ def test_a_signal_during_a_finaliser_ends_the_trial_after_it(monkeypatch):
     begin = time.monotonic()
     with pytest.raises(hw.Signalled, match="SIGTERM"), hw.ended_by_signals():  # noqa: PT012
         Finalised()
-        time.sleep(30)
-    assert time.monotonic() - begin < 20  # the wait is interrupted
+        time.sleep(200)
+    assert time.monotonic() - begin < 100  # the wait is interrupted
     assert ended == [True]
     assert not dropped
 

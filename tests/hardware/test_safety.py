@@ -108,7 +108,7 @@ def test_the_outputs_rest_as_the_duty_cycle_asks(trial, clock):
 def test_while_a_sensor_takes_too_long_the_outputs_go_off(trial, limits, message: str, in_main_thread: bool):
     def wait(_: int) -> None:
         while bench.drive().any():
-            time.sleep(60 if in_main_thread else 1e-3)  # in the main thread, the reading is interrupted
+            time.sleep(200 if in_main_thread else 1e-3)  # in the main thread, the reading is interrupted
 
     def measure() -> None:
         with pytest.raises(hw.LimitError, match=message):
@@ -136,8 +136,8 @@ def wait_for_pipe(folder):
 
 
 WAITS = {
-    "sleep": lambda _: time.sleep(60),
-    "event": lambda _: threading.Event().wait(60),
+    "sleep": lambda _: time.sleep(200),
+    "event": lambda _: threading.Event().wait(200),
     "pipe": wait_for_pipe,
 }
 
@@ -154,7 +154,7 @@ def test_a_sensor_that_never_returns_ends_the_trial(trial, tmp_path, kind: str):
             objective(FULL.expand(5, -1))
         assert bench.drive().abs().max() == 0
         assert objective.evaluations == 2  # what was read is in the log
-    assert time.monotonic() - begin < 30
+    assert time.monotonic() - begin < 100
     assert [signal.getsignal(one) for one in signal.valid_signals()] == before
 
 
@@ -162,14 +162,14 @@ def test_a_sensor_that_never_returns_in_silence_ends_the_check(trial, monkeypatc
     monkeypatch.setattr(checked_reading, "__defaults__", (0.1,))
     with trial.limited() as (bench, link):
         with pytest.raises(hw.SensorError, match="no reading within"):
-            hw.check_transducers(link, Disturbed(bench, lambda reading: reading == 2 and time.sleep(60)), 2)
+            hw.check_transducers(link, Disturbed(bench, lambda reading: reading == 2 and time.sleep(200)), 2)
         assert link.seconds_on == 0
 
 
 def test_a_signal_that_comes_while_a_sensor_hangs_ends_the_trial_at_once(trial):
     def hang(_: int) -> None:
         threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGTERM)).start()
-        time.sleep(60)
+        time.sleep(200)
 
     with trial.limited() as (bench, link), hw.ended_by_signals():
         objective = trial.objective(link, Disturbed(bench, hang))
@@ -214,7 +214,7 @@ def test_a_timer_that_comes_late_reaches_neither_the_next_stretch_nor_the_next_l
 @pytest.mark.parametrize("error", [hw.LinkError("stuck"), RuntimeError("stuck")])
 def test_a_timer_that_cannot_switch_off_says_so_at_once_and_ends_the_trial(trial, error, monkeypatch, caplog):
     def wait(_: int) -> None:
-        time.sleep(60)
+        time.sleep(200)
 
     def fail() -> None:
         raise error
@@ -337,12 +337,12 @@ def test_a_late_reading_ends_although_the_first_signal_is_lost(dropped):
             else:
                 one = Slow()
                 del one
-            time.sleep(60)
+            time.sleep(200)
 
     begin = time.monotonic()
     with pytest.raises(hw.SensorError, match=r"no reading within 0\.2 s"):
         checked_reading(Sensor(), 1, 0.2)
-    assert time.monotonic() - begin < 20
+    assert time.monotonic() - begin < 100
 
 
 def test_a_reading_that_ends_late_is_none():

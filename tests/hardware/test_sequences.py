@@ -5,6 +5,7 @@ import math
 import signal
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -42,6 +43,18 @@ def played(bench: hw.EmulatedBench) -> list[torch.Tensor]:
     real = bench.firmware.receive
     bench.firmware.receive = receive
     return drives
+
+
+def wait_until_it_plays(bench: hw.EmulatedBench) -> None:
+    while not bench.emitted().any():
+        time.sleep(1e-3)
+
+
+def once_it_plays(bench: hw.EmulatedBench, act: Callable[[], object]) -> threading.Thread:
+    """Return a thread that acts as soon as the bench emits."""
+    thread = threading.Thread(target=lambda: (wait_until_it_plays(bench), act()), daemon=True)
+    thread.start()
+    return thread
 
 
 class Clock(SimpleNamespace):
@@ -184,11 +197,9 @@ def test_another_thread_ends_a_loop(trial, how):
             "another sequence": lambda: link.play_sequence(Sequence(full[None], 1000.0), 0.05),
             "close": link.close,
         }
-        timer = threading.Timer(0.05, ends[how])
-        timer.start()
-        playback = link.play_sequence(loop)
-        timer.join()
-        assert 0 < playback.frames < 10_000
+        other = once_it_plays(bench, ends[how])
+        assert link.play_sequence(loop).frames > 0
+        other.join()
         assert bench.drive().any() == (how == "another drive")
 
 
@@ -203,7 +214,7 @@ def test_a_sequence_ends_though_its_end_comes_while_it_is_prepared(trial, how, m
     limits = {"seconds_in_a_row": 0.05} if how == "limit" else {}
     with trial.limited(hw.OPENMPD, **limits) as (bench, link):
         ends = {"off": link.off, "off of the link": link.link.off, "limit": lambda: time.sleep(0.1)}
-        watchdog = threading.Timer(10, link.link.off)
+        watchdog = threading.Timer(100, link.link.off)
         watchdog.start()
         with pytest.raises(hw.LimitError) if how == "limit" else contextlib.nullcontext():
             link.play_sequence(Sequence(frames_of(5, COUNT), 1000.0))
@@ -217,8 +228,7 @@ def test_a_mistake_ends_the_sequence_of_another_thread_with_the_outputs_off(tria
     with trial.link(bench, hw.OPENMPD) as link:
         thread = threading.Thread(target=link.play_sequence, args=(Sequence(SMALL, 1000.0),))
         thread.start()
-        while not bench.emitted().any():
-            time.sleep(1e-3)
+        wait_until_it_plays(bench)
         with pytest.raises(ValueError, match="rate"):
             link.play_sequence(Sequence(SMALL, 20e3))
         thread.join()
@@ -229,8 +239,7 @@ def test_off_of_a_limited_link_ends_a_sequence_that_another_thread_plays_without
     with trial.limited(hw.OPENMPD) as (bench, link):
         thread = threading.Thread(target=link.link.play_sequence, args=(Sequence(SMALL, 1000.0),))
         thread.start()
-        while not bench.emitted().any():
-            time.sleep(1e-3)
+        wait_until_it_plays(bench)
         link.off()
         assert not bench.emitted().any()
         thread.join()
@@ -261,7 +270,7 @@ def test_a_signal_ends_a_loop_with_the_outputs_off(trial, number):
 
     def play() -> None:
         with hw.ended_by_signals(), trial.link(bench, hw.OPENMPD) as link:
-            threading.Timer(0.03, signal.pthread_kill, (main, number)).start()
+            once_it_plays(bench, lambda: signal.pthread_kill(main, number))
             link.play_sequence(Sequence(frames_of(5, COUNT), 1000.0))
 
     try:
@@ -321,9 +330,9 @@ def test_the_timer_of_a_limited_link_ends_a_loop_and_its_off_is_no_error(trial):
         with pytest.raises(hw.LimitError, match=r"longer than the outputs may stay on, 0.06 s in a row"):
             link.play_sequence(loop)
         assert not bench.emitted().any()
-    with trial.limited(hw.OPENMPD) as (_, link):
-        threading.Timer(0.05, link.off).start()
-        assert link.play_sequence(loop).seconds < 60
+    with trial.limited(hw.OPENMPD) as (bench, link):
+        once_it_plays(bench, link.off)
+        link.play_sequence(loop)
 
 
 class TestOnAutd3:

@@ -26,7 +26,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning"),
 ]
 
-PATIENCE = 5.0  # after which a child is held to hang [s]
+PATIENCE = 60.0  # after which a child is held to hang [s]
 HELD = 0.1  # time for which a thread holds a lock during a fork [s]
 
 

@@ -61,12 +61,12 @@ def test_threads_that_leave_in_the_order_they_entered_leave_nothing_behind() -> 
         with process.one_library_thread():
             seen.append(process.thread_count())
             entered.set()
-            left.wait(10)
+            left.wait(60)
 
     other = threading.Thread(target=second)
     with process.one_library_thread():
         other.start()
-        assert entered.wait(10)
+        assert entered.wait(60)
     left.set()
     other.join()
     assert seen == [4]
