@@ -9,13 +9,12 @@ import math
 import time
 
 import torch
-from shared.document import Page, table
+from shared.document import printed
 from shared.scenes import autd3_array, paper_scene, with_array
 
 import autdtorch as at
 from autdtorch.propagators.scene_changes import SceneChanges
 
-DOCUMENT = "measured.md"
 GAIN, PHASE = 0.1, 0.5  # rms of the logarithm of the gain, and [rad]
 SHIFT, TURN = 2e-3, math.radians(2)  # of the obstacle, about any axis
 WARMER = 5.0  # K
@@ -47,21 +46,17 @@ _PRIOR = {
 }
 
 
-def main(page: Page, scenes: str, drives: str, seeds: int, outliers: str) -> None:
-    """Measure and write the block."""
-    header = [
-        "drives read", "share of the optimum", "before", "gains within 2 deviations", "place off", "stated",
-        "time",
-    ]  # fmt: skip
-    rows = [
+def main(scenes: str, drives: str, seeds: int, outliers: str) -> None:
+    """Measure, and print medians.
+
+    Of each case: share of the optimum, and before; gains within 2 deviations; place off, and as stated; time.
+    """
+    printed(
         _row(propagator, kind, seeds, float(share))
         for propagator in map(_propagator, scenes.split(","))
         for kind in drives.split(",")
         for share in outliers.split(",")
-    ]
-    noise = f"noise of -{NOISE:.0f} dB"
-    caption = f"Medians of {seeds} benches: an AUTD3 of discs, magnitudes at four points with {noise}."
-    page.write(caption, table(header, rows))
+    )
 
 
 def scene_of(name: str) -> at.Scene:

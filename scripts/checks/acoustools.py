@@ -23,7 +23,7 @@ import autdtorch as at
 DOCUMENT = "benchmarks.md"
 PACKAGES = ("acoustools", "vedo")
 
-SPHERE_SUBDIVISIONS, CUBE_SUBDIVISIONS = (2, 3, 4), (3, 4)
+SPHERE_SUBDIVISIONS, CUBE_SUBDIVISIONS = (3, 4), (4,)
 SPACINGS = (1.0, 0.5)
 """Spacings of our grids [mm]."""
 FINEST = 0.25

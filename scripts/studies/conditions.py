@@ -52,7 +52,6 @@ class Method:
 METHODS = {
     "random_search": Method("random_search"),
     "lssg": Method("lssg"),
-    "lssg_5_passes": Method("lssg", {"passes": 5}),
     "gabs": Method("gabs"),
     "gabs_2_passes": Method("gabs", {"passes": 2}),
     "bayes_opt": Method("bayes_opt", together=True),

@@ -50,8 +50,6 @@ def measure(objective: at.Objective, trials: int) -> dict[str, Figures]:
         "LSSG": at.lssg,
         "GABS": gabs,
         "GABS, 2 passes": partial(gabs, passes=2),
-        "GABS, order given": partial(at.gabs, order="given"),
-        "GABS, by strength": partial(at.gabs, order="strength"),
         "GABS, 4 levels": partial(gabs, levels=4),
     }
     solutions = {name: search(objective) for name, search in searches.items()}
