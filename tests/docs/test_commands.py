@@ -412,6 +412,7 @@ def program(page, folder):
 # --- tests
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("page", [page for page in PAGES if LISTED[page] or PYTHON[page]])
 def test_a_page_runs(page, tmp_path):
     furnish(tmp_path)

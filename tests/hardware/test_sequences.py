@@ -434,16 +434,6 @@ class TestOnAutd3:
 CLOSED, LIMITED = "closed", "limited"
 SMALL = frames_of(4, COUNT)
 MISTAKES = [
-    (hw.OPENMPD, lambda: Sequence(SMALL[:0], 10.0), {}, r"drives: shape \(0, 16\)"),
-    (
-        hw.OPENMPD,
-        lambda: Sequence(SMALL * math.nan, 10.0),
-        {},
-        r"drives\[0, 0\]: \(nan\+nanj\); .* finite",
-    ),
-    (hw.OPENMPD, lambda: Sequence(2 * SMALL, 10.0), {}, "drives: amplitude 1.9"),
-    (hw.OPENMPD, lambda: Sequence(SMALL, 0.0), {}, "rate: 0.0 Hz; must be finite and > 0"),
-    (hw.OPENMPD, lambda: Sequence(SMALL, math.nan), {}, "rate: nan Hz"),
     (hw.OPENMPD, lambda: SMALL, {}, "sequence: .*must be a Sequence"),
     (hw.OPENMPD, lambda: None, {}, "sequence: None; must be a Sequence"),
     (hw.OPENMPD, lambda: Sequence(SMALL[:, :10], 10.0), {}, "sequence: 10 transducers; must be 16"),

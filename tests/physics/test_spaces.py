@@ -59,15 +59,15 @@ def mask(hollow):
 @pytest.mark.parametrize(
     ("hollow", "solid", "difference"),
     [
-        (hollow_ball(0.3e-3), solid_ball(), 10 * STEADY),
-        (hollow_ball(1e-3), solid_ball(), 10 * STEADY),
-        (mask(True), mask(False), 1e-12),
+        (lambda: hollow_ball(0.3e-3), solid_ball, 10 * STEADY),
+        (lambda: hollow_ball(1e-3), solid_ball, 10 * STEADY),
+        (lambda: mask(True), lambda: mask(False), 1e-12),
     ],
     ids=["thin ball", "ball", "mask"],
 )
 def test_a_hollow_rigid_body_is_a_solid_one(hollow, solid, difference):
     matrices = [
-        make_propagator(small_scene((body,)), "box", SPACING, STEADY).transfer_matrix()
+        make_propagator(small_scene((body(),)), "box", SPACING, STEADY).transfer_matrix()
         for body in (hollow, solid)
     ]
     assert relative_error(*matrices) < difference
