@@ -47,7 +47,7 @@ def in_processes(kind: str) -> list[list[float]]:
         with get_reusable_executor(1) as workers:
             return list(workers.map(numbers_of_loaded_kernels, (0, 1)))
     with multiprocessing.get_context(kind).Pool(2) as pool:
-        return pool.map_async(numbers_of_loaded_kernels, (0, 1), chunksize=1).get(timeout=100)
+        return pool.map_async(numbers_of_loaded_kernels, (0, 1), chunksize=1).get(timeout=300)
 
 
 if __name__ == "__main__":
