@@ -28,7 +28,7 @@ for name in ("SIGINT", "SIGQUIT", "SIGHUP"):
         signal.signal(number, signal.default_int_handler if name == "SIGINT" else lambda *_: None)
 
 # An example may take long on a busy machine; pytest's limit stays.
-hypothesis.settings.register_profile("autdtorch", deadline=None, max_examples=40)
+hypothesis.settings.register_profile("autdtorch", deadline=None, max_examples=25)
 hypothesis.settings.load_profile("autdtorch")
 
 if not torch.cuda.is_available():
