@@ -91,8 +91,10 @@ def make_propagator(
 
     @functools.cache  # T-matrices need it for some points only; its time begins then
     def on_grids() -> SimulatedPropagator:
-        budget = Budget(seconds, memory) if spacing is None else None
-        return refined(planned.on_grids, budget, store)
+        if spacing is None:
+            return refined(planned.on_grids, Budget(seconds, memory), store)
+        planned.on_grids.require_feasible()
+        return SimulatedPropagator(planned.on_grids, store)
 
     propagator: TMatrixPropagator | SimulatedPropagator
     if planned.method == "tmatrix" and not planned.runs:

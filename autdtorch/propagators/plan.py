@@ -74,10 +74,10 @@ class Plan:
         _, grouping = choose_grids(self.region, self.method, spacing, tolerance, self.runs)
         return replace(self, spacing=spacing, tolerance=tolerance, time_step=time_step, grouping=grouping)
 
-    def fitting(self, spacing: float, coarsest: float = math.inf) -> float:
-        """Return the spacing [m] near one, not above a limit, with which flat faces fall best."""
+    def fitted(self, spacing: float, tolerance: float, coarsest: float = math.inf) -> Self:
+        """Return the plan at a spacing [m] near one, not above a limit, with which flat faces fall best."""
         regions = [grid.part.unbounded.turned(grid.axes) for grid in self.grouping.grids]
-        return fitting_spacing(regions, spacing, coarsest)
+        return self.at(fitting_spacing(regions, spacing, coarsest), tolerance, self.time_step)
 
     def of(self, scene: Scene) -> Self:
         """Return a plan of a changed scene with these settings, which takes the same bodies as rigid."""

@@ -69,34 +69,22 @@ class Budget:
         return in_time and (self.memory is None or plan.memory <= self.memory) and plan.is_feasible()
 
 
-def refined(plan: Plan, budget: Budget | None, store: Store) -> SimulatedPropagator:
-    """Return the propagator of a plan, or with a budget one whose estimated error is within its tolerance.
+def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
+    """Return the propagator of a plan, at a spacing whose estimated error is within its tolerance.
 
     Where the budget does not suffice, it is the finest that fits. Where the surface of an obstacle is not
-    known well enough, it is one that does not add to that error. Warnings name the error, and resonances.
+    known well enough, it is one that does not add to that error. Warnings name the error.
     """
-    if budget is None:
-        return _chosen(plan, plan, None, store)
-    law, region, spacing = plan.law, plan.region, coarsest_spacing(plan.region)
+    tolerance, region, law = pilot.tolerance, pilot.region, pilot.law
+    spacing = coarsest_spacing(region)
     if budget.is_unlimited:
         spacing /= min(region.wavelength / region.shortest_wavelength, _FINER_IF_SLOW)
-        spacing = min(spacing, law.spacing_of(plan.tolerance / _FIRST_ERROR))
-    first = plan.at(plan.fitting(spacing, spacing), _SETTLED * plan.tolerance, plan.time_step)
-    propagator = _chosen(plan, first, budget, store)
-    propagator.warn_of_ringing()
-    return propagator
-
-
-def _chosen(pilot: Plan, plan: Plan, budget: Budget | None, store: Store) -> SimulatedPropagator:
-    """Return the propagator of a plan, or with a budget of a finer one; `pilot` has the tolerance."""
-    tolerance, region, law = pilot.tolerance, pilot.region, pilot.law
-    blamed = ("spacing", None) if budget is None else ("tolerance", tolerance)
+        spacing = min(spacing, law.spacing_of(tolerance / _FIRST_ERROR))
+    plan = pilot.fitted(spacing, _SETTLED * tolerance, spacing)
     others: list[Simulation] = []
     while True:
-        plan.require_feasible(*blamed)
+        plan.require_feasible("tolerance", tolerance)
         begin, propagator = time.perf_counter(), SimulatedPropagator(plan, store, others)
-        if budget is None:
-            return propagator
         error, shape, rigid_error = propagator.known_errors()
         taken = time.perf_counter() - begin
         logger.debug("spacing %.3g mm: estimated error %.2g", 1e3 * plan.spacing, error)
@@ -114,12 +102,12 @@ def _chosen(pilot: Plan, plan: Plan, budget: Budget | None, store: Store) -> Sim
                 return propagator
             if not math.isfinite(error):
                 reason = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
-                raise invalid("max_periods", pilot.max_periods, reason)
+                raise invalid("max_periods", plan.max_periods, reason)
             aim = max(_AIM * tolerance - known, shape / _SHAPE)
             wanted = aim / (error - known) * law.growth(plan.spacing)
             step = min(max(plan.spacing / law.spacing_of(wanted), _SMALLEST_STEP), _LARGEST_STEP)
         for ratio in (step, _SMALLEST_STEP):
-            finer = plan.at(plan.fitting(plan.spacing / ratio), plan.tolerance, pilot.time_step)
+            finer = plan.fitted(plan.spacing / ratio, plan.tolerance)
             if budget.fits(finer, plan, taken):
                 break
         else:

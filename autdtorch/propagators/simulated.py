@@ -64,7 +64,6 @@ class SimulatedPropagator:
         tolerance: relative distance to the steady state at which a run ends.
         max_periods: periods after which a run ends in any case, with a `SteadyStateWarning`.
         plan: the plan.
-        simulation: the grids and the runs on them.
     """
 
     def __init__(self, plan: Plan, store: Store | None = None, others: Sequence[Simulation] = ()) -> None:
@@ -75,8 +74,6 @@ class SimulatedPropagator:
         self.scene, self.method, self.spacing = plan.scene, plan.method, plan.spacing
         self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
         self.plan, self._store, self._coarser = plan, store or Store(), tuple(others)
-        self.simulation = simulation_of(plan, self._store)
-        self._notices = Notices(self.simulation)
 
     def __repr__(self) -> str:
         """Scene, settings and number of runs."""
@@ -91,6 +88,15 @@ class SimulatedPropagator:
         """Return the propagator of the same scene with cells, and a tolerance, larger by factors."""
         tolerance = looser * self.tolerance
         return SimulatedPropagator(self.plan.at(factor * self.spacing, tolerance), self._store)
+
+    @cached_property
+    def simulation(self) -> Simulation:
+        """The grids and the runs on them."""
+        return simulation_of(self.plan, self._store)
+
+    @cached_property
+    def _notices(self) -> Notices:
+        return Notices(self.simulation)
 
     @property
     def runs(self) -> list[Run]:
@@ -114,11 +120,6 @@ class SimulatedPropagator:
     def cells(self) -> int:
         """Number of cells of all grids."""
         return self.plan.cells
-
-    @one_library_thread()
-    def warn_of_ringing(self) -> None:
-        """Log if the control points' sound rings, where grids may agree and be wrong together."""
-        self._error(self._results(self.scene.control_points, with_error=True), self.scene.control_points)
 
     @property
     def planned_runs(self) -> int:
