@@ -370,7 +370,6 @@ ARGUMENTS: dict[str, Any] = {
 
 #: Where a name means something else.
 OTHERS: dict[str, Any] = {
-    "SimulatedPropagator.field.drive": torch.stack([DRIVE, DRIVE]),
     "FailedTransducers.transducers": [1],
     "ForceObjective.goal": at.Trap([(22e-3, 7e-3, 14e-3)], BEAD),
     "Particle.radius": 3e-4,

@@ -23,7 +23,7 @@ from autdtorch.objectives.hermitian import ascended, forms_bound
 from autdtorch.objectives.objective import magnitudes, observe_drives
 from autdtorch.propagators.derivatives import Derivatives, derivatives, nodes_around
 from autdtorch.propagators.gorkov import factors, warn_of_large
-from autdtorch.propagators.simulated import Propagator
+from autdtorch.propagators.propagator import Propagator
 from autdtorch.scene.particle import Particle
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.process import one_library_thread

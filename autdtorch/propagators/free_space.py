@@ -5,21 +5,19 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from typing import Literal, overload
 
 import torch
 
 from autdtorch.analytic.discs import waves_of
 from autdtorch.propagators.absorbed_power import AbsorbedPower, power_into_reflectors, radiators_of_array
-from autdtorch.propagators.behind import silent_behind
+from autdtorch.propagators.propagator import ScenePropagator
 from autdtorch.scene.arrays import TransducerArray, apertures_of, complex_strengths_of
-from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene, require_clear, require_in_front
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.images import NO_MIRRORS, Image
 from autdtorch.utils.process import require_memory
 from autdtorch.utils.text import counted
-from autdtorch.utils.validation import ArrayLike, boolean, differentiable_points, points_grid, require_kind
+from autdtorch.utils.validation import ArrayLike, differentiable_points, require_kind
 
 logger = logging.getLogger(__name__)
 
@@ -65,7 +63,7 @@ def _is_differentiated(points: torch.Tensor) -> bool:
     return points.requires_grad or forward or torch._C._functorch.is_functorch_wrapped_tensor(points)
 
 
-class FreeSpacePropagator:
+class FreeSpacePropagator(ScenePropagator):
     """The exact field of the array without obstacles, which are ignored; reflectors are not.
 
     Attributes:
@@ -84,40 +82,20 @@ class FreeSpacePropagator:
         """Name of the scene."""
         return f"FreeSpacePropagator(scene {self.scene.name!r})"
 
-    @overload
-    def transfer_matrix(
-        self, points: ArrayLike | None = None, return_error: Literal[False] = False
-    ) -> torch.Tensor: ...
-    @overload
-    def transfer_matrix(
-        self, points: ArrayLike | None = None, *, return_error: Literal[True]
-    ) -> tuple[torch.Tensor, float]: ...
-    def transfer_matrix(
-        self, points: ArrayLike | None = None, return_error: bool = False
-    ) -> torch.Tensor | tuple[torch.Tensor, float]:
-        """Return the transfer matrix G (Eq. 2); see `SimulatedPropagator.transfer_matrix`.
+    def for_scene(self, scene: Scene) -> FreeSpacePropagator:
+        """Return the propagator of a changed scene."""
+        return FreeSpacePropagator(scene)
 
-        The error is 0, or infinite if obstacles are ignored. Points on a transducer raise `ValueError`.
-        """
-        points = self.scene.control_points if points is None else points
+    def _matrix(self, points: ArrayLike | None, with_error: bool) -> tuple[torch.Tensor, float]:
         scene = self.scene
-        points = differentiable_points("points", points)
+        points = differentiable_points("points", scene.control_points if points is None else points)
         require_in_front(scene.reflectors, "points", points)
         matrix = free_space_matrix(points, scene.array, scene.complex_wavenumber, scene.images)
-        error = math.inf if self.scene.obstacles else 0.0
-        return (matrix, error) if boolean("return_error", return_error) else matrix
+        return matrix, math.inf if scene.obstacles else 0.0
 
-    def absorbed_power(self, drive: torch.Tensor) -> AbsorbedPower:
-        """Return the power [W] absorbed, by reflectors alone; see `SimulatedPropagator.absorbed_power`."""
-        drive = validate_drive(drive, len(self.scene.array)).cpu().detach()
-        flat = drive.reshape(-1, drive.shape[-1])
-        power = power_into_reflectors(self.scene, [radiators_of_array(self.scene, flat)], len(flat))
-        obstacles = torch.zeros((*drive.shape[:-1], len(self.scene.obstacles)), **REAL)
-        return AbsorbedPower(obstacles, power.reshape(*drive.shape[:-1], power.shape[1]))
+    def _field(self, drive: torch.Tensor, points: torch.Tensor, is_picture: bool) -> torch.Tensor:
+        return drive @ self._matrix(points, with_error=False)[0].mT
 
-    @silent_behind
-    def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
-        """Return the pressure of drives at points; see `SimulatedPropagator.field`."""
-        drive = validate_drive(drive, len(self.scene.array)).cpu()
-        points, grid = points_grid("points", points)
-        return (drive @ self.transfer_matrix(points).mT).reshape(*drive.shape[:-1], *grid)
+    def _absorbed(self, drive: torch.Tensor) -> AbsorbedPower:
+        power = power_into_reflectors(self.scene, [radiators_of_array(self.scene, drive)], len(drive))
+        return AbsorbedPower(torch.zeros((len(drive), len(self.scene.obstacles)), **REAL), power)

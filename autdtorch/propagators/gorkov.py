@@ -23,7 +23,7 @@ from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import ArrayLike, Vector, points_grid, require_kind, unit_vector
 
 if TYPE_CHECKING:
-    from autdtorch.propagators.simulated import Propagator
+    from autdtorch.propagators.propagator import Propagator
 
 LARGEST = 0.1
 """LARGEST: radius up to which a particle is small, relative to the wavelength."""
@@ -89,7 +89,7 @@ def gorkov(
     Warns:
         ScaleWarning: a particle of a radius above 0.1 wavelength.
     """
-    from autdtorch.propagators.simulated import Propagator  # takes a second
+    from autdtorch.propagators.propagator import Propagator  # takes a second
 
     require_kind("propagator", propagator, Propagator)
     scene = propagator.scene

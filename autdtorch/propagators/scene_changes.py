@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import torch
 
 from autdtorch.propagators.free_space import FreeSpacePropagator
-from autdtorch.propagators.simulated import Propagator, SimulatedPropagator
+from autdtorch.propagators.propagator import Propagator, ScenePropagator
+from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.propagators.tmatrix.moved_bodies import MovedBodies
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.changes import (
@@ -64,7 +65,7 @@ class SceneChanges:
         Raises:
             ValueError: a name that is unknown, or a change that the scene cannot make.
         """
-        if not isinstance(propagator, FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator):
+        if not isinstance(propagator, ScenePropagator):
             raise invalid("propagator", type(propagator).__name__, "must be one that make_propagator makes")
         self._propagator, self._base = propagator, propagator.scene
         self._points = None if points is None else points_tensor("points", points).cpu()
@@ -75,10 +76,7 @@ class SceneChanges:
         if len(set(self.names)) < len(self.names):
             raise invalid("names", self.names, "must be there once each")
         self.units = tuple(map(unit_of, self.names))
-        self._last: (
-            tuple[Amounts, FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator, Image] | None
-        )
-        self._last = None
+        self._last: tuple[Amounts, ScenePropagator, Image] | None = None
 
     def scene(self, amounts: ArrayLike) -> Scene:
         """Return the scene changed by amounts (K,).
@@ -176,18 +174,14 @@ class SceneChanges:
             return changed_and_seen(base, amounts)
         return changed_scene(base, amounts), SPACE_ITSELF
 
-    def _propagator_of(
-        self, amounts: Amounts
-    ) -> tuple[FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator, Image]:
+    def _propagator_of(self, amounts: Amounts) -> tuple[ScenePropagator, Image]:
         """Return the propagator of the changed scene, and the map to its places; the last are at hand."""
         before = self._propagator
         if self._last is not None and self._last[0] == amounts:
             return self._last[1:]
         scene, view = self._seen(amounts)
-        after: FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator
-        if isinstance(before, FreeSpacePropagator):
-            after = FreeSpacePropagator(scene)
-        elif isinstance(before, TMatrixPropagator) and self._bodies and self._bodies.stay(amounts):
+        after: ScenePropagator
+        if isinstance(before, TMatrixPropagator) and self._bodies and self._bodies.stay(amounts):
             after = before.for_scene(scene, self._bodies.cluster(amounts))
         else:
             after = before.for_scene(scene)

@@ -1,4 +1,4 @@
-"""The propagator that simulates, and the protocol of all propagators."""
+"""The propagator that simulates."""
 
 from __future__ import annotations
 
@@ -6,51 +6,30 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, Protocol, overload, runtime_checkable
 
 import torch
 
 from autdtorch.fdtd.grid_errors import errors_by_grids, grid_errors, rigid_errors, shape_errors, sizes
 from autdtorch.propagators.absorbed_power import AbsorbedPower
-from autdtorch.propagators.behind import silent_behind
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.free_space import PAIR_BYTES, free_space_matrix
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.propagators.notices import Notices, warn_of_unsettled
 from autdtorch.propagators.plan import Plan
+from autdtorch.propagators.propagator import ScenePropagator
 from autdtorch.propagators.simulation import PressureMap, Run, Simulation
 from autdtorch.propagators.store import Store
-from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.process import cached_property, one_library_thread, require_memory
 from autdtorch.utils.text import counted
-from autdtorch.utils.validation import ArrayLike, boolean, points_grid
+from autdtorch.utils.validation import ArrayLike
 
 _LONGER = 1.5
 """Ratio of periods from which another grid is next to a resonance that this one is not, and is left out."""
 
 
-@runtime_checkable
-class Propagator(Protocol):
-    """Computes the pressure that a scene's transducers cause at points.
-
-    Attributes:
-        scene: the scene.
-    """
-
-    scene: Scene
-
-    def transfer_matrix(self, points: ArrayLike | None = None) -> torch.Tensor:
-        """Return the pressure (P, M) [Pa], complex128, of unit drives at points (P, 3) [m]."""
-        ...
-
-    def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
-        """Return the pressure (..., P) [Pa], complex128, of drives (..., M) at points (P, 3) or a grid."""
-        ...
-
-
-class SimulatedPropagator:
+class SimulatedPropagator(ScenePropagator):
     """A propagator that simulates the steady state of the drive by FDTD.
 
     A result depends on the scene, the settings and the arguments of its call alone. The last ones are kept,
@@ -126,44 +105,15 @@ class SimulatedPropagator:
         """Number of simulations of the control points' transfer matrix."""
         return self.simulation.matrix_runs(self.scene.control_points)
 
-    @overload
-    def transfer_matrix(
-        self, points: ArrayLike | None = None, return_error: Literal[False] = False
-    ) -> torch.Tensor: ...
-    @overload
-    def transfer_matrix(
-        self, points: ArrayLike | None = None, *, return_error: Literal[True]
-    ) -> tuple[torch.Tensor, float]: ...
     @one_library_thread()
-    def transfer_matrix(
-        self, points: ArrayLike | None = None, return_error: bool = False
-    ) -> torch.Tensor | tuple[torch.Tensor, float]:
-        """Return the transfer matrix G, from one simulation for each transducer or each point (reciprocity).
-
-        Points or transducers in one symmetry orbit of the scene on its grid share a simulation.
-
-        Args:
-            points: (P, 3) [m]; by default the scene's control points.
-            return_error: also return the estimated relative error (L2 of the whole matrix): from a second
-                grid, and from the distance to the steady state. A coarser second grid takes a fifth of the
-                time. `point_errors` returns the error of each point.
-
-        Returns:
-            complex128 (P, M) [Pa], and the error if asked for.
-
-        Raises:
-            ValueError: `points` are not finite, have another shape, are outside the domain (method "full")
-                or on a transducer (method "box").
-        """
-        with_error = boolean("return_error", return_error)
+    def _matrix(self, points: ArrayLike | None, with_error: bool) -> tuple[torch.Tensor, float]:
         places = self._places(points)
         results = self._results(places, with_error)
-        result = results[0]
-        self._notices.of_cavities(places, result.matrix)
+        matrix = results[0].matrix
+        self._notices.of_cavities(places, matrix)
         if points is None:
-            self._notices.of_faint_points(result.matrix, self._free(places))
-        matrix = result.matrix
-        return (matrix, self._error(results, places)) if with_error else matrix
+            self._notices.of_faint_points(matrix, self._free(places))
+        return matrix, self._error(results, places) if with_error else 0.0
 
     @one_library_thread()
     def point_errors(self, points: ArrayLike | None = None) -> torch.Tensor:
@@ -189,36 +139,16 @@ class SimulatedPropagator:
         shape, rigid = (float(of(matrix, free, self.plan.region)) for of in (shape_errors, rigid_errors))
         return self._error(results, points) if self._coarser else math.inf, shape, rigid
 
-    @silent_behind
     @one_library_thread()
-    def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
-        """Return the pressure of drives at points, from a simulation for each drive or the transfer matrix.
-
-        The latter takes fewer runs for many drives: for still more in later calls, multiply by
-        `transfer_matrix`.
-
-        Args:
-            drive: (..., M) complex, |q| <= 1, on any device.
-            points: (P, 3) or a grid such as (Nu, Nv, 3) [m], which may cross obstacles and reflectors; behind
-                these it is 0.
-
-        Returns:
-            complex128 (..., P) or (..., Nu, Nv) [Pa], on the CPU; differentiable by the drive.
-
-        Raises:
-            ValueError: drive or points of another shape or out of range, as in `transfer_matrix`.
-        """
-        drive = validate_drive(drive, len(self.scene.array)).cpu()
-        points, grid = points_grid("points", points)
+    def _field(self, drive: torch.Tensor, points: torch.Tensor, is_picture: bool) -> torch.Tensor:
         points = self.simulation.checked(points)
-        is_picture = len(grid) > 1  # which may cross obstacles
         if not is_picture:
             self._notices.of_points(points)
         flat = drive.reshape(-1, drive.shape[-1])
         loud = flat.detach().any(dim=1)
         by_matrix = drive.requires_grad or int(loud.sum()) > self.simulation.matrix_runs(points)
         rows = len(self.scene.array) if by_matrix else len(flat)
-        require_memory("points", (*grid, 3), PAIR_BYTES * rows * len(points))
+        require_memory("points", tuple(points.shape), PAIR_BYTES * rows * len(points))
         field = torch.zeros((len(flat), len(points)), **COMPLEX)
         if by_matrix:
             result = self.simulation.transfer_matrix(points)
@@ -231,32 +161,17 @@ class SimulatedPropagator:
         warn_of_unsettled(result.runs, self.tolerance)
         if not is_picture:
             self._notices.of_cavities(points, result.matrix)
-        return field.reshape(*drive.shape[:-1], *grid)
+        return field.reshape(*drive.shape[:-1], len(points))
 
     @one_library_thread()
-    def absorbed_power(self, drive: torch.Tensor) -> AbsorbedPower:
-        """Return the power that each obstacle and each reflector absorbs, from a simulation for each drive.
-
-        Args:
-            drive: (..., M) complex, |q| <= 1, on any device.
-
-        Returns:
-            The power [W], float64, of the obstacles (..., K) and the reflectors (..., J). Power lost in the
-            medium is not counted.
-
-        Raises:
-            ValueError: a drive of another shape or out of range, or a reflector that absorbs and has a
-                complex reflection or faces another.
-        """
-        drive = validate_drive(drive, len(self.scene.array)).cpu().detach()
-        flat = drive.reshape(-1, drive.shape[-1])
-        loud = flat.any(dim=1)
+    def _absorbed(self, drive: torch.Tensor) -> AbsorbedPower:
+        loud = drive.any(dim=1)
         counts = len(self.scene.obstacles), len(self.scene.reflectors)
-        power = [torch.zeros((len(flat), count), **REAL) for count in counts]
+        power = AbsorbedPower(*(torch.zeros((len(drive), count), **REAL) for count in counts))
         if loud.any():
-            for whole, part in zip(power, self._absorbing.absorbed_power(flat[loud]), strict=True):
+            for whole, part in zip(power, self._absorbing.absorbed_power(drive[loud]), strict=True):
                 whole[loud] = part
-        return AbsorbedPower(*(part.reshape(*drive.shape[:-1], part.shape[1]) for part in power))
+        return power
 
     @cached_property
     def _absorbing(self) -> Simulation:

@@ -27,7 +27,8 @@ from tqdm import tqdm
 
 import autdtorch as at
 from autdtorch.fdtd.symmetry import orbits_of_points, orbits_of_transducers
-from autdtorch.propagators.simulated import Propagator, SimulatedPropagator
+from autdtorch.propagators.propagator import Propagator
+from autdtorch.propagators.simulated import SimulatedPropagator
 
 SIZE = 30e-3
 """Edge of the domain [m]."""

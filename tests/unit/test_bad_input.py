@@ -72,7 +72,7 @@ def the_checks_are_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("autdtorch.plot.pressure_maps._draw_plane", stop)
     monkeypatch.setattr("autdtorch.plot.view3d.require_rendering", stop)
     monkeypatch.setattr(explore, "require_rendering", stop)
-    monkeypatch.setattr("autdtorch.propagators.volume.are_shown", stop)
+    monkeypatch.setattr("autdtorch.propagators.propagator.are_shown", stop)
     monkeypatch.setattr(at.NearbyPoses, "_coarse", stop)
 
 

@@ -8,7 +8,7 @@ import torch
 import autdtorch as at
 from autdtorch.plot.explore.display import refusal
 from autdtorch.plot.explore.situation import Situation
-from autdtorch.propagators.volume import are_shown
+from autdtorch.propagators.propagator import are_shown
 from autdtorch.study.report.tables import room_rows
 
 ARRAY = at.TransducerArray.grid((2, 2), 10e-3, (0, 0, 0), (0, 0, 1), radius=4e-3)

@@ -30,7 +30,7 @@ from autdtorch.propagators import (
     make_propagator,
     volume_field,
 )
-from autdtorch.propagators.volume import are_shown
+from autdtorch.propagators.propagator import are_shown
 from autdtorch.scene.geometry import Plane
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.progress import Stopped, stopping_when

@@ -7,15 +7,14 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Literal, overload
 
 import torch
 
 from autdtorch.fdtd.grid_errors import grid_errors, rigid_errors, shape_errors, sizes
 from autdtorch.propagators.absorbed_power import AbsorbedPower
-from autdtorch.propagators.behind import silent_behind
 from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.propagators.plan import Plan
+from autdtorch.propagators.propagator import ScenePropagator
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.propagators.simulation import Run
 from autdtorch.propagators.store import Store
@@ -23,12 +22,11 @@ from autdtorch.propagators.tmatrix.bodies import ObstacleGroup, are_outside, bod
 from autdtorch.propagators.tmatrix.body import Placed, Solver, placed
 from autdtorch.propagators.tmatrix.scattering import scattered_waves, waves_at
 from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
-from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene, require_clear, require_in_front
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.images import Image
 from autdtorch.utils.process import cached_property, one_library_thread
-from autdtorch.utils.validation import ArrayLike, boolean, differentiable_points, points_grid, points_tensor
+from autdtorch.utils.validation import ArrayLike, differentiable_points, points_tensor
 
 logger = logging.getLogger(__name__)
 
@@ -42,7 +40,7 @@ _NEAREST = 0.68  # Largest relative place of a limit point that is resolved: 48 
 _TINY = torch.finfo(torch.float64).tiny
 
 
-class TMatrixPropagator:
+class TMatrixPropagator(ScenePropagator):
     """A propagator by the T-matrices of a scene's bodies, simulated once or in closed form.
 
     Obstacles whose circumscribed spheres overlap make one body. Points inside a sphere, or so near that the
@@ -124,35 +122,16 @@ class TMatrixPropagator:
     def _spheres(self) -> list[ObstacleGroup]:
         return bodies_of(self.scene.obstacles)
 
-    @overload
-    def transfer_matrix(
-        self, points: ArrayLike | None = None, return_error: Literal[False] = False
-    ) -> torch.Tensor: ...
-    @overload
-    def transfer_matrix(
-        self, points: ArrayLike | None = None, *, return_error: Literal[True]
-    ) -> tuple[torch.Tensor, float]: ...
     @one_library_thread()
-    def transfer_matrix(
-        self, points: ArrayLike | None = None, return_error: bool = False
-    ) -> torch.Tensor | tuple[torch.Tensor, float]:
-        """Return the transfer matrix G; see `SimulatedPropagator.transfer_matrix`.
-
-        Differentiable by the points that are not served by the box. The error counts the waves left out and,
-        where T-matrices are simulated, the tolerance and the error of the grid, from a second grid. For rows
-        from the box, the box estimates it.
-        """
-        with_error = boolean("return_error", return_error)
+    def _matrix(self, points: ArrayLike | None, with_error: bool) -> tuple[torch.Tensor, float]:
         places = self._checked(points)
         matrix, served = self.by_waves(places)
         near, box_error = places[~served].detach(), 0.0
-        if len(near) and with_error:
-            rows, box_error = self._box.transfer_matrix(near, return_error=True)
+        if len(near):
+            rows, box_error = self._box._matrix(near, with_error)
             matrix = matrix.index_put((~served,), rows)
-        elif len(near):
-            matrix = matrix.index_put((~served,), self._box.transfer_matrix(near))
         if not with_error:
-            return matrix
+            return matrix, 0.0
         size = matrix.detach().norm(dim=1)
         errors = self._wave_errors(places.detach()[served], matrix.detach()[served]) * size[served]
         error = math.hypot(float(errors.norm()), box_error * float(size[~served].norm()))
@@ -188,13 +167,9 @@ class TMatrixPropagator:
         known = shape_errors(matrix, free, region) + rigid_errors(matrix, free, region)
         return self.tolerance + errors + known
 
-    @silent_behind
     @one_library_thread()
-    def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
-        """Return the pressure of drives at points; see `SimulatedPropagator.field`."""
-        drive = validate_drive(drive, len(self.scene.array)).cpu()
-        places, grid = points_grid("points", points)
-        places = self._checked(places)
+    def _field(self, drive: torch.Tensor, points: torch.Tensor, is_picture: bool) -> torch.Tensor:
+        places = self._checked(points)
         parts, masks = [], []
         for part in torch.split(places, _AT_ONCE):
             matrix, served = self.by_waves(part)
@@ -203,14 +178,11 @@ class TMatrixPropagator:
         field, served = torch.cat(parts, dim=-1), torch.cat(masks)
         if not served.all():
             field = field.clone()
-            near = places[~served].detach()
-            near = near if len(grid) == 1 else near[None]  # those of a picture may be in obstacles
-            field[..., ~served] = self._box.field(drive, near).reshape(*drive.shape[:-1], -1)
-        return field.reshape(*drive.shape[:-1], *grid)
+            field[..., ~served] = self._box._field(drive, places[~served].detach(), is_picture)
+        return field
 
-    def absorbed_power(self, drive: torch.Tensor) -> AbsorbedPower:
-        """Return the power [W] absorbed; see `SimulatedPropagator.absorbed_power`, which serves it."""
-        return self._box.absorbed_power(drive)
+    def _absorbed(self, drive: torch.Tensor) -> AbsorbedPower:
+        return self._box._absorbed(drive)
 
     @cached_property
     def _box(self) -> SimulatedPropagator:
