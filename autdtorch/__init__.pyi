@@ -63,10 +63,9 @@ from .propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
 from .scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
 from .scene.drive import amplitudes_of, drive_from_phases, focus_phases, phases_of
 from .scene.geometry import Plane, circle_points, polyline_points, sphere_points
-from .scene.medium import Medium
+from .scene.medium import Medium, porous
 from .scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
 from .scene.particle import Particle
-from .scene.porous import porous
 from .scene.reflectors import Reflector
 from .scene.scene import OverlapWarning, ScaleWarning, Scene
 from .scene.sequence import Sequence, modulated, silenced

@@ -28,7 +28,7 @@ from autdtorch.cli.settings import (
     section_of,
     solver_of,
 )
-from autdtorch.hardware.camera.orientation import turned
+from autdtorch.hardware.camera.picture import turned
 from autdtorch.hardware.sensors.sensor import AnySensor
 from autdtorch.io.drive_file import save_drive
 from autdtorch.io.goal_section import goal_section, load_goal, score_label

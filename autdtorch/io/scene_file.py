@@ -24,8 +24,8 @@ from autdtorch.io.yaml_file import TARGET, load_trusted, load_yaml, plain, unres
 from autdtorch.scene.arrays import FORMS, recipes_of
 from autdtorch.scene.drive import amplitudes_of, drive_from_phases, phases_of
 from autdtorch.scene.geometry import Plane, circle_points, sphere_points
+from autdtorch.scene.medium import porous
 from autdtorch.scene.obstacles import KINDS, Obstacle
-from autdtorch.scene.porous import porous
 from autdtorch.scene.reflectors import Reflector
 from autdtorch.scene.scene import Medium, Scene
 from autdtorch.utils.files import replace_file

@@ -1,4 +1,4 @@
-"""The medium around the obstacles: a uniform fluid, such as humid air.
+"""The medium around the obstacles: a uniform fluid, such as humid air; and porous material that it fills.
 
 Air is an ideal gas of dry air and water vapour. Absorption and vapour pressure follow ISO 9613-1:1993, whose
 equations are also those of ANSI S1.26 and of Bass et al., J. Acoust. Soc. Am. 97 (1995) 680-683.
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from autdtorch.utils.fluids import fluid
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.units import warn_user
-from autdtorch.utils.validation import invalid, not_negative, number_between
+from autdtorch.utils.validation import invalid, not_negative, number_between, positive, require_kind
 
 _TEMPERATURES = -20.0, 50.0  # deg C; range of ISO 9613-1
 _PRESSURES = 50e3, 200e3  # Pa; from half an atmosphere to the limit of ISO 9613-1
@@ -27,6 +27,7 @@ _TRIPLE_POINT = 273.16  # K
 _GAS_CONSTANT = 8.314462618  # J/(mol K)
 _DRY_AIR, _WATER = 28.9647e-3, 18.01528e-3  # kg/mol
 _DIATOMIC = 1.4  # ratio of specific heats of dry air
+_POROUS = 0.01, 1.0  # of the frequency [Hz] over a flow resistivity [Pa s/m^2], for which it is measured
 
 
 @dataclass(frozen=True)
@@ -174,3 +175,45 @@ def _absorption_of_air(
     relaxing = 0.01275 * math.exp(-2239.1 / kelvin) / (oxygen + frequency**2 / oxygen)
     relaxing += 0.1068 * math.exp(-3352.0 / kelvin) / (nitrogen + frequency**2 / nitrogen)
     return 8.686 * frequency**2 * (classical + math.pow(warmth, -2.5) * relaxing)
+
+
+@suggesting
+def porous(
+    flow_resistivity: float, frequency: float = 40e3, medium: Medium | None = None
+) -> dict[str, complex]:
+    """Return density and sound speed of a porous material with a rigid frame, such as foam, felt or fabric.
+
+    They are the material of an obstacle at one frequency::
+
+        pad = at.Box((0, 0, 0.1), (0.05, 0.05, 0.01), **at.porous(200e3))
+
+    For fibrous materials of a porosity near 1. Source: Delany and Bazley (1970), Applied Acoustics 3, 105, in
+    the form of Miki (1990), J. Acoust. Soc. Jpn. (E) 11, 19, which is passive at all frequencies.
+
+    Args:
+        flow_resistivity: static [Pa s/m^2], 1 to 100 times the frequency in Hz: 40e3 to 4e6 at 40 kHz.
+        frequency: drive frequency [Hz]; in a scene file, the scene's.
+        medium: in the pores; air by default, and in a scene file the medium of the scene.
+
+    Returns:
+        Complex `density` [kg/m^3] and `sound_speed` [m/s] by name.
+
+    Raises:
+        ValueError: an argument out of range.
+    """
+    frequency = positive("frequency", frequency, "Hz")
+    medium = Medium.air(frequency=frequency) if medium is None else medium
+    require_kind("medium", medium, Medium)
+    resistivity = positive("flow_resistivity", flow_resistivity, "Pa s/m^2")
+    least, most = _POROUS
+    ratio = frequency / resistivity
+    if not least <= ratio <= most:
+        accepted = f"must be in {frequency / most:g} to {frequency / least:g} at {frequency:g} Hz"
+        fix = "beyond, give measured complex density and sound_speed, or an impedance"
+        raise invalid("flow_resistivity", flow_resistivity, f"{accepted}; {fix}", "Pa s/m^2")
+    impedance = 1 + (0.070 + 0.107j) * math.pow(ratio, -0.632)  # over density times sound speed of the medium
+    wavenumber = 1 + (0.109 + 0.160j) * math.pow(ratio, -0.618)  # relative to the medium
+    return {
+        "density": medium.density * impedance * wavenumber,
+        "sound_speed": medium.sound_speed / wavenumber,
+    }

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from autdtorch import hardware as hw
-from autdtorch.hardware.camera.orientation import turned
-from autdtorch.hardware.camera.picture import Picture
+from autdtorch.hardware.camera.picture import Picture, turned
 from autdtorch.hardware.camera.registration import Registration, hot_spot
 from autdtorch.hardware.camera.screen import Screen
 from autdtorch.scene.geometry import Plane

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,17 @@ _OFF_PLANE = 0.02  # largest distance of a point from its plane, by the plane's 
 _WIDER = 3  # cells around a picture, for its splines
 _MOST_CELLS = 2**22  # a camera has 2**20 pixels at most
 _SMOOTHING, _FINEST = 0.2, 1e-4  # for the place of a focus, by the radius
+_BETTER = 0.2  # by which a turned picture must correlate better with the expected one
+
+_TURNS: dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], bool]] = {  # true: swaps the axes
+    "turned by half": (lambda map_: map_.rot90(2), False),
+    "mirrored along u": (lambda map_: map_.flip(0), False),
+    "mirrored along v": (lambda map_: map_.flip(1), False),
+    "turned by a quarter": (lambda map_: map_.rot90(1), True),
+    "turned by three quarters": (lambda map_: map_.rot90(3), True),
+    "mirrored along a diagonal": (lambda map_: map_.T, True),
+    "mirrored along the other diagonal": (lambda map_: map_.rot90(2).T, True),
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -183,3 +195,23 @@ def plane_coordinates(plane: Plane, points: ArrayLike, name: str = "points") -> 
         point = (offset + torch.tensor(plane.center, **REAL))[index].tolist()
         raise invalid(f"{name}[{index}]", point, "must be in the plane of the picture", "m")
     return np.asarray(coordinates.numpy(), dtype=np.float64)
+
+
+def turned(picture: Picture, expected: torch.Tensor) -> str | None:
+    """Return how a picture is turned against the expected pressure (Nu, Nv) [Pa]; None if it is not.
+
+    A symmetric field does not show it.
+    """
+    seen, square = picture.pressure.square(), expected.square()
+    is_square = seen.shape[0] == seen.shape[1]
+    alike = {
+        name: _correlation(turn(seen), square)
+        for name, (turn, swaps) in _TURNS.items()
+        if is_square or not swaps
+    }
+    best = max(alike, key=lambda name: alike[name])
+    return best if alike[best] > _correlation(seen, square) + _BETTER else None
+
+
+def _correlation(one: torch.Tensor, other: torch.Tensor) -> float:
+    return float(torch.corrcoef(torch.stack([one.reshape(-1), other.reshape(-1)]))[0, 1])
