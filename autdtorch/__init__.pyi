@@ -23,6 +23,7 @@ from .methods.functions import (
     identify,
     lss,
     lssg,
+    phase_stepping,
     random_search,
 )
 from .methods.gabs import GABS
@@ -31,6 +32,7 @@ from .methods.holography.holography import Holography, holography
 from .methods.holography.sequence import drive_sequence, sequence_along
 from .methods.identify import Identify
 from .methods.lssg import LSS, LSSG
+from .methods.phase_stepping import PhaseStepping
 from .methods.prior import Prior
 from .methods.problem import Problem
 from .methods.random_search import RandomSearch
@@ -106,6 +108,7 @@ __all__ = [
     "OpenMPDBoard",
     "OverlapWarning",
     "Particle",
+    "PhaseStepping",
     "PhasorKernel",
     "Plane",
     "Prior",
@@ -172,6 +175,7 @@ __all__ = [
     "lssg",
     "make_propagator",
     "modulated",
+    "phase_stepping",
     "phases_of",
     "plot_calibration",
     "plot_convergence",

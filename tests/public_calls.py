@@ -42,7 +42,10 @@ frequency: 40000
 control_points: {type: points, positions: [[0.08, 0, 0]]}
 """
 
-METHODS = ("BayesOpt", "GABS", "GradientAscent", "Holography", "Identify", "LSS", "LSSG", "RandomSearch")
+METHODS = (
+    *("BayesOpt", "GABS", "GradientAscent", "Holography", "Identify"),
+    *("LSS", "LSSG", "PhaseStepping", "RandomSearch"),
+)
 
 #: Results, parts of drivers, and calls that need a device.
 NOT_CALLED_BY_USERS = {

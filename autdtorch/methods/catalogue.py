@@ -13,11 +13,15 @@ from autdtorch.methods.holography.algorithms import Algorithm
 from autdtorch.methods.holography.holography import Holography
 from autdtorch.methods.identify import Identify
 from autdtorch.methods.lssg import LSS, LSSG
+from autdtorch.methods.phase_stepping import PhaseStepping
 from autdtorch.methods.random_search import RandomSearch
 
 METHODS: dict[str, type[Method]] = {
     method.name: method
-    for method in (LSS, LSSG, BayesOpt, GABS, Identify, RandomSearch, GradientAscent, Holography)
+    for method in (
+        *(LSS, LSSG, BayesOpt, GABS, Identify, PhaseStepping, RandomSearch),
+        *(GradientAscent, Holography),
+    )
 }
 """Methods by name, in the order of reports. Users' methods need no entry: configs name their class."""
 

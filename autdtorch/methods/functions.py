@@ -21,6 +21,7 @@ from autdtorch.methods.gabs import GABS
 from autdtorch.methods.gradient import GradientAscent
 from autdtorch.methods.identify import Identify
 from autdtorch.methods.lssg import LSS, LSSG
+from autdtorch.methods.phase_stepping import PhaseStepping
 from autdtorch.methods.problem import Problem
 from autdtorch.methods.random_search import RandomSearch
 from autdtorch.methods.run import run
@@ -112,6 +113,7 @@ _OF_BAYES_OPT = "evaluations initial trials seed fixed_transducer goal"
 bayes_opt = _function("bayes_opt", BayesOpt(), _OF_BAYES_OPT, continues=True)
 bo_foci = _function("bo_foci", VARIANTS["bo_foci"], _OF_BAYES_OPT, continues=True)
 identify = _function("identify", Identify(), "evaluations trials seed", continues=True)
+phase_stepping = _function("phase_stepping", PhaseStepping())
 random_search = _function("random_search", RandomSearch())
 gradient_ascent = _function(
     "gradient_ascent",

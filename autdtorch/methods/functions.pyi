@@ -70,6 +70,9 @@ def identify(
     goal: GoalFunction = ...,
     readings: Readings | None = None,
 ) -> Solution: ...
+def phase_stepping(
+    objective: Objective, rounds: int = 1, trials: Trials = 1, seed: int = 0, goal: GoalFunction = ...
+) -> Solution: ...
 def random_search(
     objective: Objective,
     evaluations: int = 256,

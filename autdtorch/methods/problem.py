@@ -45,7 +45,7 @@ class Problem:
         transfer_matrix: simulated G (P, M) [Pa], for `GradientAscent` and as a `Prior` of what is measured.
         quantise: function of drives (..., M) that gives the drives which the device plays.
         start: drive (M,) that was good before, such as at the last pose of an obstacle, or one for each trial
-            (T, M); `BayesOpt`, `GABS` and `GradientAscent` begin there.
+            (T, M); `BayesOpt`, `GABS`, `GradientAscent` and `PhaseStepping` begin there.
         readings: earlier ones of the same array and control points. `Identify` and `BayesOpt` go on from
             them; for all methods, their best drive counts. They are no evaluations.
         deviation: function of readings (..., P) [Pa], earlier ones included, that gives their standard

@@ -41,12 +41,13 @@ _LOOKS = {  # colours of Okabe and Ito
     "lss": Look("#E69F00", "^", (0, (8, 1.5))),
     "identify": Look("#CC79A7", "v", (0, (1, 1))),
     "random_search": Look("#56B4E9", "X", (0, (3, 1, 1, 1, 1, 1))),
+    "phase_stepping": Look("#332288", "<", (0, (2, 1, 6, 1))),
     "gradient_ascent": Look("#000000", "*", (0, (2, 2))),
 }
 _SPARE_LOOKS = (  # colours of Tol's muted scheme
     Look("#44AA99", "p", (0, (1, 3))),
     Look("#999933", "h", (0, (4, 1))),
-    Look("#332288", "<", (0, (2, 1, 6, 1))),
+    Look("#661100", "8", (0, (8, 2, 2, 2))),
     Look("#999999", ">", (0, (3, 3))),
 )
 

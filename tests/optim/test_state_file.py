@@ -25,6 +25,7 @@ SMALL = [
     at.Identify(evaluations=4, prior=at.Prior(GUESS)),
     at.BayesOpt(evaluations=7, initial=4),
     at.BayesOpt(evaluations=3, prior=at.Prior(GUESS), **FOCI),
+    at.PhaseStepping(),
     at.GradientAscent(starts=2, steps=5),
     at.Holography("gs"),
 ]
@@ -181,6 +182,7 @@ SEARCHES = {
     "points spread values variance",
     "identify": "answer drives ends entries factors fitted generators numbers observed outliers random "
     "spread variance",
+    "phase_stepping": "generators",
     "random_search": "generators",
     "gradient_ascent": "",
     "holography": "",

@@ -306,7 +306,10 @@ def test_poses_and_levels_are_drawn_along_the_path_and_across_their_scene() -> N
     assert labels == ["GABS", "bound", "90 %"]
 
 
-METHODS = ("lssg", "bayes_opt", "bo_foci", "gabs", "lss", "random_search", "identify", "gradient_ascent")
+METHODS = (
+    *("lssg", "bayes_opt", "bo_foci", "gabs", "lss", "random_search", "identify", "phase_stepping"),
+    "gradient_ascent",
+)
 
 
 def test_methods_differ_in_colour_in_marker_and_in_dashes() -> None:

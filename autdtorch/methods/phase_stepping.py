@@ -1,0 +1,153 @@
+"""Phase stepping: the transfer matrix by two steps of each transducer's phase, then the best drive on it.
+
+Popoff et al., Physical Review Letters 104 (2010) 100601, measure a transmission matrix for light with four
+phases of each input against a static reference. Here the reference is the drive whose entries are stepped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+
+from autdtorch.methods.base import Method, State, Step, whole
+from autdtorch.methods.gradient import climb, random_drives
+from autdtorch.methods.problem import Problem, starts_of
+from autdtorch.methods.seeds import generators_of, restored, states_of
+from autdtorch.utils.validation import invalid
+
+_TURNS = (-1 / 3, 1 / 3)  # steps of a phase
+_STARTS = 16  # drives from which the matrix is climbed
+_CLIMB_STEPS = 300
+_DARK = 1e-3  # least pressure that a reference counts with, relative to the rms of the point
+_LEAST_AREA = 1e-6  # of the triangle of three phases; 0 if the device has only two phases
+
+
+@dataclass(frozen=True)
+class PhaseStepping(Method):
+    """Step the phase of one transducer after the other, and maximise on the matrix that this shows.
+
+    Around a reference drive, the intensity at each focus is a sinusoid of a transducer's phase. Two further
+    phases determine it, and so the pressure that the transducer adds to the reference's. The row of a focus
+    follows up to a common phase, if no transducer is louder there than all others of the reference together.
+
+    The first reference has random phases, or is the drive to start from. Each further round steps around the
+    best drive of the matrix before, at which foci are loud and noise harms less.
+
+    A trial takes `rounds` * (2 M - 1) + 1 evaluations, fewer than any other method that finds the matrix.
+
+    Attributes:
+        rounds: >= 1; 2 or more under noise.
+    """
+
+    name: ClassVar[str] = "phase_stepping"
+    label: ClassVar[str] = "phase stepping"
+
+    rounds: int = whole(1, least=1)
+
+    def most_evaluations(self, problem: Problem) -> int:
+        """Return the evaluations of all rounds and of the last drive."""
+        return self.rounds * _in_round(problem) + 1
+
+    def most_at_once(self, problem: Problem) -> int:
+        """Return the evaluations of a round."""
+        return _in_round(problem)
+
+    def numbers_kept(self, problem: Problem) -> float:
+        """Add the numbers of a climb."""
+        return super().numbers_kept(problem) + 2.0 * _STARTS * (4 * problem.transducers + 2 * problem.foci)
+
+    def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
+        """Observe the steps around the first reference."""
+        generators = generators_of(seeds)
+        if (reference := starts_of(problem, len(seeds))) is None:
+            reference = torch.cat([random_drives(1, problem.transducers, draws) for draws in generators])
+        return Step(_stepped(problem, reference), {"generators": states_of(generators)})
+
+    def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
+        """Solve for the matrix, and observe steps around its best drive, or at the end the drive alone."""
+        problem, done = state.problem, state.best.history.shape[1]
+        if done == self.most_evaluations(problem):
+            return Step(state.drives[:, :0], {})
+        generators = restored(state.search["generators"])
+        matrices = _matrices(state.drives, pressure)
+        trials = zip(matrices, state.best.drive, generators, strict=True)
+        highest = torch.stack([_highest(problem, *trial) for trial in trials])
+        last = done == self.rounds * _in_round(problem)
+        drives = problem.quantise(highest)[:, None] if last else _stepped(problem, highest)
+        return Step(drives, {"generators": states_of(generators)})
+
+    def _doubts(self, state: State) -> Sequence[Iterable[str]]:
+        """Describe nothing: the last drive is far above all others by design."""
+        return []
+
+
+def _in_round(problem: Problem) -> int:
+    """Return the evaluations of a round: the reference, and two of each transducer but the first."""
+    return 2 * problem.transducers - 1
+
+
+def _stepped(problem: Problem, reference: torch.Tensor) -> torch.Tensor:
+    """Return references (T, M), fully on, each with its steps of all phases but the first (T, 2 M - 1, M)."""
+    reference = torch.where(reference == 0, 1, reference.sgn())
+    transducers = torch.arange(1, problem.transducers, device="cpu").repeat_interleave(len(_TURNS))
+    turns = torch.tensor(_TURNS, dtype=torch.float64, device="cpu").repeat(problem.transducers - 1)
+    drives = reference[:, None].repeat(1, _in_round(problem), 1)
+    rows = torch.arange(1, drives.shape[1], device="cpu")
+    drives[:, rows, transducers] *= torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
+    drives = problem.quantise(drives)
+    if (_area(*_steps(drives)).abs() < _LEAST_AREA).any():
+        raise invalid("phase levels of the objective", 2, "must be 3 or more, for phase stepping")
+    return drives
+
+
+def _steps(drives: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the relative changes (T, M - 1) of all but the first entry by its first and its second step."""
+    reference = drives[:, 0, 1:]
+    first, second = (drives[:, start::2, 1:].diagonal(dim1=1, dim2=2) / reference - 1 for start in (1, 2))
+    return first, second
+
+
+def _area(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    """Return twice the area between complex numbers."""
+    return (first.conj() * second).imag
+
+
+def _matrices(drives: torch.Tensor, pressure: torch.Tensor) -> torch.Tensor:
+    """Return the matrices (T, P, M) that explain magnitudes (T, N, P) of a reference and its steps (T, N, M).
+
+    A step d_j of a transducer, which adds b to the pressure a of the reference, changes the intensity by
+    2 Re(d_j x) + t |d_j|^2, with x = a^* b and t = |b|^2. Two steps give x = x_0 - t x_1, and t follows from
+    t a^2 = |x|^2. Of its two roots, the smaller one belongs to the transducer; the other one would exchange
+    it with the rest of the reference.
+    """
+    rms = pressure.square().mean(dim=1).sqrt()
+    level = torch.maximum(pressure[:, 0], _DARK * rms).clamp_min(torch.finfo(pressure.dtype).tiny)[..., None]
+    intensity = pressure.square().mT  # (T, P, N)
+    changes = [(intensity[..., start::2] - intensity[..., :1]) / 2 for start in (1, 2)]
+    first, second = (step[:, None] for step in _steps(drives))
+    sizes = [step.abs().square() / 2 for step in (first, second)]
+    area = _area(first, second)
+
+    def solved(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+        """Return x with Re(first x) = one and Re(second x) = other."""
+        return 1j * (second.conj() * one - first.conj() * other) / area
+
+    start, slope = solved(*changes), solved(*sizes)
+    least = 2 * start.abs() * slope.abs()  # without noise, the middle of the roots is no less
+    middle = torch.maximum(2 * (start * slope.conj()).real + level.square(), least)
+    power = 2 * start.abs().square() / (middle + (middle.square() - least.square()).sqrt()).clamp_min(1e-300)
+    added = (start - power * slope) / level
+    added = torch.cat([level - added.sum(dim=-1, keepdim=True), added], dim=-1)
+    return added / drives[:, :1]
+
+
+def _highest(
+    problem: Problem, matrix: torch.Tensor, seen: torch.Tensor, generator: torch.Generator
+) -> torch.Tensor:
+    """Return the best drive (M,) of a matrix (P, M), from a drive that was observed and from random ones."""
+    starts = random_drives(_STARTS, problem.transducers, generator)
+    return climb(problem.goal, matrix, torch.cat([seen[None], starts]), _CLIMB_STEPS)
