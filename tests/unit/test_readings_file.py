@@ -174,141 +174,106 @@ def rows_of(title, numbers):
     return "\n".join([f"{title},{other}", *(f"{number},0.5" for number in numbers)])
 
 
+BROKEN = [
+    ("", "empty"),
+    ("\n# nothing\n", "empty"),
+    ("phase [rad],p [Pa peak]\n", "no row under the header"),
+    (TABLE + "1,2,3\n", r"line 4: 3 cells; must be 4 as in the header"),
+    (TABLE + "1,2,3,4,5\n", r"line 4: 5 cells; must be 4"),
+    (
+        TABLE.replace("2\n", "two\n"),
+        r"line 2, column 'pressure 1 \[Pa rms\]': 'two'; must be a finite number",
+    ),
+    (TABLE.replace("45.5", "nan"), r"line 3, column 'phase 1 \[deg\]': 'nan'; must be a finite number$"),
+    (TABLE.replace("1.5", "inf"), r"line 2, column 'pressure 0 \[Pa rms\]': 'inf'"),
+    (TABLE.replace("1.5", "-1.5"), r"line 2, column 'pressure 0.*: '-1.5'; .* >= 0.*pressure='dB'"),
+    (TABLE.replace(" [deg]", ""), "no unit of the phases; must be stated, .*phases='deg'"),
+    (TABLE.replace(" [Pa rms]", ""), r"no unit \(Pa, kPa, mPa or dB\) of the pressures"),
+    (TABLE.replace(" [Pa rms]", " [Pa]"), r"no kind \(peak, rms .*pressure='Pa rms'"),
+    (TABLE.replace(" [Pa rms]", " [MPa]"), "column 'pressure 0 .MPa.': 'MPa'; must be Pa, kPa or mPa"),
+    (TABLE.replace(" [Pa rms]", " [dB(A)]"), "must be Pa, kPa"),
+    (TABLE.replace(" [Pa rms]", " [dB re 1 uPa]"), "must be Pa, kPa"),
+    (TABLE.replace(" [Pa rms]", " [dB peak]"), "20 uPa are an RMS pressure"),
+    (rows_of("p [dB]", range(800, 820)), "most above 101325 Pa, which no sound in air reaches"),
+    (rows_of("p [kPa rms]", range(200, 220)), "most above 101325 Pa"),
+    (rows_of("phase [rad]", range(0, 360, 30)), "phases from 0 to 330 rad, all whole numbers"),
+    (rows_of("level", range(4)), "no number of levels of the phases.*phases=32"),
+    (rows_of("autd3 phase 0", [256]), "'256'; must be a whole number from 0 to 255"),
+    ("phase [rad],amplitude,p [Pa peak]\n0,1.2,1", "line 2, column 'amplitude': '1.2'; .* from 0 to 1"),
+    ("phase [rad],amplitude,p [Pa peak]\n0,-1,1", "column 'amplitude': '-1'; .* from 0 to 1"),
+    ("phase 0 [rad],phase 1 [rad],amplitude 0,p [Pa peak]\n0,1,1,1", "1 of amplitude and 2 of phase"),
+    ("phase [rad],intensity,p [Pa peak]\n0,1,1", "amplitudes in levels beside phases in rad"),
+    (
+        "autd3 phase 0,intensity,p [Pa peak]\n0,256,1",
+        "'256'; .* from 0 to 255",
+    ),
+    (TABLE.replace("phase 1", "phase 0"), r"columns of phase, 'phase 0 \[deg\]' twice"),
+    (TABLE.replace("phase 1", "phase 7"), "must have the numbers from 0 or 1, each once"),
+    (
+        TABLE.replace("phase 1 [deg]", "phase 1 [rad]"),
+        "'phase 0 .deg.' and 'phase 1 .rad.'; must be in one unit",
+    ),
+    (TABLE.replace(",", "|"), "must be separated by commas, semicolons, tabs or blanks"),
+    (TABLE.replace(",", ";").replace("1.5", "1,5"), "decimals begin with . and with a comma"),
+    (TABLE.replace(",", ";").replace("1.5", "1.234,5"), "decimals begin with . and with a comma"),
+    (
+        TABLE.replace("pressure 1 [Pa rms]", "temperature"),
+        "unknown column 'temperature'; must be as .*columns=",
+    ),
+    (TABLE.replace("pressure", "phase of"), "unknown column 'phase of 0|columns of phase"),
+    ("phase [rad]\n1\n", "no column of pressures"),
+    ("p [Pa peak]\n1\n", "no column of phases; must have them.* drives="),
+    ("phase [rad],p [Pa peak]\n1,\n2,nan", "no pressure in any row"),
+    (TABLE.partition("\n")[2], "4 columns without names; must be counted, as in columns="),
+    ("x,y,z,phase [rad],p [Pa peak]\n1,2,3,0,1", "no unit of x, y, z"),
+    ("x [mm],y [mm],phase [rad],p [Pa peak]\n1,2,0,1", "must be x, y, z and a single pressure"),
+    ("x [in],y [in],z [in],phase [rad],p [Pa peak]\n1,2,3,0,1", "column 'x .in.'"),
+]
+
+CALLED_WRONGLY = [
+    (TABLE.replace(" [Pa rms]", " [rms]"), {"pressure": "rms"}, "no unit .*pressure='Pa rms'"),
+    (TABLE, {"pressure": "kPa"}, "pressure: 'kPa'; must agree with column 'pressure 0 .Pa rms.'"),
+    (TABLE.replace("Pa rms", "dB"), {"pressure": "Pa rms"}, "pressure: 'Pa rms'; must agree .*states dB rms"),
+    ("phase [rad],SPL 1\n1,120", {"pressure": "Pa rms"}, "pressure: 'Pa rms'; must agree"),
+    (rows_of("p", range(110, 130)), STATED, "pressures from 110 to 129 look like dB; must be pressure='dB'"),
+    (TABLE, {"phases": "rad"}, "phases: 'rad'; must agree with column 'phase 0 .deg.'"),
+    (
+        rows_of("phase", [1, 32]),
+        {"phases": 32},
+        "line 3, column 'phase': '32'; must be a whole number from 0 to 31",
+    ),
+    (rows_of("phase", [1, 2.5]), {"phases": 32}, "line 3, column 'phase': '2.5'; must be a whole number"),
+    ("phase 0 [rad],amplitude 0,p [Pa peak]\n0,1,1", {"phases": "autd3"}, "phases: 'autd3 arg'; must agree"),
+    ("phase,amplitude,p [Pa peak]\n0,1,1", {"phases": "autd3"}, "amplitudes beside phase levels of autd3"),
+    (TABLE, {"columns": {"phase": 2, "pressure": 3}}, "columns: 5 in all; must be 4"),
+    (
+        TABLE,
+        {"columns": {"phase": "phi*", "pressure": "p*"}},
+        r"columns\['phase'\]: 'phi\*'; must be a title",
+    ),
+    ("ch1,mic\n1,3", {"columns": {"phase": "*", "pressure": "mic"}, **STATED}, "columns: 'mic' in .* twice"),
+    (
+        "0,9o,1\n1,2,3",
+        {"columns": {"phase": 2, "pressure": 1}, **STATED},
+        "line 1, column '2': '9o'; must be",
+    ),
+    ("0,1,2\n5,6,7", {"columns": {"phase": 2, "pressure": 1}, **STATED}, "the first line counts the columns"),
+    (TABLE, {"drives": Q}, "drives: given, but .* has columns of phases"),
+    (TABLE, {"points": torch.zeros(3, 3)}, r"points: shape \(3, 3\); must be \(2, 3\)"),
+    (TABLE, {"phase": "deg"}, "phase: deg; but .* has no column of pressure phases"),
+    ("p [Pa peak]\n1\n2\n3", {"drives": Q}, "drives: 2; must be 3, a drive for each row"),
+]
+
+
 @pytest.mark.parametrize(
-    ("text", "arguments", "message"),
-    [
-        ("", {}, "empty"),
-        ("\n# nothing\n", {}, "empty"),
-        ("phase [rad],p [Pa peak]\n", {}, "no row under the header"),
-        (TABLE + "1,2,3\n", {}, r"line 4: 3 cells; must be 4 as in the header"),
-        (TABLE + "1,2,3,4,5\n", {}, r"line 4: 5 cells; must be 4"),
-        (
-            TABLE.replace("2\n", "two\n"),
-            {},
-            r"line 2, column 'pressure 1 \[Pa rms\]': 'two'; must be a finite number",
-        ),
-        (
-            TABLE.replace("45.5", "nan"),
-            {},
-            r"line 3, column 'phase 1 \[deg\]': 'nan'; must be a finite number$",
-        ),
-        (TABLE.replace("1.5", "inf"), {}, r"line 2, column 'pressure 0 \[Pa rms\]': 'inf'"),
-        (TABLE.replace("1.5", "-1.5"), {}, r"line 2, column 'pressure 0.*: '-1.5'; .* >= 0.*pressure='dB'"),
-        (TABLE.replace(" [deg]", ""), {}, "no unit of the phases; must be stated, .*phases='deg'"),
-        (TABLE.replace(" [Pa rms]", ""), {}, r"no unit \(Pa, kPa, mPa or dB\) of the pressures"),
-        (TABLE.replace(" [Pa rms]", " [Pa]"), {}, r"no kind \(peak, rms .*pressure='Pa rms'"),
-        (TABLE.replace(" [Pa rms]", " [rms]"), {"pressure": "rms"}, "no unit .*pressure='Pa rms'"),
-        (
-            TABLE.replace(" [Pa rms]", " [MPa]"),
-            {},
-            "column 'pressure 0 .MPa.': 'MPa'; must be Pa, kPa or mPa",
-        ),
-        (TABLE.replace(" [Pa rms]", " [dB(A)]"), {}, "must be Pa, kPa"),
-        (TABLE.replace(" [Pa rms]", " [dB re 1 uPa]"), {}, "must be Pa, kPa"),
-        (TABLE.replace(" [Pa rms]", " [dB peak]"), {}, "20 uPa are an RMS pressure"),
-        (TABLE, {"pressure": "kPa"}, "pressure: 'kPa'; must agree with column 'pressure 0 .Pa rms.'"),
-        (
-            TABLE.replace("Pa rms", "dB"),
-            {"pressure": "Pa rms"},
-            "pressure: 'Pa rms'; must agree .*states dB rms",
-        ),
-        ("phase [rad],SPL 1\n1,120", {"pressure": "Pa rms"}, "pressure: 'Pa rms'; must agree"),
-        (
-            rows_of("p", range(110, 130)),
-            STATED,
-            "pressures from 110 to 129 look like dB; must be pressure='dB'",
-        ),
-        (rows_of("p [dB]", range(800, 820)), {}, "most above 101325 Pa, which no sound in air reaches"),
-        (rows_of("p [kPa rms]", range(200, 220)), {}, "most above 101325 Pa"),
-        (TABLE, {"phases": "rad"}, "phases: 'rad'; must agree with column 'phase 0 .deg.'"),
-        (rows_of("phase [rad]", range(0, 360, 30)), {}, "phases from 0 to 330 rad, all whole numbers"),
-        (rows_of("level", range(4)), {}, "no number of levels of the phases.*phases=32"),
-        (
-            rows_of("phase", [1, 32]),
-            {"phases": 32},
-            "line 3, column 'phase': '32'; must be a whole number from 0 to 31",
-        ),
-        (rows_of("phase", [1, 2.5]), {"phases": 32}, "line 3, column 'phase': '2.5'; must be a whole number"),
-        (rows_of("autd3 phase 0", [256]), {}, "'256'; must be a whole number from 0 to 255"),
-        (
-            "phase [rad],amplitude,p [Pa peak]\n0,1.2,1",
-            {},
-            "line 2, column 'amplitude': '1.2'; .* from 0 to 1",
-        ),
-        ("phase [rad],amplitude,p [Pa peak]\n0,-1,1", {}, "column 'amplitude': '-1'; .* from 0 to 1"),
-        ("phase 0 [rad],phase 1 [rad],amplitude 0,p [Pa peak]\n0,1,1,1", {}, "1 of amplitude and 2 of phase"),
-        (
-            "phase 0 [rad],amplitude 0,p [Pa peak]\n0,1,1",
-            {"phases": "autd3"},
-            "phases: 'autd3 arg'; must agree",
-        ),
-        (
-            "phase,amplitude,p [Pa peak]\n0,1,1",
-            {"phases": "autd3"},
-            "amplitudes beside phase levels of autd3",
-        ),
-        ("phase [rad],intensity,p [Pa peak]\n0,1,1", {}, "amplitudes in levels beside phases in rad"),
-        (
-            rows_of("autd3 phase 0", [1]) and "autd3 phase 0,intensity,p [Pa peak]\n0,256,1",
-            {},
-            "'256'; .* from 0 to 255",
-        ),
-        (TABLE.replace("phase 1", "phase 0"), {}, r"columns of phase, 'phase 0 \[deg\]' twice"),
-        (TABLE.replace("phase 1", "phase 7"), {}, "must have the numbers from 0 or 1, each once"),
-        (
-            TABLE.replace("phase 1 [deg]", "phase 1 [rad]"),
-            {},
-            "'phase 0 .deg.' and 'phase 1 .rad.'; must be in one unit",
-        ),
-        (TABLE.replace(",", "|"), {}, "must be separated by commas, semicolons, tabs or blanks"),
-        (TABLE.replace(",", ";").replace("1.5", "1,5"), {}, "decimals begin with . and with a comma"),
-        (TABLE.replace(",", ";").replace("1.5", "1.234,5"), {}, "decimals begin with . and with a comma"),
-        (
-            TABLE.replace("pressure 1 [Pa rms]", "temperature"),
-            {},
-            "unknown column 'temperature'; must be as .*columns=",
-        ),
-        (TABLE.replace("pressure", "phase of"), {}, "unknown column 'phase of 0|columns of phase"),
-        ("phase [rad]\n1\n", {}, "no column of pressures"),
-        ("p [Pa peak]\n1\n", {}, "no column of phases; must have them.* drives="),
-        ("phase [rad],p [Pa peak]\n1,\n2,nan", {}, "no pressure in any row"),
-        (TABLE.partition("\n")[2], {}, "4 columns without names; must be counted, as in columns="),
-        (TABLE, {"columns": {"phase": 2, "pressure": 3}}, "columns: 5 in all; must be 4"),
-        (
-            TABLE,
-            {"columns": {"phase": "phi*", "pressure": "p*"}},
-            r"columns\['phase'\]: 'phi\*'; must be a title",
-        ),
-        (
-            "ch1,mic\n1,3",
-            {"columns": {"phase": "*", "pressure": "mic"}, **STATED},
-            "columns: 'mic' in .* twice",
-        ),
-        (
-            "0,9o,1\n1,2,3",
-            {"columns": {"phase": 2, "pressure": 1}, **STATED},
-            "line 1, column '2': '9o'; must be",
-        ),
-        (
-            "0,1,2\n5,6,7",
-            {"columns": {"phase": 2, "pressure": 1}, **STATED},
-            "the first line counts the columns",
-        ),
-        (TABLE, {"drives": Q}, "drives: given, but .* has columns of phases"),
-        (TABLE, {"points": torch.zeros(3, 3)}, r"points: shape \(3, 3\); must be \(2, 3\)"),
-        (TABLE, {"phase": "deg"}, "phase: deg; but .* has no column of pressure phases"),
-        ("x,y,z,phase [rad],p [Pa peak]\n1,2,3,0,1", {}, "no unit of x, y, z"),
-        ("x [mm],y [mm],phase [rad],p [Pa peak]\n1,2,0,1", {}, "must be x, y, z and a single pressure"),
-        ("x [in],y [in],z [in],phase [rad],p [Pa peak]\n1,2,3,0,1", {}, "column 'x .in.'"),
-        ("p [Pa peak]\n1\n2\n3", {"drives": Q}, "drives: 2; must be 3, a drive for each row"),
-    ],
+    ("text", "message", "arguments"),
+    [*((*case, {}) for case in BROKEN), *((text, message, call) for text, call, message in CALLED_WRONGLY)],
 )
-def test_a_broken_table_is_refused_with_its_place_and_the_reason(load, text, arguments, message):
+def test_a_broken_table_is_refused_with_its_place_and_the_reason(load, text, message, arguments):
     with pytest.raises(ValueError, match=message) as error:
         load(text, **arguments)
-    assert (
-        "trial.csv" in str(error.value) or str(error.value).partition(":")[0].partition("[")[0] in arguments
-    )
+    named = str(error.value).partition(":")[0].partition("[")[0]
+    assert "trial.csv" in str(error.value) or named in arguments
 
 
 @pytest.mark.parametrize(
