@@ -48,6 +48,16 @@ def with_array(scene: at.Scene, array: at.TransducerArray) -> at.Scene:
     return dataclasses.replace(scene, array=array, domain=domain, observation_plane=None)
 
 
+def cube_shadow(points: int) -> torch.Tensor:
+    """Return the transfer matrix of an AUTD3 to random points (P, 249) behind the paper's two cubes."""
+    generator = torch.Generator().manual_seed(0)
+    lower, upper = torch.tensor([[0.07, 0.03, 0.03], [0.09, 0.07, 0.07]], dtype=torch.float64)
+    places = lower + (upper - lower) * torch.rand(points, 3, dtype=torch.float64, generator=generator)
+    scene = with_array(paper_scene("two_cubes"), autd3_array())
+    matrix = at.make_propagator(scene, "box", 1e-3).transfer_matrix(places)
+    return matrix.to(torch.complex128)
+
+
 def uncached(
     scene: at.Scene, method: str, spacing: float | None, tolerance: float = 1e-3, **settings: Any
 ) -> SimulatedPropagator:

@@ -64,18 +64,43 @@ def test_points_of_no_pressure_are_quiet(random_matrix, algorithm):
         assert reached[3:].max() < 10 ** (-30 / 20) * reached[:3].min()  # 30 dB below
 
 
-@settings(max_examples=20)
-@given(st.integers(2, 8), st.floats(3e-3, 15e-3), st.integers(0, 2**31))
-def test_close_foci_do_not_change_places_for_ever(points, spread, seed):
-    """With the power 1 of the weights, one more iteration exchanged 4590 and 2735 Pa."""
+def random_foci(points: int, spread: float, seed: int) -> torch.Tensor:
+    """Transfer matrix of foci in a cube of an edge `spread` [m], 150 mm in front of 10 x 10 transducers."""
     array = TransducerArray.grid((10, 10), 10e-3, (0, 0, 0), (0, 0, 1))
     random = torch.Generator().manual_seed(seed)
     foci = torch.rand(points, 3, generator=random, dtype=torch.float64) * spread + torch.tensor([0, 0, 0.15])
-    matrix = free_space_matrix(foci, array, 740.0 + 0j)
+    return free_space_matrix(foci, array, 740.0 + 0j)
+
+
+@settings(max_examples=20)
+@given(st.integers(2, 8), st.floats(3e-3, 15e-3), st.integers(0, 2**31))
+def test_close_foci_do_not_change_places_for_ever(points, spread, seed):
+    """With weights that change as much in the end, one more iteration exchanged 4590 and 2735 Pa."""
+    matrix = random_foci(points, spread, seed)
     weakest = [pressures(matrix, holography(matrix, iterations=count)).min() for count in (200, 201)]
-    plain = pressures(matrix, holography(matrix, algorithm="gs")).min()
     assert weakest[1] == pytest.approx(float(weakest[0]), rel=0.01)
-    assert weakest[0] > 0.95 * plain
+
+
+@settings(max_examples=20)
+@given(st.integers(1, 32), st.floats(3e-3, 100e-3), st.integers(0, 2**31))
+def test_weighted_iterations_end_with_their_best_and_above_plain_ones(points, spread, seed):
+    matrix, levels = random_foci(points, spread, seed), []
+
+    def limited(drive: torch.Tensor) -> torch.Tensor:
+        levels.append(float(pressures(matrix, drive[:, 0].sgn()).min()))
+        return drive.sgn()
+
+    best = SOLVERS["wgs"](matrix, torch.ones(points, 1).double(), 20, limited)[:, 0]
+    assert pressures(matrix, best).min() == pytest.approx(max(levels), rel=1e-12)
+    weakest, plain = (pressures(matrix, holography(matrix, None, name)).min() for name in ("wgs", "gs"))
+    assert weakest > 0.99 * plain  # `check.py holography` has the least of 2,000 sets
+
+
+@pytest.mark.parametrize(("points", "least"), [(8, 0.89), (16, 0.88), (32, 0.84)])
+def test_many_foci_come_near_to_the_bound(points, least):
+    """The best of 200 starts is 5 to 10 % below the relaxation, and one start is up to 5 % below the best."""
+    matrix = random_foci(points, 100e-3, points)
+    assert pressures(matrix, holography(matrix)).min() > least * focus_bound(matrix)
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -92,9 +117,12 @@ def test_a_batch_is_its_sets_one_by_one(random_matrix, algorithm):
 
 @pytest.mark.parametrize("free", [False, True])
 @pytest.mark.parametrize("algorithm", ALGORITHMS[:-1])
-def test_kernels_on_cpus_are_the_definitions(random_matrix, algorithm, free):
-    matrix = torch.stack([random_matrix(3, 10, seed) for seed in range(21)])  # a block and a part
-    wanted = torch.rand(21, 3, 1, generator=torch.Generator().manual_seed(0)).double() + 0.5
+@pytest.mark.parametrize(("points", "transducers"), [(3, 10), (7, 3)])  # many points begin otherwise
+def test_kernels_on_cpus_are_the_definitions(random_matrix, algorithm, free, points, transducers):
+    matrix = torch.stack(
+        [random_matrix(points, transducers, seed) for seed in range(21)]
+    )  # blocks and a part
+    wanted = torch.rand(21, points, 1, generator=torch.Generator().manual_seed(0)).double() + 0.5
     exact = SOLVERS[algorithm](matrix, wanted, 20, within_largest if free else torch.sgn)
     drive = holography(matrix, wanted[..., 0], algorithm, 20, free)
     # free amplitudes are scaled to the wanted level; twenty iterations spread rounding of 1e-16

@@ -1,4 +1,4 @@
-"""Operations that Numba lacks: on several cells of a row at a time, and on counters of several threads.
+"""Operations that Numba lacks: on several numbers at a time, and on counters of several threads.
 
 Numba vectorises neither the rows around heterogeneous cells, which are scattered and whose sums keep an
 order, nor the short ends of rows with the cells of boundary layers.
@@ -24,6 +24,9 @@ _WIDTH = 4  # Cells of a row that are read: three neighbours, and a lane of padd
 _MIDDLE = 13  # The cell itself among its neighbours, from which it does not differ
 # Neighbour read first in each row, and the lane of padding: no read leaves the grid or the weights
 _FIRST, _PADDING = (*range(0, 24, 3), 23), (*8 * (3,), 0)
+VECTOR = 64
+"""Bytes of a vector of `add_products`."""
+
 ALIKE = 16
 """Neighbouring cells with equal weights that are computed at once."""
 
@@ -129,6 +132,56 @@ def _add_four(typing_context: Any, u: Any, at: Any, v: Any, start: Any) -> Any:
     return types.void(u, types.uint64, v, types.uint64), generate
 
 
+def _products_added(conjugate: bool) -> Any:
+    """Return the operation u + i v += sum over n of (a + i b)[at + n step] (x + i z)[of + n stride].
+
+    Each number is a vector of `VECTOR` bytes that begins at the index. With `conjugate`, b counts as -b.
+    Products are added with one rounding where the processor has an instruction for it.
+    """
+
+    def add(
+        typing_context: Any, u: Any, v: Any, to: Any, a: Any, b: Any, at: Any, step: Any, x: Any, z: Any,
+        of: Any, stride: Any, terms: Any,
+    ) -> Any:  # fmt: skip
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            number = context.get_data_type(u.dtype)
+            size = context.get_abi_sizeof(number)
+            lanes = VECTOR // size
+            vector = ir.VectorType(number, lanes)
+            kind = ir.FunctionType(vector, 3 * [vector])
+            fused = cgutils.get_or_insert_function(  # type: ignore[no-untyped-call]
+                builder.module, kind, f"llvm.fmuladd.v{lanes}f{8 * size}"
+            )
+            _, _, first_out, _, _, first, step, _, _, second, stride, terms = arguments
+
+            def pointer(array: int, index: Any) -> Any:
+                item = _item(context, builder, signature, arguments, array, index)
+                return builder.bitcast(item, vector.as_pointer())
+
+            def load(array: int, index: Any) -> Any:
+                return builder.load(pointer(array, index), align=size)
+
+            zero = ir.Constant(vector, None)
+            sums = [cgutils.alloca_once_value(builder, zero) for _ in range(4)]  # type: ignore[no-untyped-call]
+            with cgutils.for_range(builder, terms) as loop:
+                left = builder.add(first, builder.mul(loop.index, step))
+                right = builder.add(second, builder.mul(loop.index, stride))
+                pairs = [(load(j, left), load(k, right)) for j in (3, 4) for k in (7, 8)]
+                for total, pair in zip(sums, pairs, strict=True):
+                    builder.store(builder.call(fused, [*pair, builder.load(total)]), total)
+            ax, az, bx, bz = map(builder.load, sums)
+            real, imaginary = (builder.fadd, builder.fsub) if conjugate else (builder.fsub, builder.fadd)
+            for array, part in ((0, real(ax, bz)), (1, imaginary(az, bx))):
+                total = builder.fadd(load(array, first_out), part)
+                builder.store(total, pointer(array, first_out), align=size)
+            return context.get_dummy_value()
+
+        long = types.uint64
+        return types.void(u, v, long, a, b, long, long, x, z, long, long, long), generate
+
+    return add
+
+
 def _add_atomically(typing_context: Any, counters: Any, place: Any, amount: Any) -> Any:
     """Add to a counter and return its old value."""
 
@@ -149,6 +202,8 @@ def _read_atomically(typing_context: Any, counters: Any, place: Any) -> Any:
     return types.int64(counters, types.int64), generate
 
 
+add_products: Any = intrinsic(_products_added(False))
+add_conjugate_products: Any = intrinsic(_products_added(True))
 sum_of_rows: Any = intrinsic(_sum_of_rows)
 sums_of_rows: Any = intrinsic(_sums_of_rows)
 add_four: Any = intrinsic(_add_four)

@@ -6,9 +6,12 @@ like products by *, is taken entry by entry:
 - "naive": q = sgn(G^H t), back-propagation;
 - "gs": p = t * sgn(G q), q = sgn(G^H p) in turns (Gerchberg and Saxton 1972), iterative back-propagation of
   Marzo and Drinkwater (2019), doi:10.1073/pnas.1813047115;
-- "wgs": p = b * sgn(G q), q = sgn(G^H p), after which b is multiplied by (t / |G q|)^(1/2) and divided by its
-  largest entry. Di Leonardo, Ianni and Ruocco (2007), doi:10.1364/OE.15.001913, have the power 1, with which
-  close foci change places for ever. The result is the q of the highest weakest pressure over its target;
+- "wgs": p = b * sgn(G q), q = sgn(G^H p), after which b is multiplied by 1 + c (s / r - 1), with the shares
+  r = |G q| / t and their largest s, and divided by its largest entry. Di Leonardo, Ianni and Ruocco (2007),
+  doi:10.1364/OE.15.001913, have c = 1, with which close foci change places for ever. Here c grows from 0,
+  so that phases of foci settle before weights, and falls to 0 in the end. As many iterations before, with
+  q = G^H p, choose the phases of p that begin: at points alone, p = b * sgn(G G^H p), they are cheap.
+  The result is the q of the highest weakest share;
 - "gs_pat": p = G G^H (t * sgn(p)) in turns, and in the end q = sgn(G^H (t^2 * p / |p|^2)) (Martinez Plasencia
   et al. 2020), doi:10.1145/3386569.3392492;
 - "diff_pat": Adam on the phases, from those of "wgs", for the least sum of (|p| - t)^2 (Fushimi, Yamamoto and
@@ -19,6 +22,7 @@ With free amplitudes, drives are divided by their largest entry in place of sgn.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Literal, TypeAlias
 
@@ -28,8 +32,8 @@ Algorithm: TypeAlias = Literal["naive", "gs", "wgs", "gs_pat", "diff_pat"]
 Project: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
 
 TINY = 1e-30
-DAMPING = 0.5
-"""Power of wanted over present pressure in the weights of "wgs"; 1 overshoots."""
+GOLDEN = (math.sqrt(5) - 1) / 2
+"""Golden ratio: multiples of it, modulo 1, are spread evenly."""
 
 UNREACHED = 1e-6
 """Pressure, relative to the loudest point, below which a point gets no more weight."""
@@ -54,26 +58,51 @@ def _in_turns(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, proje
     return drive
 
 
+def weight_change(number: int, iterations: int) -> float:
+    """Return c of the iteration `number` of "wgs"."""
+    progress = (number + 0.5) / iterations
+    return min(1.0, 2 * progress, 4 * (1 - progress))
+
+
 def _weighted(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
-    back, drive = matrix.mH.resolve_conj(), torch.ones_like(matrix[..., :1, :]).mT
-    weights, best, highest = wanted, drive, torch.zeros_like(wanted[..., :1, :])
-    for _ in range(iterations):
-        drive = project(back @ (weights * (matrix @ drive).sgn()))
-        size = (matrix @ drive).abs()
-        loudest = size.amax(dim=-2, keepdim=True).clamp_min(TINY)
+    back, number = matrix.mH.resolve_conj(), torch.arange(matrix.shape[-2], device=matrix.device)
+    turns = (number * (number + 1) // 2).double() * GOLDEN % 1  # of any two foci, in no simple relation
+    pressure = torch.polar(torch.ones_like(turns), 2 * math.pi * turns)[:, None].to(matrix.dtype)
+    if matrix.shape[-2] <= 2 * matrix.shape[-1]:  # otherwise iterations at points take longer
+        both = _products(matrix)
+        pressure, _ = _reweighting(pressure, wanted, iterations, lambda imposed: both @ imposed)
+    _, best = _reweighting(pressure, wanted, iterations, lambda imposed: matrix @ project(back @ imposed))
+    return project(back @ best)
+
+
+def _reweighting(
+    pressure: torch.Tensor, wanted: torch.Tensor, iterations: int, turned: Project
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the last pressures (..., P, 1), and the imposed ones of the highest weakest pressure."""
+    weights, best, highest = wanted, wanted * pressure.sgn(), torch.zeros_like(wanted[..., :1, :])
+    for number in range(iterations):
+        imposed = weights * pressure.sgn()
+        pressure = turned(imposed)
+        share = torch.where(wanted > 0, pressure.abs() / wanted, 0)
+        top = share.amax(dim=-2, keepdim=True).clamp_min(TINY)
         # the weight of a point that no transducer reaches would outgrow all others
-        share = torch.where(size > UNREACHED * loudest, size, loudest) / wanted
+        share = torch.where(share > UNREACHED * top, share, top)
         level = share.amin(dim=-2, keepdim=True)
         worse = level <= highest  # not where a matrix is not finite, which is refused later
-        best, highest = torch.where(worse, best, drive), torch.maximum(level, highest)
-        weights = torch.where(wanted > 0, weights / share.pow(DAMPING), 0.0)
+        best, highest = torch.where(worse, best, imposed), torch.maximum(level, highest)
+        weights = weights * (1 + weight_change(number, iterations) * (top / share - 1))
         weights = weights / weights.amax(dim=-2, keepdim=True)
-    return best
+    return pressure, best
+
+
+def _products(matrix: torch.Tensor) -> torch.Tensor:
+    """Return G G^H (..., P, P) over its largest entry, against overflow."""
+    both = matrix @ matrix.mH
+    return both / both.abs().amax(dim=(-2, -1), keepdim=True).clamp_min(TINY)
 
 
 def _at_points(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
-    both, pressure = matrix @ matrix.mH, wanted.to(matrix.dtype)
-    both = both / both.abs().amax(dim=(-2, -1), keepdim=True).clamp_min(TINY)  # against overflow
+    both, pressure = _products(matrix), wanted.to(matrix.dtype)
     for _ in range(iterations):
         pressure = both @ (wanted * pressure.sgn())
     return project(matrix.mH @ (wanted.square() * pressure.sgn() / pressure.abs().clamp_min(TINY)))

@@ -86,8 +86,8 @@ def holography(
         free_amplitudes: whether amplitudes are free in [0, 1]; otherwise all are 1, and pressures at best in
             proportion to the targets, except of "diff_pat".
         starts: number of first guesses, >= 1. The drive whose weakest pressure, relative to its target, is
-            the highest is returned. The first guess has equal phases, the others have random ones,
-            the same in every call. Iterations end in local maxima, at half of the best for symmetric foci.
+            the highest is returned. The others have random phases, the same in every call. Iterations end in
+            local maxima; those of "gs" from equal phases at half of the best for symmetric foci.
 
     Returns:
         Drives (..., M), complex, |q| <= 1, in the precision and on the device of G.

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
-from autdtorch.methods.holography.algorithms import DAMPING, TINY, UNREACHED
+from autdtorch.methods.holography.algorithms import GOLDEN, TINY, UNREACHED
 from autdtorch.methods.holography.holography import checked_targets
 from autdtorch.scene.geometry import path_foci
 from autdtorch.scene.sequence import Sequence
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 _STARTS = 8  # Phases between the foci that are tried
 _SETTLED = 1e-9  # Change of all drives at which iterations end
 _TRIAL = 10  # Iterations of each, after which the best goes on
-_GOLDEN = (math.sqrt(5) - 1) / 2  # Multiples of it, modulo 1, are spread evenly
+_DAMPING = 0.5  # Power of wanted over present pressure in the weights; 1 overshoots
 
 
 @one_library_thread()
@@ -150,7 +150,7 @@ def _starts(rows: ComplexArray, closed: bool) -> ComplexArray:
         missing = np.remainder(phases[-1] + math.pi, 2 * math.pi) - math.pi
         phases -= missing * np.linspace(0, 1, len(phases))[:, None]
     foci = np.arange(rows.shape[1])
-    between = 2 * math.pi * _GOLDEN * foci * np.arange(_STARTS if len(foci) > 1 else 1)[:, None]
+    between = 2 * math.pi * GOLDEN * foci * np.arange(_STARTS if len(foci) > 1 else 1)[:, None]
     back: ComplexArray = (_first_weights(rows) * np.exp(1j * (phases[:-1, None] + between))) @ rows.conj()
     return back
 
@@ -175,7 +175,7 @@ def _best(
         scores = weakest.min(axis=0) if even else weakest.mean(axis=0)
         if scores.max() > highest:
             best, highest = drives[:, [scores.argmax()]], scores.max()
-        weights /= np.maximum(size, UNREACHED * size.max(axis=2, keepdims=True)) ** DAMPING
+        weights /= np.maximum(size, UNREACHED * size.max(axis=2, keepdims=True)) ** _DAMPING
         weights /= weights.max(axis=2, keepdims=True)
         before, drives = drives, steps.nearer(drives, (weights * (pressure / size)) @ rows.conj())
         if np.abs(drives - before).max() < _SETTLED:
