@@ -32,8 +32,8 @@ def main(page: Page) -> None:
         f"Sets of {POINTS} points a second, {ITERATIONS} iterations, {TRANSDUCERS} transducers, "
         "amplitudes 1:",
         table(["algorithm", "autdtorch", "AcousTools", "ratio"], printed(rates())),
-        "Share of the bound on the weakest focus [%], 200 iterations, behind two cubes: median and quartiles. "
-        "The bound is within 0.3 % for 4 foci, and a relaxation for more:",
+        "Share of the bound on the weakest focus [%], 200 iterations, behind two cubes (quartiles): "
+        "the bound is within 0.3 % for 4 foci, and a relaxation for more:",
         table(["foci", *ALGORITHMS, "diff_pat", f"wgs, {MORE} starts"], printed(shares())),
     )
 
