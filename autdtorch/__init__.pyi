@@ -40,7 +40,7 @@ from .methods.run import run
 from .methods.solution import Solution
 from .methods.state_file import load_state, save_state
 from .objectives.bound import focus_bound
-from .objectives.forces import ForceObjective, Levitate, Trap
+from .objectives.forces import ForceObjective, Levitate, Push, Trap
 from .objectives.goals import Goal, MeanPressure, TargetPressures, WeakestFocus
 from .objectives.haptics import HapticMetrics, haptic_metrics
 from .objectives.metrics import FocusMetrics, focus_metrics
@@ -113,6 +113,7 @@ __all__ = [
     "Plane",
     "Prior",
     "Problem",
+    "Push",
     "Quantised",
     "QuietPoints",
     "RandomSearch",

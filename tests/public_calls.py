@@ -89,7 +89,7 @@ INSIDE_METHODS |= {
     "together_on",
 }
 INSIDE_METHODS |= {"at", "farthest", "near", "section", "wanted", "write_file"}
-INSIDE_METHODS |= {"climbed", "rows", "weights"}
+INSIDE_METHODS |= {"climbed", "forms"}
 
 
 class Made(NamedTuple):
@@ -375,6 +375,7 @@ ARGUMENTS: dict[str, Any] = {
 OTHERS: dict[str, Any] = {
     "FailedTransducers.transducers": [1],
     "ForceObjective.goal": at.Trap([(22e-3, 7e-3, 14e-3)], BEAD),
+    "Push.direction": (0.0, 0.0, 1.0),
     "Particle.radius": 3e-4,
     "Particle.of.radius": 3e-4,
     "Drift.sensor": 0.1,
@@ -429,7 +430,6 @@ OTHERS: dict[str, Any] = {
     "Readings.of_rows.drives": torch.stack([DRIVE, DRIVE]),
     "Readings.of_rows.phase": [0.1, 0.2],
     "Contrast.points": [1],
-    **{f"{name}.__call__.pressure": torch.ones(240, dtype=torch.float64) for name in ("Levitate", "Trap")},
     "TargetPressures.targets": [1.0, 2.0, 3.0],
     "TargetPressures.__call__.pressure": [1.0, 2.0, 3.0],
     "PhasorKernel.mean.x": torch.ones(3, 2, dtype=torch.float64),

@@ -15,7 +15,7 @@ import torch
 from autdtorch.methods.base import Method, Step, whole
 from autdtorch.methods.problem import Problem, known_matrix, starts_of
 from autdtorch.methods.seeds import generators_of, uniform
-from autdtorch.objectives.forces import ForceGoal
+from autdtorch.objectives.forces import LeastForm
 from autdtorch.objectives.goals import scores_of, slope_of
 from autdtorch.objectives.objective import GoalFunction
 from autdtorch.utils.array_types import REAL
@@ -73,7 +73,7 @@ def random_drives(count: int, transducers: int, generator: torch.Generator) -> t
 @one_library_thread()
 def climb(goal: GoalFunction, matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor:
     """Return the highest drive (M,) of the climbs of a goal from drives (S, M), on one matrix (P, M)."""
-    if isinstance(goal, ForceGoal):
+    if isinstance(goal, LeastForm):
         drive = goal.climbed(matrix, drive, steps)
     else:
         drive = climbed(goal, matrix, drive, steps)

@@ -1,4 +1,4 @@
-"""Goals of force: traps of small particles, lift against gravity, and the push on a body.
+"""Goals of force: traps and lift of small spheres, and the push on a body.
 
 All are Hermitian forms q^H A q of the drive q. Each is written as squares of magnitudes of rows R q with
 weights of either sign, so that an objective can give the magnitudes as readings: methods take them as those
@@ -8,28 +8,31 @@ of control points, and bounds follow from the rows (`hermitian`).
 from __future__ import annotations
 
 import itertools
-import math
-from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, field
+from typing import ClassVar, Protocol
 
 import numpy as np
 import torch
 
+from autdtorch.analytic.sphere_force import PAIRS, force_forms
+from autdtorch.analytic.spherical_waves import sphere_coefficients
 from autdtorch.objectives.bound import checked_matrix
 from autdtorch.objectives.goals import Goal
 from autdtorch.objectives.hermitian import ascended, forms_bound
 from autdtorch.objectives.objective import magnitudes, observe_drives
-from autdtorch.propagators.derivatives import Derivatives, derivatives, nodes_around
-from autdtorch.propagators.gorkov import factors, warn_of_large
+from autdtorch.propagators.derivatives import nodes_around, regular_coefficients
 from autdtorch.propagators.propagator import Propagator
+from autdtorch.propagators.tmatrix.force import force_matrices
+from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.particle import Particle
+from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import (
     ArrayLike,
     Vector,
+    integer_at_least,
     invalid,
     points_tensor,
     positive,
@@ -42,31 +45,41 @@ _AXES = [axis for axis in itertools.product((-1, 0, 1), repeat=3) if axis > (0, 
 DIRECTIONS: tuple[Vector, ...] = tuple(unit_vector("direction", axis) for axis in _AXES)
 """DIRECTIONS: 13, along edges, and diagonals of faces and bodies, of a cube."""
 
-_PAIRS = (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)
-_PRODUCTS = (4,) * 3 + (8,) * 6  # of force along x, y and z, and of the stiffness of each pair
-_READINGS = 2 * sum(_PRODUCTS)
-_TINY = 1e-300
+_LARGEST = 1.0  # k a of a small sphere, for which the degrees up to 3 scatter all but 1e-5
+_SCATTERED = 3
+_LEAST = 1e-12  # Eigenvalue of a form that is left out, relative to the largest
 
 
-@dataclass(frozen=True)
-class ForceGoal(Goal):
-    """Base of goals of force: the least of some Hermitian forms, sums of squared readings with weights."""
+@dataclass(frozen=True, eq=False)
+class LeastForm(Goal):
+    """The goal of a `ForceObjective`: the least of J forms, sums of N squared readings with weights.
 
-    @abstractmethod
-    def rows(self, propagator: Propagator) -> torch.Tensor:
-        """Return the rows (N, M), complex128, whose magnitudes are the readings."""
+    Attributes:
+        of: the trap, lift or push.
+        weights: (J, N).
+    """
 
-    @abstractmethod
-    def weights(self, readings: int) -> Array:
-        """Return the weights (J, N) of the squares of N readings in each form."""
+    of: ForceGoal
+    weights: Array = field(repr=False)
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        """The name of the trap, lift or push."""
+        return self.of.name
+
+    @property
+    def unit(self) -> str:  # type: ignore[override]
+        """The unit of it."""
+        return self.of.unit
 
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:
         """Return the least form (...) of readings (..., N)."""
-        return self._forms(self.checked(pressure)).amin(dim=-1)
+        readings = self.checked(pressure)
+        return (readings.square() @ readings.new_tensor(self.weights).mT).amin(dim=-1)
 
     def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
         """Return the derivatives of the smooth least form."""
-        weights = pressure.new_tensor(self.weights(pressure.shape[-1]))
+        weights = pressure.new_tensor(self.weights)
         forms = pressure.square() @ weights.mT
         temperature = smoothing * forms.abs().mean(dim=-1, keepdim=True)
         shares = torch.softmax(-forms / temperature.clamp_min(torch.finfo(forms.dtype).tiny), dim=-1)
@@ -76,26 +89,39 @@ class ForceGoal(Goal):
         """Return the bound by the rows (N, M), 0 only if no drive scores above 0; see `Goal.bound`."""
         matrix = checked_matrix(G)
         self.check(len(matrix))
-        return forms_bound(matrix, self.weights(len(matrix)))
+        return forms_bound(matrix, self.weights)
 
-    def climbed(self, matrix: torch.Tensor, drive: torch.Tensor, iterations: int) -> torch.Tensor:
-        """Return drives (S, M) at local maxima of the goal from drives (S, M), by the rows (N, M)."""
-        rows, weights = matrix.numpy(), self.weights(len(matrix))
-        return torch.stack(
-            [torch.from_numpy(ascended(rows, weights, each, iterations)) for each in drive.numpy()]
-        )
+    def check(self, points: int) -> None:
+        """Check the number of readings."""
+        if points != self.weights.shape[1]:
+            raise ValueError(
+                f"pressure: {points} readings; must be {self.weights.shape[1]}, of a ForceObjective"
+            )
 
     def wanted(self, points: int) -> Array:
         """Refuse: no pressures are wanted."""
         raise invalid("goal", self, "must want pressures, for this method; take gradient_ascent")
 
-    def _forms(self, readings: torch.Tensor) -> torch.Tensor:
-        return readings.square() @ readings.new_tensor(self.weights(readings.shape[-1])).mT
+    def climbed(self, matrix: torch.Tensor, drive: torch.Tensor, iterations: int) -> torch.Tensor:
+        """Return drives (S, M) at local maxima of the goal from drives (S, M), by the rows (N, M)."""
+        each = [ascended(matrix.numpy(), self.weights, start, iterations) for start in drive.numpy()]
+        return torch.from_numpy(np.stack(each))
+
+
+class ForceGoal(Protocol):
+    """What a `ForceObjective` maximises: `Trap`, `Levitate` or `Push`."""
+
+    name: ClassVar[str]
+    unit: ClassVar[str]
+
+    def forms(self, propagator: Propagator) -> tuple[torch.Tensor, Array]:
+        """Return rows (N, M), complex128, and the weights (J, N) of their squares in the forms."""
+        ...
 
 
 @dataclass(frozen=True)
-class _ParticleGoal(ForceGoal):
-    """Base of goals of a small particle at points, by the force and the stiffness there."""
+class _ParticleGoal:
+    """Base of goals of a small sphere at points, by the force and the stiffness there."""
 
     points: Sequence[Vector]
     particle: Particle
@@ -116,79 +142,58 @@ class _ParticleGoal(ForceGoal):
         object.__setattr__(self, "directions", tuple(tuple(direction) for direction in directions.tolist()))
         object.__setattr__(self, "displacement", positive("displacement", self.displacement, "m"))
 
-    def rows(self, propagator: Propagator) -> torch.Tensor:
-        """Return the rows (120 P, M) of force [N^(1/2)] and stiffness [(N/m)^(1/2)]."""
-        require_kind("propagator", propagator, Propagator)
+    def forms(self, propagator: Propagator) -> tuple[torch.Tensor, Array]:
+        """Return rows (N, M) and the weights (J P, N) of their squares in the forms of each point."""
         scene = propagator.scene
-        warn_of_large(self.particle, scene)
         nodes = nodes_around(scene, points_tensor("points", self.points))
         matrix = propagator.transfer_matrix(nodes.reshape(-1, 3)).detach().cpu()
-        field = derivatives(matrix.reshape(*nodes.shape[:2], -1).mT, scene.complex_wavenumber)
-        return _particle_rows(field, *factors(self.particle, scene)).reshape(-1, matrix.shape[1])
+        pressure = matrix.reshape(*nodes.shape[:2], -1).mT
+        waves = regular_coefficients(pressure, scene.complex_wavenumber, _SCATTERED + 2)
+        factors, kinds, signs = _eigenrows(self.particle, scene)
+        weights = np.stack([form[kinds] * signs for form in self._combined()])
+        return (waves @ factors).mT.flatten(0, 1), np.kron(np.eye(len(self.points)), weights)
 
-    def weights(self, readings: int) -> Array:
-        """Return the weights (J P, 120 P) of the forms of each point."""
-        signs = np.concatenate([np.repeat((1.0, -1.0), count) for count in _PRODUCTS])
-        quantity = np.repeat(np.arange(len(_PRODUCTS)), 2 * np.array(_PRODUCTS))
-        forms = self._combined()[:, quantity] * signs
-        return np.kron(np.eye(len(self.points)), forms)
-
-    def check(self, points: int) -> None:
-        """Check the number of readings."""
-        if points != _READINGS * len(self.points):
-            accepted = f"must be the {_READINGS * len(self.points)} of the goal's ForceObjective"
-            raise ValueError(f"pressure: {points} readings; {accepted}")
-
-    @abstractmethod
     def _combined(self) -> Array:
         """Return the forms (J, 9) by force (3) and stiffness (6) at a point."""
+        raise NotImplementedError
 
 
-def _particle_rows(field: Derivatives, alpha: float, beta: float) -> torch.Tensor:
-    """Return the rows (P, 120, M) of force and stiffness, from derivatives at P points of unit drives.
-
-    Each is a sum of products 2 c Re(u^* v): of two squares with opposite signs.
-    """
-    p, first, second, third = field
-    products = []
-    for j in range(3):
-        products.append([(-alpha, p, first[..., j])])
-        products[-1] += [(beta, first[..., i], second[..., i, j]) for i in range(3)]
-    for j, k in _PAIRS:
-        products.append([(alpha, first[..., k], first[..., j]), (alpha, p, second[..., j, k])])
-        products[-1] += [(-beta, second[..., i, k], second[..., i, j]) for i in range(3)]
-        products[-1] += [(-beta, first[..., i], third[..., i, j, k]) for i in range(3)]
-    return torch.cat([_squares(each) for each in products], dim=1)
-
-
-def _squares(products: Sequence[tuple[float, torch.Tensor, torch.Tensor]]) -> torch.Tensor:
-    """Return rows (P, 2 C, M): of C sums and of C differences, of rows u and v (P, M) made equally large."""
-    sums, differences = [], []
-    for factor, u, v in products:
-        sizes = [each.norm(dim=-1, keepdim=True).clamp_min(_TINY) for each in (u, v)]
-        scale = (abs(factor) * sizes[1] / sizes[0]).sqrt()
-        left, right = scale * u, factor / scale * v
-        sums.append((left + right) / math.sqrt(2))
-        differences.append((left - right) / math.sqrt(2))
-    return torch.stack(sums + differences, dim=1)
+def _eigenrows(particle: Particle, scene: Scene) -> tuple[torch.Tensor, Array, Array]:
+    """Return the map (N, R) from regular waves to rows, and the quantity (R,) and sign (R,) of each."""
+    medium, k = scene.medium, scene.wavenumber
+    if particle.radius * k > _LARGEST:
+        accepted = f"must be at most {_LARGEST / k:.4g}: a larger one is a body of the scene"
+        raise invalid("particle.radius", particle.radius, accepted, "m")
+    density, speed = particle.density / medium.density, particle.sound_speed / medium.sound_speed
+    ratios = sphere_coefficients(_SCATTERED, particle.radius * k, density, speed)
+    scale = 1 / (2 * medium.density * scene.angular_frequency**2)
+    maps, kinds, signs = [], [], []
+    for kind, form in enumerate(force_forms(ratios, k, scale)):
+        values, vectors = torch.linalg.eigh(form)
+        some = values.abs() > _LEAST * values.abs().max()
+        maps.append(vectors[:, some].conj() * values[some].abs().sqrt())
+        kinds += [kind] * int(some.sum())
+        signs.append(values[some].sign().numpy())
+    return torch.cat(maps, dim=1), np.array(kinds), np.concatenate(signs)
 
 
 def _along(directions: Array) -> Array:
-    """Return n_i n_j of directions (D, 3) by the pairs of the stiffness (D, 6)."""
-    return np.stack([(1 + (i != j)) * directions[:, i] * directions[:, j] for i, j in _PAIRS], axis=1)
+    """Return the stiffness along directions (D, 3) by its entries `PAIRS` (D, 6)."""
+    return np.stack([(1 + (i != j)) * directions[:, i] * directions[:, j] for i, j in PAIRS], axis=1)
 
 
 @dataclass(frozen=True)
 class Trap(_ParticleGoal):
-    """The stiffness of traps of a small particle: the least one, over points and directions [N/m].
+    """The stiffness of traps of a small sphere: the least one, over points and directions [N/m].
 
     From each stiffness, the force along the direction over `displacement` is subtracted. A score above 0
-    means that the particle is pulled back along all directions, to a place within `displacement` of the
-    point.
+    means that the sphere is pulled back along all directions, to a place within `displacement` of the point.
+    Force and stiffness are exact for the sphere alone in the field: waves between it and other bodies are
+    left out.
 
     Attributes:
         points: (P, 3) [m].
-        particle: the particle.
+        particle: the sphere, of a radius up to 1 / k.
         directions: (D, 3), along which it is held; by default 13, for all.
         displacement: largest distance along a direction from the point to the place of equilibrium [m], > 0.
     """
@@ -204,21 +209,21 @@ class Trap(_ParticleGoal):
 
 @dataclass(frozen=True)
 class Levitate(_ParticleGoal):
-    """The lift of a small particle in traps, in weights of it: 1 holds it, more is the margin.
+    """The lift of a small sphere in traps, in weights of it: 1 holds it, more is the margin.
 
     The score is the least of the upward force over the weight and, over directions, of the restoring force at
     `reach` over the weight, from which the sideways force times reach / displacement is subtracted. With a
-    score of s >= 1, the drive times s^(-1/2) holds the particle within `displacement` of the point across
-    gravity, and within `reach` along it if its weight doubles.
+    score of s >= 1, the drive times s^(-1/2) holds the sphere within `displacement` of the point across
+    gravity, and within `reach` along it if its weight doubles. Forces are those of `Trap`.
 
     Attributes:
         points: (P, 3) [m].
-        particle: the particle.
+        particle: the sphere, of a radius up to 1 / k.
         directions: (D, 3), along which it is held; by default 13, for all.
         displacement: largest sideways distance from the point to the place of equilibrium [m], > 0.
         reach: distance over which the stiffness must make up the weight [m], > 0; by default 2 mm, a quarter
-        of
-            the wavelength at 40 kHz.
+        of the
+            wavelength at 40 kHz.
         up: direction against gravity (3,); any length.
     """
 
@@ -239,28 +244,61 @@ class Levitate(_ParticleGoal):
         sideways = (directions - np.outer(directions @ up, up)) / self.displacement
         stiffness = _along(directions)
         restoring = [np.hstack([sideways, stiffness]), np.hstack([-sideways, stiffness])]
-        lift = np.hstack([up, np.zeros(len(_PAIRS))])[None]
+        lift = np.hstack([up, np.zeros(len(PAIRS))])[None]
         return np.concatenate([lift, *(self.reach * part for part in restoring)]) / self.particle.weight
 
 
+@dataclass(frozen=True)
+class Push:
+    """The force along a direction on a body of a propagator of method "tmatrix" [N]; see `radiation_force`.
+
+    Attributes:
+        direction: (3,); any length.
+        body: its index in `TMatrixPropagator.bodies.bodies`.
+    """
+
+    name: ClassVar[str] = "push"
+    unit: ClassVar[str] = "N"
+
+    direction: Vector
+    body: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        object.__setattr__(self, "direction", unit_vector("direction", self.direction))
+        object.__setattr__(self, "body", integer_at_least("body", self.body, 0))
+
+    def forms(self, propagator: Propagator) -> tuple[torch.Tensor, Array]:
+        """Return rows (N, M), and the weights (1, N) of their squares in the force."""
+        require_kind("propagator", propagator, TMatrixPropagator)
+        assert isinstance(propagator, TMatrixPropagator)
+        matrices = force_matrices(propagator, self.body).detach()
+        form = torch.einsum("i,imn->mn", matrices.real.new_tensor(self.direction).to(matrices), matrices)
+        values, vectors = torch.linalg.eigh(form)
+        some = values.abs() > _LEAST * values.abs().max()
+        return (vectors * values.abs().sqrt())[:, some].mH, values[some].sign().numpy()[None]
+
+
 class ForceObjective:
-    """An objective of forces: its readings are magnitudes, from whose squares a `ForceGoal` gives the score.
+    """An objective of forces: its readings are magnitudes, from whose squares its goal gives the score.
 
     Methods maximise its goal by default.
 
     Attributes:
         scene: its array plays the drives; its control points do not count.
-        goal: the goal.
+        goal: the score of readings, with a bound.
         evaluations: number of observations so far.
         transfer_matrix: the rows (N, M), complex128, of the readings; `goal.bound` takes them.
     """
 
     def __init__(self, propagator: Propagator, goal: ForceGoal) -> None:
-        """Compute the rows of a goal by a propagator."""
+        """Compute the rows of a trap, lift or push by a propagator."""
         require_kind("propagator", propagator, Propagator)
-        require_kind("goal", goal, ForceGoal)
-        self.scene, self.goal, self.evaluations = propagator.scene, goal, 0
-        self.transfer_matrix: torch.Tensor | None = goal.rows(propagator)
+        if not isinstance(goal, _ParticleGoal | Push):
+            raise invalid("goal", goal, "must be a Trap, Levitate or Push")
+        self.scene, self.evaluations = propagator.scene, 0
+        self.transfer_matrix, weights = goal.forms(propagator)
+        self.goal = LeastForm(goal, weights)
 
     @one_library_thread()
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
@@ -269,5 +307,4 @@ class ForceObjective:
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
         self.evaluations += len(drive)
-        assert self.transfer_matrix is not None
         return magnitudes(self.transfer_matrix, drive)

@@ -21,13 +21,11 @@ from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.validation import invalid
 
-DEGREE = 3
-"""DEGREE: largest degree that matters to third derivatives."""
-
 SIZE = 1.5
 """SIZE: k r of the sphere; a larger one has smaller errors of rounding, and less room beside bodies."""
 
 _RINGS = 8  # of the sphere: waves of the degree 2 * 8 - 3 are the first to be taken for others, at 3e-11
+_THIRD = 3  # largest degree that matters to third derivatives
 _COUNTS = [1, 3, 9, 27]
 
 
@@ -69,9 +67,17 @@ def nodes_around(scene: Scene, points: torch.Tensor) -> torch.Tensor:
     return points[:, None] + radius * _sphere()[0].to(points.device)
 
 
+def regular_coefficients(pressure: torch.Tensor, wavenumber: complex, degree: int) -> torch.Tensor:
+    """Return the coefficients (..., N) of regular waves up to a degree from pressures at nodes (..., S).
+
+    The nodes take degrees of 11 and more for others: an error of 4e-7 in degree 5, far less in lower ones.
+    """
+    return pressure @ _to_waves(wavenumber, degree)
+
+
 def derivatives(pressure: torch.Tensor, wavenumber: complex) -> Derivatives:
     """Return the derivatives at points from pressures (..., S) at the nodes around them."""
-    flat = pressure @ _from_nodes(wavenumber)
+    flat = regular_coefficients(pressure, wavenumber, _THIRD) @ _to_derivatives(wavenumber)
     parts = torch.split(flat, _COUNTS, dim=-1)
     shape = flat.shape[:-1]
     return Derivatives(*(part.reshape(*shape, *[3] * order) for order, part in enumerate(parts)))
@@ -89,14 +95,19 @@ def _sphere() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @functools.lru_cache(8)
-def _from_nodes(wavenumber: complex) -> torch.Tensor:
-    """Return the map (S, 40) from pressures at nodes to p and its first, second and third derivatives."""
+def _to_waves(wavenumber: complex, degree: int) -> torch.Tensor:
+    """Return the map (S, N) from pressures at nodes to coefficients of regular waves."""
     nodes, weights = _sphere()
     size = torch.tensor([[wavenumber * SIZE / wavenumber.real]], **COMPLEX)
-    waves = weights[:, None] * harmonics(DEGREE, nodes).conj() / regular_radial(DEGREE, size)
-    each, columns = torch.eye(waves.shape[1], **COMPLEX), []
-    for order in range(DEGREE + 1):
+    return weights[:, None] * harmonics(degree, nodes).conj() / regular_radial(degree, size)
+
+
+@functools.lru_cache(8)
+def _to_derivatives(wavenumber: complex) -> torch.Tensor:
+    """Return the map (N, 40) from coefficients of waves to p and its first, second and third derivatives."""
+    each, columns = torch.eye((_THIRD + 1) ** 2, **COMPLEX), []
+    for order in range(_THIRD + 1):
         at_center = (1j * wavenumber) ** order / math.sqrt(4 * math.pi) * each[..., 0, :]
-        columns.append(at_center.reshape(-1, waves.shape[1]))
+        columns.append(at_center.reshape(-1, at_center.shape[-1]))
         each = linear_momentum(each)  # -i grad / k
-    return waves @ torch.cat(columns).mT
+    return torch.cat(columns).mT

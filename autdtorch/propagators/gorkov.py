@@ -3,13 +3,14 @@
     U = V (f1 |p|^2 / (4 rho c^2) - 3 f2 |grad p|^2 / (8 rho w^2))
 
 with peak amplitudes p, the volume V and the factors f1, f2 of `Particle.contrasts` (Gor'kov 1962, Sov. Phys.
-Dokl. 6, 773; Bruus 2012, doi:10.1039/c2lc21068a). The force is -grad U, to the order (ka)^2 of its parts. The
-force of a travelling wave, of the order (ka)^3 of these, is left out, as are waves between particle and
-bodies: `radiation_force` of a sphere has both.
+Dokl. 6, 773; Bruus 2012, doi:10.1039/c2lc21068a). The force is -grad U, with a relative error of about (ka)^2
+/ 2. Waves between particle and bodies are left out. `Trap` and `radiation_force` take the exact force on a
+sphere.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from autdtorch.propagators.propagator import Propagator
 
 LARGEST = 0.1
-"""LARGEST: radius up to which a particle is small, relative to the wavelength."""
+"""LARGEST: radius of a small particle, relative to the wavelength; the force then errs by a quarter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,8 +113,9 @@ def factors(particle: Particle, scene: Scene) -> tuple[float, float]:
     """Return alpha and beta of U = alpha |p|^2 - beta |grad p|^2."""
     medium = scene.medium
     f1, f2 = particle.contrasts(medium)
-    alpha = particle.volume * f1 / (4 * medium.density * medium.sound_speed**2)
-    beta = particle.volume * 3 * f2 / (8 * medium.density * scene.angular_frequency**2)
+    volume = 4 / 3 * math.pi * particle.radius**3
+    alpha = volume * f1 / (4 * medium.density * medium.sound_speed**2)
+    beta = volume * 3 * f2 / (8 * medium.density * scene.angular_frequency**2)
     return alpha, beta
 
 

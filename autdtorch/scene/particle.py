@@ -58,14 +58,9 @@ class Particle:
         return cls(radius, *MATERIALS[material])
 
     @property
-    def volume(self) -> float:
-        """The volume [m^3], of a sphere."""
-        return 4 / 3 * math.pi * self.radius**3
-
-    @property
     def weight(self) -> float:
         """The weight [N], without buoyancy."""
-        return self.volume * self.density * GRAVITY
+        return 4 / 3 * math.pi * self.radius**3 * self.density * GRAVITY
 
     def contrasts(self, medium: Medium) -> tuple[float, float]:
         """Return Gor'kov's factors f1 of compressibility and f2 of density in a medium.
