@@ -167,6 +167,9 @@ def choose_grids(
     region: Region, method: str, spacing: float, tolerance: float, runs: int
 ) -> tuple[str, Grouping]:
     """Return the method and its grids; for "auto" the cheapest of "box" and "full" that is accurate."""
+    limits = MAX_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH
+    finest, coarsest = (region.wavelength / cells for cells in limits)
+    spacing = max(finest, min(spacing, coarsest))  # others are refused later
     walls = any(body.continued for body in region.bodies)
     if method in ("box", "tmatrix") or (method == "auto" and region.mirrors and not walls):
         return "box", cheapest_boxes(region, spacing, tolerance, runs)
@@ -241,7 +244,8 @@ def _box_along(region: Region, group: Sequence[int], spacing: float, along_faces
         axes = np.roll(axes, turns, axis=0)
         roll = functools.partial(np.roll, shift=turns)
         extent = replace(extent, lower=roll(extent.lower), upper=roll(extent.upper))
-    return PlannedGrid(tuple(group), near, part, axes, extent, aligned, *_steps(region, spacing))
+    steps = _steps_per_period(region, spacing)
+    return PlannedGrid(tuple(group), near, part, axes, extent, aligned, spacing, steps)
 
 
 def domain_grid(region: Region, spacing: float) -> PlannedGrid:
@@ -249,17 +253,15 @@ def domain_grid(region: Region, spacing: float) -> PlannedGrid:
     whole, axes, group = region.whole, np.eye(3), tuple(range(len(region.bodies)))
     aligned = bool(group) and all(body.faces.all_aligned(axes) for body in region.bodies)
     extent = domain_extent(whole, spacing)
-    return PlannedGrid(group, (), whole, axes, extent, aligned, *_steps(region, spacing))
+    steps = _steps_per_period(region, spacing)
+    return PlannedGrid(group, (), whole, axes, extent, aligned, spacing, steps)
 
 
-def _steps(region: Region, spacing: float) -> tuple[float, float]:
-    """Return a spacing [m] within the accepted ones, and the fewest steps in a period; others are refused."""
-    limits = MAX_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH
-    finest, coarsest = (region.wavelength / cells for cells in limits)
-    spacing = max(finest, min(spacing, coarsest))
+def _steps_per_period(region: Region, spacing: float) -> float:
+    """Return the fewest steps in a period on a grid of `spacing` [m]."""
     stencil = tuned_stencil(region.wavenumber * spacing, region.attenuation * spacing)
     fastest = max(region.sound_speeds.values()) / region.fluid.phase_speed
-    return spacing, fewest_steps(stencil, stencil.largest_symbol * fastest**2)
+    return fewest_steps(stencil, stencil.largest_symbol * fastest**2)
 
 
 def _turns_to_flat(interior: tuple[int, int, int]) -> int:

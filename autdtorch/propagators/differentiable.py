@@ -13,7 +13,8 @@ from autdtorch.fdtd.material_gradients import cells_of_maps, cells_of_obstacles,
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import block_of, fewest_periods
 from autdtorch.fdtd.stepping import drive_dft, drive_signal
-from autdtorch.propagators.scene_region import region_of, warn_of_ending_walls, warn_of_near_points
+from autdtorch.propagators.notices import warn_of_ending_walls, warn_of_near_points
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import apertures_of, complex_strengths_of
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene, require_in_front, require_inside

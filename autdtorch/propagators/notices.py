@@ -1,4 +1,4 @@
-"""Notices on results: points that are less accurate, silence, resonances, runs without a steady state."""
+"""Notices on scenes and results: inaccurate places, silence, resonances, runs without a steady state."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from autdtorch.fdtd.grid import warn_if_coarse
 from autdtorch.fdtd.thin_walls import warn_of_thin_walls
 from autdtorch.fdtd.turning import axes_along
 from autdtorch.propagators.plan import Plan
-from autdtorch.propagators.scene_region import warn_of_ending_walls, warn_of_near_points
+from autdtorch.propagators.scene_region import walls_of
 from autdtorch.propagators.simulation import Run, Simulation
+from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.text import counted
 from autdtorch.utils.units import warn_user
@@ -93,6 +94,34 @@ def warn_of_scene(plan: Plan) -> None:
     warn_of_thin_walls(region, spacing, grids)
     warn_of_near_points(scene, "array.positions", scene.array.positions, spacing)
     warn_of_near_points(scene, "control_points", scene.control_points, spacing)
+
+
+def warn_of_ending_walls(scene: Scene) -> None:
+    """Log which walls end before the boundary layers because an earlier wall has another direction."""
+    walls = enumerate(walls_of(scene))
+    if ending := [str(index) for index, (wall, continued) in walls if wall and not continued]:
+        logger.warning(
+            "obstacle %s crosses the domain in another direction than a wall before: it ends where the"
+            " boundary layer begins, and its end reflects", ", ".join(ending),
+        )  # fmt: skip
+
+
+def warn_of_near_points(scene: Scene, name: str, points: torch.Tensor, spacing: float) -> bool:
+    """Log which points (P, 3) [m] are less than a cell from a surface, on either side; return whether any."""
+    is_near = False
+    for index, obstacle in enumerate(scene.obstacles):
+        around = obstacle.near(points, spacing).nonzero()[:, 0]
+        gap = obstacle.signed_distance(points[around]) if len(around) else points.new_zeros(0)
+        if count := int((gap.abs() < spacing).sum()):
+            is_near, nearest = True, int(gap.abs().argmin())
+            point = int(around[nearest])
+            logger.warning(
+                "%s[%d] at %s mm is %.2g mm %s obstacle %d%s: less accurate within a cell, %.2g mm, of a"
+                " surface", name, point, _in_mm(points[point]),
+                1e3 * abs(float(gap[nearest])), "inside" if gap[nearest] < 0 else "from", index,
+                f", and {count - 1} more are near it" if count > 1 else "", 1e3 * spacing,
+            )  # fmt: skip
+    return is_near
 
 
 def warn_of_unsettled(runs: Sequence[Run], tolerance: float) -> None:

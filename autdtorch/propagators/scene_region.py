@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import cast
 
 import numpy as np
-import torch
 
 from autdtorch.fdtd.region import Body, Fluid, Region
 from autdtorch.fdtd.shapes import Shape
@@ -28,7 +27,7 @@ _NEAR_RIGID = 1.4
 def region_of(scene: Scene) -> Region:
     """Return the region of a scene; parallel walls across it continue through the boundary layers."""
     bodies = []
-    for number, (obstacle, (_, continued)) in enumerate(zip(scene.obstacles, _walls(scene), strict=True)):
+    for number, (obstacle, (_, continued)) in enumerate(zip(scene.obstacles, walls_of(scene), strict=True)):
         material = obstacle.fluid_at(scene.frequency)
         fluid = None if material is None else Fluid(*material)
         bodies.append(Body(obstacle, fluid, continued, obstacle.uncertainty, 0.0, obstacle.impedance, number))
@@ -86,35 +85,7 @@ def difference_from_rigid(body: Body, region: Region) -> float:
     return float(_NEAR_RIGID * (moved + 1 / stiffer) / heavier)
 
 
-def warn_of_ending_walls(scene: Scene) -> None:
-    """Log which walls end before the boundary layers because an earlier wall has another direction."""
-    walls = enumerate(_walls(scene))
-    if ending := [str(index) for index, (wall, continued) in walls if wall and not continued]:
-        logger.warning(
-            "obstacle %s crosses the domain in another direction than a wall before: it ends where the"
-            " boundary layer begins, and its end reflects", ", ".join(ending),
-        )  # fmt: skip
-
-
-def warn_of_near_points(scene: Scene, name: str, points: torch.Tensor, spacing: float) -> bool:
-    """Log which points (P, 3) [m] are less than a cell from a surface, on either side; return whether any."""
-    is_near = False
-    for index, obstacle in enumerate(scene.obstacles):
-        around = obstacle.near(points, spacing).nonzero()[:, 0]
-        gap = obstacle.signed_distance(points[around]) if len(around) else points.new_zeros(0)
-        if count := int((gap.abs() < spacing).sum()):
-            is_near, nearest = True, int(gap.abs().argmin())
-            point = int(around[nearest])
-            logger.warning(
-                "%s[%d] at %s mm is %.2g mm %s obstacle %d%s: less accurate within a cell, %.2g mm, of a"
-                " surface", name, point, tuple(round(1e3 * entry, 3) for entry in points[point].tolist()),
-                1e3 * abs(float(gap[nearest])), "inside" if gap[nearest] < 0 else "from", index,
-                f", and {count - 1} more are near it" if count > 1 else "", 1e3 * spacing,
-            )  # fmt: skip
-    return is_near
-
-
-def _walls(scene: Scene) -> list[tuple[bool, bool]]:
+def walls_of(scene: Scene) -> list[tuple[bool, bool]]:
     """Return whether each obstacle is a wall, and whether it continues through the boundary layers.
 
     A wall or slab is aligned with the axes, and crosses the domain on two axes at least. Those parallel to

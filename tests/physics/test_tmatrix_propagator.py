@@ -153,12 +153,12 @@ def test_gradients_by_the_points_are_those_of_finite_differences():
 def test_obstacles_whose_spheres_overlap_or_touch_make_one_body():
     apart = replace(SMALL, center=(12e-3, 12e-3, 40e-3))
     near = replace(SMALL, center=(12e-3, 12e-3, 17e-3))
-    groups = [body.obstacles for body in bodies_of([SMALL, apart, near])]
+    groups = [body.numbers for body in bodies_of([SMALL, apart, near])]
     assert groups == [(0, 2), (1,)]
     assert len(by_tmatrix(scene_of(BALL, replace(BALL, center=(14e-3, 12e-3, 30e-3)))).bodies.bodies) == 2
     pair = [replace(BALL, center=(14e-3, y, 12e-3)) for y in (8e-3, 16e-3)]
     (body,) = bodies_of(pair)
-    assert body.obstacles == (0, 1)
+    assert body.numbers == (0, 1)
     apart = replace(pair[1], center=(14e-3, 16e-3 + 1e-6, 12e-3))
     near = make_propagator(scene_of(pair[0], apart), tolerance=1e-4, cache=False)
     box = make_propagator(scene_of(*pair), "box", 0.7e-3, cache=False).transfer_matrix()

@@ -26,12 +26,14 @@ class ObstacleGroup:
     """Obstacles that scatter as one body.
 
     Attributes:
-        obstacles: ascending indices of the scene's obstacles.
+        numbers: ascending indices of the scene's obstacles.
+        obstacles: these obstacles.
         center: of the circumscribed sphere (3,) [m].
         radius: of this sphere [m].
     """
 
-    obstacles: tuple[int, ...]
+    numbers: tuple[int, ...]
+    obstacles: tuple[Obstacle, ...]
     center: torch.Tensor
     radius: float
 
@@ -40,9 +42,9 @@ def bodies_of(obstacles: Sequence[Obstacle]) -> list[ObstacleGroup]:
     """Return the bodies of obstacles: those whose spheres overlap are joined, until none do."""
     bodies = [_body(obstacles, (index,)) for index in range(len(obstacles))]
     while pair := next((pair for pair in combinations(bodies, 2) if _overlap(*pair)), None):
-        joined = sorted(pair[0].obstacles + pair[1].obstacles)
+        joined = sorted(pair[0].numbers + pair[1].numbers)
         bodies = [body for body in bodies if body not in pair] + [_body(obstacles, tuple(joined))]
-    return sorted(bodies, key=lambda body: body.obstacles)
+    return sorted(bodies, key=lambda body: body.numbers)
 
 
 def has_closed_form(obstacles: Sequence[Obstacle], medium: Medium) -> bool:
@@ -71,16 +73,13 @@ def waves_to_simulate(scene: Scene, error: float, most: int | None = None) -> in
             return None
         accepted = f"needs the spheres around obstacles to be in front of reflector {crossed[0]}; take box"
         raise invalid("method", "tmatrix", accepted)
-    counts = [waves(body.radius) for body in bodies]
-    closed = [
-        has_closed_form([obstacles[index] for index in body.obstacles], scene.medium) for body in bodies
-    ]
-    simulated = sum(count for count, known in zip(counts, closed, strict=True) if not known)
+    unknown_bodies = [body for body in bodies if not has_closed_form(body.obstacles, scene.medium)]
+    simulated = sum(waves(body.radius) for body in unknown_bodies)
     if most is None:
         return simulated
     places = torch.cat([scene.control_points, scene.array.nodes.positions.reshape(-1, 3)])
-    few = len(bodies) <= _MOST_BODIES and sum(counts) <= _MOST_WAVES and simulated <= most
-    return simulated if few and are_outside(places, bodies).all() else None
+    few = len(bodies) <= _MOST_BODIES and sum(waves(body.radius) for body in bodies) <= _MOST_WAVES
+    return simulated if few and simulated <= most and are_outside(places, bodies).all() else None
 
 
 def are_outside(points: torch.Tensor, bodies: Sequence[ObstacleGroup]) -> torch.Tensor:
@@ -94,8 +93,9 @@ def _in_front(reflector: Reflector, bodies: Sequence[ObstacleGroup]) -> bool:
     return all(float(reflector.mirror.height(body.center)) >= body.radius for body in bodies)
 
 
-def _body(obstacles: Sequence[Obstacle], chosen: tuple[int, ...]) -> ObstacleGroup:
-    return ObstacleGroup(chosen, *circumscribed([obstacles[index] for index in chosen]))
+def _body(obstacles: Sequence[Obstacle], numbers: tuple[int, ...]) -> ObstacleGroup:
+    group = tuple(obstacles[number] for number in numbers)
+    return ObstacleGroup(numbers, group, *circumscribed(group))
 
 
 def _overlap(one: ObstacleGroup, other: ObstacleGroup) -> bool:

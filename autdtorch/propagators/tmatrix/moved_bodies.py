@@ -39,7 +39,7 @@ class MovedBodies:
     def __init__(self, propagator: TMatrixPropagator) -> None:
         """Take the bodies of a propagator; nothing is simulated here."""
         self._propagator, self._scene = propagator, propagator.scene
-        self._groups = [group.obstacles for group in bodies_of(self._scene.obstacles)]
+        self._groups = [group.numbers for group in bodies_of(self._scene.obstacles)]
         self._matrices: dict[float, list[torch.Tensor]] = {}
 
     def stay(self, amounts: Amounts) -> bool:
@@ -47,9 +47,8 @@ class MovedBodies:
         joined = [f"obstacles[{index}]" for group in self._groups if len(group) > 1 for index in group]
         if any(name.partition(".")[0] in joined for name in amounts):
             return False
-        return [
-            each.obstacles for each in bodies_of(changed_obstacles(self._scene.obstacles, amounts))
-        ] == self._groups
+        bodies = bodies_of(changed_obstacles(self._scene.obstacles, amounts))
+        return [body.numbers for body in bodies] == self._groups
 
     def cluster(self, amounts: Amounts) -> TMatrixCluster:
         """Return the bodies after changes by amounts."""

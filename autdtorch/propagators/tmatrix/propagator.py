@@ -238,13 +238,13 @@ def placed_bodies(plan: Plan) -> list[Placed]:
     scene, error = plan.scene, min(max(plan.tolerance, _ERRORS[0]), _ERRORS[1])
     solver = Solver(plan.spacing, error, plan.kernel, plan.dtype, plan.max_periods, plan.time_step)
     bodies, settings = bodies_of(scene.obstacles), (scene.medium, scene.frequency, solver)
-    groups = [[scene.obstacles[index] for index in body.obstacles] for body in bodies]
-    near = [_degrees_between(body, bodies, scene.images, error) for body in bodies]
-    known = [has_closed_form(group, scene.medium) for group in groups]  # others would take more runs
-    return [
-        placed(group, *settings, fewest_degrees=fewest if closed else 0)
-        for group, fewest, closed in zip(groups, near, known, strict=True)
+    degrees = [
+        _degrees_between(body, bodies, scene.images, error)
+        if has_closed_form(body.obstacles, scene.medium)  # others would take more runs
+        else 0
+        for body in bodies
     ]
+    return [placed(body.obstacles, *settings, fewest) for body, fewest in zip(bodies, degrees, strict=True)]
 
 
 def _degrees_between(
