@@ -9,15 +9,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import pdist
 from torch import Tensor
 
 from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.placement import grid_offset
 from autdtorch.fdtd.region import Region
-from autdtorch.fdtd.shapes import bounds
+from autdtorch.fdtd.shapes import Shape, bounds
 from autdtorch.fdtd.stencil import places_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.process import cached_property
+from autdtorch.utils.spatial import places_on
 from autdtorch.utils.validation import invalid, positive
 
 logger = logging.getLogger(__name__)
@@ -43,6 +45,10 @@ FINE_LAYER_CELLS, COARSE_LAYER_CELLS = 6, 8
 # scattered field cancel: behind a plate of 0.1 m, 12 wavelengths, the error at 1 mm is 1.1 %, and 0.3 % with
 # the whole layer.
 _THINNER, _SMALL_BODIES = 2, 4
+# Places on the surfaces of a few bodies in a box, as many on each, and the share of their pairs between which
+# sound has arrived before a run may end. Sources drive all of them at once; what later comes from corner to
+# corner of a plate or a cube is below 5e-4 of the field. More bodies fill their box.
+_PLACES, _REACHED, _FEW = 256, 0.995, 8
 RATIO = 1.5  # Ratio of the spacings of the two grids: the coarser costs a fifth of the finer
 
 
@@ -55,7 +61,7 @@ class Grid:
     origin: tuple[float, float, float]  # centre of cell (0, 0, 0) [m]
     kappa: float  # wavenumber in air times spacing [rad]
     layer_cells: int  # thickness of the boundary layer
-    crossings: int  # times that sound crosses the grid before it has arrived everywhere
+    path: float  # way of sound before it has arrived everywhere [m]
 
     @property
     def rim(self) -> int:
@@ -82,12 +88,12 @@ class Grid:
     @property
     def crossing(self) -> float:
         """Time of sound in air along the longest path through the interior [periods]."""
-        return crossing_time(self.interior, self.kappa)
+        return math.hypot(*self.interior) * self.kappa / (2 * math.pi)
 
     @property
     def arrival(self) -> float:
         """Time after which sound has arrived everywhere [periods]."""
-        return self.crossings * self.crossing
+        return self.path / self.spacing * self.kappa / (2 * math.pi)
 
     @cached_property
     def centers(self) -> tuple[Array, Array, Array]:
@@ -121,11 +127,6 @@ class Grid:
         return np.clip(cells, self.first, np.array(self.last) - 1)
 
 
-def crossing_time(interior: tuple[int, int, int], kappa: float) -> float:
-    """Return the time of sound through cells from corner to corner [periods], with `kappa` as in `Grid`."""
-    return math.hypot(*interior) * kappa / (2 * math.pi)
-
-
 @dataclass(frozen=True)
 class Extent:
     """The space that a grid covers."""
@@ -134,9 +135,7 @@ class Extent:
     upper: Sequence[float]  # corner with the largest coordinates (3,) [m]
     margin: int  # cells around that, before the boundary layer begins
     thinner: int  # cells by which the boundary layer is thinner
-    # times that sound crosses the grid before it has arrived everywhere: on a grid of the whole domain once,
-    # and again as an echo; a box is driven everywhere at once
-    crossings: int
+    path: float  # way of sound before it has arrived everywhere [m]
 
     def layer_cells(self, kappa: float) -> int:
         """Return the thickness of the boundary layer at a wavenumber times spacing `kappa` [rad]."""
@@ -152,16 +151,30 @@ class Extent:
 
 
 def domain_extent(region: Region, spacing: float) -> Extent:
-    """Return the region's domain, with the air that the interpolation of points near its faces needs."""
-    margin = interpolation_width(region.wavenumber * spacing) // 2 - 1
-    return Extent(*region.domain, margin, thinner=0, crossings=2 if region.bodies else 1)
+    """Return the region's domain, with the air that the interpolation of points near its faces needs.
+
+    Sound crosses it once, and again as an echo.
+    """
+    margin, (lower, upper) = interpolation_width(region.wavenumber * spacing) // 2 - 1, region.domain
+    crossing = math.dist(lower, upper) + 2 * math.sqrt(3) * margin * spacing
+    return Extent(lower, upper, margin, thinner=0, path=crossing * (2 if region.bodies else 1))
 
 
 def bodies_extent(region: Region) -> Extent:
     """Return the extent of the region's bodies and the air around them in a box."""
     lower, upper = bounds(region.shapes)
     thinner = _THINNER if (upper - lower).max() <= _SMALL_BODIES * region.wavelength else 0
-    return Extent(lower.tolist(), upper.tolist(), AROUND, thinner, crossings=1)
+    path = path_between(region.shapes) + region.wavelength
+    return Extent(lower.tolist(), upper.tolist(), AROUND, thinner, path)
+
+
+def path_between(shapes: Sequence[Shape]) -> float:
+    """Return the distance [m] that few pairs of places on the surfaces of shapes exceed; see `_REACHED`."""
+    if len(shapes) > _FEW:
+        return math.dist(*bounds(shapes))
+    surfaces = [[part.numpy() for part in shape.surface()] for shape in shapes]
+    places = [places_on(vertices[triangles], _PLACES // len(shapes)) for vertices, triangles in surfaces]
+    return float(np.quantile(pdist(np.concatenate(places)), _REACHED))
 
 
 def make_grid(region: Region, spacing: float) -> Grid:
@@ -191,7 +204,7 @@ def _covering(region: Region, spacing: float, extent: Extent) -> Grid:
     layer = extent.layer_cells(kappa)
     rim = layer + 1 + extent.margin - 0.5
     x, y, z = (low - (rim + first) * spacing for low, first in zip(extent.lower, offset, strict=True))
-    grid = Grid(spacing, extent.interior(spacing, offset), (x, y, z), kappa, layer, extent.crossings)
+    grid = Grid(spacing, extent.interior(spacing, offset), (x, y, z), kappa, layer, extent.path)
     if math.prod(grid.shape) > MAX_CELLS:
         cells = " x ".join(map(str, grid.shape))
         raise invalid("spacing", spacing, f"gives {cells} cells, must be at most {MAX_CELLS:.0e} in all", "m")

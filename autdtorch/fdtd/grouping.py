@@ -19,7 +19,6 @@ from autdtorch.fdtd.grid import (
     MIN_CELLS_PER_WAVELENGTH,
     Extent,
     bodies_extent,
-    crossing_time,
     domain_extent,
 )
 from autdtorch.fdtd.region import Region
@@ -93,7 +92,7 @@ class PlannedGrid:
     @property
     def steps(self) -> int:
         """The fewest steps of a run."""
-        periods = fewest_periods(self.extent.crossings * crossing_time(self.interior, self.kappa))
+        periods = fewest_periods(self.extent.path / self.part.wavelength)
         return math.ceil(periods * self.steps_per_period)
 
     @property

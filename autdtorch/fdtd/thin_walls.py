@@ -17,7 +17,7 @@ import torch
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.shapes import Shape
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.spatial import doubled_normals, extents, mean_thickness
+from autdtorch.utils.spatial import doubled_normals, extents, mean_thickness, spread_evenly
 from autdtorch.utils.validation import Vector
 
 logger = logging.getLogger(__name__)
@@ -101,7 +101,7 @@ def thin_wall(shape: Shape, spacing: float) -> tuple[float, Array] | None:
     corners = vertices[triangles]
     normals = doubled_normals(corners)
     area = np.linalg.norm(normals, axis=1)
-    some = np.searchsorted(np.cumsum(area), (np.arange(_PLACES) + 0.5) / _PLACES * area.sum())
+    some = spread_evenly(area, _PLACES)
     places, inwards = corners[some].mean(axis=1), -normals[some] / area[some, None]
     step = spacing / _DEPTHS
     depths = step * np.arange(1, _DEPTHS + 2)  # one beyond a cell, for the slope there

@@ -8,6 +8,9 @@ import torch
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
+_LATTICE = 0.7548776662466927, 0.5698402909980532
+"""Steps of a plane lattice of low discrepancy: powers of the root of x^3 + x^2 = 1 (Roberts 2018)."""
+
 
 def distances(points: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
     """Return the distances (P, M) [m] between `points` (P, 3) and `others` (M, 3)."""
@@ -59,6 +62,21 @@ def sides_of(triangles: Index) -> Index:
 def areas_of(corners: Array) -> Array:
     """Return the areas (T,) of triangles with `corners` (T, 3, 3)."""
     return np.asarray(np.linalg.norm(doubled_normals(corners), axis=1) / 2)
+
+
+def spread_evenly(areas: Array, count: int) -> Index:
+    """Return the numbers (count,) of triangles of `areas` (T,) on which places share the area evenly."""
+    total = np.cumsum(areas)
+    return np.asarray(np.searchsorted(total, (np.arange(count) + 0.5) / count * total[-1]))
+
+
+def places_on(corners: Array, count: int) -> Array:
+    """Return places (count, 3) that share the area of triangles with `corners` (T, 3, 3) evenly."""
+    first, second, third = np.moveaxis(corners[spread_evenly(areas_of(corners), count)], 1, 0)
+    a, b = np.outer(_LATTICE, np.arange(count))[:, :, None] % 1
+    beyond = a + b > 1
+    a, b = np.where(beyond, 1 - a, a), np.where(beyond, 1 - b, b)
+    return np.asarray(first + a * (second - first) + b * (third - first))
 
 
 def paired_sides(triangles: Index) -> Index:

@@ -24,9 +24,7 @@ from autdtorch.scene.scene import Medium, Scene
 
 AIR = Medium(density=1.293, sound_speed=340.0)
 STENCIL = tuned_stencil(2 * math.pi / 8.5)
-GRID = Grid(
-    1e-3, interior=(10, 10, 10), origin=(-6.5e-3,) * 3, kappa=STENCIL.kappa, layer_cells=6, crossings=1
-)
+GRID = Grid(1e-3, interior=(10, 10, 10), origin=(-6.5e-3,) * 3, kappa=STENCIL.kappa, layer_cells=6, path=0.0)
 """Cells of 1 mm whose interior fills a cube of 10 mm from the origin on."""
 
 STRIDES = np.array((GRID.shape[1] * GRID.shape[2], GRID.shape[2], 1))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from small_scenes import AIR
 
 from autdtorch.fdtd.boundary import reflection, tuned_profile
-from autdtorch.fdtd.grid import FINE_LAYER_CELLS, Extent, make_grid
+from autdtorch.fdtd.grid import FINE_LAYER_CELLS, Extent, make_grid, path_between
 from autdtorch.fdtd.interpolation import (
     WIDTH_ERROR,
     average_nodes,
@@ -208,6 +208,21 @@ def test_only_axis_aligned_faces_move_the_grid_which_covers_the_domain():
     for centers, first, last in zip(grid.centers, grid.first, grid.last, strict=True):
         assert centers[first + margin] <= 0.5 * SPACING + 1e-9
         assert centers[last - 1 - margin] >= 30e-3 - 0.5 * SPACING - 1e-9
+
+
+@settings(max_examples=10)
+@given(st.tuples(*[st.floats(-3, 3)] * 3), st.floats(3e-3, 60e-3))
+def test_sound_arrives_between_most_places_on_surfaces(angles, size):
+    """A run waits for that. The share of the pairs that are farther apart follows from geometry.
+
+    It is 0.005 of those on a sphere from 0.9975 of its diameter on. Places are a lattice: 2 %.
+    """
+    sphere = Sphere((0.1, 0.0, 0.0), size, rigid=True)
+    assert path_between([sphere]) == pytest.approx(2 * size * math.sqrt(0.995), rel=0.02)
+    plate = Box((0.0, 0.0, 0.0), (size, size, size / 100), angles, rigid=True)
+    assert size < path_between([plate]) < 1.25 * size  # of a square all but 0.005 are within 1.16 sides
+    far = Sphere((0.1, 0.3, 0.0), 1e-3, rigid=True)  # of bodies apart, however small, half of the pairs
+    assert 0.3 <= path_between([sphere, far]) <= 0.301 + size
 
 
 @settings(max_examples=15)
