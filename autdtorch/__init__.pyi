@@ -36,6 +36,7 @@ from .methods.phase_stepping import PhaseStepping
 from .methods.prior import Prior
 from .methods.problem import Problem
 from .methods.random_search import RandomSearch
+from .methods.robust import robust_drive
 from .methods.run import run
 from .methods.solution import Solution
 from .methods.state_file import load_state, save_state
@@ -45,9 +46,12 @@ from .objectives.goals import Goal, MeanPressure, TargetPressures, WeakestFocus
 from .objectives.haptics import HapticMetrics, haptic_metrics
 from .objectives.metrics import FocusMetrics, focus_metrics
 from .objectives.objective import Objective, SimulatedObjective, weakest_focus
+from .objectives.over_scenes import OverScenes
 from .objectives.perturbations import CameraNoise, Drift, FailedTransducers, Noise, Quantised, true_pressure
+from .objectives.pose_ball import PoseBall
 from .objectives.quiet import Contrast, QuietPoints, SeenPoints
 from .objectives.readings import Readings
+from .objectives.scenarios import Scenarios
 from .plot.calibration_figure import plot_calibration
 from .plot.costs import plot_pareto, plot_scaling
 from .plot.explore import explore
@@ -106,11 +110,13 @@ __all__ = [
     "Objective",
     "Obstacle",
     "OpenMPDBoard",
+    "OverScenes",
     "OverlapWarning",
     "Particle",
     "PhaseStepping",
     "PhasorKernel",
     "Plane",
+    "PoseBall",
     "Prior",
     "Problem",
     "Push",
@@ -120,6 +126,7 @@ __all__ = [
     "Readings",
     "Reflector",
     "ScaleWarning",
+    "Scenarios",
     "Scene",
     "SeenPoints",
     "Sequence",
@@ -193,6 +200,7 @@ __all__ = [
     "radiation_force",
     "radiation_torque",
     "random_search",
+    "robust_drive",
     "run",
     "save_calibration",
     "save_drive",

@@ -35,6 +35,7 @@ _SETTINGS = (
     "seed",
     "plane_spacing",
     "poses",
+    "scenarios",
     "drive",
     "readings",
     "explore",

@@ -81,6 +81,7 @@ def study(
         goal=goal,
         config=_as_text(settings, scenes),
         poses=poses is not None,
+        scenarios=None if settings.get("scenarios") is None else section_of(settings, "scenarios"),
     )
     if drive is not None:
         _save_drives(results, scenes, folder, device)

@@ -14,12 +14,13 @@ from autdtorch.objectives.goals import (
     TargetPressures,
     WeakestFocus,
 )
+from autdtorch.objectives.over_scenes import OverScenes
 from autdtorch.objectives.quiet import Contrast, QuietPoints, SeenPoints
 from autdtorch.utils.validation import invalid, require_known, require_name, require_one_of
 
 GOALS: dict[str, type[Goal]] = {
     goal.name: goal
-    for goal in (WeakestFocus, MeanPressure, TargetPressures, QuietPoints, SeenPoints, Contrast)
+    for goal in (WeakestFocus, MeanPressure, TargetPressures, QuietPoints, SeenPoints, Contrast, OverScenes)
 }
 """The goals by name."""
 
@@ -88,6 +89,14 @@ def require_score(name: object, unit: object) -> None:
 def score_label(name: str, unit: str = "") -> str:
     """Return the name and unit of scores for tables and figures, such as "weakest focus [Pa]"."""
     return name.replace("_", " ") + (f" [{unit}]" if unit else "")
+
+
+def goal_label(section: Mapping[str, Any], unit: str = "") -> str:
+    """Return the name and unit of the scores of a goal's section, such as "worst weakest focus [Pa]"."""
+    if section["name"] != OverScenes.name:
+        return score_label(section["name"], unit)
+    by, inner = section["by"], section["goal"]["name"]
+    return score_label(f"{inner}, {by if isinstance(by, str) else f'quantile {by:g}'} of scenes", unit)
 
 
 PAPERS_GOAL = goal_section(WEAKEST_FOCUS)

@@ -40,6 +40,9 @@ def fitting(
         accepted = f"must be a magnitude up to {LOUDEST:g}, not a level in dB"
         raise invalid(f"{where}pressure{place}", float(readings.pressure[tuple(place)]), accepted, "Pa")
     if readings.points is not None:
+        if scene is not None and len(scene.control_points) != foci:
+            accepted = "must be None, with a column for each point of each scene: a place is in all scenes"
+            raise ValueError(f"{where}points: shape {tuple(readings.points.shape)}; {accepted}")
         return _in_order(readings, readings.points, scene)
     if readings.pressure.shape[1] != foci:
         accepted = f"must be (N, {foci}), a column for each control point, or the readings have points"

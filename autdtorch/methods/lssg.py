@@ -12,6 +12,7 @@ import torch
 
 from autdtorch.methods.base import Method, State, Step, first_of_best, setting, whole
 from autdtorch.methods.problem import Problem
+from autdtorch.objectives.over_scenes import OverScenes
 from autdtorch.scene.arrays import phase_offsets_of
 from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise, phases_of
 from autdtorch.utils.array_types import COMPLEX, REAL
@@ -141,11 +142,11 @@ class LSSG(Method):
 
     def check(self, problem: Problem) -> None:
         """Check the order against the number of foci."""
-        require_all(self.order, problem.foci)
+        require_all(self.order, _foci(problem))
 
     def most_evaluations(self, problem: Problem) -> int:
         """Return the evaluations of all passes."""
-        return self.passes * problem.foci * self.levels
+        return self.passes * _foci(problem) * self.levels
 
     def most_at_once(self, problem: Problem) -> int:
         """Return the number of levels."""
@@ -154,8 +155,8 @@ class LSSG(Method):
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Compare the offsets of the first focus."""
         foci = _focus_drives(problem)
-        start = torch.ones(1, problem.foci, **COMPLEX)
-        order = indices_of(self.order, problem.foci)[None]
+        start = torch.ones(1, len(foci), **COMPLEX)
+        order = indices_of(self.order, len(foci))[None]
         search = {**begin_ascent(start, order), "foci": foci}
         return Step(normalise(candidates(search, self.levels, 0) @ foci), search)
 
@@ -163,10 +164,16 @@ class LSSG(Method):
         """Compare the offsets of the next focus."""
         step = state.best.history.shape[1] // self.levels
         search, goes_on = ascend(state.search, step - 1, score)
-        if step == self.passes * state.problem.foci:
+        if step == self.passes * _foci(state.problem):
             return Step(state.drives[:, :0], search)
         weights = candidates(search, self.levels, step)
         return Step(normalise(weights @ search["foci"]), search, goes_on)
+
+
+def _foci(problem: Problem) -> int:
+    """Return the number of foci, in one scene if there are several."""
+    goal = problem.goal
+    return problem.foci // goal.scenes if isinstance(goal, OverScenes) else problem.foci
 
 
 def _focus_drives(problem: Problem) -> torch.Tensor:
@@ -174,7 +181,7 @@ def _focus_drives(problem: Problem) -> torch.Tensor:
     scene = problem.scene
     if scene is None:
         raise invalid("problem.scene", None, "must be a scene: the phases of the foci need its geometry")
-    if len(scene.control_points) != problem.foci:
+    if len(scene.control_points) != _foci(problem):
         accepted = f"must be the readings of the {len(scene.control_points)} control points"
         raise invalid("problem.foci", problem.foci, accepted)
     phases = focus_phases(scene.array.positions, scene.control_points, scene.wavenumber)

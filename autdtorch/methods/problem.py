@@ -17,8 +17,9 @@ from autdtorch.objectives.objective import (
     validate_drives,
     validate_matrix,
 )
-from autdtorch.objectives.perturbations import deviation_of, innermost, quantised, simulated_matrix
+from autdtorch.objectives.perturbations import deviation_of, quantised, simulated_matrix
 from autdtorch.objectives.readings import Readings
+from autdtorch.objectives.scenarios import observed_goal
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import (
     complex_tensor,
@@ -38,7 +39,7 @@ class Problem:
 
     Attributes:
         transducers: number M of entries of a drive.
-        foci: number P of control points.
+        foci: number P of control points, of all scenes of `Scenarios`.
         goal: such as `WeakestFocus`, or a function of pressures (..., P) [Pa] that gives the scores (...) to
             maximise.
         scene: geometry, for methods that start from free-space phases (`LSS`, `LSSG`).
@@ -112,11 +113,9 @@ class Problem:
         """
         require_objective(objective)
         scene, matrix = objective.scene, simulated_matrix(objective)
-        if goal is WEAKEST_FOCUS:
-            goal = getattr(innermost(objective), "goal", goal)
-        counts = len(scene.array), len(scene.control_points if matrix is None else matrix)
-        quantise = partial(quantised, objective)
-        return cls(*counts, goal, scene, matrix, quantise, start, readings, deviation_of(objective))
+        goal, foci = observed_goal(objective, goal)
+        quantise, deviation = partial(quantised, objective), deviation_of(objective)
+        return cls(len(scene.array), foci, goal, scene, matrix, quantise, start, readings, deviation)
 
 
 def starts_of(problem: Problem, trials: int) -> torch.Tensor | None:

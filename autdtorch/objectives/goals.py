@@ -12,9 +12,9 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from autdtorch.objectives.bound import checked_matrix, least_bound, level_bound
+from autdtorch.objectives.bound import checked_matrix, joint_bound, least_bound, level_bound
 from autdtorch.objectives.objective import GoalFunction, checked_pressure, weakest_focus
-from autdtorch.utils.array_types import Array
+from autdtorch.utils.array_types import Array, ComplexArray
 from autdtorch.utils.validation import ArrayLike, invalid, real_tensor
 
 
@@ -62,6 +62,13 @@ class Goal(ABC):
             ValueError: not finite complex numbers, not (P, M), or another number of points than the goal's.
         """
         return math.inf
+
+    def worst_bound(self, matrices: ComplexArray) -> float:
+        """Return an upper bound on the lowest of the scores that a drive has with matrices (S, P, M) [Pa].
+
+        By default the least of their bounds.
+        """
+        return min(self.bound(matrix) for matrix in matrices)
 
     def wanted(self, points: int) -> Array:
         """Return the pressures (P,) wanted, relative to each other, or in Pa if `absolute`: 1 for each."""
@@ -111,6 +118,10 @@ class WeakestFocus(Goal):
         matrix = checked_matrix(G)
         self.check(len(matrix))
         return least_bound(matrix, self.wanted(len(matrix)))
+
+    def worst_bound(self, matrices: ComplexArray) -> float:
+        """Return the bound [Pa] on the foci of all matrices together; see `Goal.worst_bound`."""
+        return joint_bound(matrices, self.wanted(matrices.shape[1]))
 
     def check(self, points: int) -> None:
         """Check the number of weights."""
@@ -181,8 +192,12 @@ class TargetPressures(Goal):
         """Return the bound from the largest share of the targets that all can reach; see `Goal.bound`."""
         matrix = checked_matrix(G)
         self.check(len(matrix))
-        share = least_bound(matrix, self.wanted(len(matrix)))
-        return min(0.0, share - 1) / math.sqrt(len(matrix))
+        return self.worst_bound(matrix[None])
+
+    def worst_bound(self, matrices: ComplexArray) -> float:
+        """Return the bound from the share of the targets that all reach together; see `Goal.worst_bound`."""
+        share = joint_bound(matrices, self.wanted(matrices.shape[1]))
+        return min(0.0, share - 1) / math.sqrt(matrices.shape[1])
 
     def wanted(self, points: int) -> Array:
         """Return the targets (P,) [Pa]."""

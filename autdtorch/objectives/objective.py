@@ -174,6 +174,16 @@ class SimulatedObjective:
         if mode == "transfer":
             self.transfer_matrix = propagator.transfer_matrix().to("cpu", torch.complex128)
 
+    @classmethod
+    def of_matrix(cls, scene: Scene, transfer_matrix: ArrayLike) -> SimulatedObjective:
+        """Return the objective of a scene whose transfer matrix (P, M) [Pa] is known."""
+        require_kind("scene", scene, Scene)
+        objective = cls.__new__(cls)
+        objective.scene, objective.evaluations = scene, 0
+        shape = len(scene.control_points), len(scene.array)
+        objective.transfer_matrix = validate_matrix("transfer_matrix", transfer_matrix, *shape)
+        return objective
+
     def __repr__(self) -> str:
         """Return scene, mode and number of evaluations."""
         mode = "replay" if self.transfer_matrix is None else "transfer"

@@ -137,6 +137,10 @@ class SeenPoints(_GoalBesideOthers):
         """Return the bound of the goal; see `Goal.bound`."""
         return self.goal.bound(self._rows(G)[0])
 
+    def worst_bound(self, matrices: ComplexArray) -> float:
+        """Return the bound of the goal; see `Goal.worst_bound`."""
+        return self.goal.worst_bound(matrices[:, self._foci(matrices.shape[1])])
+
     def _takes(self, goal: _BesideOthers) -> bool:
         return not isinstance(goal, SeenPoints)
 
@@ -215,6 +219,11 @@ class QuietPoints(_GoalBesideOthers):
             if scores.max() > (1 - _GAIN) * before:
                 break
         return float(scores.max())
+
+    def worst_bound(self, matrices: ComplexArray) -> float:
+        """Return the bound of the goal on all matrices, or of the first with quiet points, if lower."""
+        loud = matrices[:, self._foci(matrices.shape[1])]
+        return min(self.goal.worst_bound(loud), self.bound(matrices[0]))
 
 
 @dataclass(frozen=True)

@@ -146,7 +146,9 @@ class StudyFolder:
 
     trials: TrialFile
 
-    def __init__(self, path: Path, provenance: Provenance, scenes: Mapping[str, Scene], reuse: bool) -> None:
+    def __init__(
+        self, path: Path, provenance: Provenance, scenes: Mapping[str, Scene], copies: int, reuse: bool
+    ) -> None:
         """Read the files of the study with this provenance; the folder must be locked.
 
         Each file holds its own provenance, so that a damaged one does not spoil the others.
@@ -154,7 +156,9 @@ class StudyFolder:
         self.path = path
         self.provenance = provenance
         self.scenes: dict[str, SceneResult] = {}
-        self._shapes = {name: (len(scene.array), len(scene.control_points)) for name, scene in scenes.items()}
+        self._shapes = {
+            name: (len(scene.array), copies * len(scene.control_points)) for name, scene in scenes.items()
+        }
         self._not_used = dict.fromkeys(_FILES, _ANOTHER)
         if reuse:
             self._take_up()
@@ -217,10 +221,13 @@ class StudyFolder:
 
 @contextlib.contextmanager
 def open_folder(
-    path: Path, provenance: Provenance, scenes: Mapping[str, Scene], reuse: bool
+    path: Path, provenance: Provenance, scenes: Mapping[str, Scene], copies: int, reuse: bool
 ) -> Iterator[StudyFolder]:
-    """Lock the folder of a study, made if it is missing; `reuse` takes files of its origin from it."""
+    """Lock the folder of a study, made if it is missing; `reuse` takes files of its origin from it.
+
+    Each of `scenes` has the pressures of so many `copies`: the scene itself, or the scenarios around it.
+    """
     path.mkdir(parents=True, exist_ok=True)
     accepted = "another process writes there; wait until it ends, or give another folder"
     with held(FileLock(path / _LOCK_FILE), ValueError(f"output: {path}; {accepted}")):
-        yield StudyFolder(path, provenance, scenes, reuse)
+        yield StudyFolder(path, provenance, scenes, copies, reuse)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 import autdtorch
-from autdtorch.io.goal_section import PAPERS_GOAL, score_label
+from autdtorch.io.goal_section import PAPERS_GOAL, goal_label
 from autdtorch.methods.base import NEAR_TIE
 from autdtorch.methods.catalogue import label_of
 from autdtorch.methods.solution import Solution
@@ -178,7 +178,7 @@ class SceneResult:
     @property
     def score_label(self) -> str:
         """Name and unit of the scores, such as "weakest focus [Pa]"."""
-        return score_label(self.goal["name"], self.unit)
+        return goal_label(self.goal, self.unit)
 
     def in_unit(self, score: object) -> str:
         """Return a score, or its text, with its unit."""

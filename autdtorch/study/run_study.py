@@ -24,8 +24,10 @@ from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.objectives.metrics import focus_metrics
 from autdtorch.objectives.objective import Objective, SimulatedObjective
+from autdtorch.objectives.over_scenes import OverScenes
 from autdtorch.objectives.quiet import QuietPoints, SeenPoints
 from autdtorch.objectives.readings import Readings
+from autdtorch.objectives.scenarios import Scenarios, observed_goal
 from autdtorch.propagators import Propagator, SimulatedPropagator, TMatrixPropagator, make_propagator
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.tmatrix.propagator import placed_bodies
@@ -84,6 +86,7 @@ def run_study(
     goal: Goal = WEAKEST_FOCUS,
     config: str = "",
     poses: bool = False,
+    scenarios: Mapping[str, Any] | None = None,
 ) -> StudyResult:
     """Run every method in every scene; return the results of all scenes.
 
@@ -105,6 +108,8 @@ def run_study(
         poses: whether the scenes are poses of the obstacles, in order. Methods start at the drives of
             the scene before, and the method "auto" of the solver takes T-matrices where these are
             fewer simulations in all.
+        scenarios: arguments of `Scenarios.around`: each scene stands for itself and variants of it, and
+            scores, pressures and bounds are those of all. Observation planes show the scene itself.
 
     Raises:
         ValueError: an argument out of range, a solver's and a method's included, or another process writes
@@ -119,13 +124,14 @@ def run_study(
     counts = _counts(methods, trials, seed)
     plane_spacing = positive("plane_spacing", plane_spacing, "m")
     check_goal(goal, scenes, methods)
+    copies = _scenes_of(scenarios, goal)
     for name, method in methods.items():
         for scene in scenes.values():
             if isinstance(method, Method):
-                points, transducers = len(scene.control_points), len(scene.array)
+                points, transducers = copies.scenes * len(scene.control_points), len(scene.array)
                 # In place of the matrix that the simulation will give: a prior needs one, of this shape.
                 blank = torch.ones(points, transducers, **COMPLEX)
-                problem = Problem(transducers, points, goal, scene, blank)
+                problem = Problem(transducers, points, copies, scene, blank)
                 with within(f"method {name}"):
                     method.require_fit(problem, min(counts[name], method.block))
     planes = {name: _plane_points(scene, plane_spacing) for name, scene in scenes.items()}
@@ -134,7 +140,7 @@ def run_study(
     code += [type(obstacle) for scene in scenes.values() for obstacle in scene.obstacles]
     ours = all(one.__module__.partition(".")[0] == "autdtorch" for one in code)
     provenance = provenance_now(config, seed)
-    with open_folder(folder, provenance, scenes, reuse=bool(config) and ours) as stored:
+    with open_folder(folder, provenance, scenes, copies.scenes, reuse=bool(config) and ours) as stored:
         missing = {name: scene for name, scene in scenes.items() if name not in stored.scenes}
         with within("solver"):
             settings = _for_poses(scenes, solver or {}) if poses else solver or {}
@@ -146,7 +152,7 @@ def run_study(
                 propagator = propagators.pop(name)
                 first = not poses or name == names[0]
                 before = None if first else stored.scenes[names[names.index(name) - 1]]
-                place = name, propagator, planes[name]
+                place = name, propagator, scenarios, planes[name]
                 finished = _run_scene(*place, methods, counts, seed, goal, stored.trials, progress, before)
                 stored.save(name, finished)
                 level = logging.DEBUG if poses else logging.INFO
@@ -154,6 +160,18 @@ def run_study(
         if poses and missing:
             logger.info("%s, the last: %s", counted(len(missing), "pose"), _in_short(propagator, finished))
         return StudyResult(stored.provenance, {name: stored.scenes[name] for name in scenes})
+
+
+def _scenes_of(scenarios: Mapping[str, Any] | None, goal: Goal) -> OverScenes:
+    """Return the goal over the scenes that stand for each, after checking the settings of the scenarios."""
+    if scenarios is None:
+        return OverScenes(goal, 1)
+    with within("scenarios"):
+        taken = dict(inspect.signature(Scenarios.around).parameters)
+        del taken["propagator"]
+        require_known("scenarios", scenarios, taken)
+        settings = {name: scenarios.get(name, taken[name].default) for name in ("count", "by")}
+        return OverScenes(goal, integer_at_least("count", settings["count"], 1), settings["by"])
 
 
 def _for_poses(scenes: Mapping[str, Scene], solver: Mapping[str, Any]) -> dict[str, Any]:
@@ -267,6 +285,7 @@ def solve(
 def _run_scene(
     name: str,
     propagator: Propagator,
+    scenarios: Mapping[str, Any] | None,
     plane: torch.Tensor | None,
     methods: Mapping[str, StudyMethod],
     counts: Mapping[str, int],
@@ -279,9 +298,15 @@ def _run_scene(
     scene = propagator.scene
     progress.describe(f"{name}: transfer matrix")
     begin = time.perf_counter()
-    transfer_matrix = propagator.transfer_matrix().cpu()
+    objective = (
+        SimulatedObjective(scene, propagator)
+        if scenarios is None
+        else Scenarios.around(propagator, **scenarios)
+    )
+    transfer_matrix, (maximised, _) = objective.transfer_matrix, observed_goal(objective, goal)
     matrix_seconds = time.perf_counter() - begin
-    objective = SimulatedObjective(scene, propagator)
+    assert transfer_matrix is not None
+    assert isinstance(maximised, Goal)
     progress.advance(1)
     for method_name, method in methods.items():
         where = name, method_name, counts[method_name]
@@ -316,8 +341,8 @@ def _run_scene(
     if isinstance(propagator, SimulatedPropagator | TMatrixPropagator):
         grid = {"spacing": propagator.spacing, "tolerance": propagator.tolerance}
         simulation = replace(simulation, method=propagator.method, **grid, runs=tuple(propagator.runs))
-    known = transfer_matrix, float(goal.bound(transfer_matrix)), simulation, results
-    return SceneResult(len(scene.obstacles), *known, goal_section(goal), goal.unit)
+    known = transfer_matrix, float(maximised.bound(transfer_matrix)), simulation, results
+    return SceneResult(len(scene.obstacles), *known, goal_section(maximised), goal.unit)
 
 
 def _run_trials(

@@ -263,3 +263,24 @@ def test_poses_are_simulated_by_tmatrices_where_these_are_fewer_runs():
     solver = {"spacing": 2e-3, "tolerance": 0.1}
     assert _for_poses(scenes, solver) == solver | {"method": "tmatrix"}
     assert _for_poses({"0": scenes["0"]}, solver) == solver
+
+
+def test_scenarios_stand_for_each_scene(tmp_path):
+    around = {"count": 3, "by": "worst", "failed": 1}
+    study = functools.partial(
+        run_study, {"a": scene()}, METHODS, tmp_path, solver=FREE_SPACE, plane_spacing=2e-3, config="one"
+    )
+    result = study(scenarios=around).scenes["a"]
+    points = len(scene().control_points)
+    every = at.Scenarios.around(FreeSpacePropagator(scene()), **around)
+    assert torch.equal(result.transfer_matrix, every.transfer_matrix)
+    assert result.score_label == "weakest focus, worst of scenes [Pa]"
+    for method in result.methods.values():
+        assert method.solution.pressure.shape == (1, 3 * points)
+        assert every.scores(method.solution.drive).amin() == pytest.approx(float(method.solution.score))
+        assert method.solution.score <= result.bound
+    again = study(scenarios=around).scenes["a"]  # read from the folder
+    assert torch.equal(again.methods["gabs"].solution.drive, result.methods["gabs"].solution.drive)
+    for wrong, message in (({"counts": 3}, "counts"), ({"count": 0}, "count: 0"), ({"by": "best"}, "by")):
+        with pytest.raises(ValueError, match=f"scenarios.*{message}"):
+            study(scenarios=wrong)

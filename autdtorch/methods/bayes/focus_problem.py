@@ -10,6 +10,7 @@ from botorch.test_functions.base import BaseTestProblem
 from autdtorch.methods.bayes_opt import drives_at, require_transducer
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import GoalFunction, Objective, observe_drives, require_objective
+from autdtorch.objectives.scenarios import observed_goal
 from autdtorch.utils.hints import renamed_keywords
 from autdtorch.utils.validation import boolean, integer_at_least, not_negative, real_tensor, require_callable
 
@@ -57,7 +58,7 @@ class FocusProblem(BaseTestProblem):
         self._bounds = [(0.0, 1.0)] * self.dim
         self.continuous_inds = list(range(self.dim))
         super().__init__(noise_std, negate)
-        self.objective, self.goal = objective, goal
+        self.objective, (self.goal, _) = objective, observed_goal(objective, goal)
         self.fixed_transducer = fixed_transducer
 
     @property

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
+from autdtorch.io.goal_section import goal_label
 from autdtorch.methods.catalogue import label_of
 from autdtorch.study.report.claims import Claim, Verdict
 from autdtorch.study.report.tables import competitors, median_score
@@ -65,7 +66,7 @@ def _best(scene: SceneResult) -> _Best:
 def _winners(results: StudyResult, best: Mapping[str, _Best]) -> str:
     """Return the sentence on the best scores, and the methods that reached them."""
     scenes = results.scenes
-    goals = {scene.goal["name"].replace("_", " ") for scene in scenes.values()}
+    goals = {goal_label(scene.goal) for scene in scenes.values()}
     goal = goals.pop() if len(goals) == 1 else "of each scene"
     median = any(method.trials > 1 for scene in scenes.values() for method in scene.methods.values())
     every = {label_of(method) for scene in scenes.values() for method in competitors(scene)}

@@ -11,7 +11,7 @@ from typing import TypeVar
 import torch
 from PIL import Image, ImageOps
 
-from autdtorch.io.goal_section import score_label
+from autdtorch.io.goal_section import goal_label, score_label
 from autdtorch.methods.catalogue import label_of
 from autdtorch.plot.costs import plot_pareto
 from autdtorch.plot.pressure_maps import plot_planes
@@ -227,7 +227,7 @@ def _numbered(name: str, before: Sequence[str]) -> str:
 def _draw_convergence(results: StudyResult, folder: Path) -> list[str]:
     """Return the pictures, one for each goal and unit."""
     pictures: list[str] = []
-    for (goal, unit), scenes in _grouped(results, lambda scene: (scene.goal["name"], scene.unit)).items():
+    for (goal, unit), scenes in _grouped(results, lambda scene: (goal_label(scene.goal), scene.unit)).items():
         history, levels = {}, {}
         for name, scene in scenes.items():
             competitors = tables.competitors(scene)

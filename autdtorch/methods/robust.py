@@ -1,0 +1,91 @@
+"""A drive that holds at all places of the obstacles in a ball, with its certificate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from autdtorch.methods.base import Method
+from autdtorch.methods.gradient import GradientAscent
+from autdtorch.methods.run import run
+from autdtorch.objectives.goals import WEAKEST_FOCUS, WeakestFocus
+from autdtorch.objectives.objective import SimulatedObjective
+from autdtorch.objectives.pose_ball import Certificate, PoseBall
+from autdtorch.objectives.scenarios import Scenarios
+from autdtorch.utils.validation import integer_at_least, require_kind
+
+_CLOSE = 5e-3  # relative distance of the worst place in the ball to the score of the scenarios, at the end
+
+
+@dataclass(frozen=True, eq=False)
+class RobustDrive:
+    """A drive for all places in a ball.
+
+    Attributes:
+        drive: (M,).
+        nominal: its score without shift [Pa].
+        certificate: its proven least score in the ball, and its worst places.
+        bound: no drive has a higher score at all places in the ball [Pa].
+        scenarios: the places that it was made for; the first is that of the scene.
+    """
+
+    drive: torch.Tensor
+    nominal: float
+    certificate: Certificate
+    bound: float
+    scenarios: Scenarios
+
+    def __repr__(self) -> str:
+        """Return the pressures."""
+        least, places = self.certificate.least, len(self.scenarios)
+        pressures = f"at least {least:.4g} of at most {self.bound:.4g} Pa, nominal {self.nominal:.4g} Pa"
+        return f"RobustDrive({pressures}, {places} places)"
+
+
+def robust_drive(
+    ball: PoseBall,
+    goal: WeakestFocus = WEAKEST_FOCUS,
+    method: Method | None = None,
+    rounds: int = 12,
+    seed: int = 0,
+) -> RobustDrive:
+    """Return the drive of the highest certificate: the worst places join the scenarios, round by round.
+
+    Each round maximises the goal at all places so far, from the last drive on, and asks the ball for the
+    worst places of the drive. It ends when these are no worse than the score, by 0.5 %.
+
+    Args:
+        ball: of places.
+        goal: to maximise at the worst place.
+        method: that maximises; None for `GradientAscent`.
+        rounds: most rounds, >= 1.
+        seed: of the method, >= 0.
+
+    Raises:
+        ValueError: as `PoseBall.certificate`.
+    """
+    require_kind("ball", ball, PoseBall)
+    method, rounds = method or GradientAscent(), integer_at_least("rounds", rounds, 1)
+    scene, offsets = ball.propagator.scene, torch.zeros(1, 3, dtype=torch.float64)
+    best: RobustDrive | None = None
+    start: torch.Tensor | None = None
+    for number in range(rounds):
+        matrices = ball.transfer_matrix(offsets)
+        places = [scene.moved(tuple(offset)) for offset in offsets.tolist()]
+        objectives = map(SimulatedObjective.of_matrix, places, matrices)
+        scenarios = Scenarios(objectives)
+        solution = run(method, scenarios, seed=seed + number, goal=goal, start=start)
+        start = solution.drive[0]
+        certificate = ball.certificate(start, goal)
+        if best is None or certificate.least > best.certificate.least:
+            nominal = float(scenarios.scores(start, goal)[0])
+            best = RobustDrive(start, nominal, certificate, 0.0, scenarios)
+        if certificate.worst >= (1 - _CLOSE) * float(solution.score[0]):
+            break
+        offsets = torch.cat([offsets, certificate.offsets])
+    assert best is not None
+    matrix = best.scenarios.transfer_matrix
+    assert matrix is not None
+    bound = best.scenarios.over(goal).bound(matrix)
+    return RobustDrive(best.drive, best.nominal, best.certificate, bound, best.scenarios)

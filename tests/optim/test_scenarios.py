@@ -1,0 +1,198 @@
+"""Scenarios: several scenes as one objective, for every method, goal and bound."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import autdtorch as at
+from autdtorch.methods.gradient import climb, random_drives
+from autdtorch.objectives.goals import derivative
+
+BY = ["worst", "mean", 0.3]
+
+
+@pytest.fixture
+def scenarios(make_objective, random_matrix):
+    def make(by="worst", scenes=3, points=2, transducers=5):
+        return at.Scenarios(
+            [make_objective(random_matrix(points, transducers, seed)) for seed in range(scenes)], by
+        )
+
+    return make
+
+
+def goals_for(points):
+    return [
+        at.WeakestFocus(),
+        at.WeakestFocus([1.0 + point for point in range(points)]),
+        at.MeanPressure(),
+        at.TargetPressures([1.0 + point for point in range(points)]),
+        at.QuietPoints(at.WeakestFocus(), [0], 0.3),
+        at.SeenPoints(at.WeakestFocus(), [1]),
+        at.Contrast([0]),
+    ]
+
+
+def test_scores_are_the_worst_the_mean_and_the_quantile_of_the_scenes(scenarios):
+    drives = random_drives(7, 5, torch.Generator().manual_seed(0))
+    for by, expected in (
+        ("worst", lambda scores: scores.amin(dim=1)),
+        ("mean", lambda scores: scores.mean(dim=1)),
+        (0.5, lambda scores: scores.median(dim=1).values),
+        (0.99, lambda scores: scores.amax(dim=1)),
+    ):
+        every = scenarios(by)
+        pressure = every(drives)
+        alone = torch.stack([each(drives) for each in every.objectives], dim=1)
+        assert torch.equal(pressure.reshape(7, 3, 2), alone)
+        assert every.evaluations == 7
+        assert torch.equal(every.scores(drives), alone.amin(dim=2))
+        assert torch.equal(every.over()(pressure), expected(alone.amin(dim=2)))
+        assert torch.equal(
+            every.transfer_matrix, torch.cat([each.transfer_matrix for each in every.objectives])
+        )
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        at.RandomSearch(),
+        at.LSSG(levels=4),
+        at.GABS(levels=4),
+        at.Identify(20),
+        at.GradientAscent(2, 50),
+        at.Holography(),
+        at.BayesOpt(6, initial=4),
+        at.BayesOpt(8, initial=4, model="foci", kernel="phasor"),
+    ],
+    ids=lambda method: getattr(method, "model", "") + method.name,
+)
+def test_every_method_maximises_the_score_of_all_scenes(scenarios, method):
+    every = scenarios()
+    solution = at.run(method, every)
+    assert solution.pressure.shape == (1, 6)
+    assert every.over().by_scene(every(solution.drive)).amin(dim=1) == pytest.approx(solution.score, rel=1e-6)
+    assert solution.score <= every.over().bound(every.transfer_matrix)
+    # not the best of one scene alone
+    if method.name == "gradient_ascent":
+        alone = at.run(method, every.objectives[0])
+        assert every.scores(alone.drive).amin() < solution.score
+
+
+def test_lssg_takes_the_evaluations_of_one_scene(scenarios):
+    assert at.LSSG(levels=4).most_evaluations(at.Problem.of(scenarios())) == 2 * 4
+    with pytest.raises(ValueError, match="order"):
+        at.lssg(scenarios(), order=[0, 1, 2, 3, 4, 5])
+
+
+@settings(max_examples=15)
+@given(
+    by=st.sampled_from(BY),
+    scenes=st.integers(1, 6),
+    points=st.integers(2, 4),
+    transducers=st.integers(2, 16),
+    seed=st.integers(0, 1000),
+)
+def test_no_drive_scores_above_the_bound(random_matrix, by, scenes, points, transducers, seed):
+    matrix, generator = random_matrix(scenes * points, transducers, seed), torch.Generator().manual_seed(seed)
+    drives = random_drives(50, transducers, generator)
+    for goal in goals_for(points):
+        over = at.OverScenes(goal, scenes, by)
+        best = torch.cat([drives, climb(over, matrix, drives[:4], 60)[None], torch.zeros_like(drives[:1])])
+        assert over((best @ matrix.T).abs()).max() <= over.bound(matrix) * (1 + 1e-12) + 1e-12
+
+
+@pytest.mark.parametrize("by", BY)
+@pytest.mark.parametrize("goal", goals_for(2)[:3] + goals_for(2)[5:6], ids=lambda goal: goal.name)
+def test_slopes_are_derivatives(by, goal):
+    over = at.OverScenes(goal, 4, by)
+    pressure = torch.tensor([1.3, 1.9, 2.4, 3.1, 0.8, 5.0, 2.0, 1.1], dtype=torch.float64)
+    cosine = torch.nn.functional.cosine_similarity(
+        over.slope(pressure, 1e-4), derivative(over, pressure), dim=0
+    )
+    assert cosine == pytest.approx(1, abs=1e-6)
+
+
+def test_failed_transducers_are_supposed_within_and_unknown_around(make_objective, random_matrix):
+    whole = make_objective(random_matrix(2, 5, 0))
+    every = at.Scenarios([whole, at.FailedTransducers(whole, [1])])
+    assert torch.equal(every.transfer_matrix[:2], whole.transfer_matrix)
+    assert every.transfer_matrix[2:, 1].abs().max() == 0
+    around = at.FailedTransducers(every, [1])
+    assert torch.equal(at.Problem.of(around).transfer_matrix, every.transfer_matrix)
+    assert at.Problem.of(around).goal == every.over()
+    assert at.Problem.of(at.Quantised(every, 4)).foci == 4
+    drive = at.gabs(at.Noise(at.Quantised(every, 4), snr=40)).drive
+    assert torch.equal(at.Quantised(every, 4).quantised(drive), drive)
+
+
+@pytest.fixture(scope="module")
+def behind_a_ball():
+    array = at.TransducerArray.grid((3, 3), pitch=10e-3, center=(0, 0, 0), normal=(0, 0, 1))
+    foci = at.circle_points(center=(0, 0, 80e-3), radius=15e-3, count=2, normal=(0, 0, 1))
+    ball = at.Sphere(center=(0, 0, 40e-3), radius=8e-3, density=100.0, sound_speed=340.0)
+    scene = at.Scene(array, at.Medium.air(), frequency=40e3, control_points=foci, obstacles=(ball,))
+    return at.make_propagator(scene, "tmatrix")
+
+
+def test_scenes_around_one_are_those_that_the_propagator_gives(behind_a_ball):
+    settings = {"offset": 2e-3, "warming": 3.0, "gain": 0.1, "failed": 1, "seed": 3}
+    every = at.Scenarios.around(behind_a_ball, 4, **settings)
+    assert torch.allclose(every.objectives[0].transfer_matrix, behind_a_ball.transfer_matrix(), rtol=1e-9)
+    for each in every.objectives[1:]:
+        moved = each.scene.obstacles[0].center
+        assert 0 < math.dist(moved, (0, 0, 40e-3)) <= 2e-3
+        assert abs(each.scene.medium.temperature - 20) <= 3
+    columns = every.transfer_matrix.reshape(4, 2, 9).abs().amax(dim=1)
+    assert (columns == 0).sum(dim=1).tolist() == [0, 1, 1, 1]
+    more = at.Scenarios.around(behind_a_ball, 6, **settings)
+    assert torch.equal(more.transfer_matrix[:8], every.transfer_matrix)
+    # a shift of the ball alone is the scene that make_propagator simulates
+    shifted = at.Scenarios.around(behind_a_ball, 2, offset=2e-3).objectives[1]
+    exact = at.make_propagator(shifted.scene, "tmatrix").transfer_matrix()
+    assert torch.allclose(shifted.transfer_matrix, exact, rtol=1e-6)
+
+
+def test_a_box_of_offsets_has_its_edges(behind_a_ball):
+    every = at.Scenarios.around(behind_a_ball, 20, offset=(1e-3, 0, 4e-3))
+    places = torch.tensor([each.scene.obstacles[0].center for each in every.objectives])
+    away = (places - places[0]).abs().amax(dim=0)
+    assert away[0] <= 1e-3
+    assert away[1] < 1e-12
+    assert 2e-3 < away[2] <= 4e-3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"count": 0}, "count: 0"),
+        ({"by": 1.0}, "by: 1.0; must be .*quantile"),
+        ({"by": "best"}, "by: 'best'"),
+        ({"offset": -1.0}, "offset: -1.0"),
+        ({"offset": (1e-3, 1e-3)}, "offset: .*, or 3 of them"),
+        ({"failed": 9}, "failed: 9; must be below"),
+        ({"rotation": 0.1}, "turn_x.*sphere"),
+        ({"offset": 1.0}, "scene 1 of the scenarios"),
+    ],
+)
+def test_wrong_variants_are_named(behind_a_ball, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        at.Scenarios.around(behind_a_ball, **{"count": 3, **arguments})
+
+
+def test_scenes_that_do_not_fit_are_named(make_objective, random_matrix, scenarios):
+    one, other = make_objective(random_matrix(2, 5, 0)), make_objective(random_matrix(3, 5, 0))
+    with pytest.raises(ValueError, match=r"objectives\[1\]: numbers of .*must be \(5, 2\)"):
+        at.Scenarios([one, other])
+    with pytest.raises(ValueError, match=r"objectives: .*at least one"):
+        at.Scenarios([])
+    with pytest.raises(ValueError, match="must be of one scene"):
+        at.Scenarios([scenarios()])
+    readings = at.Readings(torch.ones(1, 5) + 0j, torch.ones(1, 2), points=one.scene.control_points)
+    with pytest.raises(ValueError, match=r"points: .*a place is in all scenes"):
+        at.run(at.Identify(20), scenarios(), readings=readings)
+    assert dataclasses.replace(at.Problem.of(scenarios()), readings=None).foci == 6
