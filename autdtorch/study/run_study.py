@@ -166,10 +166,10 @@ def _scenes_of(scenarios: Mapping[str, Any] | None, goal: Goal) -> OverScenes:
     """Return the goal over the scenes that stand for each, after checking the settings of the scenarios."""
     if scenarios is None:
         return OverScenes(goal, 1)
+    taken = dict(inspect.signature(Scenarios.around).parameters)
+    del taken["propagator"]
+    require_known("scenarios", scenarios, taken)
     with within("scenarios"):
-        taken = dict(inspect.signature(Scenarios.around).parameters)
-        del taken["propagator"]
-        require_known("scenarios", scenarios, taken)
         settings = {name: scenarios.get(name, taken[name].default) for name in ("count", "by")}
         return OverScenes(goal, integer_at_least("count", settings["count"], 1), settings["by"])
 
