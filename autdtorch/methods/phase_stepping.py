@@ -7,7 +7,7 @@ phases of each input against a static reference. Here the reference is the drive
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -17,11 +17,13 @@ from autdtorch.methods.base import Method, State, Step, whole
 from autdtorch.methods.gradient import climb, random_drives
 from autdtorch.methods.problem import Problem, starts_of
 from autdtorch.methods.seeds import generators_of, restored, states_of
+from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.validation import invalid
 
 _TURNS = (-1 / 3, 1 / 3)  # steps of a phase
 _STARTS = 16  # drives from which the matrix is climbed
 _CLIMB_STEPS = 300
+_MEAN = ("matrix", "weight")  # tensors of a search, as `_averaged` makes them
 _DARK = 1e-3  # least pressure that a reference counts with, relative to the rms of the point
 _LEAST_AREA = 1e-6  # of the triangle of three phases; 0 if the device has only two phases
 
@@ -35,11 +37,10 @@ class PhaseStepping(Method):
     follows up to a common phase, if no transducer is louder there than all others of the reference together.
 
     The first reference has random phases, or is the drive to start from. Each further round steps around the
-    best drive of the matrix before, at which no focus is dark.
+    best drive of the matrix before, at which no focus is dark. The matrix is the mean of the rounds.
 
-    A trial takes `rounds` * (2 M - 1) + 1 evaluations, fewer than `Identify`. A step changes little of the
-    pressure, so that noise harms more: with more than a hundred transducers, it must be 40 dB below the
-    pressure at random phases.
+    A trial takes `rounds` * (2 M + 1) + 1 evaluations, fewer than `Identify`. A step changes little of the
+    pressure, so that noise harms more: it should be 30 dB below the pressure at random phases.
 
     Attributes:
         rounds: >= 1.
@@ -75,12 +76,18 @@ class PhaseStepping(Method):
         if done == self.most_evaluations(problem):
             return Step(state.drives[:, :0], {})
         generators = restored(state.search["generators"])
-        matrices = _matrices(state.drives, pressure)
-        trials = zip(matrices, state.best.drive, generators, strict=True)
-        highest = torch.stack([_highest(problem, *trial) for trial in trials])
+        searches, drives = [], []
+        for trial, generator in enumerate(generators):
+            # Copies: sums of a part of a tensor may round by its place in memory.
+            before = {name: state.search[name][trial].clone() for name in _MEAN if name in state.search}
+            played, observed = state.drives[trial].clone(), pressure[trial].clone()
+            searches.append(_averaged(before, _matrix(played, observed), observed[0]))
+            drives.append(_highest(problem, searches[-1]["matrix"], state.best.drive[trial], generator))
+        highest = torch.stack(drives)
+        search = {name: torch.stack([each[name] for each in searches]) for name in _MEAN}
         last = done == self.rounds * _in_round(problem)
-        drives = problem.quantise(highest)[:, None] if last else _stepped(problem, highest)
-        return Step(drives, {"generators": states_of(generators)})
+        asked = problem.quantise(highest)[:, None] if last else _stepped(problem, highest)
+        return Step(asked, {**search, "generators": states_of(generators)})
 
     def _doubts(self, state: State) -> Sequence[Iterable[str]]:
         """Describe nothing: the last drive is far above all others by design."""
@@ -88,18 +95,18 @@ class PhaseStepping(Method):
 
 
 def _in_round(problem: Problem) -> int:
-    """Return the evaluations of a round: the reference, and two of each transducer but the first."""
-    return 2 * problem.transducers - 1
+    """Return the evaluations of a round: the reference, and two of each transducer."""
+    return 2 * problem.transducers + 1
 
 
 def _stepped(problem: Problem, reference: torch.Tensor) -> torch.Tensor:
-    """Return references (T, M), fully on, each with its steps of all phases but the first (T, 2 M - 1, M)."""
-    reference = torch.where(reference == 0, 1, reference.sgn())
-    transducers = torch.arange(1, problem.transducers, device="cpu").repeat_interleave(len(_TURNS))
-    turns = torch.tensor(_TURNS, dtype=torch.float64, device="cpu").repeat(problem.transducers - 1)
-    drives = reference[:, None].repeat(1, _in_round(problem), 1)
-    rows = torch.arange(1, drives.shape[1], device="cpu")
-    drives[:, rows, transducers] *= torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
+    """Return references (T, M), fully on, each with its steps of all phases (T, 2 M + 1, M)."""
+    factors = torch.ones(_in_round(problem), problem.transducers, **COMPLEX)
+    turns = 2 * math.pi * torch.tensor(_TURNS, **REAL)
+    for start, factor in enumerate(torch.polar(torch.ones_like(turns), turns), 1):
+        factors[start::2].fill_diagonal_(factor)
+    # Trial by trial, as the rounding of a product may depend on its place in memory
+    drives = torch.stack([torch.where(row == 0, 1, row.clone().sgn()) * factors for row in reference])
     drives = problem.quantise(drives)
     if (_area(*_steps(drives)).abs() < _LEAST_AREA).any():
         raise invalid("phase levels of the objective", 2, "must be 3 or more, for phase stepping")
@@ -107,9 +114,10 @@ def _stepped(problem: Problem, reference: torch.Tensor) -> torch.Tensor:
 
 
 def _steps(drives: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the relative changes (T, M - 1) of all but the first entry by its first and its second step."""
-    reference = drives[:, 0, 1:]
-    first, second = (drives[:, start::2, 1:].diagonal(dim1=1, dim2=2) / reference - 1 for start in (1, 2))
+    """Return the relative changes (..., M) of all entries by their first and their second step."""
+    first, second = (
+        drives[..., start::2, :].diagonal(dim1=-2, dim2=-1) / drives[..., 0, :] - 1 for start in (1, 2)
+    )
     return first, second
 
 
@@ -118,19 +126,19 @@ def _area(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     return (first.conj() * second).imag
 
 
-def _matrices(drives: torch.Tensor, pressure: torch.Tensor) -> torch.Tensor:
-    """Return the matrices (T, P, M) that explain magnitudes (T, N, P) of a reference and its steps (T, N, M).
+def _matrix(drives: torch.Tensor, pressure: torch.Tensor) -> torch.Tensor:
+    """Return the matrix (P, M) that explains magnitudes (N, P) of a reference and its steps (N, M).
 
     A step d_j of a transducer, which adds b to the pressure a of the reference, changes the intensity by
     2 Re(d_j x) + t |d_j|^2, with x = a^* b and t = |b|^2. Two steps give x = x_0 - t x_1, and t follows from
     t a^2 = |x|^2. Of its two roots, the smaller one belongs to the transducer; the other one would exchange
     it with the rest of the reference.
     """
-    rms = pressure.square().mean(dim=1).sqrt()
-    level = torch.maximum(pressure[:, 0], _DARK * rms).clamp_min(torch.finfo(pressure.dtype).tiny)[..., None]
-    intensity = pressure.square().mT  # (T, P, N)
+    rms = pressure.square().mean(dim=0).sqrt()
+    level = torch.maximum(pressure[0], _DARK * rms).clamp_min(torch.finfo(pressure.dtype).tiny)[..., None]
+    intensity = pressure.square().mT  # (P, N)
     changes = [(intensity[..., start::2] - intensity[..., :1]) / 2 for start in (1, 2)]
-    first, second = (step[:, None] for step in _steps(drives))
+    first, second = _steps(drives)
     sizes = [step.abs().square() / 2 for step in (first, second)]
     area = _area(first, second)
 
@@ -142,9 +150,24 @@ def _matrices(drives: torch.Tensor, pressure: torch.Tensor) -> torch.Tensor:
     least = 2 * start.abs() * slope.abs()  # without noise, the middle of the roots is no less
     middle = torch.maximum(2 * (start * slope.conj()).real + level.square(), least)
     power = 2 * start.abs().square() / (middle + (middle.square() - least.square()).sqrt()).clamp_min(1e-300)
-    added = (start - power * slope) / level
-    added = torch.cat([level - added.sum(dim=-1, keepdim=True), added], dim=-1)
-    return added / drives[:, :1]
+    return (start - power * slope) / level / drives[0]
+
+
+def _averaged(
+    search: Mapping[str, torch.Tensor], matrix: torch.Tensor, reference: torch.Tensor
+) -> dict[str, torch.Tensor]:
+    """Return the mean of the matrices so far (P, M), and the weights of its rows (P, 1).
+
+    Rows have the phases of the first round. They count by the intensity of the reference at the focus, as
+    a dark one may have exchanged a transducer with the rest.
+    """
+    weight = reference.square()[..., None]
+    if "matrix" not in search:
+        return {"matrix": matrix, "weight": weight}
+    mean, before = search["matrix"], search["weight"]
+    turned = matrix * (matrix.conj() * mean).sum(dim=-1, keepdim=True).sgn()
+    share = weight / (before + weight).clamp_min(torch.finfo(weight.dtype).tiny)
+    return {"matrix": mean + share * (turned - mean), "weight": before + weight}
 
 
 def _highest(

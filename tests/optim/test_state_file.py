@@ -182,7 +182,7 @@ SEARCHES = {
     "points spread values variance",
     "identify": "answer drives ends entries factors fitted generators numbers observed outliers random "
     "spread variance",
-    "phase_stepping": "generators",
+    "phase_stepping": "generators matrix weight",
     "random_search": "generators",
     "gradient_ascent": "",
     "holography": "",
