@@ -55,6 +55,7 @@ from .objectives.scenarios import Scenarios
 from .plot.calibration_figure import plot_calibration
 from .plot.costs import plot_pareto, plot_scaling
 from .plot.explore import explore
+from .plot.force_figure import plot_force
 from .plot.haptics_figure import plot_haptics
 from .plot.pressure_maps import plot_plane, plot_planes
 from .plot.scene_figure import plot_scene
@@ -187,6 +188,7 @@ __all__ = [
     "phases_of",
     "plot_calibration",
     "plot_convergence",
+    "plot_force",
     "plot_haptics",
     "plot_pareto",
     "plot_plane",

@@ -13,7 +13,7 @@ from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.objectives.objective import GoalFunction, Objective
 from autdtorch.utils.validation import finite_number, require_kind
 
-_STARTS = 4
+_STARTS = 4, 32  # of ascents; more where the first decide nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,5 +62,9 @@ def attainable(
     require_kind("goal", problem.goal, Goal)
     assert isinstance(problem.goal, Goal)
     bound = problem.goal.bound(known_matrix(problem))
-    solution = run(GradientAscent(starts=_STARTS), objective, seed=seed, goal=problem.goal)
-    return Attainable(least, float(solution.score[0]), solution.drive[0], bound)
+    for starts in _STARTS:
+        solution = run(GradientAscent(starts=starts), objective, seed=seed, goal=problem.goal)
+        best = Attainable(least, float(solution.score[0]), solution.drive[0], bound)
+        if best.answer is not None:
+            break
+    return best

@@ -7,7 +7,6 @@ of control points, and bounds follow from the rows (`hermitian`).
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
@@ -25,6 +24,7 @@ from autdtorch.propagators.derivatives import nodes_around, regular_coefficients
 from autdtorch.propagators.propagator import Propagator
 from autdtorch.propagators.tmatrix.force import force_matrices
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
+from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.particle import Particle
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
@@ -41,9 +41,9 @@ from autdtorch.utils.validation import (
     unit_vector,
 )
 
-_AXES = [axis for axis in itertools.product((-1, 0, 1), repeat=3) if axis > (0, 0, 0)]
-DIRECTIONS: tuple[Vector, ...] = tuple(unit_vector("direction", axis) for axis in _AXES)
-"""DIRECTIONS: 13, along edges, and diagonals of faces and bodies, of a cube."""
+_HALF = sphere_points((0.0, 0.0, 0.0), 1.0, 200)
+DIRECTIONS: tuple[Vector, ...] = tuple((x, y, z) for x, y, z in _HALF.tolist() if z > 0)
+"""DIRECTIONS: 100 of a half sphere; between them, a stiffness is less by at most 3 % of the largest."""
 
 _LARGEST = 1.0  # k a of a small sphere, for which the degrees up to 3 scatter all but 1e-5
 _SCATTERED = 3
@@ -194,7 +194,7 @@ class Trap(_ParticleGoal):
     Attributes:
         points: (P, 3) [m].
         particle: the sphere, of a radius up to 1 / k.
-        directions: (D, 3), along which it is held; by default 13, for all.
+        directions: (D, 3), along which it is held; by default 100, for all.
         displacement: largest distance along a direction from the point to the place of equilibrium [m], > 0.
     """
 
@@ -219,7 +219,7 @@ class Levitate(_ParticleGoal):
     Attributes:
         points: (P, 3) [m].
         particle: the sphere, of a radius up to 1 / k.
-        directions: (D, 3), along which it is held; by default 13, for all.
+        directions: (D, 3), along which it is held; by default 100, for all.
         displacement: largest sideways distance from the point to the place of equilibrium [m], > 0.
         reach: distance over which the stiffness must make up the weight [m], > 0; by default 2 mm, a quarter
         of the

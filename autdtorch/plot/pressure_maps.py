@@ -364,9 +364,9 @@ def _hatch(ax: Axes, plane: Plane, reflector: Reflector, others: Iterable[Reflec
     ends = list(clipped(np.array(ends), (-math.inf,) * 3, (math.inf,) * 3, others)[:2])
     if len(ends) != 2:
         return
-    here, there = _coordinates(plane, torch.from_numpy(np.array(ends))).numpy()
+    here, there = coordinates_in(plane, torch.from_numpy(np.array(ends))).numpy()
     far = int(np.abs(height).argmax())
-    aside = _coordinates(plane, corners)[far].numpy() - here
+    aside = coordinates_in(plane, corners)[far].numpy() - here
     line = MM * np.array([here, there])
     if ((there - here)[0] * aside[1] - (there - here)[1] * aside[0]) * height[far] > 0:
         line = line[::-1]  # strokes are on the left
@@ -374,7 +374,7 @@ def _hatch(ax: Axes, plane: Plane, reflector: Reflector, others: Iterable[Reflec
     ax.plot(*line.T, path_effects=[withTickedStroke(spacing=4.5, angle=135, length=0.7)], **style)
 
 
-def _coordinates(plane: Plane, points: torch.Tensor) -> torch.Tensor:
+def coordinates_in(plane: Plane, points: torch.Tensor) -> torch.Tensor:
     """Return the coordinates (P, 2) [m] of points (P, 3) in a map of the plane, as of `_plane_axis`."""
     sides = torch.stack(plane.basis).to(points)
     axes = sides.abs().argmax(dim=1)
@@ -386,7 +386,7 @@ def _circle_points(ax: Axes, plane: Plane, points: torch.Tensor, cells: int) -> 
     """Circle the `points` (P, 3) [m] that are less than one cell away from the plane."""
     center = points.new_tensor(plane.center)
     near = ((points - center) @ points.new_tensor(plane.normal)).abs() < max(plane.size) / cells
-    coordinates = _coordinates(plane, points[near])
+    coordinates = coordinates_in(plane, points[near])
     style: Any = {"marker": "o", "ms": 9, "mfc": "none", "mec": "white", "mew": 1.2, "linestyle": "none"}
     outline = [withStroke(linewidth=2.6, foreground="black")]
     ax.plot(*(MM * coordinates.T.cpu().numpy()), path_effects=outline, **style)
