@@ -84,7 +84,7 @@ def test_foci_that_nothing_reaches(make_objective, random_matrix, dark, with_pri
 def test_foci_find_the_maximum_and_reach_the_goal_of_a_user(make_objective, random_matrix):
     objective = make_objective(random_matrix(3, 6, 4))
     best = at.gradient_ascent(objective).score
-    solution = at.bayes_opt(objective, evaluations=30, initial=6, fixed_transducer=0, trials=2, **FOCI)
+    solution = at.bayes_opt(objective, evaluations=30, initial=6, fixed_transducer=0, **FOCI)
     # Amplitudes below 1, which gradient ascent may use, and other local maxima are within a few per cent.
     assert (solution.score > 0.9 * best).all()
     # A goal is improved by its samples, without the smooth minimum: the pressure at the first focus.
