@@ -48,48 +48,22 @@ METHODS = (
 )
 
 #: Results, parts of drivers, and calls that need a device.
-NOT_CALLED_BY_USERS = {
-    *(
-        "Estimate",
-        "Evaluation",
-        "EvaluationLog",
-        "FocusMetrics",
-        "HapticMetrics",
-        "Preflight",
-        "Run",
-        "Solution",
-        "Sweep",
-    ),
-    *("Adapter", "Device", "Dialect", "Obstacle", "OpenMPDBoard"),
-    *("Calibration", "Picture", "Playback", "TMatrixPropagator", "TMatrix", "SimulatedPropagator"),
-    "UsbtmcPort",
-    *("EmulatedBench.receive", "EmulatedScope.execute", "Goal", "Method", "State", "Waveform"),
-    *("CallableFrames.wait", "FolderFrames.wait", "ThermalCamera.deviation", "ThermalCamera.read_pulse"),
-    "uvc_frames",
-    *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
-    *("LimitedLink.play_sequence", "Link.play_sequence", "Link.play_prepared"),  # until they are stopped
-    *("Device.pack", "lock_log", "open_autd3"),  # the one only makes a context, the other asks the network
-}
-
+NOT_CALLED_BY_USERS = """
+Adapter Calibration Device Dialect Estimate Evaluation EvaluationLog FocusMetrics Goal HapticMetrics Method
+Obstacle OpenMPDBoard Picture Playback Preflight Run SimulatedPropagator Solution State Sweep TMatrix
+TMatrixPropagator UsbtmcPort Waveform
+CallableFrames.wait Device.pack EmulatedBench.receive EmulatedScope.execute EmulatedScope.plug_into
+FolderFrames.wait Oscilloscope.capture Oscilloscope.set_up ThermalCamera.deviation ThermalCamera.read_pulse
+LimitedLink.play_sequence Link.play_sequence Link.play_prepared
+lock_log open_autd3 uvc_frames
+"""
 
 #: Methods that the driver calls, and that authors of methods implement.
-INSIDE_METHODS = {"advance", "begin", "check", "most_at_once", "most_evaluations", "numbers_kept"}
-INSIDE_METHODS |= {
-    "by_poses",
-    "by_waves",
-    "checked",
-    "coarser",
-    "for_scene",
-    "forward",
-    "images_around",
-    "levels",
-    "recorded",
-    "require_fit",
-    "slope",
-    "together_on",
-}
-INSIDE_METHODS |= {"at", "farthest", "near", "section", "wanted", "write_file"}
-INSIDE_METHODS |= {"climbed", "forms"}
+INSIDE_METHODS = """
+advance at begin by_poses by_waves check checked climbed coarser farthest for_scene forms forward
+images_around levels most_at_once most_evaluations near numbers_kept recorded require_fit section slope
+together_on wanted write_file
+"""
 
 
 class Made(NamedTuple):
@@ -586,18 +560,19 @@ def public_calls() -> dict[str, Call]:
         if callable(thing := getattr(module, name))
         for call in (_calls_of(thing) if inspect.isclass(thing) else [Call(name, thing)])
     ]
-    called = [call for call in calls if call.parameters and call.name not in NOT_CALLED_BY_USERS]
+    called = [call for call in calls if call.parameters and call.name not in NOT_CALLED_BY_USERS.split()]
     return {call.name: call for call in {call.function: call for call in reversed(called)}.values()}
 
 
 def _calls_of(kind: type) -> Iterator[Call]:
     """The constructor and the methods of a class."""
     protocol = getattr(kind, "_is_protocol", False)
-    not_made = kind.__name__ in NOT_CALLED_BY_USERS and kind.__name__ not in INSTANCES
+    not_made = kind.__name__ in NOT_CALLED_BY_USERS.split() and kind.__name__ not in INSTANCES
     if issubclass(kind, BaseException) or protocol or not_made:
         return
     yield Call(kind.__name__, kind)
-    inner = INSIDE_METHODS | getattr(kind, "__dataclass_fields__", {}).keys()  # defaults that are functions
+    # fields, as defaults may be functions
+    inner = {*INSIDE_METHODS.split(), *getattr(kind, "__dataclass_fields__", {})}
     for name in dir(kind):
         member = inspect.getattr_static(kind, name)
         if isinstance(member, classmethod) and name[0] != "_":
