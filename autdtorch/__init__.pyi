@@ -65,6 +65,7 @@ from .propagators import SteadyStateWarning, cell_centers, differentiable_field,
 from .propagators.estimate import Estimate, estimate
 from .propagators.gorkov import gorkov
 from .propagators.nearby import NearbyPoses
+from .propagators.stress import radiation_stress
 from .propagators.tmatrix.force import force_matrices, radiation_force, radiation_torque
 from .propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
 from .scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
@@ -200,6 +201,7 @@ __all__ = [
     "polyline_points",
     "porous",
     "radiation_force",
+    "radiation_stress",
     "radiation_torque",
     "random_search",
     "robust_drive",

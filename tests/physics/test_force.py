@@ -42,6 +42,15 @@ def with_slopes(
     return values.detach(), torch.complex(*parts)
 
 
+def around(rings: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Directions (n, 3), and solid angles (n,) with which products of waves up to the degree are exact."""
+    heights, weights = np.polynomial.legendre.leggauss(rings)
+    turns, across = math.pi * np.arange(2 * rings) / rings, np.sqrt(1 - heights**2)[:, None]
+    parts = [across * np.cos(turns), across * np.sin(turns), heights[:, None] + 0 * turns]
+    directions = torch.from_numpy(np.stack(parts, axis=-1).reshape(-1, 3))
+    return directions, torch.from_numpy(np.repeat(weights, 2 * rings)) * math.pi / rings
+
+
 def by_surface(
     bodies: at.TMatrix | at.TMatrixCluster,
     drive: torch.Tensor,
@@ -50,12 +59,7 @@ def by_surface(
     array: at.TransducerArray = ARRAY,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Force and torque about the centre, from the field and its gradient on a sphere around it."""
-    heights, weights = np.polynomial.legendre.leggauss(20)
-    turns = 2 * math.pi * np.arange(40) / 40
-    across = np.sqrt(1 - heights**2)[:, None]
-    normals = [across * np.cos(turns), across * np.sin(turns), heights[:, None] + 0 * turns]
-    normals = torch.from_numpy(np.stack(normals, axis=-1).reshape(-1, 3))
-    areas = torch.from_numpy(np.repeat(weights, 40)) * radius**2 * 2 * math.pi / 40
+    normals, areas = around(20)
     pressure, slopes = with_slopes(
         lambda points: bodies.transfer_matrix(array, points) @ drive, center + radius * normals
     )
@@ -64,7 +68,7 @@ def by_surface(
     energy = pressure.abs() ** 2 / (4 * density * speed**2) - density / 4 * velocity.abs().square().sum(dim=1)
     normal = (velocity * normals).sum(dim=1)
     flux = energy[:, None] * normals + density / 2 * (velocity * normal.conj()[:, None]).real
-    force = -areas[:, None] * flux
+    force = -(radius**2) * areas[:, None] * flux
     return force.sum(dim=0), radius * torch.linalg.cross(normals, force).sum(dim=0)
 
 
@@ -181,14 +185,8 @@ def test_all_momentum_is_that_of_the_far_field():
         _, slope = with_slopes(regular, place[None])
         omega = 2 * math.pi * FREQUENCY
         on_sources += 2 * math.pi / (AIR.density * omega**2) * (strength[index] * slope[0].conj()).real
-    heights, weights = np.polynomial.legendre.leggauss(40)
-    turns, across = 2 * math.pi * np.arange(80) / 80, np.sqrt(1 - heights**2)[:, None]
-    normals = np.stack(
-        [across * np.cos(turns), across * np.sin(turns), heights[:, None] + 0 * turns], axis=-1
-    )
-    normals = torch.from_numpy(normals.reshape(-1, 3))
+    normals, areas = around(40)
     field = far * cluster.transfer_matrix(ARRAY, far * normals) @ DRIVE
-    areas = torch.from_numpy(np.repeat(weights, 80)) * 2 * math.pi / 80
     flux = (areas * field.abs().square()) @ normals * energy_density()
     assert relative_error(on_bodies + on_sources, -flux) < 1e-6
     assert on_sources.norm() > 0.1 * on_bodies.norm()
@@ -248,14 +246,57 @@ def test_gradients_by_pose_and_drive_are_those_of_finite_differences(cube):
 
     pose = torch.tensor([1e-3, 0.5e-3, -1e-3, 0.2, 0.1, -0.3], dtype=torch.float64)
     assert_slopes(push, pose, steps=[1e-6] * 3 + [1e-4] * 3)
-    change = torch.linspace(-1e-6, 1e-6, 6).double()
-    second = torch.autograd.functional.hvp(push, pose, change)[1]
-    ends = [torch.autograd.functional.jacobian(push, pose + sign * change) for sign in (0.5, -0.5)]
-    assert relative_error(second, ends[0] - ends[1]) < 1e-5  # rounding of the difference
     drive = DRIVE.clone().requires_grad_(True)
     cluster = at.TMatrixCluster([cube, other])
     (slope,) = torch.autograd.grad(at.radiation_force(cluster, drive, **setting)[0], drive)
     assert relative_error(slope, 2 * at.force_matrices(cluster, **setting)[0] @ DRIVE) < 1e-9
+
+
+def test_the_stress_on_a_surface_around_a_body_is_the_force_on_it():
+    body = at.Sphere((30e-3, 4e-3, -3e-3), 4e-3, **MATERIALS["EPS"])
+    scene = at.Scene(ARRAY, AIR, FREQUENCY, [(60e-3, 0, 0)], [body])
+    propagator, drives = (
+        at.make_propagator(scene, "tmatrix", tolerance=1e-7),
+        torch.stack([DRIVE, -1j * DRIVE]),
+    )
+    normals, areas = around(12)
+    points = torch.tensor(body.center).double() + 6.2e-3 * normals
+    stress = at.radiation_stress(propagator, drives, points, 2 * normals)
+    force = at.radiation_force(propagator, DRIVE)
+    # by waves up to the 13th degree at the nodes around each point
+    assert relative_error(6.2e-3**2 * torch.einsum("p,rpc->rc", areas, stress), force.expand(2, 3)) < 1e-6
+
+
+@pytest.mark.filterwarnings("ignore::autdtorch.ScaleWarning")  # of sources far away
+def test_the_momentum_through_a_plane_is_that_through_others():
+    """Of a plane wave, the energy density; of a beam, as much at each distance."""
+    scene = at.Scene(far_away((0.0, 0.6, 0.8)), AIR, FREQUENCY, [(0, 0, 0)])
+    free, one = at.make_propagator(scene, "free_space"), torch.ones(1, dtype=torch.complex128)
+    stress = at.radiation_stress(free, one, [[0.0, 0.0, 0.0]], (0.0, 0.0, -1.0))[0]
+    expected = energy_density() * 0.8 * torch.tensor([0.0, 0.6, 0.8]).double()
+    assert relative_error(stress, expected) < 1e-6
+    array = at.TransducerArray.grid((6, 6), 6e-3, (0, 0, 0), (0, 0, 1.0), radius=2.5e-3)
+    free = at.make_propagator(at.Scene(array, AIR, FREQUENCY, [(0, 0, 0.03)]), "free_space")
+    focus = at.drive_from_phases(at.focus_phases(array.positions, (0, 0, 0.03), WAVENUMBER))
+    planes = [at.Plane((0, 0, z), (0, 0, 1), (0.12, 0.12)).points(5e-3) for z in (0.02, 0.03)]
+    near, far = (at.radiation_stress(free, focus, each, (0, 0, -1))[..., 2].sum().item() for each in planes)
+    assert near == pytest.approx(far, rel=0.05)  # planes of finite size miss the edge of the beam
+
+
+def test_second_derivatives_by_the_pose_are_differences_of_first_ones(cube):
+    def push(pose: torch.Tensor) -> torch.Tensor:
+        force = at.radiation_force(cube.moved(pose[:3], pose[3:]), DRIVE, array=ARRAY, medium=AIR)
+        return force @ torch.tensor([1.0, 2.0, -1.0]).double()
+
+    pose, change = torch.linspace(-1e-3, 1e-3, 6).double(), torch.linspace(-1e-6, 1e-6, 6).double()
+
+    def slope(pose: torch.Tensor) -> torch.Tensor:
+        return torch.autograd.grad(push(pose), pose, create_graph=True)[0]
+
+    pose.requires_grad_(True)
+    (second,) = torch.autograd.grad(slope(pose) @ change, pose)
+    ends = [slope(pose + sign * change) for sign in (0.5, -0.5)]
+    assert relative_error(second, (ends[0] - ends[1]).detach()) < 1e-5  # rounding of the difference
 
 
 def test_bad_input_is_named():
