@@ -29,10 +29,10 @@ SIZES = 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0, 8.0
 FAR, FARTHER = 1e6, 1e10
 """Distances [m] of points that send plane waves: from FAR, the fall of 1 / r counts for small spheres."""
 CUBE = at.Box((0.0, 0.0, 60e-3), (10e-3,) * 3, rigid=True)
-SPACING, FINE = 1e-3, 0.5e-3  # [m]
+SPACING, FINE = 1e-3, 0.6e-3  # [m]
 POSES, TURNS = 1000, 50
-FOCUS, PALM = 150e-3, 80e-3  # [m]
-WINDOWS = 8e-3, 20e-3, 80e-3, 300e-3  # [m]
+FOCUS, PALM = 150e-3, 60e-3  # [m]
+WINDOWS = 6e-3, 18e-3, 60e-3, 300e-3  # [m]
 
 
 def main(page: Page) -> None:
@@ -205,11 +205,11 @@ def on_a_palm() -> str:
         inside = aside <= window / 2
         sums = [1e3 * spacing**2 * float(each[inside].sum()) for each in (pressure, momentum)]
         rows.append([f"{1e3 * window:g} mm", *(f"{value:.1f}" for value in sums)])
-    thickness = 6e-3
+    thickness = 4e-3
     plate = at.Box((0, 0, FOCUS + thickness / 2), (PALM, PALM, thickness), rigid=True)
     scene = at.Scene(array, AIR, FREQUENCY, [(0, 0, FOCUS - 5e-3)], [plate])
-    box = at.make_propagator(scene, "box", 1.5e-3, cache=False)
-    forces = [1e3 * float(stress_on_box(box, drive, plate, aside)) for aside in (4e-3, 6e-3)]
+    box = at.make_propagator(scene, "box", 2e-3, cache=False)
+    forces = [1e3 * float(stress_on_box(box, drive, plate, aside)) for aside in (12e-3, 15e-3)]
     return (
         f"An AUTD3 (249 discs) focuses at {1e3 * FOCUS:g} mm. Force [mN] on squares of the plane through\n"
         "the focus:\n\n"
@@ -227,7 +227,7 @@ def stress_on_box(
     total = torch.zeros((), dtype=torch.float64)
     for axis in range(3):
         others = [other for other in range(3) if other != axis]
-        rules = [np.polynomial.legendre.leggauss(max(6, math.ceil(half[other] / 2e-3))) for other in others]
+        rules = [np.polynomial.legendre.leggauss(max(6, math.ceil(half[other] / 2.5e-3))) for other in others]
         grids = np.meshgrid(*(rule[0] * half[other] for rule, other in zip(rules, others, strict=True)))
         areas = np.outer(rules[1][1], rules[0][1]) * half[others[0]] * half[others[1]]
         for sign in (-1, 1):
