@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from autdtorch.propagators.derivatives import derivatives, nodes_around
-from autdtorch.propagators.simulated import Propagator
+from autdtorch.propagators.propagator import Propagator
 from autdtorch.scene.drive import validate_drive
 from autdtorch.utils.validation import ArrayLike, points_grid, real_tensor, require_kind
 

@@ -14,6 +14,7 @@ from shared.document import Page, printed, table
 from shared.scenes import relative_error
 
 import autdtorch as at
+from autdtorch.propagators import Propagator
 
 DOCUMENT = "force.md"
 
@@ -127,7 +128,7 @@ def around_bodies() -> Iterator[list[str]]:
 
 
 def stress_around(
-    propagator: at.propagators.Propagator, drive: torch.Tensor, center: tuple[float, ...], radius: float
+    propagator: Propagator, drive: torch.Tensor, center: tuple[float, ...], radius: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return force and torque about the centre by the stress on a sphere."""
     rings = 18
@@ -219,9 +220,7 @@ def on_a_palm() -> str:
     )
 
 
-def stress_on_box(
-    propagator: at.propagators.Propagator, drive: torch.Tensor, box: at.Box, aside: float
-) -> torch.Tensor:
+def stress_on_box(propagator: Propagator, drive: torch.Tensor, box: at.Box, aside: float) -> torch.Tensor:
     """Return the force along z on what is within a box, by the stress on a box that is larger by a margin."""
     half = np.array(box.size) / 2 + aside
     total = torch.zeros((), dtype=torch.float64)
