@@ -65,6 +65,25 @@ def test_a_standing_wave_holds_a_bead_as_theory_says():
     assert bead.weight == pytest.approx(4 / 3 * math.pi * 0.4e-3**3 * 29.36 * GRAVITY)
 
 
+@pytest.mark.parametrize("material", ["EPS", "water"])
+@pytest.mark.parametrize("size", [0.05, 0.2, 0.4])
+def test_the_force_approaches_that_on_a_sphere_as_the_square_of_its_size(material, size):
+    bead = at.Particle.of(material, size * 343 / (2 * math.pi * 40e3))
+    fluid = {"density": bead.density, "sound_speed": bead.sound_speed}
+    sphere = at.TMatrix.of(at.Sphere(POINTS[0], bead.radius, **fluid), MEDIUM, 40e3, error=1e-8)
+    above = at.TransducerArray.grid((4, 4), 10e-3, (5e-3, 0, 0.1), (0, 0, -1), source_strength=1.0)
+    below = scene().array
+    places, normals = (
+        torch.cat([getattr(each, name) for each in (below, above)]) for name in ("positions", "normals")
+    )
+    array = at.TransducerArray(places, normals, source_strength=1.0)
+    propagator = at.make_propagator(at.Scene(array, MEDIUM, 40e3, [(0, 0, 0.1)]), "free_space")
+    both = torch.cat([drive(0), drive(1)], dim=-1)
+    exact = at.radiation_force(sphere, both, array=array, medium=MEDIUM)
+    force = at.gorkov(propagator, POINTS[:1], both, bead).force[:, 0]
+    assert relative(force, exact) < size**2  # about half of it
+
+
 def test_a_box_gives_the_force_of_the_t_matrix():
     sphere = at.Sphere((0.005, 0, 0.04), 6e-3, rigid=True)
     exact, box = (
