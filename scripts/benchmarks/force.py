@@ -214,7 +214,7 @@ def on_a_palm() -> str:
     return (
         f"An AUTD3 (249 discs) focuses at {1e3 * FOCUS:g} mm. Force [mN] on squares of the plane through\n"
         "the focus:\n\n"
-        + table(["square", "|p|^2 / (rho c^2)", "twice the momentum"], rows)
+        + table(["square", "p^2 / (rho c^2)", "twice the momentum"], rows)
         + f"\n\nA rigid plate of {1e3 * PALM:g} mm there takes up {forces[0]:.1f} mN ({forces[1]:.1f} mN by a"
         " wider surface around it)."
     )
