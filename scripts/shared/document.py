@@ -76,8 +76,9 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
         if None not in numbers and len(units) == 1:
             cells = [cell.split(" ")[0] for cell in cells]
             title = f"{title} [{units.pop()}]"
-        columns.append([title, "---", *cells])
-    return "\n".join(f"| {' | '.join(line)} |" for line in zip(*columns, strict=True))
+        columns.append([title, *cells])
+    head, *lines = (f"| {' | '.join(line)} |" for line in zip(*columns, strict=True))
+    return "\n".join((head, "|" + "---|" * len(columns), *lines))
 
 
 def printed(rows: Iterable[Sequence[str]]) -> list[Sequence[str]]:
