@@ -22,6 +22,7 @@ from autdtorch.methods.base import Method, State
 from autdtorch.methods.problem import Problem
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import Goal
+from autdtorch.objectives.over_scenes import OverScenes
 from autdtorch.objectives.readings import Readings
 from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.digest import digest_of
@@ -151,6 +152,8 @@ def _differences(written: Mapping[str, Any], wanted: Mapping[str, Any]) -> tuple
 
 
 def _goal(goal: object) -> str:
+    if isinstance(goal, OverScenes):
+        return f"{goal.by} of {goal.scenes} scenes, {_goal(goal.goal)}"
     if isinstance(goal, Goal):
         return repr(goal)
     function = goal.func if isinstance(goal, functools.partial) else goal

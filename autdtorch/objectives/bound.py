@@ -95,12 +95,16 @@ def least_bound(foci: ComplexArray, wanted: Array) -> float:
 def joint_bound(matrices: ComplexArray, wanted: Array) -> float:
     """Return a bound on the level t of foci that reach t `wanted` (P,) with each of matrices (S, P, M).
 
-    Of many foci, those that reach the least alone decide: a bound on some of them holds for all.
+    Of many foci, those that reach the least alone decide: a bound on some of them holds for all. Few foci of
+    one scene have the closer bound where scenes are much alike.
     """
     rows, targets = matrices.reshape(-1, matrices.shape[-1]), np.tile(wanted, len(matrices))
     alone = np.abs(rows).sum(axis=1) / targets
     least = np.sort(np.argsort(alone, kind="stable")[:_MOST_JOINT])
-    return least_bound(rows[least], targets[least])
+    bound = least_bound(rows[least], targets[least])
+    if len(matrices) == 1 or len(wanted) > _MOST_FOCI:
+        return bound
+    return min(bound, least_bound(matrices[alone.argmin() // len(wanted)], wanted))
 
 
 def checked_matrix(G: ArrayLike, name: str = "G") -> ComplexArray:

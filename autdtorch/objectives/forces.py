@@ -72,6 +72,16 @@ class LeastForm(Goal):
         """The unit of it."""
         return self.of.unit
 
+    def __eq__(self, other: object) -> bool:
+        """Return whether another goal gives the same scores of readings."""
+        if not isinstance(other, LeastForm):
+            return NotImplemented
+        return self.of == other.of and np.array_equal(self.weights, other.weights)
+
+    def __hash__(self) -> int:
+        """Return the hash of the trap, lift or push."""
+        return hash(self.of)
+
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:
         """Return the least form (...) of readings (..., N)."""
         readings = self.checked(pressure)

@@ -64,7 +64,8 @@ class Scenarios:
             by: "worst", "mean", or a quantile in (0, 1): 0.1 is the score that nine of ten scenes exceed.
 
         Raises:
-            ValueError: no objective, other numbers of transducers or points, or another `by`.
+            ValueError: no objective, other numbers of transducers or points, other goals of force, or another
+                `by`.
         """
         self.objectives = tuple(objectives)
         if not self.objectives:
@@ -78,6 +79,8 @@ class Scenarios:
                 if counts != first:
                     accepted = f"must be {first}, as of the first"
                     raise invalid("numbers of transducers and control points", counts, accepted)
+                if _goal_inside(each) != _goal_inside(self.objectives[0]):
+                    raise invalid("goal of the objective", _goal_inside(each), "must be that of the first")
         self.by = checked_by(by)
         self.scene = self.objectives[0].scene
         self.evaluations = 0
@@ -170,11 +173,16 @@ class Scenarios:
 
     def scores(self, drive: torch.Tensor, goal: GoalFunction = WEAKEST_FOCUS) -> torch.Tensor:
         """Observe drives (..., M), and return the scores (..., S) of a goal in each scene."""
-        goal, _ = observed_goal(self.objectives[0], goal)
-        return self.over(goal).by_scene(self(drive))
+        over, _ = observed_goal(self, goal)
+        assert isinstance(over, OverScenes)
+        return over.by_scene(self(drive))
 
     def over(self, goal: GoalFunction = WEAKEST_FOCUS) -> OverScenes:
-        """Return the goal over all scenes that methods maximise for a goal of each."""
+        """Return the goal over all scenes that methods maximise for a goal of each; one over all stays."""
+        if isinstance(goal, OverScenes):
+            if goal.scenes != len(self):
+                raise invalid("goal.scenes", goal.scenes, f"must be {len(self)}, as of the scenarios")
+            return goal
         return OverScenes(goal_of(goal), len(self), self.by)
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
@@ -188,11 +196,17 @@ def observed_goal(objective: Objective, goal: GoalFunction) -> tuple[GoalFunctio
     """
     inside, matrix = innermost(objective), simulated_matrix(objective)
     if isinstance(inside, Scenarios):
-        goal, points = observed_goal(inside.objectives[0], goal)
-        return inside.over(goal), len(inside) * points
+        each, points = observed_goal(inside.objectives[0], goal)
+        return inside.over(each), len(inside) * points
     if goal is WEAKEST_FOCUS:
-        goal = getattr(inside, "goal", goal)
+        goal = _goal_inside(objective)
     return goal, len(objective.scene.control_points if matrix is None else matrix)
+
+
+def _goal_inside(objective: Objective) -> GoalFunction:
+    """Return the goal that an objective has, or else the paper's."""
+    goal: GoalFunction = getattr(innermost(objective), "goal", WEAKEST_FOCUS)
+    return goal
 
 
 def _counts(objective: Objective) -> tuple[int, int]:

@@ -106,6 +106,55 @@ def test_no_drive_scores_above_the_bound(random_matrix, by, scenes, points, tran
         assert over((best @ matrix.T).abs()).max() <= over.bound(matrix) * (1 + 1e-12) + 1e-12
 
 
+def test_a_quantile_is_the_kth_lowest_in_spite_of_rounding():
+    scores = torch.arange(1.0, 101.0, dtype=torch.float64)
+    for percent in range(1, 100):
+        assert at.OverScenes(at.WeakestFocus(), 100, percent / 100).joined(scores) == percent
+    assert at.OverScenes(at.WeakestFocus(), 3, 1e-15).joined(scores[:3]) == 1
+
+
+def test_a_scene_that_is_there_twice_changes_no_bound(make_objective, random_matrix):
+    scene = make_objective(random_matrix(4, 6, 0))
+    twice = at.Scenarios([scene, scene])
+    alone = at.focus_bound(scene.transfer_matrix)
+    assert twice.over().bound(twice.transfer_matrix) <= alone * (1 + 1e-9)
+
+
+def test_a_goal_over_all_scenes_stays(scenarios):
+    every = scenarios()
+    assert at.Problem.of(every, every.over()).goal == every.over()
+    highest = at.run(at.GradientAscent(2, 50), every, goal=at.OverScenes(at.WeakestFocus(), 3, "mean"))
+    assert highest.score == pytest.approx(every.scores(highest.drive).mean(dim=1))
+    assert at.attainable(every, 0.0).answer is True
+    assert at.attainable(every, 100.0).answer is False
+    with pytest.raises(ValueError, match=r"goal.scenes: 2; must be 3"):
+        at.gabs(every, goal=at.OverScenes(at.WeakestFocus(), 2))
+
+
+def test_forces_in_scenes_have_one_goal():
+    array = at.TransducerArray.grid((3, 3), 10e-3, (0, 0, 0), (0, 0, 1))
+    propagator = at.make_propagator(at.Scene(array, at.Medium.air(), 40e3, [(0, 0, 0.1)]), "free_space")
+    bead = at.Particle.of("EPS", 0.5e-3)
+    low, same, other = (
+        at.ForceObjective(propagator, at.Trap([(0, 0, 0.03)], bead, directions))
+        for directions in ([(1, 0, 0)], [(1, 0, 0)], [(0, 1, 0)])
+    )
+    every = at.Scenarios([low, same])
+    drive = torch.ones(1, 9) + 0j
+    assert every.scores(drive).tolist() == [[low.goal(low(drive)).item()] * 2]
+    with pytest.raises(ValueError, match=r"objectives\[1\]: goal .*must be that of the first"):
+        at.Scenarios([low, other])
+
+
+def test_a_run_goes_on_from_the_file_with_a_function_as_goal(scenarios, tmp_path):
+    def functions():  # of equal code at other addresses, as in another process
+        return lambda pressure: pressure.amin(dim=-1)
+
+    goals, file = [functions(), functions()], tmp_path / "state.npz"
+    first, again = (at.run(at.GABS(levels=3), scenarios(), goal=goal, state_file=file) for goal in goals)
+    assert torch.equal(first.drive, again.drive)
+
+
 @pytest.mark.parametrize("by", BY)
 @pytest.mark.parametrize("goal", goals_for(2)[:3] + goals_for(2)[5:6], ids=lambda goal: goal.name)
 def test_slopes_are_derivatives(by, goal):
