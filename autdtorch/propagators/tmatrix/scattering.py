@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -94,8 +95,10 @@ def waves_of_body(
     """Return the coefficients (..., n, R) [Pa] of all regular waves on a body and of its outgoing waves.
 
     The array, its images and all other bodies send the regular ones. R drives are (..., R, M), or one of each
-    transducer alone. `together` maps the array's waves on all bodies to both, if it is known.
+    transducer alone. Both have one degree more than T, up to which regular waves exchange momentum with the
+    outgoing ones. `together` maps the array's waves on all bodies to both, if it is known; see `joined_on`.
     """
+    bodies = _with_next_degree(bodies, number)
     if drive is None:
         incident = [IncomingWaves.of(body, array, images).matrix for body in bodies]
     else:
@@ -115,12 +118,29 @@ def joined_on(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the maps (n, N) from the array's waves on all bodies to the regular and outgoing waves of one.
 
-    `every` is what `joined` returns.
+    `every` is what `joined` returns. As in `waves_of_body`, one degree more of this body counts.
     """
+    end, before = sum(len(body.matrix) for body in bodies[: number + 1]), len(every)
+    bodies = _with_next_degree(bodies, number)
     sizes = [len(body.matrix) for body in bodies]
+    more = sum(sizes) - before
+    every = _with_zeros(_with_zeros(every, end, more).mT, end, more).mT
     parts = torch.split(every, sizes)
     direct = torch.split(torch.eye(len(every), **COMPLEX), sizes)[number]
     return direct + _echoes(_between(bodies, NO_MIRRORS)[number], parts), parts[number]
+
+
+def _with_next_degree(bodies: Sequence[TMatrix], number: int) -> list[TMatrix]:
+    """Return bodies, one of them with a degree more, which it does not scatter."""
+    body = bodies[number]
+    more = 2 * body.degree + 3
+    raised = replace(body, matrix=torch.nn.functional.pad(body.matrix, (0, more, 0, more)))
+    return [*bodies[:number], raised, *bodies[number + 1 :]]
+
+
+def _with_zeros(rows: torch.Tensor, place: int, count: int) -> torch.Tensor:
+    """Return rows (N + count, K) with so many of zeros at a place."""
+    return torch.cat([rows[:place], rows.new_zeros(count, rows.shape[1]), rows[place:]])
 
 
 def _echoes(between: Sequence[torch.Tensor | None], scattered: Sequence[torch.Tensor]) -> torch.Tensor:
