@@ -88,8 +88,8 @@ class PoseBall:
             goal: with the weights of the foci, if any; its scores are certified.
 
         Raises:
-            ValueError: another drive or goal, points or transducers near the bodies, or a radius that is too
-                large for the tolerance.
+            ValueError: another drive or goal, points or transducers near the bodies, waves between bodies that
+                do not converge, or a radius that is too large for the tolerance.
         """
         scene = self.propagator.scene
         played = validate_drive(drive, len(scene.array)).detach().cpu().to(torch.complex128)
@@ -110,4 +110,8 @@ class PoseBall:
     def _polynomial(self) -> ShiftPolynomial:
         scene = self.propagator.scene
         settings = scene.array, scene.control_points, self.radius, self.tolerance
-        return ShiftPolynomial.of(self.propagator.bodies, *settings)
+        polynomial = ShiftPolynomial.of(self.propagator.bodies, *settings)
+        if not self.propagator.by_waves(scene.control_points)[1].all():
+            accepted = "must have waves that converge to its tolerance at all control points"
+            raise invalid("propagator", self.propagator, accepted)
+        return polynomial
