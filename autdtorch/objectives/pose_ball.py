@@ -88,8 +88,8 @@ class PoseBall:
             goal: with the weights of the foci, if any; its scores are certified.
 
         Raises:
-            ValueError: another drive or goal, points or transducers near the bodies, waves between bodies that
-                do not converge, or a radius that is too large for the tolerance.
+            ValueError: another drive or goal, points or transducers near the bodies, waves between
+                bodies that do not converge, or a radius that is too large for the tolerance.
         """
         scene = self.propagator.scene
         played = validate_drive(drive, len(scene.array)).detach().cpu().to(torch.complex128)

@@ -298,11 +298,9 @@ def _run_scene(
     scene = propagator.scene
     progress.describe(f"{name}: transfer matrix")
     begin = time.perf_counter()
-    objective = (
-        SimulatedObjective(scene, propagator)
-        if scenarios is None
-        else Scenarios.around(propagator, **scenarios)
-    )
+    with within("scenarios"):
+        around = None if scenarios is None else Scenarios.around(propagator, **scenarios)
+    objective = around or SimulatedObjective(scene, propagator)
     transfer_matrix, (maximised, _) = objective.transfer_matrix, observed_goal(objective, goal)
     matrix_seconds = time.perf_counter() - begin
     assert transfer_matrix is not None

@@ -284,3 +284,5 @@ def test_scenarios_stand_for_each_scene(tmp_path):
     for wrong, message in (({"counts": 3}, "counts"), ({"count": 0}, "count: 0"), ({"by": "best"}, "by")):
         with pytest.raises(ValueError, match=f"scenarios.*{message}"):
             study(scenarios=wrong)
+    with pytest.raises(ValueError, match="scenarios: failed: -1"):
+        study(scenarios={"failed": -1}, config="two")
