@@ -19,7 +19,7 @@ from autdtorch.fdtd.shapes import Shape, bounds
 from autdtorch.fdtd.stencil import places_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.process import cached_property
-from autdtorch.utils.spatial import places_on
+from autdtorch.utils.spatial import parts_of, places_on
 from autdtorch.utils.validation import invalid, positive
 
 logger = logging.getLogger(__name__)
@@ -45,9 +45,9 @@ FINE_LAYER_CELLS, COARSE_LAYER_CELLS = 6, 8
 # scattered field cancel: behind a plate of 0.1 m, 12 wavelengths, the error at 1 mm is 1.1 %, and 0.3 % with
 # the whole layer.
 _THINNER, _SMALL_BODIES = 2, 4
-# Places on the surfaces of a few bodies in a box, as many on each, and the share of their pairs between which
-# sound has arrived before a run may end. Sources drive all of them at once; what later comes from corner to
-# corner of a plate or a cube is below 5e-4 of the field. More bodies fill their box.
+# Places on the few separate surfaces in a box, as many on each however small, and the share of their pairs
+# between which sound has arrived before a run may end. Sources drive all of them at once; what later comes
+# from corner to corner of a plate or a cube is below 5e-4 of the field. More surfaces fill their box.
 _PLACES, _REACHED, _FEW = 256, 0.995, 8
 RATIO = 1.5  # Ratio of the spacings of the two grids: the coarser costs a fifth of the finer
 
@@ -172,8 +172,11 @@ def path_between(shapes: Sequence[Shape]) -> float:
     """Return the distance [m] that few pairs of places on the surfaces of shapes exceed; see `_REACHED`."""
     if len(shapes) > _FEW:
         return math.dist(*bounds(shapes))
-    surfaces = [[part.numpy() for part in shape.surface()] for shape in shapes]
-    places = [places_on(vertices[triangles], _PLACES // len(shapes)) for vertices, triangles in surfaces]
+    surfaces = [[tensor.numpy() for tensor in shape.surface()] for shape in shapes]
+    parts = [part for surface in surfaces for part in parts_of(*surface)]
+    if len(parts) > _FEW:
+        return math.dist(*bounds(shapes))
+    places = [places_on(part, _PLACES // len(parts)) for part in parts]
     return float(np.quantile(pdist(np.concatenate(places)), _REACHED))
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.distinct import distinct_rows
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 _LATTICE = 0.7548776662466927, 0.5698402909980532
@@ -77,6 +78,20 @@ def places_on(corners: Array, count: int) -> Array:
     beyond = a + b > 1
     a, b = np.where(beyond, 1 - a, a), np.where(beyond, 1 - b, b)
     return np.asarray(first + a * (second - first) + b * (third - first))
+
+
+def parts_of(vertices: Array, triangles: Index) -> list[Array]:
+    """Return the corners (T, 3, 3) of each part of a surface, vertices (V, 3) [m], that touches no other."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    joined = distinct_rows(np.round(vertices / LENGTH_TOLERANCE).astype(np.int64))[1][triangles]
+    sides = sides_of(joined)
+    graph = coo_array((np.ones(len(sides)), sides.T), shape=(len(vertices),) * 2)
+    label = connected_components(graph, directed=False)[1][joined[:, 0]]
+    order = np.argsort(label, kind="stable")
+    starts = np.flatnonzero(np.diff(label[order])) + 1
+    return np.split(vertices[triangles[order]], starts)
 
 
 def paired_sides(triangles: Index) -> Index:

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from checks.boundary import measured_reflection
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -22,7 +23,7 @@ from autdtorch.fdtd.placement import fitting_spacing, grid_offset
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
-from autdtorch.scene.obstacles import Box, Sphere
+from autdtorch.scene.obstacles import Box, Mesh, Sphere
 from autdtorch.scene.scene import Scene
 
 KAPPAS = st.floats(0.1, 2 * math.pi / 3)
@@ -223,6 +224,10 @@ def test_sound_arrives_between_most_places_on_surfaces(angles, size):
     assert size < path_between([plate]) < 1.25 * size  # of a square all but 0.005 are within 1.16 sides
     far = Sphere((0.1, 0.3, 0.0), 1e-3, rigid=True)  # of bodies apart, however small, half of the pairs
     assert 0.3 <= path_between([sphere, far]) <= 0.301 + size
+    surfaces = [shape.surface() for shape in (sphere, far)]
+    faces = torch.cat([surfaces[0][1], surfaces[1][1] + len(surfaces[0][0])])
+    both = Mesh.from_surface((torch.cat([vertices for vertices, _ in surfaces]), faces), rigid=True)
+    assert 0.3 <= path_between([both]) <= 0.301 + size  # nor do parts of one body that are apart
 
 
 @settings(max_examples=15)
