@@ -43,7 +43,7 @@ from autdtorch.utils.validation import (
 
 _HALF = sphere_points((0.0, 0.0, 0.0), 1.0, 200)
 DIRECTIONS: tuple[Vector, ...] = tuple((x, y, z) for x, y, z in _HALF.tolist() if z > 0)
-"""DIRECTIONS: 100 of a half sphere; between them, a stiffness is less by at most 3 % of the largest."""
+"""DIRECTIONS: 100 of a half sphere; the least stiffness of all is lower by at most 5 % of its range."""
 
 _LARGEST = 1.0  # k a of a small sphere, for which the degrees up to 3 scatter all but 1e-5
 _SCATTERED = 3
@@ -223,8 +223,9 @@ class Levitate(_ParticleGoal):
 
     The score is the least of the upward force over the weight and, over directions, of the restoring force at
     `reach` over the weight, from which the sideways force times reach / displacement is subtracted. With a
-    score of s >= 1, the drive times s^(-1/2) holds the sphere within `displacement` of the point across
-    gravity, and within `reach` along it if its weight doubles. Forces are those of `Trap`.
+    score of s >= 1 and an upward force of l >= s weights, the drive times l^(-1/2) holds the sphere within
+    `displacement` of the point across gravity, and within l / s of `reach` along it if its weight doubles.
+    Forces are those of `Trap`.
 
     Attributes:
         points: (P, 3) [m].
@@ -232,8 +233,7 @@ class Levitate(_ParticleGoal):
         directions: (D, 3), along which it is held; by default 100, for all.
         displacement: largest sideways distance from the point to the place of equilibrium [m], > 0.
         reach: distance over which the stiffness must make up the weight [m], > 0; by default 2 mm, a quarter
-        of the
-            wavelength at 40 kHz.
+            of the wavelength at 40 kHz.
         up: direction against gravity (3,); any length.
     """
 

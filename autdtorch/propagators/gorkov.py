@@ -76,8 +76,7 @@ def gorkov(
         drive: (..., M) complex, |q| <= 1.
         particle: the particle.
         up: direction against gravity (3,); the weight of the particle then counts in potential and force.
-        Without
-            it, sound alone.
+            Without it, sound alone.
 
     Returns:
         Potential (..., P) [J], force (..., P, 3) [N] and stiffness (..., P, 3, 3) [N/m], differentiable as

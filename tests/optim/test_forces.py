@@ -1,5 +1,7 @@
 """Goals of force: forms of the drive, their bounds, and whether a trap exists."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -119,3 +121,21 @@ def test_whether_a_trap_exists_is_decided(propagator):
     drop = at.Levitate([POINT], at.Particle.of("water", 0.5e-3))
     heavy = at.attainable(at.ForceObjective(propagator, drop), 1.0)
     assert heavy.answer is False
+
+
+def test_a_lifted_bead_stays_near_its_place(propagator):
+    """The drive times l^(-1/2), with a lift of l weights, does what `Levitate` says of the score."""
+    louder = replace(propagator.scene, array=replace(propagator.scene.array, source_strength=20.0))
+    loud, lift = at.make_propagator(louder, "free_space"), at.Levitate([POINT], BEAD)
+    climbed = at.gradient_ascent(at.ForceObjective(loud, lift), starts=2)
+    drive, score = climbed.drive[0], climbed.score.item()
+    place = torch.tensor([POINT]).double()
+    force = exact(loud, BEAD, place, drive)[0]
+    slope = torch.autograd.functional.jacobian(lambda point: exact(loud, BEAD, point, drive)[0], place)[:, 0]
+    up = force[2].item() / BEAD.weight
+    assert up > 0.999 * score > 1
+    force, stiffness = force / up, -(slope + slope.T) / 2 / up
+    for angle in torch.linspace(0, torch.pi, 9).double():
+        across = torch.stack([angle.cos(), angle.sin(), 0 * angle])
+        assert (force @ across).abs() < 1.1 * lift.displacement * (across @ stiffness @ across)
+    assert BEAD.weight / stiffness[2, 2] < 1.1 * lift.reach * up / score  # between `directions`
