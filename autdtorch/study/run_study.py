@@ -331,7 +331,10 @@ def _run_scene(
     progress.advance(1)
     results = {}
     for (method_name, (solution, seconds)), pressure in zip(solutions.items(), planes, strict=True):
-        metrics = focus_metrics(solution.pressure, None if pressure is None else pressure.abs(), cell_area)
+        metrics = focus_metrics(solution.pressure)
+        if pressure is not None:  # of the first scene, where there are several
+            foci = solution.pressure[:, : len(scene.control_points)]
+            metrics = replace(metrics, area=focus_metrics(foci, pressure.abs(), cell_area).area)
         shown = median_trial(solution.score)
         shown_plane = None if pressure is None else pressure[shown].clone()
         results[method_name] = MethodResult(solution, metrics, seconds, shown, shown_plane)

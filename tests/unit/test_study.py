@@ -279,6 +279,8 @@ def test_scenarios_stand_for_each_scene(tmp_path):
         assert method.solution.pressure.shape == (1, 3 * points)
         assert every.scores(method.solution.drive).amin() == pytest.approx(float(method.solution.score))
         assert method.solution.score <= result.bound
+        foci = at.focus_metrics(method.solution.pressure[:, :points], method.plane_pressure[None].abs(), 4e-6)
+        assert method.metrics.area.item() == pytest.approx(foci.area.item())  # of the scene itself
     again = study(scenarios=around).scenes["a"]  # read from the folder
     assert torch.equal(again.methods["gabs"].solution.drive, result.methods["gabs"].solution.drive)
     for wrong, message in (({"counts": 3}, "counts"), ({"count": 0}, "count: 0"), ({"by": "best"}, "by")):
