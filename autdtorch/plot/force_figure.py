@@ -56,8 +56,9 @@ def plot_force(
     typical = float(np.median(size[size > 0])) if size.any() else 1.0
     shown = along * (_ARROW * apart / typical)
     shown /= np.maximum(np.linalg.norm(shown, axis=1) / (_LONGEST * apart), 1)[:, None]
+    drawn = size > 0  # Matplotlib would mark the others by dots
     figure.axes[0].quiver(
-        *(MM * starts).T, *shown.T, angles="xy", scale_units="xy", scale=1, color="white", pivot="mid",
-        width=0.006, path_effects=[withStroke(linewidth=1.6, foreground="black")],
+        *(MM * starts[drawn]).T, *shown[drawn].T, angles="xy", scale_units="xy", scale=1, color="white",
+        pivot="mid", width=0.006, path_effects=[withStroke(linewidth=1.6, foreground="black")],
     )  # fmt: skip
     return figure

@@ -14,6 +14,7 @@ from matplotlib.collections import LineCollection, QuadMesh
 from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
+from matplotlib.quiver import Quiver
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from small_scenes import AIR, scene_of_all_kinds, small_scene
 
@@ -462,3 +463,12 @@ def test_maps_of_several_methods_share_the_reflectors() -> None:
     plane = at.Plane((0, 0, 5e-3), (0, -1, 0), (30e-3, 40e-3))
     figure = at.plot_planes({"a": np.ones((6, 8))}, plane, reflectors=scene.reflectors)
     assert len(figure.axes[0].lines) == 2
+
+
+def test_no_arrow_is_drawn_where_there_is_no_force() -> None:
+    plane = at.Plane(center=(0, 0, 0), normal=(0, 0, 1), size=(4e-3, 4e-3))
+    force = torch.zeros(4, 4, 3)
+    for count in range(3):
+        (arrows,) = at.plot_force(force, torch.ones(8, 8), plane).axes[0].findobj(Quiver)
+        assert len(arrows.get_offsets()) == arrows.N == count
+        force[count, 0, 0] = 1e-6
