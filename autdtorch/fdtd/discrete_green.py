@@ -3,7 +3,7 @@
 It solves sum_j g_j (u_j - u) + L u = -4 pi L' / (2 k h) at the cell of the source, and 0 at all others, with
 the stencil's symbol L and its slope L' at k h (`stencil.py`). At one and two cells it differs from e^{ikr} /
 r by 1 %; from five cells on, only by the dispersion of the grid. So a cube of cells suffices. At its faces
-u - e^{ikh} u_before is that of the exact field, which leaves no resonance. By symmetry, the cells
+u - e^{ikh} u_before is taken from the exact field, which leaves no resonance. By symmetry, the cells
 x >= y >= z >= 0 are the unknowns.
 """
 
@@ -23,7 +23,7 @@ _REACH = 12
 """Cells from the source to the faces of the cube. With 18, the field at 8 cells changes by less than 1e-4
 from 6 cells per wavelength on."""
 
-_BESIDE = 7  # Cells around those of a source where its field is that of the grid, 9 from a point at least
+_BESIDE = 7  # Cells around a source, 9 from a point at least, where the grid gives its field
 
 
 @lru_cache(maxsize=64)

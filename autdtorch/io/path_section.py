@@ -31,7 +31,7 @@ def path_points(where: str, section: Mapping[str, Any], scene: Scene, rate: floa
         section: `type`, `frequency` [Hz] of laps, and the settings of the type. Without a place the path is
             around the middle of the control points, across the direction of the first transducer.
         scene: the scene.
-        rate: points per second [Hz]; the frequency becomes that of the nearest whole number of points a lap.
+        rate: points per second [Hz]; the frequency is rounded to a whole number of points a lap.
 
     Returns:
         Points (T, 3) [m].

@@ -51,7 +51,7 @@ def attainable(
     Args:
         objective: with a transfer matrix, such as a `ForceObjective` of a trap.
         least: the score.
-        goal: with a bound; that of the objective in place of the default, where it has one.
+        goal: with a bound; the default gives way to a goal of the objective.
         seed: of the drives that ascents start from, >= 0.
 
     Raises:

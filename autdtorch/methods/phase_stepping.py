@@ -129,7 +129,7 @@ def _area(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
 def _matrix(drives: torch.Tensor, pressure: torch.Tensor) -> torch.Tensor:
     """Return the matrix (P, M) that explains magnitudes (N, P) of a reference and its steps (N, M).
 
-    A step d_j of a transducer, which adds b to the pressure a of the reference, changes the intensity by
+    A transducer adds b to the pressure a of the reference. Its step d_j changes the intensity by
     2 Re(d_j x) + t |d_j|^2, with x = a^* b and t = |b|^2. Two steps give x = x_0 - t x_1, and t follows from
     t a^2 = |x|^2. Of its two roots, the smaller one belongs to the transducer; the other one would exchange
     it with the rest of the reference.

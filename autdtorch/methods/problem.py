@@ -106,8 +106,8 @@ class Problem:
 
         Args:
             objective: simulated or measured.
-            goal: function of pressures (..., P) [Pa] that gives the scores (...) to maximise; that of the
-                objective in place of the default, where it has one.
+            goal: function of pressures (..., P) [Pa] that gives the scores (...) to maximise; the
+                default gives way to a goal of the objective.
             start: drive (M,) or (T, M) to start from, if any.
             readings: earlier ones, if any.
         """

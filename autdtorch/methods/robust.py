@@ -27,7 +27,7 @@ class RobustDrive:
         nominal: its score without shift [Pa].
         certificate: its proven least score in the ball, and its worst places.
         bound: no drive has a higher score at all places in the ball [Pa].
-        scenarios: the places that it was made for; the first is that of the scene.
+        scenarios: the places that it was made for; the first is the scene's.
     """
 
     drive: torch.Tensor

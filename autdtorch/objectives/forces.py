@@ -119,7 +119,7 @@ class LeastForm(Goal):
 
 
 class ForceGoal(Protocol):
-    """What a `ForceObjective` maximises: `Trap`, `Levitate` or `Push`."""
+    """A goal of a `ForceObjective`: `Trap`, `Levitate` or `Push`."""
 
     name: ClassVar[str]
     unit: ClassVar[str]
@@ -221,9 +221,9 @@ class Trap(_ParticleGoal):
 class Levitate(_ParticleGoal):
     """The lift of a small sphere in traps, in weights of it: 1 holds it, more is the margin.
 
-    The score is the least of the upward force over the weight and, over directions, of the restoring force at
-    `reach` over the weight, from which the sideways force times reach / displacement is subtracted. With a
-    score of s >= 1 and an upward force of l >= s weights, the drive times l^(-1/2) holds the sphere within
+    The score is the least of two forces over the weight: the upward one, and over directions the restoring
+    one at `reach`. From the latter, the sideways force times reach / displacement is subtracted. With a score
+    of s >= 1 and an upward force of l >= s weights, the drive times l^(-1/2) holds the sphere within
     `displacement` of the point across gravity, and within l / s of `reach` along it if its weight doubles.
     Forces are those of `Trap`.
 

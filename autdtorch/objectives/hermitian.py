@@ -1,7 +1,7 @@
 """Hermitian forms of the drive, such as forces and stiffnesses: certified bounds, and drives near them.
 
 J forms share N rows of a matrix R (N, M) with weights W (J, N) of either sign: q^H A_j q = sum_n W_jn |(R
-q)_n|^2. For any a >= 0 with sum a_j = 1 and any z > 0, all drives |q_i| <= 1 satisfy
+q)_n|^2. Take any a >= 0 with sum a_j = 1, and any z > 0. All drives |q_i| <= 1 satisfy
 
     min_j q^H A_j q <= q^H (sum a_j A_j) q <= lambda |z|^2,
 

@@ -93,8 +93,8 @@ class OverScenes(Goal):
     def bound(self, G: ArrayLike) -> float:
         """Return a bound for the matrix (S P, M) of all scenes; see `Goal.bound`.
 
-        A mean or quantile of scores is at most that of the scenes' bounds. The worst has the bound of the
-        goal on all scenes together.
+        A mean or quantile of scores is at most the mean or quantile of the scenes' bounds. The worst has the
+        bound of the goal on all scenes together.
         """
         if not isinstance(self.goal, Goal):
             return math.inf

@@ -23,13 +23,13 @@ MATERIALS = {
 class Particle:
     """A sphere that is small against the wavelength.
 
-    In air the force hardly depends on the material: of all beads and drops the density is far above that
-    of air. The weight does.
+    In air the force hardly depends on the material, as all beads and drops are far denser than air. The
+    weight does.
 
     Attributes:
         radius: [m].
         density: [kg/m^3].
-        sound_speed: [m/s]; of a solid, that of its bulk modulus K, (K / density)^(1/2).
+        sound_speed: [m/s]; of a solid with the bulk modulus K, (K / density)^(1/2).
     """
 
     radius: float

@@ -174,7 +174,7 @@ def silenced(sequence: Sequence, phase_time: float = 1e-3, amplitude_time: float
     """Return a sequence as a device plays it that changes phases and amplitudes evenly over some time.
 
     AUTD3 does so by default, by its silencer of fixed completion time. A phase turns the shorter way, from
-    the moment at which its frame begins; a time above that of a frame is shortened to it. Each frame becomes
+    the moment at which its frame begins; a longer time than a frame's is shortened to it. Each frame becomes
     ten, each for the middle of its time.
 
     Args:

@@ -1,7 +1,7 @@
 """Holography on CPUs, in numba: the algorithms of `algorithms.py`, for blocks of sets at once.
 
 A block packs the matrices of several sets entry by entry, one set a lane, so that every operation is one on
-vectors, and its matrices stay in the cache through all iterations. Each iteration reads them once, a few
+vectors. Its matrices stay in the cache through all iterations. Each iteration reads them once, a few
 transducers at a time. Arrays are flat with unsigned indices, real and imaginary parts apart. The order of all
 sums is fixed.
 """

@@ -6,8 +6,8 @@ A transducer whose phase jumps is silent for a moment, which is audible (Suzuki,
 With the pressures p_t = G_t q_t and weights w of the foci, the sum of w |p| over all frames rises in turns:
 
 - c_t = G_t^H (w * sgn(p_t)), as in "wgs"; the sum of Re(c_t^H q_t) is a lower bound of the sum of w |p|;
-- each phase moves as near to that of c_t as the limits to the frame before *and* the frame after allow: the
-  even frames first, then the odd ones. No step lowers the bound.
+- each phase moves as near to the phase of c_t as the limits to the frame before *and* the frame after allow:
+  the even frames first, then the odd ones. No step lowers the bound.
 
 Weights grow where a focus is weak. The phases of the foci decide how smooth the drives are. Each focus begins
 with phases that keep its back-propagated drive most alike from frame to frame; the difference after a closed

@@ -1,8 +1,8 @@
 """The radiation force and torque on bodies with known T-matrices.
 
 Let d be the coefficients of the regular waves that come in on a body and b = T d those of its outgoing waves.
-Far away, both are waves towards the body, d / 2, and away from it, d / 2 + b. The force is the momentum that
-the former bring less what the latter take away,
+Far away, both are waves towards the body, d / 2, and away from it, d / 2 + b. The former bring momentum, the
+latter take some away; the force is the difference.
 
     F = -1 / (2 rho w^2) Re (d + b)^H P b,   P = -i grad / k,
 
@@ -75,7 +75,7 @@ def radiation_torque(
 ) -> torch.Tensor:
     """Return the mean radiation torque (..., 3) [N m] on a body about its centre; see `radiation_force`.
 
-    The centre is that of its circumscribed sphere, `TMatrix.center`. About another point, add the
+    The centre is its circumscribed sphere's, `TMatrix.center`. About another point, add the
     cross product of the centre's offset from it and the force.
     """
     return _Driven.of(bodies, body, array, medium).sums(angular_momentum, drive)
