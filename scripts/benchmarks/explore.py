@@ -11,18 +11,19 @@ import itertools
 import shutil
 import statistics
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import psutil
 from playwright.sync_api import sync_playwright
-from shared.document import Page, table
+from shared.document import DOCS, table
 from shared.scenes import paper_scene
 
 import autdtorch as at
 
-DOCUMENT = "explore.md"
 OPTIONS = {
     "--moves": {"type": int, "default": 25, "help": "moves that are timed, dragged and let go"},
+    "--picture": {"type": Path, "default": DOCS / "explore.png", "help": "of the page"},
     "--more": {"type": int, "default": 500, "help": "moves while memory is watched"},
 }
 
@@ -59,8 +60,8 @@ _MOVE = """([name, value, letGo]) => new Promise((resolve, reject) => {
 })"""
 
 
-def main(page: Page, moves: int, more: int) -> None:
-    """Measure and write the block."""
+def main(picture: Path, moves: int, more: int) -> None:
+    """Take the picture of the page, and print times and memory."""
     program = shutil.which("chromium") or shutil.which("google-chrome")
     rows, megabytes = [], []
     with sync_playwright() as playwright:
@@ -72,7 +73,7 @@ def main(page: Page, moves: int, more: int) -> None:
             tab.goto(explorer.address)
             tab.wait_for_selector("section.picture[aria-busy=false]")
             tab.get_by_text("Estimated error").wait_for()
-            tab.screenshot(path=page.folder / "explore.png")
+            tab.screenshot(path=picture)
             place = places(1e3 * explorer.scene.obstacles[0].center[1])
             times(tab, place, 3)  # what is done once
             rows += [[label, kind, *row_of(spent)] for kind, spent in times(tab, place, moves).items()]
@@ -81,13 +82,12 @@ def main(page: Page, moves: int, more: int) -> None:
             tab.close()
             explorer.close()
         browser.close()
-    parts = [
+    parts = (
         f"From a slider's move to the frame with the new field, {moves} moves each:",
         table(("scene", "the slider is", "median", "95 % within"), rows),
         f"Memory of the process: {megabytes[0]:.0f} MB before {more} more moves of a cube, after every "
         f"{_SOME} {min(megabytes[1:]):.0f} to {max(megabytes[1:]):.0f} MB, {megabytes[-1]:.0f} MB at last.",
-    ]
-    page.write(*parts)
+    )
     print("\n\n".join(parts))
 
 
