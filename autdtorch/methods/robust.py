@@ -13,6 +13,7 @@ from autdtorch.objectives.goals import WEAKEST_FOCUS, WeakestFocus
 from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.objectives.pose_ball import Certificate, PoseBall
 from autdtorch.objectives.scenarios import Scenarios
+from autdtorch.utils.text import counted
 from autdtorch.utils.validation import integer_at_least, require_kind
 
 _CLOSE = 5e-3  # relative distance of the worst place in the ball to the score of the scenarios, at the end
@@ -38,9 +39,9 @@ class RobustDrive:
 
     def __repr__(self) -> str:
         """Return the pressures."""
-        least, places = self.certificate.least, len(self.scenarios)
+        least, places = self.certificate.least, counted(len(self.scenarios), "place")
         pressures = f"at least {least:.4g} of at most {self.bound:.4g} Pa, nominal {self.nominal:.4g} Pa"
-        return f"RobustDrive({pressures}, {places} places)"
+        return f"RobustDrive({pressures}, {places})"
 
 
 def robust_drive(
