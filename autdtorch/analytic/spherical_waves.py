@@ -240,7 +240,7 @@ def regular_radial(degree: int, x: torch.Tensor) -> torch.Tensor:
 
 def sphere_coefficients(
     degree: int,
-    size: float,
+    size: complex,
     density_ratio: complex = math.inf,
     speed_ratio: complex = 1.0,
     impedance: complex | None = None,
@@ -249,10 +249,10 @@ def sphere_coefficients(
 
     Args:
         degree: L.
-        size: k a, real.
+        size: k a, complex in a medium that absorbs.
         density_ratio: density ratio, sphere over medium; infinite if rigid.
-        speed_ratio: ratio of sound speeds, sphere over medium.
-        impedance: of the surface, as a ratio to the medium, in place of both ratios.
+        speed_ratio: ratio of sound speeds, sphere over medium: k over the wavenumber inside.
+        impedance: of the surface, as a ratio to w density / k of the medium, in place of both ratios.
     """
     order = np.arange(degree + 1)
     regular, slope = spherical_jn(order, size), spherical_jn(order, size, derivative=True)

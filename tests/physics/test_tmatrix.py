@@ -316,6 +316,21 @@ def test_coefficients_of_spheres_that_absorb_are_passive(size, density, dense, s
         assert (np.abs(1 + 2 * coefficients) < 1 + 1e-9).all()  # rounding at resonances
 
 
+@given(st.floats(0.01, 20), st.floats(0.1, 60), st.floats(0.05, 20))
+def test_a_sphere_in_air_that_absorbs_needs_no_simulation(size, absorption, impedance):
+    """One of this air scatters nothing; where waves inside are short and die out, it has an impedance."""
+    air = at.Medium(1.2, 343.0, absorption)
+    radius = size * 343.0 / (2 * math.pi * FREQUENCY)
+    same = at.Sphere((0, 0, 0), radius, density=1.2, sound_speed=343.0, absorption=absorption)
+    assert at.TMatrix.of(same, air, FREQUENCY).matrix.norm() < 1e-9  # rounding, as a resonance may amplify it
+    speed = 343.0 / (2000 * (1 + 0.5j)) / max(1, 1 / size)  # at least 2000 rad of phase along a radius
+    slower = 1 + 1j * absorption / 8.685889638 * 343.0 / (2 * math.pi * FREQUENCY)
+    ratios = impedance / (speed / 343.0), speed / 343.0 * slower
+    fluid = sphere_coefficients(6, size * slower, *ratios)
+    surface = sphere_coefficients(6, size * slower, impedance=impedance * slower)
+    assert np.abs(fluid - surface).max() < 0.01  # the curvature, of 1 / 2000, times slopes up to 7 / size
+
+
 SPHERES = (
     at.Sphere(center=(30e-3, 8e-3, -1e-3), radius=6e-3, rigid=True),
     at.Sphere(center=(33e-3, -6e-3, 2e-3), radius=5e-3, rigid=True),

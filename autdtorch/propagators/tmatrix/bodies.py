@@ -10,7 +10,6 @@ import numpy as np
 import torch
 
 from autdtorch.analytic.spherical_waves import enough_degrees
-from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle, Sphere
 from autdtorch.scene.obstacles.moving import circumscribed
 from autdtorch.scene.reflectors import Reflector
@@ -47,9 +46,9 @@ def bodies_of(obstacles: Sequence[Obstacle]) -> list[ObstacleGroup]:
     return sorted(bodies, key=lambda body: body.numbers)
 
 
-def has_closed_form(obstacles: Sequence[Obstacle], medium: Medium) -> bool:
-    """Return whether T of a body has a closed form: a sphere, in a medium without losses."""
-    return len(obstacles) == 1 and type(obstacles[0]) is Sphere and medium.absorption == 0
+def has_closed_form(obstacles: Sequence[Obstacle]) -> bool:
+    """Return whether T of a body has a closed form: a sphere."""
+    return len(obstacles) == 1 and type(obstacles[0]) is Sphere
 
 
 def waves_to_simulate(scene: Scene, error: float, most: int | None = None) -> int | None:
@@ -64,7 +63,7 @@ def waves_to_simulate(scene: Scene, error: float, most: int | None = None) -> in
 
     obstacles = scene.obstacles
     if most is not None:  # without circumscribed spheres, which take time
-        unknown = [obstacle for obstacle in obstacles if not has_closed_form([obstacle], scene.medium)]
+        unknown = [obstacle for obstacle in obstacles if not has_closed_form([obstacle])]
         if any(waves(max(np.subtract(one.upper, one.lower)) / 2) > most for one in unknown):
             return None
     bodies = bodies_of(obstacles)
@@ -73,7 +72,7 @@ def waves_to_simulate(scene: Scene, error: float, most: int | None = None) -> in
             return None
         accepted = f"needs the spheres around obstacles to be in front of reflector {crossed[0]}; take box"
         raise invalid("method", "tmatrix", accepted)
-    unknown_bodies = [body for body in bodies if not has_closed_form(body.obstacles, scene.medium)]
+    unknown_bodies = [body for body in bodies if not has_closed_form(body.obstacles)]
     simulated = sum(waves(body.radius) for body in unknown_bodies)
     if most is None:
         return simulated

@@ -117,7 +117,7 @@ class Placed(NamedTuple):
     def runs(self) -> int:
         """Number of simulations that T takes where it is not there."""
         body = self.body
-        return 0 if has_closed_form(body.obstacles, body.medium) else len(body.waves.runs)
+        return 0 if has_closed_form(body.obstacles) else len(body.waves.runs)
 
     def matrix(self, store: Store) -> BodyMatrix:
         """Return T and its place, from memory or the store's folder if it is there."""
@@ -125,7 +125,7 @@ class Placed(NamedTuple):
         center, radius = body.sphere
         count = (body.degree + 1) ** 2
         require_memory("obstacles", f"{count} waves", _ENTRY_BYTES * count**2)
-        if has_closed_form(body.obstacles, body.medium):
+        if has_closed_form(body.obstacles):
             matrix, axes = _of_sphere(body.obstacles[0], scene, body.degree), torch.eye(3, **REAL)
         else:
             settings = tuple(str(entry) if isinstance(entry, torch.dtype) else entry for entry in body.solver)
@@ -154,11 +154,16 @@ def placed(
 
 def _of_sphere(sphere: Obstacle, scene: Scene, degree: int) -> torch.Tensor:
     assert isinstance(sphere, Sphere)
-    ratios: tuple[complex, complex] = math.inf, 1.0
+    wavenumber = scene.complex_wavenumber if scene.attenuation else scene.wavenumber
+    slower = wavenumber / scene.wavenumber  # ratios are those to a medium of this wavenumber
+    density: complex = math.inf
+    speed: complex = 1.0
     if (material := sphere.fluid_at(scene.frequency)) is not None:
-        ratios = material[0] / scene.medium.density, material[1] / scene.medium.sound_speed
-    size = scene.wavenumber * sphere.radius
-    each = torch.from_numpy(sphere_coefficients(degree, size, *ratios, sphere.impedance))
+        density, speed = material[0] / scene.medium.density, material[1] / scene.medium.sound_speed * slower
+    impedance = None if sphere.impedance is None else sphere.impedance * slower
+    each = torch.from_numpy(
+        sphere_coefficients(degree, wavenumber * sphere.radius, density, speed, impedance)
+    )
     return torch.diag(each[degrees(degree)])
 
 

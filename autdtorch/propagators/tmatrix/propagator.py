@@ -240,7 +240,7 @@ def placed_bodies(plan: Plan) -> list[Placed]:
     bodies, settings = bodies_of(scene.obstacles), (scene.medium, scene.frequency, solver)
     degrees = [
         _degrees_between(body, bodies, scene.images, error)
-        if has_closed_form(body.obstacles, scene.medium)  # others would take more runs
+        if has_closed_form(body.obstacles)  # others would take more runs
         else 0
         for body in bodies
     ]

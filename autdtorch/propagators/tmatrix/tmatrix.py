@@ -90,7 +90,7 @@ class TMatrix:
         device: torch.device | str | None = None,
         cache: str | os.PathLike[str] | Literal[False] | None = None,
     ) -> TMatrix:
-        """Simulate the T-matrix of obstacles; for a single sphere in air without absorption it is exact.
+        """Simulate the T-matrix of obstacles; for a single sphere it is exact.
 
         A body of few cells is coarse: a bead in air that absorbs needs a `spacing` far below its radius.
 
