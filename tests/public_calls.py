@@ -61,8 +61,8 @@ lock_log open_autd3 uvc_frames
 #: Methods that the driver calls, and that authors of methods implement.
 INSIDE_METHODS = """
 advance at begin by_poses by_waves check checked climbed coarser farthest for_scene forms forward
-images_around levels most_at_once most_evaluations near numbers_kept recorded require_fit section slope
-together_on wanted write_file
+images_around joined levels most_at_once most_evaluations near numbers_kept recorded require_fit section slope
+together_on wanted worst_bound write_file
 """
 
 
@@ -350,7 +350,17 @@ ARGUMENTS: dict[str, Any] = {
 OTHERS: dict[str, Any] = {
     "FailedTransducers.transducers": [1],
     "ForceObjective.goal": at.Trap([(22e-3, 7e-3, 14e-3)], BEAD),
+    "OverScenes.scenes": 1,
+    "PoseBall.propagator": Made(lambda _: at.make_propagator(BALL, "tmatrix")),
+    "PoseBall.radius": 1e-4,
     "Push.direction": (0.0, 0.0, 1.0),
+    "Scenarios.around.failed": 1,
+    "Scenarios.around.offset": 1e-4,
+    "Scenarios.around.rotation": 0.0,
+    "Scenarios.around.propagator": Made(lambda _: at.make_propagator(BALL, "tmatrix")),
+    "Scenarios.objectives": Made(lambda _: [objective()]),
+    "robust_drive.ball": Made(lambda _: at.PoseBall(at.make_propagator(BALL, "tmatrix"), 1e-4)),
+    "robust_drive.method": Made(lambda _: made("GABS")),
     "Particle.radius": 3e-4,
     "Particle.of.radius": 3e-4,
     "Drift.sensor": 0.1,

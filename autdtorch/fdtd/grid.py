@@ -164,7 +164,7 @@ def bodies_extent(region: Region) -> Extent:
     """Return the extent of the region's bodies and the air around them in a box."""
     lower, upper = bounds(region.shapes)
     thinner = _THINNER if (upper - lower).max() <= _SMALL_BODIES * region.wavelength else 0
-    path = path_between(region.shapes) + region.wavelength
+    path = round(path_between(region.shapes) + region.wavelength, 6)  # alike wherever the bodies are
     return Extent(lower.tolist(), upper.tolist(), AROUND, thinner, path)
 
 

@@ -8,7 +8,7 @@ import torch
 
 from autdtorch.methods.base import Method
 from autdtorch.methods.gradient import GradientAscent
-from autdtorch.methods.run import run
+from autdtorch.methods.run import require_method, run
 from autdtorch.objectives.goals import WEAKEST_FOCUS, WeakestFocus
 from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.objectives.pose_ball import Certificate, PoseBall
@@ -67,7 +67,9 @@ def robust_drive(
         ValueError: as `PoseBall.certificate`.
     """
     require_kind("ball", ball, PoseBall)
-    method, rounds = method or GradientAscent(), integer_at_least("rounds", rounds, 1)
+    method = GradientAscent() if method is None else method
+    require_method(method)
+    rounds, seed = integer_at_least("rounds", rounds, 1), integer_at_least("seed", seed, 0)
     scene, offsets = ball.propagator.scene, torch.zeros(1, 3, dtype=torch.float64)
     best: RobustDrive | None = None
     start: torch.Tensor | None = None

@@ -87,7 +87,7 @@ def run(
             another method, problem, seed or other trials.
         OSError: the state file cannot be read or written.
     """
-    _require_method(method)
+    require_method(method)
     require_callable("goal", goal)
     if stop is not None:
         require_callable("stop", stop)
@@ -111,7 +111,7 @@ def run(
     return solutions
 
 
-def _require_method(method: object) -> None:
+def require_method(method: object) -> None:
     """Refuse what is no method: a name, a class that is not called, or a function that runs one."""
     if isinstance(method, Method):
         return

@@ -103,7 +103,8 @@ class OverScenes(Goal):
         matrices = matrix.reshape(self.scenes, -1, matrix.shape[1])
         if self.by == "worst":
             return self.goal.worst_bound(matrices)
-        return float(self.joined(torch.tensor([self.goal.bound(each) for each in matrices])))
+        bounds = torch.from_numpy(np.array([self.goal.bound(each) for each in matrices]))
+        return float(self.joined(bounds))
 
     def wanted(self, points: int) -> Array:
         """Return the pressures (S P,) wanted: those of the goal in each scene."""
@@ -124,7 +125,7 @@ class OverScenes(Goal):
         return 1 if isinstance(self.by, str) else max(1, math.ceil(self.by * self.scenes * (1 - _ROUNDING)))
 
     def _apart(self, pressure: torch.Tensor) -> torch.Tensor:
-        return pressure.reshape(*pressure.shape[:-1], self.scenes, -1)
+        return pressure.reshape(*pressure.shape[:-1], self.scenes, pressure.shape[-1] // self.scenes)
 
 
 _TINY = 1e-300

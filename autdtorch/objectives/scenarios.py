@@ -26,8 +26,10 @@ from autdtorch.utils.validation import (
     ArrayLike,
     integer_at_least,
     invalid,
+    members,
     not_negative,
     real_tensor,
+    require_kind,
     within,
 )
 
@@ -67,7 +69,7 @@ class Scenarios:
             ValueError: no objective, other numbers of transducers or points, other goals of force, or another
                 `by`.
         """
-        self.objectives = tuple(objectives)
+        self.objectives: tuple[Objective, ...] = members("objectives", objectives, Objective)
         if not self.objectives:
             raise invalid("objectives", self.objectives, "must have at least one")
         for number, each in enumerate(self.objectives):
@@ -124,8 +126,10 @@ class Scenarios:
         Raises:
             ValueError: an argument out of range, or a change that the scene cannot make.
         """
+        from autdtorch.propagators import Propagator
         from autdtorch.propagators.scene_changes import SceneChanges
 
+        require_kind("propagator", propagator, Propagator)
         count, scene = integer_at_least("count", count, 1), propagator.scene
         transducers, names, ranges = len(scene.array), list[str](), []
         for name, value, unit, changes in (

@@ -57,8 +57,9 @@ def test_every_method_builds_with_known_settings():
 
 
 def test_every_goal_has_a_config_of_its_name_with_all_its_settings():
-    assert sorted(GOALS) == CONFIG_NAMES["goal"]
-    for name, goal in GOALS.items():
+    assert sorted({*GOALS} - {"over_scenes"}) == CONFIG_NAMES["goal"]  # that of scenarios, around a goal
+    for name in CONFIG_NAMES["goal"]:
+        goal = GOALS[name]
         section = composed(f"goal={name}")["goal"]
         assert section["name"] == name
         assert list(section)[1:] == [field.name for field in dataclasses.fields(goal)]

@@ -21,7 +21,8 @@ def test_an_algorithm_brings_four_transducers_into_phase_within_its_budget(make_
     losses = Losses(objective, at.WeakestFocus(), 160)
     with torch.random.fork_rng():
         drive = answer(ALGORITHMS[name], losses, seed=1, noisy=False)
-    assert 100 < objective.evaluations <= 160  # whole populations; TuRBO ends with a small region
+    fewest = 40 if name == "TuRBO" else 100  # whole populations; TuRBO ends with a small region
+    assert fewest < objective.evaluations <= 160
     assert objective(drive).item() > 3.6  # of 4 in phase; random phases have an rms of 2
 
 

@@ -117,7 +117,7 @@ def test_a_robust_drive_holds_where_the_nominal_one_does_not(ball):
 
 
 def test_spheres_whose_waves_do_not_converge_have_no_certificate(balls):
-    nearly_touching = tuple(at.Sphere((x, 0, 40e-3), 8e-3, rigid=True) for x in (-8.05e-3, 8.05e-3))
+    nearly_touching = tuple(at.Sphere((x, 0, 40e-3), 8e-3, rigid=True) for x in (-8.005e-3, 8.005e-3))
     near = at.make_propagator(replace(balls.scene, obstacles=nearly_touching), "tmatrix", tolerance=1e-4)
     with pytest.raises(ValueError, match=r"propagator: .*waves that converge"):
         at.PoseBall(near, RADIUS).certificate(torch.ones(9) + 0j)

@@ -49,6 +49,11 @@ EXPECTED = {
         for call in ("Scene.moved", "NearbyPoses.transfer_matrix")
         for kind in ("of 8 bits", "of unsigned integers", "with gradient")
     ),
+    *(
+        ("Scenarios.around", name, kind)  # metres, and turns of a sphere
+        for name in ("offset", "rotation")
+        for kind in ("1.5", "a tensor of 8 bits", "a tensor of unsigned integers", "a tensor with gradient")
+    ),
 }
 
 #: Kinds of annotations that let a kind of value in.
