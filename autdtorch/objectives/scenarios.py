@@ -222,7 +222,7 @@ def _matrix(objective: Objective) -> torch.Tensor | None:
     matrix = simulated_matrix(objective)
     while matrix is not None and isinstance(objective, Perturbation):
         if isinstance(objective, FailedTransducers):
-            matrix = objective.emitted(torch.ones(matrix.shape[1], dtype=matrix.dtype)) * matrix
+            matrix = objective.emitted(torch.ones_like(matrix[0])) * matrix
         objective = objective.inner
     return matrix
 
