@@ -13,6 +13,7 @@ from autdtorch.objectives.goals import WEAKEST_FOCUS, WeakestFocus
 from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.objectives.pose_ball import Certificate, PoseBall
 from autdtorch.objectives.scenarios import Scenarios
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import integer_at_least, require_kind
 
@@ -70,7 +71,7 @@ def robust_drive(
     method = GradientAscent() if method is None else method
     require_method(method)
     rounds, seed = integer_at_least("rounds", rounds, 1), integer_at_least("seed", seed, 0)
-    scene, offsets = ball.propagator.scene, torch.zeros(1, 3, dtype=torch.float64)
+    scene, offsets = ball.propagator.scene, torch.zeros(1, 3, **REAL)
     best: RobustDrive | None = None
     start: torch.Tensor | None = None
     for number in range(rounds):
