@@ -61,12 +61,10 @@ def main(page: Page, methods: list[str], seeds: int, bo_seeds: int, logs: Path, 
         )
     strengths = ", ".join(f"{strength:g} ({scene})" for scene, strength in STRENGTHS.items())
     page.write(
-        table(
-            ["method", "scene", "seeds", "microphones [kPa]", "camera [kPa]", "camera over microphones"], rows
-        ),
-        "The true weakest focus by the drive that a method chose: medians (quartiles) of seeds, which are "
-        "random choices of the method and noise of the camera. The microphones at the foci have no noise. "
-        f"Source strengths are {strengths} Pa m, and the screen is {1e3 * SIDE:g} mm wide.",
+        table(["method", "scene", "seeds", "camera [kPa]", "camera over microphones"], rows),
+        "The true weakest focus by the drive that a method chose: medians (quartiles) of seeds, for the "
+        "method's random choices and the camera's noise. Microphones at the foci have no noise. Source "
+        f"strengths are {strengths} Pa m, and the screen is {1e3 * SIDE:g} mm wide.",
     )
 
 
@@ -77,8 +75,8 @@ def blocks_of(seeds: int) -> list[range]:
 
 def summary(pressure: torch.Tensor) -> list[str]:
     """Return the cells of a row for pressures (2, T) [Pa] by microphones and by camera."""
-    medians = [f"{float(each.quantile(0.5)):.3f}" for each in 1e-3 * pressure]
-    return [str(pressure.shape[1]), *medians, quartiles(pressure[1] / pressure[0])]
+    median = f"{1e-3 * float(pressure[1].quantile(0.5)):.3f}"
+    return [str(pressure.shape[1]), median, quartiles(pressure[1] / pressure[0])]
 
 
 def weakest_foci(method: str, scene: str, trials: range, logs: Path) -> torch.Tensor:

@@ -19,11 +19,8 @@ DOCUMENT = "methods.md"
 SCENE = "two_cubes"
 
 METHODS: dict[str, Callable[..., at.Solution]] = {
-    "random search": partial(at.random_search, evaluations=1000),
     "LSSG, 5 passes": lambda objective, trials: at.lssg(objective, passes=5),
-    "GABS, 4 levels": partial(at.gabs, levels=4),
     "GABS, 16 levels": at.gabs,
-    "BO": at.bayes_opt,
     "BO per focus": partial(
         at.bayes_opt, evaluations=600, initial=4, model="foci", kernel="phasor", noise="inferred"
     ),
