@@ -15,7 +15,7 @@ from autdtorch.scene.arrays import TransducerArray, apertures_of, complex_streng
 from autdtorch.scene.scene import Scene, require_clear, require_in_front
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.images import NO_MIRRORS, Image
-from autdtorch.utils.process import require_memory
+from autdtorch.utils.process import one_library_thread, require_memory
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import ArrayLike, differentiable_points, require_kind
 
@@ -94,7 +94,9 @@ class FreeSpacePropagator(ScenePropagator):
         return matrix, math.inf if scene.obstacles else 0.0
 
     def _field(self, drive: torch.Tensor, points: torch.Tensor, is_picture: bool) -> torch.Tensor:
-        return drive @ self._matrix(points, with_error=False)[0].mT
+        matrix, _ = self._matrix(points, with_error=False)
+        with one_library_thread():  # BLAS rounds by the number of threads
+            return drive @ matrix.mT
 
     def _absorbed(self, drive: torch.Tensor) -> AbsorbedPower:
         power = power_into_reflectors(self.scene, [radiators_of_array(self.scene, drive)], len(drive))
