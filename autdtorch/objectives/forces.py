@@ -179,12 +179,18 @@ def _eigenrows(particle: Particle, scene: Scene) -> tuple[torch.Tensor, Array, A
     scale = 1 / (2 * medium.density * scene.angular_frequency**2)
     maps, kinds, signs = [], [], []
     for kind, form in enumerate(force_forms(ratios, k, scale)):
-        values, vectors = torch.linalg.eigh(form)
-        some = values.abs() > _LEAST * values.abs().max()
-        maps.append(vectors[:, some].conj() * values[some].abs().sqrt())
-        kinds += [kind] * int(some.sum())
-        signs.append(values[some].sign().numpy())
+        rows, sign = _squares(form)
+        maps.append(rows.mT)
+        kinds += [kind] * len(rows)
+        signs.append(sign)
     return torch.cat(maps, dim=1), np.array(kinds), np.concatenate(signs)
+
+
+def _squares(form: torch.Tensor) -> tuple[torch.Tensor, Array]:
+    """Return rows (R, N) and signs (R,) of a Hermitian form: x^H A x is the sum of sign |row x|^2."""
+    values, vectors = torch.linalg.eigh(form)
+    some = values.abs() > _LEAST * values.abs().max()
+    return (vectors[:, some] * values[some].abs().sqrt()).mH, values[some].sign().numpy()
 
 
 def _along(directions: Array) -> Array:
@@ -284,9 +290,8 @@ class Push:
         assert isinstance(propagator, TMatrixPropagator)
         matrices = force_matrices(propagator, self.body).detach()
         form = torch.einsum("i,imn->mn", matrices.real.new_tensor(self.direction).to(matrices), matrices)
-        values, vectors = torch.linalg.eigh(form)
-        some = values.abs() > _LEAST * values.abs().max()
-        return (vectors * values.abs().sqrt())[:, some].mH, values[some].sign().numpy()[None]
+        rows, signs = _squares(form)
+        return rows, signs[None]
 
 
 class ForceObjective:

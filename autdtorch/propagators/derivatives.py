@@ -17,6 +17,7 @@ import torch
 
 from autdtorch.analytic.momentum import linear_momentum
 from autdtorch.analytic.spherical_waves import harmonics, regular_radial
+from autdtorch.propagators.propagator import Propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.validation import invalid
@@ -81,6 +82,12 @@ def derivatives(pressure: torch.Tensor, wavenumber: complex) -> Derivatives:
     parts = torch.split(flat, _COUNTS, dim=-1)
     shape = flat.shape[:-1]
     return Derivatives(*(part.reshape(*shape, *[3] * order) for order, part in enumerate(parts)))
+
+
+def field_derivatives(propagator: Propagator, drive: torch.Tensor, nodes: torch.Tensor) -> Derivatives:
+    """Return the derivatives at P points under drives (..., M), by the field at the nodes (P, S, 3)."""
+    pressure = propagator.field(drive, nodes.reshape(-1, 3)).reshape(*drive.shape[:-1], *nodes.shape[:2])
+    return derivatives(pressure, propagator.scene.complex_wavenumber)
 
 
 @functools.lru_cache(1)

@@ -12,19 +12,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 
-from autdtorch.propagators.derivatives import Derivatives, derivatives, nodes_around
+from autdtorch.propagators.derivatives import Derivatives, field_derivatives, nodes_around
+from autdtorch.propagators.propagator import Propagator
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.particle import Particle
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import ArrayLike, Vector, points_grid, require_kind, unit_vector
-
-if TYPE_CHECKING:
-    from autdtorch.propagators.propagator import Propagator
 
 LARGEST = 0.1
 """LARGEST: radius of a small particle, relative to the wavelength; the force then errs by a quarter."""
@@ -89,17 +86,14 @@ def gorkov(
     Warns:
         ScaleWarning: a particle of a radius above 0.1 wavelength.
     """
-    from autdtorch.propagators.propagator import Propagator  # takes a second
-
     require_kind("propagator", propagator, Propagator)
     scene = propagator.scene
     require_kind("particle", particle, Particle)
     warn_of_large(particle, scene)
     places, grid = points_grid("points", points)
     drive = validate_drive(drive, len(scene.array))
-    nodes = nodes_around(scene, places)
-    pressure = propagator.field(drive, nodes.reshape(-1, 3)).reshape(*drive.shape[:-1], *nodes.shape[:2])
-    potential, force, stiffness = _of(derivatives(pressure, scene.complex_wavenumber), particle, scene)
+    field = field_derivatives(propagator, drive, nodes_around(scene, places))
+    potential, force, stiffness = _of(field, particle, scene)
     if up is not None:
         upwards = force.new_tensor(unit_vector("up", up))
         potential = potential + particle.weight * (places.to(force) @ upwards)

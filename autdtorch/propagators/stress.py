@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from autdtorch.propagators.derivatives import derivatives, nodes_around
+from autdtorch.propagators.derivatives import field_derivatives, nodes_around
 from autdtorch.propagators.propagator import Propagator
 from autdtorch.scene.drive import validate_drive
 from autdtorch.utils.validation import ArrayLike, points_grid, real_tensor, require_kind
@@ -40,9 +40,8 @@ def radiation_stress(
     drive = validate_drive(drive, len(scene.array)).cpu()
     normals = _unit_normals(normals, grid)
     medium, parts = scene.medium, []
-    for some in torch.split(nodes_around(scene, places.detach().cpu()), _AT_ONCE):
-        pressure = propagator.field(drive, some.reshape(-1, 3)).reshape(*drive.shape[:-1], *some.shape[:2])
-        parts.append(derivatives(pressure, scene.complex_wavenumber)[:2])
+    for nodes in torch.split(nodes_around(scene, places.detach().cpu()), _AT_ONCE):
+        parts.append(field_derivatives(propagator, drive, nodes)[:2])
     pressure, slope = (torch.cat(each, dim=drive.ndim - 1) for each in zip(*parts, strict=True))
     velocity = slope / (1j * scene.angular_frequency * medium.density)
     potential = pressure.abs().square() / (4 * medium.density * medium.sound_speed**2)

@@ -110,10 +110,10 @@ def l_shade(losses: Losses, seed: int) -> Phases:
                 memory[kind, slot] = (gain @ value**2) / max(gain @ value, 1e-300)
             slot = (slot + 1) % memory.shape[1]
             population[:count][better], loss[:count][better] = trial[better], new[better]
-        kept = max(4, round(largest + (4 - largest) * (1 - losses.left / budget)))
-        order = loss.argsort()[:kept]
+        survivors = max(4, round(largest + (4 - largest) * (1 - losses.left / budget)))
+        order = loss.argsort()[:survivors]
         population, loss = population[order], loss[order]
-        archive = rng.permutation(archive)[: round(2.6 * kept)]
+        archive = rng.permutation(archive)[: round(2.6 * survivors)]
     return population[loss.argmin()]
 
 

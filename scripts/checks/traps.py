@@ -72,9 +72,9 @@ def check_answers(count: int, rng: np.random.Generator) -> int:
     answers: Counter[tuple[str, str]] = Counter()
     for number in range(count):
         objective = random_objective(rng, int(rng.integers(2, 5)))
-        found = at.attainable(objective, seed=number)
+        attained = at.attainable(objective, seed=number)
         forced = best_by_force(rng, objective.transfer_matrix.numpy(), objective.goal.weights)
-        answer = {True: "exists", False: "none", None: "undecided"}[found.answer]
+        answer = {True: "exists", False: "none", None: "undecided"}[attained.answer]
         answers[answer, "exists" if forced > 0 else "none"] += 1
     for (ours, forced), times in sorted(answers.items()):
         print(f"{times} questions: {ours}; brute force: {forced}")

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -31,8 +31,15 @@ from autdtorch.utils.images import Image
 from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import ArrayLike, integer_at_least, invalid, require_kind
 
-Momentum = Callable[[torch.Tensor], torch.Tensor]
-"""Momentum: maps coefficients of waves (..., N, R) to those of their momentum (3, ..., N, R)."""
+
+class _Momentum(NamedTuple):
+    """A momentum of waves: the map of their coefficients (..., N, R) to (3, ..., N, R), and its kind."""
+
+    of_waves: Callable[[torch.Tensor], torch.Tensor]
+    is_angular: bool
+
+
+_LINEAR, _ANGULAR = _Momentum(linear_momentum, is_angular=False), _Momentum(angular_momentum, is_angular=True)
 
 
 def radiation_force(
@@ -62,7 +69,7 @@ def radiation_force(
     Raises:
         ValueError: an argument of another kind, shape or range.
     """
-    return _Driven.of(bodies, body, array, medium).sums(linear_momentum, drive)
+    return _Driven.of(bodies, body, array, medium).sums(_LINEAR, drive)
 
 
 def radiation_torque(
@@ -78,7 +85,7 @@ def radiation_torque(
     The centre is its circumscribed sphere's, `TMatrix.center`. About another point, add the
     cross product of the centre's offset from it and the force.
     """
-    return _Driven.of(bodies, body, array, medium).sums(angular_momentum, drive)
+    return _Driven.of(bodies, body, array, medium).sums(_ANGULAR, drive)
 
 
 def force_matrices(
@@ -92,7 +99,7 @@ def force_matrices(
 
     Leading dimensions are those of the poses. Arguments and errors are those of `radiation_force`.
     """
-    return _Driven.of(bodies, body, array, medium).matrices(linear_momentum)
+    return _Driven.of(bodies, body, array, medium).matrices(_LINEAR)
 
 
 @dataclass(frozen=True)
@@ -135,13 +142,13 @@ class _Driven:
         return cls(cluster, number, array, images, 1 / (2 * medium.density * frequency**2))
 
     @one_library_thread()
-    def sums(self, momentum: Momentum, drive: ArrayLike) -> torch.Tensor:
+    def sums(self, momentum: _Momentum, drive: ArrayLike) -> torch.Tensor:
         """Return what a body takes up of a momentum (..., 3) under drives (..., M)."""
         drive, together = validate_drive(drive, len(self.array)).cpu(), self.cluster.together_on(self.number)
 
         def of_drives(bodies: Sequence[TMatrix], drives: torch.Tensor) -> torch.Tensor:  # (..., R, M)
             regular, outgoing = waves_of_body(bodies, self.number, self.array, self.images, drives, together)
-            taken = -(momentum(regular + outgoing).conj() * outgoing).sum(dim=-2).real
+            taken = -(momentum.of_waves(regular + outgoing).conj() * outgoing).sum(dim=-2).real
             return (self._to_scene(bodies, momentum) @ taken.movedim(0, -2)).mT
 
         if not self.cluster.poses:
@@ -162,16 +169,15 @@ class _Driven:
         return forces.reshape(*every, 3)
 
     @one_library_thread()
-    def matrices(self, momentum: Momentum) -> torch.Tensor:
+    def matrices(self, momentum: _Momentum) -> torch.Tensor:
         """Return the Hermitian matrices (..., 3, M, M) of `sums`."""
         together = self.cluster.together_on(self.number)
 
         def of_units(bodies: Sequence[TMatrix], _: slice = slice(None)) -> torch.Tensor:
             regular, outgoing = waves_of_body(bodies, self.number, self.array, self.images, together=together)
-            taken = -(momentum(regular + outgoing).mH @ outgoing).movedim(0, -3)
+            taken = -(momentum.of_waves(regular + outgoing).mH @ outgoing).movedim(0, -3)
             scene = self._to_scene(bodies, momentum).to(taken.dtype)
-            turned = torch.einsum("...ij,...jmn->...imn", scene, (taken + taken.mH) / 2)
-            return turned
+            return torch.einsum("...ij,...jmn->...imn", scene, (taken + taken.mH) / 2)
 
         poses = self.cluster.poses
         if not poses:
@@ -179,10 +185,10 @@ class _Driven:
         matrices = self.cluster.by_poses(poses, len(self.array), len(self.images) > 1, of_units)
         return matrices.reshape(*poses, *matrices.shape[-3:])
 
-    def _to_scene(self, bodies: Sequence[TMatrix], momentum: Momentum) -> torch.Tensor:
+    def _to_scene(self, bodies: Sequence[TMatrix], momentum: _Momentum) -> torch.Tensor:
         """Return the map (..., 3, 3) from momentum along a body's axes to that in the scene [SI]."""
         body = bodies[self.number]
-        if momentum is linear_momentum:
+        if not momentum.is_angular:
             return self.scale * body.axes
         handedness: torch.Tensor = torch.linalg.det(body.axes)[..., None, None]
         return self.scale / body.wavenumber.real * handedness * body.axes
