@@ -276,12 +276,3 @@ def sphere_coefficients(
         inner_slope = slope_inside / (density_ratio * speed_ratio)
     outgoing = out_slope * inner - out * inner_slope
     return np.asarray(-(slope * inner - regular * inner_slope) / outgoing, np.complex128)
-
-
-def enough_degrees(size: float, error: float) -> int:
-    """Return the degree up to which waves reach a body of size ka, to a relative error.
-
-    ka + 1.8 D^(2/3) (ka)^(1/3) for D digits (Song and Chew 2001, doi:10.1109/5.940280).
-    """
-    digits: float = max(-math.log10(error), 1.0)
-    return math.ceil(size + 1.8 * math.pow(digits, 2 / 3) * math.pow(size, 1 / 3))

@@ -208,10 +208,15 @@ def _covering(region: Region, spacing: float, extent: Extent) -> Grid:
     rim = layer + 1 + extent.margin - 0.5
     x, y, z = (low - (rim + first) * spacing for low, first in zip(extent.lower, offset, strict=True))
     grid = Grid(spacing, extent.interior(spacing, offset), (x, y, z), kappa, layer, extent.path)
-    if math.prod(grid.shape) > MAX_CELLS:
-        cells = " x ".join(map(str, grid.shape))
-        raise invalid("spacing", spacing, f"gives {cells} cells, must be at most {MAX_CELLS:.0e} in all", "m")
+    require_cells(grid.shape, spacing)
     return grid
+
+
+def require_cells(shape: tuple[int, int, int], spacing: float) -> None:
+    """Check the number of cells of a grid of a shape."""
+    if math.prod(shape) > MAX_CELLS:
+        cells = " x ".join(map(str, shape))
+        raise invalid("spacing", spacing, f"gives {cells} cells, must be at most {MAX_CELLS:.0e} in all", "m")
 
 
 def require_fine(speeds: Mapping[str, float], frequency: float, spacing: float) -> None:

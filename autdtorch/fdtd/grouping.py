@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations, permutations
 
 import numpy as np
+import torch
 
 from autdtorch.fdtd.grid import (
     MAX_CELLS_PER_WAVELENGTH,
@@ -21,7 +22,7 @@ from autdtorch.fdtd.grid import (
     bodies_extent,
     domain_extent,
 )
-from autdtorch.fdtd.region import Region
+from autdtorch.fdtd.region import CLEARANCE, Region
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil
@@ -55,7 +56,6 @@ class PlannedGrid:
         extent: along these axes.
         aligned: whether every face is parallel to the axes.
         spacing: edge of a cell [m].
-        steps_per_period: the fewest.
     """
 
     group: tuple[int, ...]
@@ -65,7 +65,6 @@ class PlannedGrid:
     extent: Extent
     aligned: bool
     spacing: float
-    steps_per_period: float
 
     @cached_property
     def interior(self) -> tuple[int, int, int]:
@@ -88,6 +87,13 @@ class PlannedGrid:
     def kappa(self) -> float:
         """Wavenumber in air times spacing [rad]."""
         return self.part.wavenumber * self.spacing
+
+    @cached_property
+    def steps_per_period(self) -> float:
+        """The fewest steps in a period."""
+        stencil = tuned_stencil(self.kappa, self.part.attenuation * self.spacing)
+        fastest = max(self.part.sound_speeds.values()) / self.part.fluid.phase_speed
+        return fewest_steps(stencil, stencil.largest_symbol * fastest**2)
 
     @property
     def steps(self) -> int:
@@ -237,30 +243,29 @@ def _box_along(region: Region, group: Sequence[int], spacing: float, along_faces
         near, part = reached, region.part(group, reached)
         axes = axes_along([body.faces for body in part.bodies]) if along_faces else np.eye(3)
         extent = bodies_extent(part.turned(axes))
-        reached = region.mirrors_near(extent.lower, extent.upper, axes, spacing)
+        reached = _mirrors_near(region, extent, axes, spacing)
     aligned = all(body.faces.all_aligned(axes) for body in part.bodies)
     if turns := _turns_to_flat(extent.interior(spacing)):
         axes = np.roll(axes, turns, axis=0)
         roll = functools.partial(np.roll, shift=turns)
         extent = replace(extent, lower=roll(extent.lower), upper=roll(extent.upper))
-    steps = _steps_per_period(region, spacing)
-    return PlannedGrid(tuple(group), near, part, axes, extent, aligned, spacing, steps)
+    return PlannedGrid(tuple(group), near, part, axes, extent, aligned, spacing)
+
+
+def _mirrors_near(region: Region, extent: Extent, axes: Array, spacing: float) -> tuple[int, ...]:
+    """Return the mirrors next to an extent along `axes`."""
+    beside = CLEARANCE * spacing
+    ends = np.stack([np.array(extent.lower) - beside, np.array(extent.upper) + beside])
+    corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3) @ axes
+    heights = [mirror.height(torch.from_numpy(corners)).min() for mirror in region.mirrors]
+    return tuple(number for number, height in enumerate(heights) if height < 0)
 
 
 def domain_grid(region: Region, spacing: float) -> PlannedGrid:
     """Return the grid of the whole domain, of `spacing` [m], which follows the axes of the scene."""
     whole, axes, group = region.whole, np.eye(3), tuple(range(len(region.bodies)))
     aligned = bool(group) and all(body.faces.all_aligned(axes) for body in region.bodies)
-    extent = domain_extent(whole, spacing)
-    steps = _steps_per_period(region, spacing)
-    return PlannedGrid(group, (), whole, axes, extent, aligned, spacing, steps)
-
-
-def _steps_per_period(region: Region, spacing: float) -> float:
-    """Return the fewest steps in a period on a grid of `spacing` [m]."""
-    stencil = tuned_stencil(region.wavenumber * spacing, region.attenuation * spacing)
-    fastest = max(region.sound_speeds.values()) / region.fluid.phase_speed
-    return fewest_steps(stencil, stencil.largest_symbol * fastest**2)
+    return PlannedGrid(group, (), whole, axes, domain_extent(whole, spacing), aligned, spacing)
 
 
 def _turns_to_flat(interior: tuple[int, int, int]) -> int:

@@ -131,7 +131,6 @@ class BoxSimulation(Simulation):
     def boxes(self) -> list[ScatteredField]:
         """The assembled boxes."""
         plan = self.plan
-        plan.require_feasible()
         boxes, wavenumber = [], plan.scene.complex_wavenumber
         for grid in plan.grouping.grids:
             if is_tilted(grid.axes):

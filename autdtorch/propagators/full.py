@@ -28,7 +28,6 @@ class DomainSimulation(Simulation):
     def assemblies(self) -> Sequence[Assembly]:
         """The assembled grid of the domain."""
         plan = self.plan
-        plan.require_feasible()
         return (assemble(plan.region.whole, plan.spacing, plan.dtype, plan.time_step),)
 
     @property

@@ -10,7 +10,7 @@ from typing import Self
 import torch
 
 from autdtorch.fdtd.costs import Costs
-from autdtorch.fdtd.grid import MAX_CELLS, coarsest_spacing, require_spacing, second_spacing
+from autdtorch.fdtd.grid import coarsest_spacing, require_cells, require_spacing, second_spacing
 from autdtorch.fdtd.grid_errors import Law
 from autdtorch.fdtd.grouping import Grouping, choose_grids
 from autdtorch.fdtd.kernels.choice import available_kernel, precision_of
@@ -157,29 +157,21 @@ class Plan:
             meshes=tuple(isinstance(shape, Mesh) for shape in region.shapes),
         )  # fmt: skip
 
-    def is_feasible(self) -> bool:
-        """Return whether the machine can hold it."""
+    @cached_property
+    def refusal(self) -> str:
+        """The reason why this machine cannot run it, or why no grid can; empty if one can."""
         try:
-            self.require_feasible()
-        except ValueError:
-            return False
-        return True
-
-    def require_feasible(self, field: str = "spacing", value: float | None = None) -> None:
-        """Refuse too much memory or too many cells, and name the field and the value to blame."""
-        value, unit = (self.spacing, "m") if value is None else (value, "")
-        require_memory(field, value, self.memory, unit)
-        for grid in self.grouping.grids:
-            if grid.cells > MAX_CELLS:
-                shape = " x ".join(map(str, grid.shape))
-                raise invalid(
-                    field, value, f"gives {shape} cells, must be at most {MAX_CELLS:.0e} in all", unit
-                )
-        require_spacing(self.region, self.spacing)
-        if self.method == "full":
-            self.region.require_domain()
-        for grid in self.grouping.grids:
-            self.region.require_held(grid.mirrors, self.spacing)
+            require_memory("spacing", self.spacing, self.memory, "m")
+            for grid in self.grouping.grids:
+                require_cells(grid.shape, self.spacing)
+            require_spacing(self.region, self.spacing)
+            if self.method == "full":
+                self.region.require_domain()
+            for grid in self.grouping.grids:
+                self.region.require_held(grid.mirrors, self.spacing)
+        except ValueError as error:
+            return str(error)
+        return ""
 
 
 def plan(

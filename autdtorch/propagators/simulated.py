@@ -46,10 +46,12 @@ class SimulatedPropagator(ScenePropagator):
     """
 
     def __init__(self, plan: Plan, store: Store | None = None, others: Sequence[Simulation] = ()) -> None:
-        """Use `make_propagator`, which checks its arguments. Nothing is computed here.
+        """Use `make_propagator`, which checks its arguments. A plan with a refusal raises it.
 
         `others` are simulations of the scene on other grids, for error estimates; by default one is made.
         """
+        if plan.refusal:
+            raise ValueError(plan.refusal)
         self.scene, self.method, self.spacing = plan.scene, plan.method, plan.spacing
         self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
         self.plan, self._store, self._coarser = plan, store or Store(), tuple(others)

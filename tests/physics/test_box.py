@@ -10,7 +10,7 @@ from small_scenes import AIR, CUBE, relative_error, scene_of_all_kinds, small_sc
 
 from autdtorch.analytic import rigid_sphere
 from autdtorch.fdtd.grid import make_box
-from autdtorch.fdtd.grouping import cheapest_boxes, one_box
+from autdtorch.fdtd.grouping import box_grid, cheapest_boxes, one_box
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.propagators import SimulatedPropagator, assembled_box, make_propagator
 from autdtorch.propagators.free_space import free_space_matrix
@@ -283,6 +283,14 @@ def test_obstacles_share_a_box_where_that_is_cheaper():
     plate = Box((12e-3, 32e-3, 32e-3), (2e-3, 50e-3, 50e-3), rigid=True)
     other = dataclasses.replace(plate, center=(42e-3, 32e-3, 32e-3))
     assert len(cheapest(far_apart(plate, other), 1e-3).grids) == 1
+
+
+def test_a_box_takes_the_steps_of_its_bodies_alone():
+    fast = Sphere(FAR, 4e-3, density=1100.0, sound_speed=2500.0)
+    rigid = Sphere(NEAR, 4e-3, rigid=True)
+    scenes = far_apart(rigid), far_apart(rigid, fast)
+    alone, beside = (box_grid(region_of(scene), [0], 1e-3).steps_per_period for scene in scenes)
+    assert alone == beside
 
 
 def cheapest(scene, spacing):

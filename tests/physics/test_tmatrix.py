@@ -18,7 +18,6 @@ from autdtorch.analytic.disc_waves import MeanWaves, powers_needed
 from autdtorch.analytic.sphere import fluid_sphere, impedance_sphere, rigid_sphere
 from autdtorch.analytic.spherical_waves import (
     degrees,
-    enough_degrees,
     harmonics,
     mirrored,
     outgoing_waves,
@@ -27,6 +26,7 @@ from autdtorch.analytic.spherical_waves import (
 )
 from autdtorch.analytic.wave_frames import translation
 from autdtorch.propagators import make_propagator
+from autdtorch.propagators.tmatrix.bodies import enough_degrees
 from autdtorch.scene.geometry import rotation_matrix
 
 AIR = at.Medium(density=1.2, sound_speed=340.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -9,7 +10,6 @@ from itertools import combinations
 import numpy as np
 import torch
 
-from autdtorch.analytic.spherical_waves import enough_degrees
 from autdtorch.scene.obstacles import Obstacle, Sphere
 from autdtorch.scene.obstacles.moving import circumscribed
 from autdtorch.scene.reflectors import Reflector
@@ -49,6 +49,15 @@ def bodies_of(obstacles: Sequence[Obstacle]) -> list[ObstacleGroup]:
 def has_closed_form(obstacles: Sequence[Obstacle]) -> bool:
     """Return whether T of a body has a closed form: a sphere."""
     return len(obstacles) == 1 and type(obstacles[0]) is Sphere
+
+
+def enough_degrees(size: float, error: float) -> int:
+    """Return the degree up to which waves reach a body of size ka, to a relative error.
+
+    ka + 1.8 D^(2/3) (ka)^(1/3) for D digits (Song and Chew 2001, doi:10.1109/5.940280).
+    """
+    digits: float = max(-math.log10(error), 1.0)
+    return math.ceil(size + 1.8 * math.pow(digits, 2 / 3) * math.pow(size, 1 / 3))
 
 
 def waves_to_simulate(scene: Scene, error: float, most: int | None = None) -> int | None:

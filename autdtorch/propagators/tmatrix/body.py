@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import torch
 
-from autdtorch.analytic.spherical_waves import degrees, enough_degrees, sphere_coefficients
+from autdtorch.analytic.spherical_waves import degrees, sphere_coefficients
 from autdtorch.propagators.notices import SteadyStateWarning
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.store import BODIES, Store, key_of
-from autdtorch.propagators.tmatrix.bodies import has_closed_form
+from autdtorch.propagators.tmatrix.bodies import enough_degrees, has_closed_form
 from autdtorch.propagators.tmatrix.waves import BodyWaves
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.medium import Medium
