@@ -48,6 +48,7 @@ from autdtorch.study.run_study import check_goal, name_of, solve
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.progress import Progress, show_progress
+from autdtorch.utils.validation import invalid
 
 logger = logging.getLogger(__name__)
 
@@ -103,7 +104,10 @@ class _Trial:
         seed = settings.get("seed", 0)
         self._scene = scene_of("scene", section_of(settings, "scene"), modules)
         self._method = load_method("method", section_of(settings, "method"), modules)
-        self._goal = load_goal("goal", settings.get("goal"))
+        goal = load_goal("goal", settings.get("goal"))
+        if not isinstance(goal, Goal):
+            raise invalid("goal", goal.name, "must be of pressures, which the sensor of a bench reads")
+        self._goal = goal
         check_goal(self._goal, {"scene": self._scene}, {name_of(self._method): self._method})
         self._bench = bench = Bench(section_of(settings, "hardware"), self._scene, seed)
         self._seed = seed

@@ -25,7 +25,7 @@ from autdtorch.propagators import CACHE_VARIABLE
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.moving import angles_of
 from autdtorch.scene.scene import Scene
-from autdtorch.study.results import StudyResult, summary_rows
+from autdtorch.study.results import StudyResult, summary_rows, with_prefixes
 from autdtorch.study.run_study import StudyMethod, name_of, run_study
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.text import counted
@@ -195,7 +195,7 @@ def _draw_poses(results: StudyResult, poses: Poses, folder: Path) -> None:
     """Draw the scores along the path of the obstacles."""
     from autdtorch.plot.trials import plot_poses
 
-    outcomes = list(results.scenes.values())
+    outcomes = list(with_prefixes(results).scenes.values())
     scores = {
         name: torch.stack([scene.methods[name].solution.score for scene in outcomes])
         for name in outcomes[0].methods

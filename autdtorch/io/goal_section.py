@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from autdtorch.objectives.forces import ForceGoal, LeastForm, Levitate, Push, Trap
 from autdtorch.objectives.goals import (
     WEAKEST_FOCUS,
     Goal,
@@ -16,22 +17,24 @@ from autdtorch.objectives.goals import (
 )
 from autdtorch.objectives.over_scenes import OverScenes
 from autdtorch.objectives.quiet import Contrast, QuietPoints, SeenPoints
-from autdtorch.utils.validation import invalid, require_known, require_name, require_one_of
+from autdtorch.scene.particle import Particle
+from autdtorch.utils.validation import invalid, require_known, require_name, require_one_of, within
 
-GOALS: dict[str, type[Goal]] = {
-    goal.name: goal
-    for goal in (WeakestFocus, MeanPressure, TargetPressures, QuietPoints, SeenPoints, Contrast, OverScenes)
+_PRESSURES = WeakestFocus, MeanPressure, TargetPressures, QuietPoints, SeenPoints, Contrast, OverScenes
+GOALS: dict[str, type[Goal] | type[ForceGoal]] = {
+    goal.name: goal for goal in (*_PRESSURES, Trap, Levitate, Push)
 }
-"""The goals by name."""
+"""The goals by name, those of pressures and those of force."""
 
 
-def load_goal(where: str, section: object) -> Goal:
+def load_goal(where: str, section: object) -> Goal | ForceGoal:
     """Make the goal of a section such as ``{name: target_pressures, targets: [400, 200]}``.
 
     Args:
         where: name of the section in messages.
         section: a mapping of `name` and the settings of that goal, or a name alone. A config file may have
-            written it. Consecutive points can be text such as "4-67".
+            written it. Consecutive points can be text such as "4-67"; a particle is ``{material: EPS,
+            radius: 1e-3}``, or has a density and a sound speed in place of a material.
 
     Raises:
         ValueError: an unknown name or setting, or a setting out of range.
@@ -43,17 +46,38 @@ def load_goal(where: str, section: object) -> Goal:
     name = section.get("name")
     require_one_of(f"{where}.name", name, GOALS)
     kind = GOALS[str(name)]
-    fields = [field.name for field in dataclasses.fields(kind)]
-    require_known(where, section, ["name", *fields])
-    settings = {field: section.get(field) for field in fields}
+    defaults = {field.name: field.default for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    require_known(where, section, ["name", *defaults])
+    settings: dict[str, Any] = {
+        field: section.get(field, None if default is dataclasses.MISSING else default)
+        for field, default in defaults.items()
+    }
     if isinstance(points := settings.get("points"), str):
         settings["points"] = _span(f"{where}.points", points)
-    if "goal" in fields:
+    if "goal" in settings:
         settings["goal"] = load_goal(f"{where}.goal", settings["goal"])
+    if "particle" in settings:
+        settings["particle"] = _particle(f"{where}.particle", settings["particle"])
     try:
         return kind(**settings)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
+
+
+def _particle(where: str, section: object) -> Particle:
+    """Return the particle of a section."""
+    fields = [field.name for field in dataclasses.fields(Particle)]
+    if not isinstance(section, Mapping):
+        raise invalid(where, section, "must be a mapping, such as {material: EPS, radius: 1e-3}")
+    require_known(where, section, ["material", *fields])
+    settings = {field: section.get(field) for field in fields}
+    with within(where):
+        if (material := section.get("material")) is None:
+            return Particle(**settings)  # type: ignore[arg-type]
+        radius = settings.pop("radius")
+        if any(value is not None for value in settings.values()):
+            raise invalid("material", material, "must be null where density and sound_speed are given")
+        return Particle.of(material, radius)  # type: ignore[arg-type]
 
 
 def _span(where: str, text: str) -> range:
@@ -66,24 +90,31 @@ def _span(where: str, text: str) -> range:
     return range(int(span[1]), int(span[2]) + 1)
 
 
-def goal_section(goal: Goal) -> dict[str, Any]:
+def goal_section(goal: Goal | ForceGoal) -> dict[str, Any]:
     """Return the section of a goal, from which `load_goal` makes it again."""
-    return {"name": goal.name} | {
-        field.name: _entry(getattr(goal, field.name)) for field in dataclasses.fields(goal)
-    }
+    if isinstance(goal, LeastForm):
+        return goal_section(goal.of)
+    return {"name": goal.name} | _entries(goal)
+
+
+def _entries(of: Any) -> dict[str, Any]:
+    return {field.name: _entry(getattr(of, field.name)) for field in dataclasses.fields(of)}
 
 
 def _entry(value: object) -> object:
     if isinstance(value, Goal):
         return goal_section(value)
-    return list(value) if isinstance(value, tuple) else value
+    if isinstance(value, Particle):
+        return _entries(value)
+    return [_entry(each) for each in value] if isinstance(value, tuple) else value
 
 
 def require_score(name: object, unit: object) -> None:
     """Check the name of a goal and the unit of its scores, which reports and figures show."""
     require_name("goal", name)
     if unit != "":
-        require_name("goal.unit", unit)
+        for part in unit.split("/") if isinstance(unit, str) else [unit]:  # as of N/m
+            require_name("goal.unit", part)
 
 
 def score_label(name: str, unit: str = "") -> str:

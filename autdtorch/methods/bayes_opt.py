@@ -21,7 +21,7 @@ from autdtorch.methods.prior import (
     prior_mean,
     prior_of,
 )
-from autdtorch.methods.problem import Problem, starts_of
+from autdtorch.methods.problem import Problem, require_pressures, starts_of
 from autdtorch.methods.seeds import generators_of, restored, states_of, uniform
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import scores_of
@@ -139,6 +139,8 @@ class BayesOpt(Method):
         """Check the number of transducers, the prior, and earlier readings."""
         require_transducer(self._fixed(problem.transducers), problem.transducers)
         earlier = _usable(problem.readings)
+        if self.model == "foci":
+            require_pressures(problem, 'the model "foci"')
         if self.model == "foci" and earlier is not None and not (read := earlier.pressure.any(dim=0)).all():
             point = int((~read).nonzero()[0])
             accepted = "must not be 0 throughout: the sensor of this control point has failed"

@@ -25,7 +25,7 @@ from autdtorch.methods.prior import (
     prior_mean,
     prior_of,
 )
-from autdtorch.methods.problem import Problem
+from autdtorch.methods.problem import Problem, require_pressures
 from autdtorch.methods.seeds import generators_of, restored, states_of
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import scores_of
@@ -75,6 +75,7 @@ class Identify(Method):
 
     def check(self, problem: Problem) -> None:
         """Check that there are enough evaluations for the number of transducers, or that the prior fits."""
+        require_pressures(problem, self.name)
         if self.prior is not None:
             prior_mean(self.prior, problem)
             return

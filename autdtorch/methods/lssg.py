@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 import torch
 
 from autdtorch.methods.base import Method, State, Step, first_of_best, setting, whole
-from autdtorch.methods.problem import Problem
+from autdtorch.methods.problem import FOR_FORCE, Problem, scores_pressures
 from autdtorch.objectives.over_scenes import OverScenes
 from autdtorch.scene.arrays import phase_offsets_of
 from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise, phases_of
@@ -124,7 +124,7 @@ class LSSG(Method):
     offsets while the others stay, and keeps the best. Since 0 is among them, LSSG is never worse than LSS. A
     pass takes P * levels evaluations, as many as the paper's: 64 with 4 foci. The search ends early with a
     pass that changes nothing. Obstacles enter through the observed scores, not through the phases. The
-    amplitudes are in [0, 1], not all 1.
+    amplitudes are in [0, 1], not all 1. For a force, the foci are the scene's control points, two or more.
 
     Attributes:
         levels: number of offsets in [0, 2 pi), >= 2.
@@ -141,7 +141,10 @@ class LSSG(Method):
     passes: int = whole(1, least=1)
 
     def check(self, problem: Problem) -> None:
-        """Check the order against the number of foci."""
+        """Check the order against the number of foci, and that offsets of these change a force."""
+        if _foci(problem) == 1 and not scores_pressures(problem):
+            accepted = f"must be 2 or more, whose foci lssg superposes; else {FOR_FORCE}"
+            raise invalid("number of control points", 1, accepted)
         require_all(self.order, _foci(problem))
 
     def most_evaluations(self, problem: Problem) -> int:
@@ -171,8 +174,10 @@ class LSSG(Method):
 
 
 def _foci(problem: Problem) -> int:
-    """Return the number of foci, in one scene if there are several."""
+    """Return the number of foci, in one scene if there are several: for a force, the control points."""
     goal = problem.goal
+    if problem.scene is not None and not scores_pressures(problem):
+        return len(problem.scene.control_points)
     return problem.foci // goal.scenes if isinstance(goal, OverScenes) else problem.foci
 
 

@@ -15,7 +15,7 @@ import torch
 
 from autdtorch.methods.base import Method, State, Step, whole
 from autdtorch.methods.gradient import climb, random_drives
-from autdtorch.methods.problem import Problem, starts_of
+from autdtorch.methods.problem import Problem, require_pressures, starts_of
 from autdtorch.methods.seeds import generators_of, restored, states_of
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.validation import invalid
@@ -50,6 +50,10 @@ class PhaseStepping(Method):
     label: ClassVar[str] = "phase stepping"
 
     rounds: int = whole(1, least=1)
+
+    def check(self, problem: Problem) -> None:
+        """Check that the goal is of pressures."""
+        require_pressures(problem, self.name)
 
     def most_evaluations(self, problem: Problem) -> int:
         """Return the evaluations of all rounds and of the last drive."""

@@ -30,6 +30,9 @@ from autdtorch.utils.validation import (
     within,
 )
 
+FOR_FORCE = "take gradient_ascent, or gabs and bayes_opt, which see scores alone"
+"""Advice for a method that cannot take a force."""
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -126,6 +129,18 @@ def starts_of(problem: Problem, trials: int) -> torch.Tensor | None:
     if len(start) != trials:
         raise ValueError(f"start: {len(start)} drives; must be one for each of {trials} trials")
     return start
+
+
+def scores_pressures(problem: Problem) -> bool:
+    """Return whether the goal of a problem scores pressures at control points, and no force."""
+    return not isinstance(problem.goal, Goal) or problem.goal.of_pressures
+
+
+def require_pressures(problem: Problem, method: str) -> None:
+    """Refuse a goal of force, for a method that fits the pressures of control points."""
+    if not scores_pressures(problem):
+        accepted = f"must be of pressures at control points, which {method} fits; for a force {FOR_FORCE}"
+        raise invalid("goal", getattr(problem.goal, "name", problem.goal), accepted)
 
 
 def known_matrix(problem: Problem) -> torch.Tensor:

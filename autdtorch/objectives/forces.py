@@ -7,9 +7,10 @@ of control points, and bounds follow from the rows (`hermitian`).
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from autdtorch.objectives.hermitian import ascended, forms_bound
 from autdtorch.objectives.objective import magnitudes, observe_drives
 from autdtorch.propagators.derivatives import nodes_around, regular_coefficients
 from autdtorch.propagators.propagator import Propagator
+from autdtorch.propagators.tmatrix.bodies import bodies_of
 from autdtorch.propagators.tmatrix.force import force_matrices
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.geometry import sphere_points
@@ -48,6 +50,7 @@ DIRECTIONS: tuple[Vector, ...] = tuple((x, y, z) for x, y, z in _HALF.tolist() i
 _LARGEST = 1.0  # k a of a small sphere, for which the degrees up to 3 scatter all but 1e-5
 _SCATTERED = 3
 _LEAST = 1e-12  # Eigenvalue of a form that is left out, relative to the largest
+_TRANSPARENT = 1e-14  # Largest entry of T by rounding alone; 1e-10 at k a = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +61,8 @@ class LeastForm(Goal):
         of: the trap, lift or push.
         weights: (J, N).
     """
+
+    of_pressures: ClassVar[bool] = False
 
     of: ForceGoal
     weights: Array = field(repr=False)
@@ -110,7 +115,7 @@ class LeastForm(Goal):
 
     def wanted(self, points: int) -> Array:
         """Refuse: no pressures are wanted."""
-        raise invalid("goal", self, "must want pressures, for this method; take gradient_ascent")
+        raise invalid("goal", self.name, "must want pressures, for this method; take gradient_ascent")
 
     def climbed(self, matrix: torch.Tensor, drive: torch.Tensor, iterations: int) -> torch.Tensor:
         """Return drives (S, M) at local maxima of the goal from drives (S, M), by the rows (N, M)."""
@@ -118,54 +123,76 @@ class LeastForm(Goal):
         return torch.from_numpy(np.stack(each))
 
 
-class ForceGoal(Protocol):
-    """A goal of a `ForceObjective`: `Trap`, `Levitate` or `Push`."""
+class ForceGoal(ABC):
+    """Base of goals of a `ForceObjective`: `Trap`, `Levitate` and `Push`."""
 
     name: ClassVar[str]
     unit: ClassVar[str]
 
+    @abstractmethod
     def forms(self, propagator: Propagator) -> tuple[torch.Tensor, Array]:
         """Return rows (N, M), complex128, and the weights (J, N) of their squares in the forms."""
-        ...
+
+    @abstractmethod
+    def check(self, scene: Scene) -> None:
+        """Check the goal against a scene before it is simulated; `ValueError` where it does not fit."""
 
 
 @dataclass(frozen=True)
-class _ParticleGoal:
+class _ParticleGoal(ForceGoal):
     """Base of goals of a small sphere at points, by the force and the stiffness there."""
 
-    points: Sequence[Vector]
+    points: Sequence[Vector] | None
     particle: Particle
-    directions: Sequence[Vector] = DIRECTIONS
+    directions: Sequence[Vector] | None = None
     displacement: float = 2e-4
 
     def __post_init__(self) -> None:
         """Check the fields."""
-        points = points_tensor("points", self.points)
-        object.__setattr__(self, "points", tuple(tuple(point) for point in points.tolist()))
+        if self.points is not None:
+            points = points_tensor("points", self.points)
+            object.__setattr__(self, "points", tuple(tuple(point) for point in points.tolist()))
         require_kind("particle", self.particle, Particle)
-        directions = real_tensor("directions", self.directions)
-        if directions.ndim != 2 or directions.shape[1] != 3 or not len(directions):
-            raise invalid("directions", self.directions, "must be (D, 3) with D >= 1")
-        if not directions.norm(dim=1).min() > 0:
-            raise invalid("directions", self.directions, "must not be 0")
-        directions = directions / directions.norm(dim=1, keepdim=True)
-        object.__setattr__(self, "directions", tuple(tuple(direction) for direction in directions.tolist()))
+        if self.directions is not None:
+            directions = real_tensor("directions", self.directions)
+            if directions.ndim != 2 or directions.shape[1] != 3 or not len(directions):
+                raise invalid("directions", self.directions, "must be (D, 3) with D >= 1")
+            if not directions.norm(dim=1).min() > 0:
+                raise invalid("directions", self.directions, "must not be 0")
+            directions = directions / directions.norm(dim=1, keepdim=True)
+            object.__setattr__(self, "directions", tuple(tuple(each) for each in directions.tolist()))
         object.__setattr__(self, "displacement", positive("displacement", self.displacement, "m"))
+
+    def check(self, scene: Scene) -> None:
+        """Check that the sphere is small, and that bodies and the array are far enough from the points."""
+        self._nodes(scene)
+        _eigenrows(self.particle, scene)
+
+    def _nodes(self, scene: Scene) -> torch.Tensor:
+        """Return the nodes (P, S, 3) [m] around the points."""
+        points = scene.control_points if self.points is None else points_tensor("points", self.points)
+        return nodes_around(scene, points)
 
     def forms(self, propagator: Propagator) -> tuple[torch.Tensor, Array]:
         """Return rows (N, M) and the weights (J P, N) of their squares in the forms of each point."""
         scene = propagator.scene
-        nodes = nodes_around(scene, points_tensor("points", self.points))
+        nodes = self._nodes(scene)
         matrix = propagator.transfer_matrix(nodes.reshape(-1, 3)).detach().cpu()
         pressure = matrix.reshape(*nodes.shape[:2], -1).mT
         waves = regular_coefficients(pressure, scene.complex_wavenumber, _SCATTERED + 2)
         factors, kinds, signs = _eigenrows(self.particle, scene)
         weights = np.stack([form[kinds] * signs for form in self._combined()])
-        return (waves @ factors).mT.flatten(0, 1), np.kron(np.eye(len(self.points)), weights)
+        return (waves @ factors).mT.flatten(0, 1), np.kron(np.eye(len(nodes)), weights)
 
+    @abstractmethod
     def _combined(self) -> Array:
         """Return the forms (J, 9) by force (3) and stiffness (6) at a point."""
-        raise NotImplementedError
+
+    def _along(self) -> tuple[Array, Array]:
+        """Return directions (D, 3), and the stiffness along each by its entries `PAIRS` (D, 6)."""
+        directions = np.array(DIRECTIONS if self.directions is None else self.directions)
+        entries = [(1 + (i != j)) * directions[:, i] * directions[:, j] for i, j in PAIRS]
+        return directions, np.stack(entries, axis=1)
 
 
 def _eigenrows(particle: Particle, scene: Scene) -> tuple[torch.Tensor, Array, Array]:
@@ -193,11 +220,6 @@ def _squares(form: torch.Tensor) -> tuple[torch.Tensor, Array]:
     return (vectors[:, some] * values[some].abs().sqrt()).mH, values[some].sign().numpy()
 
 
-def _along(directions: Array) -> Array:
-    """Return the stiffness along directions (D, 3) by its entries `PAIRS` (D, 6)."""
-    return np.stack([(1 + (i != j)) * directions[:, i] * directions[:, j] for i, j in PAIRS], axis=1)
-
-
 @dataclass(frozen=True)
 class Trap(_ParticleGoal):
     """The stiffness of traps of a small sphere: the least one, over points and directions [N/m].
@@ -205,12 +227,12 @@ class Trap(_ParticleGoal):
     From each stiffness, the force along the direction over `displacement` is subtracted. A score above 0
     means that the sphere is pulled back along all directions, to a place within `displacement` of the point.
     Force and stiffness are exact for the sphere alone in the field: waves between it and other bodies are
-    left out.
+    left out. `equilibrium` has them.
 
     Attributes:
-        points: (P, 3) [m].
+        points: (P, 3) [m]; None for the control points of the scene.
         particle: the sphere, of a radius up to 1 / k.
-        directions: (D, 3), along which it is held; by default 100, for all.
+        directions: (D, 3), along which it is held; None for 100, for all.
         displacement: largest distance along a direction from the point to the place of equilibrium [m], > 0.
     """
 
@@ -218,8 +240,8 @@ class Trap(_ParticleGoal):
     unit: ClassVar[str] = "N/m"
 
     def _combined(self) -> Array:
-        directions = np.array(self.directions)
-        stiffness, force = _along(directions), directions / self.displacement
+        directions, stiffness = self._along()
+        force = directions / self.displacement
         return np.concatenate([np.hstack([force, stiffness]), np.hstack([-force, stiffness])])
 
 
@@ -234,9 +256,9 @@ class Levitate(_ParticleGoal):
     Forces are those of `Trap`.
 
     Attributes:
-        points: (P, 3) [m].
+        points: (P, 3) [m]; None for the control points of the scene.
         particle: the sphere, of a radius up to 1 / k.
-        directions: (D, 3), along which it is held; by default 100, for all.
+        directions: (D, 3), along which it is held; None for 100, for all.
         displacement: largest sideways distance from the point to the place of equilibrium [m], > 0.
         reach: distance over which the stiffness must make up the weight [m], > 0; by default 2 mm, a quarter
             of the wavelength at 40 kHz.
@@ -256,16 +278,15 @@ class Levitate(_ParticleGoal):
         object.__setattr__(self, "up", unit_vector("up", self.up))
 
     def _combined(self) -> Array:
-        directions, up = np.array(self.directions), np.array(self.up)
+        (directions, stiffness), up = self._along(), np.array(self.up)
         sideways = (directions - np.outer(directions @ up, up)) / self.displacement
-        stiffness = _along(directions)
         restoring = [np.hstack([sideways, stiffness]), np.hstack([-sideways, stiffness])]
         lift = np.hstack([up, np.zeros(len(PAIRS))])[None]
         return np.concatenate([lift, *(self.reach * part for part in restoring)]) / self.particle.weight
 
 
 @dataclass(frozen=True)
-class Push:
+class Push(ForceGoal):
     """The force along a direction on a body of a propagator of method "tmatrix" [N]; see `radiation_force`.
 
     Attributes:
@@ -284,11 +305,21 @@ class Push:
         object.__setattr__(self, "direction", unit_vector("direction", self.direction))
         object.__setattr__(self, "body", integer_at_least("body", self.body, 0))
 
+    def check(self, scene: Scene) -> None:
+        """Check that the scene has such a body."""
+        if self.body >= (count := len(bodies_of(scene.obstacles))):
+            accepted = f"must be in 0 to {count - 1}" if count else "must be a body, and the scene has none"
+            raise invalid("body", self.body, accepted)
+
     def forms(self, propagator: Propagator) -> tuple[torch.Tensor, Array]:
         """Return rows (N, M), and the weights (1, N) of their squares in the force."""
-        require_kind("propagator", propagator, TMatrixPropagator)
-        assert isinstance(propagator, TMatrixPropagator)
+        if not isinstance(propagator, TMatrixPropagator):
+            raise invalid("propagator", propagator, 'must be of method "tmatrix", for the force on a body')
         matrices = force_matrices(propagator, self.body).detach()
+        if not propagator.bodies.bodies[self.body].matrix.abs().max() > _TRANSPARENT:
+            raise invalid(
+                "body", self.body, "must scatter sound: a body that is as the medium feels no force"
+            )
         form = torch.einsum("i,imn->mn", matrices.real.new_tensor(self.direction).to(matrices), matrices)
         rows, signs = _squares(form)
         return rows, signs[None]
@@ -309,10 +340,16 @@ class ForceObjective:
     def __init__(self, propagator: Propagator, goal: ForceGoal) -> None:
         """Compute the rows of a trap, lift or push by a propagator."""
         require_kind("propagator", propagator, Propagator)
-        if not isinstance(goal, _ParticleGoal | Push):
+        if not isinstance(goal, ForceGoal):
             raise invalid("goal", goal, "must be a Trap, Levitate or Push")
+        goal.check(propagator.scene)
         self.scene, self.evaluations = propagator.scene, 0
-        self.transfer_matrix, weights = goal.forms(propagator)
+        rows, weights = goal.forms(propagator)
+        self.transfer_matrix = rows.resolve_conj()
+        if not self.transfer_matrix.any():
+            raise invalid(
+                "goal", goal, "must be of a force that some drive exerts: no sound is scattered there"
+            )
         self.goal = LeastForm(goal, weights)
 
     @one_library_thread()

@@ -29,11 +29,13 @@ class Goal(ABC):
         name: of the goal in configs, results and figures; of the class where it has none.
         unit: of the scores, "" for numbers.
         absolute: whether `wanted` gives pressures in Pa.
+        of_pressures: whether it scores pressures at control points; a goal of force scores other readings.
     """
 
     name: ClassVar[str]
     unit: ClassVar[str] = "Pa"
     absolute: ClassVar[bool] = False
+    of_pressures: ClassVar[bool] = True
 
     def __init_subclass__(cls) -> None:
         """Name a goal without a name after its class."""

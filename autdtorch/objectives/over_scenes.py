@@ -61,6 +61,11 @@ class OverScenes(Goal):
         """True if the goal wants pressures in Pa."""
         return isinstance(self.goal, Goal) and self.goal.absolute
 
+    @property
+    def of_pressures(self) -> bool:  # type: ignore[override]
+        """False if the goal scores other readings."""
+        return not isinstance(self.goal, Goal) or self.goal.of_pressures
+
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:
         """Return the score (...) of pressures (..., S P) [Pa]."""
         return self.joined(self.by_scene(pressure))

@@ -42,11 +42,13 @@ TRIALS_FILE = "trials.jsonl"
 class TrialFile:
     """The finished trials by scene, method and number, in memory and in a file."""
 
-    def __init__(self, path: Path, origin: str, seed: int, shapes: Mapping[str, tuple[int, int]]) -> None:
+    def __init__(
+        self, path: Path, origin: str, seed: int, shapes: Mapping[str, tuple[int, int | None]]
+    ) -> None:
         """Read the trials of the study from the file, which is not changed before `mend`.
 
         The origin is part of the checksum of the lines. The `shapes` are the numbers of transducers and of
-        control points by name of the scene.
+        control points by name of the scene; None for readings of a force, of any number.
         """
         self._seed = seed
         self._shapes = shapes
@@ -86,14 +88,14 @@ class TrialFile:
 
     def _row(self, scene: str, method: str, trial: int) -> dict[str, Any]:
         solution, seconds = self._trials[scene, method, trial]
-        metrics = vars(focus_metrics(solution.pressure)).items()
+        metrics = {} if self._shapes[scene][1] is None else vars(focus_metrics(solution.pressure))
         return {
             "scene": scene,
             "method": method,
             "trial": trial,
             "seed": self._seed,
             "score": float(solution.score),
-            **{name: float(value) for name, value in metrics if value is not None},
+            **{name: float(value) for name, value in metrics.items() if value is not None},
             "evaluations": int(solution.evaluations),
             "seconds": seconds,
             "pressure": solution.pressure[0].tolist(),
@@ -110,12 +112,12 @@ class TrialFile:
         where = row["scene"], row["method"], integer_at_least("trial", row["trial"], 0)
         if where in self._trials:
             raise invalid("trial", where, "must be there once")
-        transducers, foci = self._shapes[row["scene"]]
+        transducers, points = self._shapes[row["scene"]]
         fields: dict[str, Any] = {
             name: [row[name]] for name in ("pressure", "score", "evaluations", "history")
         }
         fields["drive"] = torch.view_as_complex(real_tensor("drive", row["drive"]))[None]
-        solution = stored_solution(fields, transducers, foci)
+        solution = stored_solution(fields, transducers, len(row["pressure"]) if points is None else points)
         if solution.history.shape[1] != int(solution.evaluations):
             raise invalid("history", row["history"], f"must be {row['evaluations']} numbers")
         self._trials[where] = solution, not_negative("seconds", row["seconds"], "s")
@@ -147,7 +149,7 @@ class StudyFolder:
     trials: TrialFile
 
     def __init__(
-        self, path: Path, provenance: Provenance, scenes: Mapping[str, Scene], copies: int, reuse: bool
+        self, path: Path, provenance: Provenance, scenes: Mapping[str, Scene], copies: int | None, reuse: bool
     ) -> None:
         """Read the files of the study with this provenance; the folder must be locked.
 
@@ -157,7 +159,8 @@ class StudyFolder:
         self.provenance = provenance
         self.scenes: dict[str, SceneResult] = {}
         self._shapes = {
-            name: (len(scene.array), copies * len(scene.control_points)) for name, scene in scenes.items()
+            name: (len(scene.array), None if copies is None else copies * len(scene.control_points))
+            for name, scene in scenes.items()
         }
         self._not_used = dict.fromkeys(_FILES, _ANOTHER)
         if reuse:
@@ -221,11 +224,12 @@ class StudyFolder:
 
 @contextlib.contextmanager
 def open_folder(
-    path: Path, provenance: Provenance, scenes: Mapping[str, Scene], copies: int, reuse: bool
+    path: Path, provenance: Provenance, scenes: Mapping[str, Scene], copies: int | None, reuse: bool
 ) -> Iterator[StudyFolder]:
     """Lock the folder of a study, made if it is missing; `reuse` takes files of its origin from it.
 
-    Each of `scenes` has the pressures of so many `copies`: the scene itself, or the scenarios around it.
+    Each of `scenes` has the pressures of so many `copies`: the scene itself, or the scenarios around it; None
+    for readings of a force.
     """
     path.mkdir(parents=True, exist_ok=True)
     accepted = "another process writes there; wait until it ends, or give another folder"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import platform
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,8 @@ from autdtorch.utils.validation import invalid, real_tensor
 
 PROVENANCE_FILE = "provenance.json"
 
+_NEWTONS = "N", "N/m"  # units that are shown with a prefix
+_PREFIXES = ("", 1.0), ("m", 1e3), ("µ", 1e6), ("n", 1e9)
 _TYPES = {"config": str, "seed": int, "versions": dict, "source_digest": str, "date": str}
 
 
@@ -130,7 +132,7 @@ class MethodResult:
 
     Attributes:
         solution: drives of the T trials, with pressures, scores, evaluations and history.
-        metrics: figures of merit (T,).
+        metrics: figures of merit (T,); None where the goal is a force.
         seconds: run time of each trial (T,), float64; trials that ran together have equal shares.
         shown_trial: the trial of median score, for pictures.
         plane_pressure: pressure of the shown trial on the observation plane (Nu, Nv), complex128 [Pa]; None
@@ -138,7 +140,7 @@ class MethodResult:
     """
 
     solution: Solution
-    metrics: FocusMetrics
+    metrics: FocusMetrics | None
     seconds: torch.Tensor
     shown_trial: int
     plane_pressure: torch.Tensor | None
@@ -147,6 +149,11 @@ class MethodResult:
     def trials(self) -> int:
         """Number of trials T."""
         return len(self.solution.score)
+
+    def of_foci(self, name: str) -> torch.Tensor | None:
+        """Return a figure of merit (T,) of foci by name, such as "mean", if it is known."""
+        values: torch.Tensor | None = getattr(self.metrics, name, None)
+        return values
 
     def __repr__(self) -> str:
         """Return the solution and the mean time of a trial, with units."""
@@ -159,7 +166,7 @@ class SceneResult:
 
     Attributes:
         obstacles: number of obstacles.
-        transfer_matrix: of the control points (P, M), complex128 [Pa].
+        transfer_matrix: of the control points (P, M), complex128 [Pa]; of a `ForceObjective` for a force.
         bound: certified upper bound on the score; infinite if none is known.
         simulation: the simulation of the field.
         methods: results by method name, in the order of the runs.
@@ -174,6 +181,11 @@ class SceneResult:
     methods: dict[str, MethodResult]
     goal: Mapping[str, Any] = field(default_factory=PAPERS_GOAL.copy)
     unit: str = "Pa"
+
+    @property
+    def of_pressures(self) -> bool:
+        """False where the goal is a force."""
+        return any(method.metrics is not None for method in self.methods.values())
 
     @property
     def score_label(self) -> str:
@@ -257,24 +269,59 @@ def median_trial(score: torch.Tensor) -> int:
     return int(score.argsort(stable=True)[(len(score) - 1) // 2])
 
 
+def with_prefixes(results: StudyResult) -> StudyResult:
+    """Return results to be shown: forces and stiffnesses in mN, µN or nN, by the largest of the study."""
+    scenes = dict(results.scenes)
+    for unit in _NEWTONS:
+        of_unit = {name: scene for name, scene in scenes.items() if scene.unit == unit}
+        sizes = [_largest(scene) for scene in of_unit.values()]
+        prefix, factor = next(
+            ((prefix, factor) for prefix, factor in _PREFIXES if factor * max(sizes, default=0.0) >= 1),
+            _PREFIXES[-1],
+        )
+        scenes |= {name: _scaled(scene, factor, f"{prefix}{unit}") for name, scene in of_unit.items()}
+    return replace(results, scenes=scenes)
+
+
+def _largest(scene: SceneResult) -> float:
+    """Return the largest size of a score."""
+    return max(float(method.solution.score.abs().max()) for method in scene.methods.values())
+
+
+def _scaled(scene: SceneResult, factor: float, unit: str) -> SceneResult:
+    """Return a scene with its scores times a factor, in another unit."""
+    methods = {}
+    for name, method in scene.methods.items():
+        solution = method.solution
+        scores = {"score": factor * solution.score, "history": factor * solution.history}
+        methods[name] = replace(method, solution=replace(solution, **scores))
+    return replace(scene, bound=factor * scene.bound, methods=methods, unit=unit)
+
+
 def summary_rows(results: StudyResult) -> list[list[str]]:
     """Return a table of the metrics, header first: mean over the trials ± standard deviation.
 
-    The score has a column where it is not the pressure of the weakest focus, as in the paper. The last column
-    has the mean score over the bound of the scene. The numbers of a column have equal decimals.
+    The score has a column where it is not the pressure of the weakest focus, as in the paper; studies of
+    forces alone have no columns of pressures. The last column has the mean score over the bound of the scene.
+    The numbers of a column have equal decimals.
     """
+    results = with_prefixes(results)
     scored = any(scene.goal != PAPERS_GOAL for scene in results.scenes.values())
     head = ["scene", "method", "trials", *(["score"] if scored else [])]
-    rows = [[*head, "mean [Pa]", "weakest [Pa]", "std [Pa]", "area [mm²]", "evaluations", "of the bound"]]
+    columns = ["mean [Pa]", "weakest [Pa]", "std [Pa]", "area [mm²]"] if with_foci(results) else []
+    rows = [[*head, *columns, "evaluations", "of the bound"]]
     scores = column_decimals(results, lambda method: method.solution.score)
-    pressures = column_decimals(results, lambda method: method.metrics.mean)
-    areas = column_decimals(results, lambda method: _square_mm(method.metrics.area))
+    pressures = column_decimals(results, lambda method: method.of_foci("mean"))
+    areas = column_decimals(results, area_of)
     for scene_name, scene in results.scenes.items():
         for name, method in scene.methods.items():
-            metrics, area = method.metrics, _square_mm(method.metrics.area)
             score = [scene.in_unit(_over_trials(method.solution.score, scores))] if scored else []
-            numbers = [_over_trials(values, pressures) for values in (metrics.mean, metrics.min, metrics.std)]
-            numbers.append("none" if area is None else _over_trials(area, areas))
+            numbers = ["-"] * len(columns)
+            if (metrics := method.metrics) is not None:
+                of_foci = metrics.mean, metrics.min, metrics.std
+                area = area_of(method)
+                numbers = [_over_trials(values, pressures) for values in of_foci]
+                numbers.append("none" if area is None else _over_trials(area, areas))
             evaluations = f"{method.solution.evaluations.double().mean():.0f}"
             share = _share_of_bound(scene, float(method.solution.score.mean()))
             rows.append(
@@ -301,7 +348,14 @@ def _share_of_bound(scene: SceneResult, score: float) -> str:
     return f"{100 * score / scene.bound:.1f} % of {scene.in_unit(f'{scene.bound:.4g}')}"
 
 
-def _square_mm(area: torch.Tensor | None) -> torch.Tensor | None:
+def with_foci(results: StudyResult) -> bool:
+    """Return whether any result has figures of merit of foci, and not forces alone."""
+    return any(scene.of_pressures for scene in results.scenes.values())
+
+
+def area_of(method: MethodResult) -> torch.Tensor | None:
+    """Return the area a focus of each trial (T,) [mm^2], if it is known."""
+    area = method.of_foci("area")
     return None if area is None else 1e6 * area
 
 

@@ -114,7 +114,7 @@ def _read_provenance(attributes: Any) -> Provenance:
 def _write_scene(group: Any, scene: SceneResult) -> None:
     # A user's goal may have settings that JSON cannot hold.
     attributes: dict[str, Any] = {"goal": json.dumps(scene.goal, default=str), "unit": scene.unit}
-    attributes |= {"obstacles": scene.obstacles, "bound": scene.bound}
+    attributes |= {"obstacles": scene.obstacles, "bound": scene.bound, "of_pressures": scene.of_pressures}
     attributes |= {key: getattr(scene.simulation, key) for key in _SIMULATION}
     group.attrs.update({key: value for key, value in attributes.items() if value is not None})
     for key in _RUN:
@@ -128,6 +128,7 @@ def _write_scene(group: Any, scene: SceneResult) -> None:
 def _read_scene(group: Any) -> SceneResult:
     matrix = _complex_matrix(group, "transfer_matrix")
     points, transducers = matrix.shape
+    of_pressures = boolean("of_pressures", group.attrs.get("of_pressures", True))
     goal, unit = _read_goal(group.attrs)
     bound = group.attrs["bound"]
     return SceneResult(
@@ -135,7 +136,10 @@ def _read_scene(group: Any) -> SceneResult:
         matrix,
         math.inf if bound == math.inf else finite_number("bound", bound, unit),
         _read_simulation(group),
-        {name: _read_method(entry, points, transducers) for name, entry in _named(group, "methods")},
+        {
+            name: _read_method(entry, points, transducers, of_pressures)
+            for name, entry in _named(group, "methods")
+        },
         goal,
         unit,
     )
@@ -179,21 +183,24 @@ def _run(periods: Any, remaining: Any, reached: Any, seconds: Any) -> Run:
 def _write_method(group: Any, method: MethodResult) -> None:
     group.attrs["shown_trial"] = method.shown_trial
     tensors = {key: getattr(method.solution, key) for key in _SOLUTION}
-    tensors |= {key: getattr(method.metrics, key) for key in _METRICS}
+    if method.metrics is not None:
+        tensors |= {key: getattr(method.metrics, key) for key in _METRICS}
     tensors |= {"seconds": method.seconds, "plane_pressure": method.plane_pressure}
     for key, tensor in tensors.items():
         if tensor is not None:
             group[key] = tensor.numpy()
 
 
-def _read_method(group: Any, points: int, transducers: int) -> MethodResult:
+def _read_method(group: Any, points: int, transducers: int, of_pressures: bool) -> MethodResult:
     solution = stored_solution({key: _array(group, key) for key in _SOLUTION}, transducers, points)
     trials = len(solution.score)
     shown = integer_at_least("shown_trial", group.attrs["shown_trial"], 0)
     if shown >= trials:
         raise invalid("shown_trial", shown, f"must be in 0 to {trials - 1}, one of the trials")
-    area = _magnitudes(group, "area", trials) if "area" in group else None
-    metrics = FocusMetrics(**{key: _magnitudes(group, key, trials) for key in _METRICS[:-1]}, area=area)
+    metrics = None
+    if of_pressures:
+        area = _magnitudes(group, "area", trials) if "area" in group else None
+        metrics = FocusMetrics(**{key: _magnitudes(group, key, trials) for key in _METRICS[:-1]}, area=area)
     plane = _complex_matrix(group, "plane_pressure") if "plane_pressure" in group else None
     return MethodResult(solution, metrics, _magnitudes(group, "seconds", trials), shown, plane)
 

@@ -17,23 +17,24 @@ import torch
 
 from autdtorch.io.goal_section import goal_section, require_score
 from autdtorch.methods.base import Method
-from autdtorch.methods.problem import Problem
 from autdtorch.methods.run import run
 from autdtorch.methods.seeds import TRIAL_BYTES, Trials
 from autdtorch.methods.solution import Solution
+from autdtorch.objectives.forces import ForceGoal, ForceObjective, Push
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.objectives.metrics import focus_metrics
-from autdtorch.objectives.objective import Objective, SimulatedObjective
+from autdtorch.objectives.objective import Objective
 from autdtorch.objectives.over_scenes import OverScenes
 from autdtorch.objectives.quiet import QuietPoints, SeenPoints
 from autdtorch.objectives.readings import Readings
-from autdtorch.objectives.scenarios import Scenarios, observed_goal
+from autdtorch.objectives.scenarios import observed_goal
 from autdtorch.propagators import Propagator, SimulatedPropagator, TMatrixPropagator, make_propagator
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.tmatrix.propagator import placed_bodies
 from autdtorch.scene.obstacles.moving import is_movable
 from autdtorch.scene.scene import Scene
 from autdtorch.study.folder import TrialFile, open_folder
+from autdtorch.study.problems import blank_problem, method_for_bodies, objective_of, scenes_of
 from autdtorch.study.results import (
     MethodResult,
     SceneResult,
@@ -42,7 +43,6 @@ from autdtorch.study.results import (
     median_trial,
     provenance_now,
 )
-from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.process import require_memory
 from autdtorch.utils.progress import Progress, show_progress
 from autdtorch.utils.spatial import nearest
@@ -83,7 +83,7 @@ def run_study(
     trials: int | Mapping[str, int] = 1,
     seed: int = 0,
     plane_spacing: float = 1e-3,
-    goal: Goal = WEAKEST_FOCUS,
+    goal: Goal | ForceGoal = WEAKEST_FOCUS,
     config: str = "",
     poses: bool = False,
     scenarios: Mapping[str, Any] | None = None,
@@ -101,7 +101,8 @@ def run_study(
         trials: of every method that has random choices, or by method name.
         seed: of the random choices, >= 0; the same in every scene.
         plane_spacing: edge of a cell of the observation plane [m].
-        goal: what the methods maximise.
+        goal: what the methods maximise. For a force, methods see the readings of a `ForceObjective`; a `Push`
+            takes T-matrices, if the solver's method is left open.
         config: all of the above as text. What the folder holds for the same text, made with the same source
             and packages, is taken from there. Without text, or with methods, obstacles or a goal that are not
             autdtorch's, everything is computed.
@@ -124,14 +125,12 @@ def run_study(
     counts = _counts(methods, trials, seed)
     plane_spacing = positive("plane_spacing", plane_spacing, "m")
     check_goal(goal, scenes, methods)
-    copies = _scenes_of(scenarios, goal)
+    copies = scenes_of(scenarios, goal)
+    counted_copies = copies.scenes if isinstance(copies, OverScenes) else None
     for name, method in methods.items():
         for scene in scenes.values():
             if isinstance(method, Method):
-                points, transducers = copies.scenes * len(scene.control_points), len(scene.array)
-                # In place of the matrix that the simulation will give: a prior needs one, of this shape.
-                blank = torch.ones(points, transducers, **COMPLEX)
-                problem = Problem(transducers, points, copies, scene, blank)
+                problem = blank_problem(scene, copies)
                 with within(f"method {name}"):
                     method.require_fit(problem, min(counts[name], method.block))
     planes = {name: _plane_points(scene, plane_spacing) for name, scene in scenes.items()}
@@ -140,10 +139,12 @@ def run_study(
     code += [type(obstacle) for scene in scenes.values() for obstacle in scene.obstacles]
     ours = all(one.__module__.partition(".")[0] == "autdtorch" for one in code)
     provenance = provenance_now(config, seed)
-    with open_folder(folder, provenance, scenes, copies.scenes, reuse=bool(config) and ours) as stored:
+    with open_folder(folder, provenance, scenes, counted_copies, reuse=bool(config) and ours) as stored:
         missing = {name: scene for name, scene in scenes.items() if name not in stored.scenes}
         with within("solver"):
             settings = _for_poses(scenes, solver or {}) if poses else solver or {}
+            if isinstance(goal, Push):
+                settings = {**settings, "method": method_for_bodies(settings)}
             propagators = {name: make_propagator(scene, **settings) for name, scene in missing.items()}
         stored.begin()
         names = list(scenes)
@@ -160,18 +161,6 @@ def run_study(
         if poses and missing:
             logger.info("%s, the last: %s", counted(len(missing), "pose"), _in_short(propagator, finished))
         return StudyResult(stored.provenance, {name: stored.scenes[name] for name in scenes})
-
-
-def _scenes_of(scenarios: Mapping[str, Any] | None, goal: Goal) -> OverScenes:
-    """Return the goal over the scenes that stand for each, after checking the settings of the scenarios."""
-    if scenarios is None:
-        return OverScenes(goal, 1)
-    taken = dict(inspect.signature(Scenarios.around).parameters)
-    del taken["propagator"]
-    require_known("scenarios", scenarios, taken)
-    with within("scenarios"):
-        settings = {name: scenarios.get(name, taken[name].default) for name in ("count", "by")}
-        return OverScenes(goal, integer_at_least("count", settings["count"], 1), settings["by"])
 
 
 def _for_poses(scenes: Mapping[str, Scene], solver: Mapping[str, Any]) -> dict[str, Any]:
@@ -217,13 +206,16 @@ def _counts(methods: Mapping[str, StudyMethod], trials: int | Mapping[str, int],
     return counts
 
 
-def check_goal(goal: Goal, scenes: Mapping[str, Scene], methods: Mapping[str, StudyMethod]) -> None:
+def check_goal(
+    goal: Goal | ForceGoal, scenes: Mapping[str, Scene], methods: Mapping[str, StudyMethod]
+) -> None:
     """Check the goal against all scenes, and that every method can maximise it."""
-    require_kind("goal", goal, Goal)
+    if not isinstance(goal, ForceGoal):
+        require_kind("goal", goal, Goal)
     require_score(goal.name, goal.unit)
     for scene in scenes.values():
         with within("goal"):
-            goal.check(len(scene.control_points))
+            goal.check(scene) if isinstance(goal, ForceGoal) else goal.check(len(scene.control_points))
     for name, method in methods.items():
         if goal == WEAKEST_FOCUS or isinstance(method, Method):
             continue
@@ -241,7 +233,7 @@ def goal_keyword(method: Callable[..., Solution]) -> str | None:
     return "score"
 
 
-def _goals_of(goal: Goal) -> list[Goal]:
+def _goals_of(goal: Goal | ForceGoal) -> list[Goal | ForceGoal]:
     """Return a goal, and the goals that it is made of."""
     return [goal, *_goals_of(goal.goal)] if isinstance(goal, QuietPoints | SeenPoints) else [goal]
 
@@ -290,7 +282,7 @@ def _run_scene(
     methods: Mapping[str, StudyMethod],
     counts: Mapping[str, int],
     seed: int,
-    goal: Goal,
+    goal: Goal | ForceGoal,
     trials: TrialFile,
     progress: Progress,
     before: SceneResult | None,
@@ -298,9 +290,9 @@ def _run_scene(
     scene = propagator.scene
     progress.describe(f"{name}: transfer matrix")
     begin = time.perf_counter()
-    with within("scenarios"):
-        around = None if scenarios is None else Scenarios.around(propagator, **scenarios)
-    objective = around or SimulatedObjective(scene, propagator)
+    objective = objective_of(propagator, goal, scenarios)
+    goal = objective.goal if isinstance(objective, ForceObjective) else goal
+    assert isinstance(goal, Goal)
     transfer_matrix, (maximised, _) = objective.transfer_matrix, observed_goal(objective, goal)
     matrix_seconds = time.perf_counter() - begin
     assert transfer_matrix is not None
@@ -331,8 +323,8 @@ def _run_scene(
     progress.advance(1)
     results = {}
     for (method_name, (solution, seconds)), pressure in zip(solutions.items(), planes, strict=True):
-        metrics = focus_metrics(solution.pressure)
-        if pressure is not None:  # of the first scene, where there are several
+        metrics = focus_metrics(solution.pressure) if goal.of_pressures else None
+        if metrics is not None and pressure is not None:  # of the first scene, where there are several
             foci = solution.pressure[:, : len(scene.control_points)]
             metrics = replace(metrics, area=focus_metrics(foci, pressure.abs(), cell_area).area)
         shown = median_trial(solution.score)

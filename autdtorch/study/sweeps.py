@@ -161,7 +161,7 @@ def _flat_goal(goal: Mapping[str, Any], key: str = "goal") -> Iterator[tuple[str
     """Yield the name of a goal as ``goal``, and its settings as ``goal.targets``."""
     yield key, goal["name"]
     for name, entry in goal.items():
-        if isinstance(entry, dict):
+        if isinstance(entry, dict) and "name" in entry:
             yield from _flat_goal(entry, f"{key}.{name}")
         elif name != "name":
             yield from _flat(entry, f"{key}.{name}")
@@ -270,7 +270,10 @@ def _merged_trials(parts: Sequence[_Part]) -> MethodResult:
     )
 
 
-def _joined_metrics(metrics: Sequence[FocusMetrics]) -> FocusMetrics:
+def _joined_metrics(every: Sequence[FocusMetrics | None]) -> FocusMetrics | None:
+    metrics = [one for one in every if one is not None]
+    if not metrics:
+        return None
     areas = [one.area for one in metrics if one.area is not None]
     names = ("mean", "min", "std", "uniformity")
     joint = {name: torch.cat([getattr(one, name) for one in metrics]) for name in names}

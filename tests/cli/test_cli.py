@@ -116,7 +116,14 @@ def test_a_run_maximises_the_goal_of_its_settings_and_uses_no_results_of_another
 
 #: Overrides in one string, divided by two spaces, and the beginning of the message.
 WRONG = {
-    "goal=loudest": "goal: 'loudest'; must be one of contrast, mean_pressure, quiet_points, ",
+    "goal=loudest": "goal: 'loudest'; must be one of contrast, levitate, mean_pressure, push, quiet_points, ",
+    "goal=push": "goal: direction: None; must be 3 real numbers",
+    "goal=push  goal.direction=[1,0,0]": "goal: body: 0; must be a body, and the scene has none",
+    "goal=trap  goal.particle.density=20": "goal.particle: material: 'EPS'; must be null where density and",
+    "goal=trap  goal.particle.material=wood": "goal.particle: material: 'wood'; must be one of EPS, water",
+    "goal=trap  goal.particle.radius=5e-3": "goal: particle.radius: 0.005 m; must be at most 0.001",
+    "goal=trap  goal.particle=3": "goal.particle: 3; must be a mapping, such as",
+    "goal=trap  scenarios={count:3}": "scenarios: {'count': 3}; must be null: a goal of force",
     "goal.name=loudest": r"goal\.name: 'loudest'; must be one of weakest_focus, mean_pressure, ",
     "goal=target_pressures": "goal: targets: None; must be",
     "goal=target_pressures  goal.targets=[4,2]": r"goal: targets: \(4\.0, 2\.0\); must be 4 numbers",

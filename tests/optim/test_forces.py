@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import autdtorch as at
+from autdtorch.objectives.forces import DIRECTIONS
 from autdtorch.objectives.hermitian import ascended, forms_bound
 
 BEAD = at.Particle.of("EPS", 0.5e-3)
@@ -44,7 +45,7 @@ def test_scores_are_those_of_the_force_on_a_sphere_and_its_slope(propagator, rad
     steps = torch.cat([torch.zeros(1, 3), torch.eye(3), -torch.eye(3)]).double()
     forces = exact(propagator, bead, torch.tensor(POINT) + step * steps, drive)
     force, stiffness = forces[:, 0], (forces[:, 4:] - forces[:, 1:4]) / (2 * step)
-    n = torch.tensor(goal.directions, dtype=torch.float64)
+    n = torch.tensor(DIRECTIONS, dtype=torch.float64)
     along, across = torch.einsum("di,...ij,dj->...d", n, stiffness, n), n[:, :2]
     expected = (along - (force @ n.mT).abs() / goal.displacement).amin(dim=-1)
     objective = at.ForceObjective(propagator, goal)
@@ -67,8 +68,9 @@ def test_methods_maximise_the_goal_of_the_objective(propagator):
     held = at.gorkov(propagator, [POINT], climbed.drive[0], bead)
     assert held.principal_stiffness.min() > 0
     assert held.displacement.norm() < 1e-3  # `displacement` is along each direction, not along all
-    with pytest.raises(ValueError, match="must be the readings of the 1 control points"):
-        at.lssg(objective)
+    for method in (at.identify, at.phase_stepping, at.lssg, at.holography):
+        with pytest.raises(ValueError, match="take gradient_ascent, or gabs and bayes_opt"):
+            method(objective)
 
 
 def test_a_push_is_the_force_on_a_body_and_has_a_bound():

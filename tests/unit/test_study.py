@@ -1,6 +1,7 @@
 """A study is repeatable, checks its settings first, and does not compute again what it finds finished."""
 
 import functools
+import json
 import logging
 import math
 from dataclasses import dataclass, replace
@@ -15,6 +16,7 @@ from autdtorch.io.goal_section import load_goal
 from autdtorch.propagators import FreeSpacePropagator, Run
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.study.folder import TRIALS_FILE
+from autdtorch.study.results import summary_rows
 from autdtorch.study.run_study import _for_poses, run_study
 
 PLANE = at.Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 16e-3))
@@ -161,6 +163,17 @@ def test_a_study_goes_on_after_the_scenes_that_were_finished(scenes, count_runs,
         ({"plane_spacing": float("nan")}, "plane_spacing: nan m"),
         ({"solver": {"spacing": -1.0}}, r"solver: spacing: -1\.0 m"),
         ({"goal": "mean_pressure"}, "goal: 'mean_pressure'; must be a Goal"),
+        ({"goal": at.Push((1, 0, 0))}, "goal: body: 0; must be a body, and the scene has none"),
+        ({"goal": at.Levitate(None, at.Particle.of("EPS", 2e-3))}, "goal: particle.radius: 0.002 m; must be"),
+        ({"goal": at.Levitate(None, at.Particle.of("EPS", 1e-3)), "scenarios": {}}, "scenarios: {}; must be"),
+        (
+            {"goal": at.Push((1, 0, 0)), "scenes": {"a": scene(None, (CUBE,))}, "solver": {"method": "box"}},
+            'solver: method: \'box\'; must be "auto" or "tmatrix"',
+        ),
+        (
+            {"goal": at.Levitate(None, at.Particle.of("EPS", 1e-3)), "methods": {"i": at.Identify()}},
+            "method i: goal: 'levitate'; must be of pressures at control points, which identify fits; for a",
+        ),
         ({"goal": at.TargetPressures([3, 4])}, r"goal: targets: \(3\.0, 4\.0\); must be 3 numbers"),
         ({"methods": {"gabs": at.GABS(first=16)}}, "method gabs: first: 16; must be an integer from 0 to"),
     ],
@@ -208,6 +221,35 @@ def test_methods_and_functions_maximise_the_goal_of_the_study(goal, tmp_path):
         assert torch.equal(method.solution.score, goal(method.solution.pressure))
     climbed = scene_result.methods["climb"].solution.score
     assert scene_result.methods["gabs"].solution.score < climbed <= scene_result.bound
+
+
+BEAD = at.Particle.of("EPS", 0.3e-3)
+FORCES = {
+    "push": at.Push((1, 0, 0)),
+    "trap": at.Trap([(22e-3, 7e-3, 14e-3)], BEAD, [(1, 0, 0), (0, 2, 0)]),
+    "levitate": at.Levitate(None, BEAD, [(1, 0, 0)], up=(1, 0, 0)),
+}
+
+
+@pytest.mark.parametrize("goal", FORCES.values(), ids=FORCES)
+def test_a_study_of_a_force_has_a_score_and_a_bound_and_no_figures_of_foci(goal, tmp_path):
+    methods = {"climb": at.GradientAscent(starts=2), "gabs": at.GABS(levels=4), "lssg": at.LSSG(levels=4)}
+    ball = at.Sphere((14e-3, 12e-3, 12e-3), radius=3e-3, rigid=True)
+    results = run_study({"a": scene(None, (ball,))}, methods, tmp_path, goal=goal, config="a: 1")
+    for found in (results.scenes["a"], at.load_results(tmp_path).scenes["a"]):
+        assert load_goal("goal", found.goal) == goal
+        assert (found.simulation.method, found.unit) == ("tmatrix", goal.unit)
+        scores = [method.solution.score for method in found.methods.values()]
+        assert max(scores) == scores[0] <= found.bound
+        assert all(method.metrics is None for method in found.methods.values())
+    head, first, *_ = summary_rows(results)
+    assert head == ["scene", "method", "trials", "score", "evaluations", "of the bound"]
+    number, *unit = first[3].split()
+    factor = {"mN": 1e-3, "µN": 1e-6, "nN": 1e-9, "": 1.0}["".join(unit).removesuffix("/m")]
+    assert float(number) * factor == pytest.approx(float(scores[0]), rel=5e-3)  # three digits
+    (row, *_) = map(json.loads, (tmp_path / TRIALS_FILE).read_text().splitlines())
+    assert "weakest" not in str(row)
+    assert "min" not in row
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import torch
 
 from autdtorch.methods.base import Method, Step, choice, setting, whole
 from autdtorch.methods.holography.algorithms import SOLVERS, TINY, Algorithm, descent, within_largest
-from autdtorch.methods.problem import Problem, known_matrix
+from autdtorch.methods.problem import Problem, known_matrix, require_pressures
 from autdtorch.objectives.goals import Goal
 from autdtorch.objectives.objective import GoalFunction, Objective
 from autdtorch.utils.array_types import REAL
@@ -99,7 +99,9 @@ def holography(
     iterations = integer_at_least("iterations", iterations, 1)
     free = boolean("free_amplitudes", free_amplitudes)
     if isinstance(G, Objective):
-        G = known_matrix(Problem.of(G))
+        problem = Problem.of(G)
+        require_pressures(problem, algorithm)
+        G = known_matrix(problem)
     matrix = _checked_matrix(G)
     wanted = checked_targets(targets, matrix)
     solver = "wgs" if algorithm == "diff_pat" else algorithm

@@ -17,7 +17,7 @@ import torch
 from autdtorch.io.goal_section import PAPERS_GOAL
 from autdtorch.methods.catalogue import label_of
 from autdtorch.methods.solution import Solution
-from autdtorch.study.results import SceneResult, StudyResult
+from autdtorch.study.results import SceneResult, StudyResult, area_of
 from autdtorch.study.statistics import Interval, bootstrap, share_interval
 from autdtorch.utils.text import decimals_of
 
@@ -87,7 +87,7 @@ class Claim:
         )
 
     def _is_about(self, name: str, scene: SceneResult) -> bool:
-        with_area = all(method.metrics.area is not None for method in scene.methods.values())
+        with_area = all(area_of(method) is not None for method in scene.methods.values())
         fits = self.obstacles in (None, scene.obstacles > 0) and self.scene in ("", name)
         return fits and (with_area or not self.area)
 
@@ -105,6 +105,7 @@ def _values(scene: SceneResult, method: str, quantity: str) -> torch.Tensor | fl
     """Return a quantity of each trial, or a single number if it is exact."""
     result = scene.methods[method]
     source = result.solution if quantity == "evaluations" else result.metrics
+    assert source is not None  # of the paper's goal
     values: torch.Tensor = _UNITS[quantity][1] * getattr(source, quantity).double()
     exact = quantity == "evaluations" or (method == LSSG and len(values) == 1)
     return float(values.mean()) if exact else values
@@ -171,7 +172,7 @@ def _converged(solution: Solution) -> torch.Tensor:
 
 def _foci_form(scene: SceneResult, _: SceneResult) -> Comparison:
     metrics = (scene.methods[method].metrics for method in (BO, GABS))
-    bo, gabs = (bootstrap(one.min / one.mean) for one in metrics)
+    bo, gabs = (bootstrap(one.min / one.mean) for one in metrics if one is not None)
     return _listed({"BO": bo, "GABS": gabs}), [_above(bo, FORMED), _above(gabs, FORMED)]
 
 

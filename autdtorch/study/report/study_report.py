@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -24,7 +25,15 @@ from autdtorch.study.report import alt_texts, tables
 from autdtorch.study.report.claims import BO, GABS, judge_claims
 from autdtorch.study.report.document import as_page, picture, rendered
 from autdtorch.study.report.findings import LEVEL, findings, gaps
-from autdtorch.study.results import MethodResult, SceneResult, StudyResult, summary_rows
+from autdtorch.study.results import (
+    MethodResult,
+    SceneResult,
+    StudyResult,
+    area_of,
+    summary_rows,
+    with_foci,
+    with_prefixes,
+)
 from autdtorch.study.results_file import RESULTS_FILE
 from autdtorch.study.statistics import FEWEST_TRIALS, NEAR_BOUND, has_shares
 
@@ -72,6 +81,7 @@ def _markdown(
     unfinished: Sequence[str],
 ) -> str:
     """Draw the figures into a folder; return the text of the report."""
+    results = with_prefixes(results)
     scenes = {name: scenes[name] for name in results.scenes}
     counts: dict[str, list[int]] = {}
     for scene in results.scenes.values():
@@ -98,6 +108,7 @@ def _markdown(
             (name, picture(f"fig1_{name}.png", alt_texts.of_scene(name, scenes[name]))) for name in scenes
         ],
         room=tables.room_rows(scenes),
+        foci=with_foci(results),
         reflecting=any(scene.reflectors for scene in scenes.values()),
         planes=_draw_planes(results, scenes, folder, "fig2", shown),
         alike=[label_of(name) for name in counts if name not in shown],
@@ -192,14 +203,17 @@ def _draw_planes(
 
 def _draw_trials(results: StudyResult, folder: Path) -> tuple[str, list[str]]:
     """Return the picture and the labels of the quantities; both are empty if each has a single value."""
-    areas = _by_method(
-        results, lambda result: None if result.metrics.area is None else 1e6 * result.metrics.area
-    )
     quantities = {
-        "mean pressure of the foci [Pa]": _by_method(results, lambda result: result.metrics.mean),
-        **({"area per focus [mm²]": areas} if areas else {}),
-        "std among the foci [Pa]": _by_method(results, lambda result: result.metrics.std),
+        "mean pressure of the foci [Pa]": _by_method(results, lambda one: one.of_foci("mean")),
+        "area per focus [mm²]": _by_method(results, area_of),
+        "std among the foci [Pa]": _by_method(results, lambda one: one.of_foci("std")),
     }
+    forces = _grouped(results, lambda scene: "" if scene.of_pressures else scene.score_label)
+    for label, scenes in forces.items():
+        if label:
+            part = replace(results, scenes=scenes)
+            quantities[label] = _by_method(part, lambda one: one.solution.score)
+    quantities = {label: values for label, values in quantities.items() if values}
     counts = [method.trials for scene in results.scenes.values() for method in scene.methods.values()]
     if counts == [1]:  # the table says it
         return "", []

@@ -75,13 +75,13 @@ def room_rows(scenes: Mapping[str, Scene]) -> list[list[str]]:
 
 def focus_rows(results: StudyResult) -> list[list[str]]:
     """Return the pressure at each control point in the trials that are shown; nothing of many points."""
-    scenes = results.scenes.values()
-    most = max(len(scene.transfer_matrix) for scene in scenes)
-    if most > _MOST_POINTS:
+    scenes = {name: scene for name, scene in results.scenes.items() if scene.of_pressures}
+    most = max((len(scene.transfer_matrix) for scene in scenes.values()), default=0)
+    if not 0 < most <= _MOST_POINTS:
         return []
     rows = [["scene", "method", *(f"point {number} [Pa]" for number in range(1, most + 1))]]
     decimals = column_decimals(results, lambda method: method.solution.pressure)
-    for name, scene in results.scenes.items():
+    for name, scene in scenes.items():
         for method, result in scene.methods.items():
             pressures = result.solution.pressure[result.shown_trial].tolist()
             cells = [f"{pressure:.{decimals}f}" for pressure in pressures]
@@ -174,7 +174,9 @@ def save_summary(sweep: Sweep, path: Path) -> None:
 
 
 def _numbers(method: MethodResult, scene: SceneResult) -> dict[str, object]:
-    gap, metrics = bound_gap(method, scene.bound), method.metrics
+    gap = bound_gap(method, scene.bound)
+    foci = {name: method.of_foci(name) for name in ("mean", "std", "area")}
+    means = {name: None if values is None else float(values.mean()) for name, values in foci.items()}
     return {
         "goal": scene.goal["name"],
         "unit": scene.unit,
@@ -183,9 +185,9 @@ def _numbers(method: MethodResult, scene: SceneResult) -> dict[str, object]:
         "best score": float(method.solution.score.max()),
         "bound": scene.bound if math.isfinite(scene.bound) else None,
         "gap to the bound": gap.gap.value if has_shares(scene.bound) else None,
-        "mean of the foci [Pa]": float(metrics.mean.mean()),
-        "std among the foci [Pa]": float(metrics.std.mean()),
-        "area a focus [m^2]": None if metrics.area is None else float(metrics.area.mean()),
+        "mean of the foci [Pa]": means["mean"],
+        "std among the foci [Pa]": means["std"],
+        "area a focus [m^2]": means["area"],
         "evaluations": float(method.solution.evaluations.double().mean()),
         "median seconds a trial": float(method.seconds.median()),
     }
