@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import hashlib
+import importlib
 import logging
 import os
 import re
@@ -37,6 +38,11 @@ from autdtorch.cli.errors import AGAIN, FULL_ERROR, FailedJob, in_one_line, stop
 logger = logging.getLogger(__name__)
 
 _LONGEST_NAME = 150  # of a job's folder; file systems allow 255 bytes
+_COMMANDS = {  # modules and functions of the commands that take a config
+    "explore": (__name__, "explore_scene"),
+    "calibrate": ("autdtorch.cli.calibrate_command", "calibrate_scene"),
+    "play": ("autdtorch.cli.play_command", "play"),
+}
 _EXPLORE_KEYS = ("port", "browser", "drive", "trial")
 _EXPLORE_SETTINGS = re.compile(r"\+*(scene|modules|explore|hydra)\b|\+*solver\.spacing=")
 
@@ -86,7 +92,10 @@ def main() -> None:
                 raise ValueError(f"{command}: a sweep; must be one scene at a time")
             sys.argv[1:] = arguments
             register()
-            {"explore": _explore, "calibrate": _calibrate, "play": _play, None: _run}[command]()
+            if command is None:
+                _run()
+            else:
+                _run_command(*_COMMANDS[command])
             if sweep:
                 print("autdtorch collect merges the results of a sweep into one table and one report")
     except _Carrier as carrier:
@@ -122,36 +131,23 @@ def _run(config: DictConfig) -> None:
         raise FailedJob(f"{failure}; {AGAIN}") from error
 
 
-@hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")
-def _explore(config: DictConfig) -> None:
-    with _errors_carried():
-        with _importing():
-            from autdtorch.cli.settings import settings_of
+def _run_command(module: str, function: str) -> None:
+    """Run a function of the settings, in a module that is imported then, at a composed config."""
 
-        settings, modules, _ = settings_of(config)
-        explore_scene(settings, modules)
+    @hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")
+    def run(config: DictConfig) -> None:
+        try:
+            with warnings.catch_warnings():
+                with _importing():
+                    from autdtorch.cli.settings import settings_of
 
+                    command = getattr(importlib.import_module(module), function)
+                warnings.showwarning = _log_warning
+                command(*settings_of(config))
+        except Exception as error:
+            raise _Carrier from error
 
-@hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")
-def _calibrate(config: DictConfig) -> None:
-    with _errors_carried(), warnings.catch_warnings():
-        with _importing():
-            from autdtorch.cli.calibrate_command import calibrate_scene
-            from autdtorch.cli.settings import settings_of
-
-        warnings.showwarning = _log_warning
-        calibrate_scene(*settings_of(config))
-
-
-@hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")
-def _play(config: DictConfig) -> None:
-    with _errors_carried(), warnings.catch_warnings():
-        with _importing():
-            from autdtorch.cli.play_command import play
-            from autdtorch.cli.settings import settings_of
-
-        warnings.showwarning = _log_warning
-        play(*settings_of(config))
+    run()
 
 
 @contextlib.contextmanager
@@ -167,16 +163,7 @@ def _importing() -> Iterator[None]:
             gc.enable()
 
 
-@contextlib.contextmanager
-def _errors_carried() -> Iterator[None]:
-    """Carry errors past Hydra."""
-    try:
-        yield
-    except Exception as error:
-        raise _Carrier from error
-
-
-def explore_scene(settings: dict[str, Any], modules: list[Any]) -> None:
+def explore_scene(settings: dict[str, Any], modules: list[Any], _: Any) -> None:
     """Show the scene of the settings until Ctrl+C or SIGTERM, which a job in the background gets, ends it.
 
     Raises:

@@ -2,7 +2,7 @@
 
 For obstacles the derivatives are central differences of the whole assembly. Maps are differentiated by
 autograd. On a map two cells are coupled by both densities in series, 2 / (rho_i + rho_j). The
-mass of a cell is 1 / (rho_i f_i), with density and speed factor f as in `assembly/materials.py`. Uniform maps
+mass of a cell is 1 / (rho_i f_i), with density and speed factor f as in `assembly/unions.py`. Uniform maps
 give the stencil rows of an obstacle of that material. Surfaces are staircases half-way between two cells, for
 which densities are scaled.
 """

@@ -31,9 +31,9 @@ from autdtorch.fdtd.stencil import flat_offsets, places_of
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.utils.apertures import Apertures, Discs, image_of
 from autdtorch.utils.array_types import COMPLEX, Array, Index
-from autdtorch.utils.distinct import distinct_cells, places_among
 from autdtorch.utils.images import NO_MIRRORS, SPACE_ITSELF, Image
 from autdtorch.utils.process import cached_property
+from autdtorch.utils.spatial import distinct_cells, places_among
 
 # Distance [cells] from the rim of the interior within which points are not read from the grid. Interpolation
 # is poor there, and the Huygens surface, two cells from the rim, is farther than half a cell from such a

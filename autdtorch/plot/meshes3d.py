@@ -13,8 +13,13 @@ import torch
 from PIL import ImageFont
 
 from autdtorch.plot import colours
-from autdtorch.plot.data import MM, outside_on_plane, plane_magnitude, single_drive_phases
-from autdtorch.plot.polygons import parts_of_reflectors
+from autdtorch.plot.data import (
+    MM,
+    outside_on_plane,
+    parts_of_reflectors,
+    plane_magnitude,
+    single_drive_phases,
+)
 from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.drive import amplitudes_of
 from autdtorch.scene.geometry import Plane

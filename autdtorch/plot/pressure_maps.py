@@ -17,8 +17,7 @@ from matplotlib.patheffects import withStroke, withTickedStroke
 
 from autdtorch.plot import data
 from autdtorch.plot.colours import EDGE_COLOUR, FLOOR, OBSTACLE_COLOUR, PRESSURE_MAP
-from autdtorch.plot.data import MM, ByMethod, outside_on_plane, plane_magnitude, require_each
-from autdtorch.plot.polygons import clipped
+from autdtorch.plot.data import MM, ByMethod, clipped, outside_on_plane, plane_magnitude, require_each
 from autdtorch.plot.style import TICK_SIZE, label_of, new_figure, readable, set_ticks, styled, wrapped
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle

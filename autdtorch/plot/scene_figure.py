@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from autdtorch.plot import colours
 from autdtorch.plot.axes3d import axes_of, grid_lines, view_from
-from autdtorch.plot.data import MM, single_drive_phases
-from autdtorch.plot.polygons import clipped, parts_of_reflectors
+from autdtorch.plot.data import MM, clipped, parts_of_reflectors, single_drive_phases
 from autdtorch.plot.style import TICK_SIZE, new_figure, styled, text_width
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.reflectors import are_in_front

@@ -20,8 +20,7 @@ from triton.backends.compiler import GPUTarget
 from triton.runtime import driver
 from triton.runtime.jit import JITFunction
 
-from autdtorch.fdtd.kernels.cuda import DeviceMedium, DeviceRun, blocks_of
-from autdtorch.fdtd.kernels.cuda_tables import Cells
+from autdtorch.fdtd.kernels.cuda import Cells, DeviceMedium, DeviceRun, blocks_of
 from autdtorch.fdtd.stepping import assemble, drive_signal
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import autdtorch as at
-from autdtorch.io.path_section import path_points
+from autdtorch.cli.play_command import path_points
 from autdtorch.utils.array_types import REAL
 
 SCENE = """

@@ -12,9 +12,9 @@ from autdtorch.fdtd.assembly.element import VERTICES, InterfaceElements, stiffne
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import condensed, heterogeneous_cells
 from autdtorch.fdtd.assembly.layers import mean_thickness, two_port
-from autdtorch.fdtd.assembly.materials import speed_factor
 from autdtorch.fdtd.assembly.prisms import Prisms, prisms, stacked
 from autdtorch.fdtd.assembly.sections import MaterialKey, Section, plane_fields
+from autdtorch.fdtd.assembly.unions import speed_factor
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
 from autdtorch.propagators.scene_region import region_of

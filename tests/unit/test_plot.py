@@ -20,7 +20,7 @@ from small_scenes import AIR, scene_of_all_kinds, small_scene
 
 import autdtorch as at
 from autdtorch.plot.costs import plot_pareto, plot_scaling
-from autdtorch.plot.polygons import clipped, parts_of_reflectors
+from autdtorch.plot.data import clipped, parts_of_reflectors
 from autdtorch.plot.pressure_maps import plot_plane, plot_planes
 from autdtorch.plot.scene_figure import plot_scene
 from autdtorch.plot.style import looks_of

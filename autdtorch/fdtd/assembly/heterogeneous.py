@@ -31,7 +31,7 @@ from autdtorch.fdtd.assembly.losses import COUPLING, GROUND, MASS, condensed_los
 from autdtorch.fdtd.shapes import Shape
 from autdtorch.fdtd.stencil import Stencil, flat_offsets, places_of
 from autdtorch.utils.array_types import AnyArray, Array, Index
-from autdtorch.utils.distinct import distinct_cells, distinct_rows, places_among
+from autdtorch.utils.spatial import distinct_cells, distinct_rows, places_among
 
 logger = logging.getLogger(__name__)
 

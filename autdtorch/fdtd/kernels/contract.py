@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from autdtorch.utils.array_types import AnyArray, Index
-from autdtorch.utils.distinct import distinct_rows
 from autdtorch.utils.process import cached_property
+from autdtorch.utils.spatial import distinct_rows
 
 
 class Layer(NamedTuple):

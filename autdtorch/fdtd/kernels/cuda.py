@@ -14,8 +14,15 @@ import triton
 from torch import Tensor
 
 from autdtorch.fdtd.kernels import cuda_steps
-from autdtorch.fdtd.kernels import cuda_tables as tables
-from autdtorch.fdtd.kernels.contract import Coefficients, Layer, Memory, Receivers, Sources, WaveState
+from autdtorch.fdtd.kernels.contract import (
+    Coefficients,
+    Columns,
+    Layer,
+    Memory,
+    Receivers,
+    Sources,
+    WaveState,
+)
 from autdtorch.utils.validation import invalid, no_cuda
 
 _GRAPH_STEPS = 16  # Steps of a captured graph; even, so that both fields return to their places
@@ -35,7 +42,7 @@ class BlockSizes(NamedTuple):
     lanes: int = 16  # columns through a boundary layer
 
 
-def blocks_of(shape: tables.Cells) -> BlockSizes:
+def blocks_of(shape: Cells) -> BlockSizes:
     """Return the blocks for a grid, by timings on an H100; `docs/decisions/kernels.md` has them."""
     nx, ny, nz = shape
     if nx * ny * nz > _MOST_CACHED:
@@ -61,9 +68,7 @@ class Ends(NamedTuple):
 class DeviceMedium:
     """A medium on the device, and workspace."""
 
-    def __init__(
-        self, c: Coefficients, shape: tables.Cells, blocks: BlockSizes, device: torch.device
-    ) -> None:
+    def __init__(self, c: Coefficients, shape: Cells, blocks: BlockSizes, device: torch.device) -> None:
         """Copy the medium `c` of a grid to a device."""
         self.coefficients, self.shape, self.blocks, self.device = c, shape, blocks, device
         self.cells, self.depths = c.layer_cells, triton.next_power_of_2(max(1, c.layer_cells))
@@ -72,12 +77,12 @@ class DeviceMedium:
         self.weights = torch.tensor(weights, dtype=self.dtype, device=device)
         padding = 0, 2 * self.depths + 1 - len(c.layer_decay)
         profile = (torch.nn.functional.pad(each, padding) for each in (c.layer_decay, c.layer_gain))
-        self.profile = tables.Profile(*(each.to(device) for each in profile))
-        self.heterogeneous = tables.heterogeneous_table(c, device)
-        self.columns = tables.column_table(c.columns, c.crossing, device)
-        self.crossed = tables.column_table(c.crossed, c.crossing[:0], device)
-        self.settled = tables.settled_table(c, device)
-        self.terms = tables.no_terms(shape, c, device)
+        self.profile = Profile(*(each.to(device) for each in profile))
+        self.heterogeneous = heterogeneous_table(c, device)
+        self.columns = column_table(c.columns, c.crossing, device)
+        self.crossed = column_table(c.crossed, c.crossing[:0], device)
+        self.settled = settled_table(c, device)
+        self.terms = no_terms(shape, c, device)
         nx, ny, nz = shape
         z, y, yz = (2 * triton.cdiv(rows, blocks.lanes) for rows in (nx * ny, nx * nz, 2 * self.cells * nx))
         heterogeneous = triton.cdiv(self.heterogeneous.size, self.depths * blocks.lanes)
@@ -98,8 +103,8 @@ class DeviceRun:
         self._fields = tuple(field.to(device).contiguous() for field in (state.now, state.before))
         memory = Memory(*(Layer(*(part.to(device).contiguous() for part in each)) for each in state.memory))
         self._memories = memory, Memory(*(Layer(*map(torch.zeros_like, each)) for each in memory))
-        self._driven = tables.driven_table(sources, medium.settled, dtype, device)
-        self._received = tables.receiver_table(receivers, steps, dtype, device)
+        self._driven = driven_table(sources, medium.settled, dtype, device)
+        self._received = receiver_table(receivers, steps, dtype, device)
         self.signal = torch.zeros((steps, sources.force.shape[1]), dtype=dtype, device=device)
         self._first = torch.zeros((), dtype=torch.int64, device=device)
         self._turn = 0
@@ -186,7 +191,7 @@ class CudaKernel:
         self, state: WaveState, c: Coefficients, sources: Sources, receivers: Receivers, signal: Tensor
     ) -> tuple[WaveState, Tensor]:
         """See `Kernel.advance`; the record stays on the device."""
-        shape = tables.Cells(*state.now.shape)
+        shape = Cells(*state.now.shape)
         medium, run = self._medium, self._run
         if medium is None or medium.coefficients is not c or medium.shape != shape:
             self._run = run = None
@@ -199,3 +204,146 @@ class CudaKernel:
             self._run = run = DeviceRun(medium, state, sources, receivers, len(signal))
         recorded = run.advance(signal)
         return run.state, recorded
+
+
+class Cells(NamedTuple):
+    """Number of cells along x, y and z."""
+
+    nx: int
+    ny: int
+    nz: int
+
+
+class Profile(NamedTuple):
+    """Recursion coefficients of the layers, zero-padded to the depth of a block of lanes."""
+
+    decay: Tensor
+    gain: Tensor
+
+
+class Terms(NamedTuple):
+    """Terms that layers add to the sums across them, low layer first, both counted inwards."""
+
+    y: Tensor  # E_y p (nx, 2 L, nz)
+    z: Tensor  # E_z p (nx, ny, 2 L)
+    yz: Tensor  # E_y E_z p (nx, 2 L, 2 L)
+    columns: Tensor  # added to the pressure (L m + 1,), with a zero at the end
+    crossed: Tensor  # likewise, added to the columns
+
+
+class Heterogeneous(NamedTuple):
+    """n heterogeneous cells."""
+
+    size: int
+    cell: Tensor  # flat index (n,)
+    weight: Tensor  # stencil rows (27, n)
+    scale: Tensor  # of the layers' term, 0 outside of them (n,)
+    settled: Tensor  # workspace: new pressure less `scale` times the result of the sweep (n,)
+    loss: Tensor  # rows on the change of a step, and ground (28, n); none (0, n) without losses
+
+
+class ColumnTable(NamedTuple):
+    """m columns."""
+
+    size: int
+    cell: Tensor  # flat index (L + 2, m)
+    offset: Tensor  # (w, m)
+    weight: Tensor  # (w, m)
+    crossing: Tensor  # place of the terms that cross them (L + 2, m)
+
+
+class Settled(NamedTuple):
+    """k cells that a sweep leaves wrong, ascending."""
+
+    cell: Tensor  # flat index (k,)
+    heterogeneous: Tensor  # place among the heterogeneous cells, -1 for others (k,)
+    share: Tensor  # places among the columns' terms, including the zero at their end (w, k)
+    sound_hard: Tensor  # 1 where sound-hard (k,)
+
+
+class Driven(NamedTuple):
+    """n cells to correct: the k of `Settled`, then those that are only driven."""
+
+    settled: int  # k
+    size: int  # n
+    cell: Tensor  # flat index (n,)
+    force: Tensor  # by each of the S signals (S, n)
+
+
+class ReceiverTable(NamedTuple):
+    """R receivers of w cells each."""
+
+    size: int  # R
+    width: int  # w
+    cell: Tensor  # flat index (w, R)
+    weight: Tensor  # (w, R)
+    recorded: Tensor  # record (steps, R)
+
+
+def heterogeneous_table(c: Coefficients, device: torch.device) -> Heterogeneous:
+    """Return the heterogeneous cells, with the scale of the layers' term in those in layers."""
+    index, count = c.heterogeneous_index.to(device), len(c.heterogeneous_index)
+    scale = torch.zeros(count, dtype=c.heterogeneous_weight.dtype, device=device)
+    scale[torch.searchsorted(index, c.layer_index.to(device))] = c.layer_scale.to(device)
+    weight = c.heterogeneous_weight.to(device).T.contiguous()
+    loss = weight.new_zeros((28 if len(c.loss_index) else 0, count))
+    place = torch.searchsorted(index, c.loss_index.to(device).contiguous())
+    loss[:, place] = torch.cat((c.loss_weight.T, c.loss_ground[None])).to(weight)[: len(loss)]
+    return Heterogeneous(count, index.contiguous(), weight, scale, torch.zeros_like(scale), loss)
+
+
+def column_table(columns: Columns, crossing: Tensor, device: torch.device) -> ColumnTable:
+    """Return columns, with the places (m, L + 2) of the terms to add to each cell's sum."""
+    index, offset, weight, crossing = (
+        each.to(device).T.contiguous() for each in (columns.index, columns.offset, columns.weight, crossing)
+    )
+    return ColumnTable(index.shape[1], index, offset, weight, crossing)
+
+
+def settled_table(c: Coefficients, device: torch.device) -> Settled:
+    """Return heterogeneous cells, sound-hard cells and those of columns, each once."""
+    inside = c.columns.index.to(device).T[1:-1].reshape(-1)
+    heterogeneous, sound_hard = c.heterogeneous_index.to(device), c.sound_hard_index.to(device)
+    cell = torch.unique(torch.cat((heterogeneous, sound_hard, inside)))
+    place = torch.full_like(cell, -1)
+    place[torch.searchsorted(cell, heterogeneous)] = torch.arange(len(heterogeneous), device=device)
+    hard = torch.zeros(len(cell), dtype=torch.int8, device=device)
+    hard[torch.searchsorted(cell, sound_hard)] = 1
+    # the n-th of the terms that come to a cell is in row n
+    taker, order = torch.sort(torch.searchsorted(cell, inside), stable=True)
+    count = torch.bincount(taker, minlength=len(cell))
+    nth = torch.arange(len(inside), device=device) - (count.cumsum(0) - count)[taker]
+    width = int(count.max()) if len(inside) else 0
+    share = torch.full((width, len(cell)), len(inside), dtype=torch.int64, device=device)
+    share[nth, taker] = order
+    return Settled(cell, place, share, hard)
+
+
+def driven_table(sources: Sources, settled: Settled, dtype: torch.dtype, device: torch.device) -> Driven:
+    """Return the settled cells and the driven ones, each once."""
+    index = sources.index.to(device)
+    listed = torch.isin(index, settled.cell)
+    cell = torch.cat((settled.cell, index[~listed]))
+    place = torch.searchsorted(settled.cell, index)
+    place[~listed] = torch.arange(len(settled.cell), len(cell), device=device)
+    of_sources = sources.force.detach().to(device, dtype)
+    force = torch.zeros((of_sources.shape[1], len(cell)), dtype=dtype, device=device)
+    force[:, place] = of_sources.T
+    return Driven(len(settled.cell), len(cell), cell, force)
+
+
+def receiver_table(
+    receivers: Receivers, steps: int, dtype: torch.dtype, device: torch.device
+) -> ReceiverTable:
+    """Return the receivers, for calls of `steps`."""
+    index, weight = receivers.index.to(device).T.contiguous(), receivers.weight.to(device).T.contiguous()
+    recorded = torch.zeros((steps, index.shape[1]), dtype=dtype, device=device)
+    return ReceiverTable(index.shape[1], len(index), index, weight.to(dtype), recorded)
+
+
+def no_terms(shape: Cells, c: Coefficients, device: torch.device) -> Terms:
+    """Return workspace for the layers' terms."""
+    cells, (nx, ny, nz) = c.layer_cells, shape
+    columns, crossed = ((cells * len(each.index) + 1,) for each in (c.columns, c.crossed))
+    sizes = ((nx, 2 * cells, nz), (nx, ny, 2 * cells), (nx, 2 * cells, 2 * cells), columns, crossed)
+    return Terms(*(torch.zeros(size, dtype=c.layer_decay.dtype, device=device) for size in sizes))
