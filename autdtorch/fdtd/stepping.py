@@ -14,13 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from autdtorch.fdtd.assembly.elements import elements_of
-from autdtorch.fdtd.assembly.heterogeneous import (
-    HeterogeneousCells,
-    corners_around,
-    flat_index,
-    heterogeneous_cells,
-    sees,
-)
+from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
+from autdtorch.fdtd.assembly.neighbours import corners_around, flat_index, sees
 from autdtorch.fdtd.boundary import layer_columns, tuned_profile
 from autdtorch.fdtd.damping import at_time_step, fewest_stable_steps
 from autdtorch.fdtd.grid import Grid, make_grid

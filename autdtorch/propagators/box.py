@@ -43,9 +43,10 @@ from autdtorch.propagators.simulation import (
     mean_of_images,
 )
 from autdtorch.propagators.store import MOST_BYTES
+from autdtorch.scene.checks import require_clear
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.obstacles.moving import circumscribed
-from autdtorch.scene.scene import require_clear, require_in_front
+from autdtorch.scene.reflectors import require_in_front
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL, Index
 from autdtorch.utils.digest import digest_of

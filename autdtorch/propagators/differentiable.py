@@ -16,8 +16,10 @@ from autdtorch.fdtd.stepping import drive_dft, drive_signal
 from autdtorch.propagators.notices import warn_of_ending_walls, warn_of_near_points
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import apertures_of, complex_strengths_of
+from autdtorch.scene.checks import require_inside
 from autdtorch.scene.drive import validate_drive
-from autdtorch.scene.scene import Scene, require_in_front, require_inside
+from autdtorch.scene.reflectors import require_in_front
+from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.validation import (
     ArrayLike,

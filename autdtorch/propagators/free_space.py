@@ -12,7 +12,9 @@ from autdtorch.analytic.discs import waves_of
 from autdtorch.propagators.absorbed_power import AbsorbedPower, power_into_reflectors, radiators_of_array
 from autdtorch.propagators.propagator import ScenePropagator
 from autdtorch.scene.arrays import TransducerArray, apertures_of, complex_strengths_of
-from autdtorch.scene.scene import Scene, require_clear, require_in_front
+from autdtorch.scene.checks import require_clear
+from autdtorch.scene.reflectors import require_in_front
+from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.images import NO_MIRRORS, Image
 from autdtorch.utils.process import one_library_thread, require_memory

@@ -14,7 +14,8 @@ from autdtorch.fdtd.steady_state import MOST_JUDGED, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble
 from autdtorch.propagators.absorbed_power import Radiators
 from autdtorch.propagators.simulation import AbsorbingCells, Run, Simulation, Stepped
-from autdtorch.scene.scene import require_in_front, require_inside
+from autdtorch.scene.checks import require_inside
+from autdtorch.scene.reflectors import require_in_front
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.images import Mirror
 from autdtorch.utils.process import cached_property, one_library_thread

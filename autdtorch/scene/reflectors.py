@@ -153,3 +153,18 @@ def _factor(value: object) -> float | complex:
     if abs(factor) > 1 + LENGTH_TOLERANCE:
         raise invalid(name, value, "its magnitude must be at most 1")
     return factor
+
+
+def require_in_front(
+    reflectors: Sequence[Reflector], name: str, points: torch.Tensor, first_number: int = 0
+) -> None:
+    """Refuse points (N, 3) [m] behind a reflector."""
+    for number, reflector in enumerate(reflectors, first_number):
+        height = reflector.mirror.height(points)
+        if (height < -LENGTH_TOLERANCE).any():
+            lowest = int(height.argmin())
+            accepted = f"is {-1e3 * float(height[lowest]):.4g} mm behind reflector {number}"
+            accepted += ", must be in front of it"
+            if (height < 0).all():
+                accepted += "; its normal points into the space that is simulated"
+            raise invalid(f"{name}[{lowest}]", points[lowest], accepted, "m")

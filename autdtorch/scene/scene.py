@@ -4,30 +4,33 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from operator import attrgetter
 
 import torch
 
 from autdtorch.scene.arrays import TransducerArray, phase_offsets_of, radii_of, strengths_of, strengths_text
+from autdtorch.scene.checks import OverlapWarning as OverlapWarning
+from autdtorch.scene.checks import (
+    everything_of,
+    require_places,
+    require_waves,
+    require_within,
+    warn_of_doubts,
+)
 from autdtorch.scene.geometry import Coordinates, Plane
 from autdtorch.scene.medium import Medium as Medium
 from autdtorch.scene.obstacles import Obstacle
-from autdtorch.scene.obstacles.base import overlap, shared_box
 from autdtorch.scene.obstacles.moving import moved
-from autdtorch.scene.plausibility import extent_of, unit_hint, warn_of_implausible
 from autdtorch.scene.reflectors import Reflector, kinds_of, require_arrangement
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.images import Image, images_of
 from autdtorch.utils.process import cached_property
-from autdtorch.utils.spatial import require_distinct
 from autdtorch.utils.text import counted, html_facts
-from autdtorch.utils.units import DECIBELS, angles, warn_user
+from autdtorch.utils.units import DECIBELS, angles
 from autdtorch.utils.units import ScaleWarning as ScaleWarning
 from autdtorch.utils.validation import (
-    LENGTH_TOLERANCE,
     ArrayLike,
     Vector,
     finite_vector,
@@ -41,16 +44,7 @@ from autdtorch.utils.validation import (
 )
 
 _DEFAULT_MARGIN = 2.0  # [wavelengths] of air on each side, by default
-_FARTHEST = 1e6  # [m] along an axis; far beyond any simulation, and volumes do not overflow
 _FREQUENCIES = 1e-3, 1e12  # [Hz]
-_LOWEST = 1000.0  # [Hz], below which a frequency may be in kHz
-_MOST_ABSORPTION = 3.0  # [dB per wavelength]: the model assumes a small imaginary part of the wavenumber
-_MOST_OF_OBSTACLE = 27.0  # [dB per wavelength], an imaginary part of half the wavenumber
-_AT_ONCE = 1_000_000  # pairs of a point and a transducer whose distances are in memory at once
-
-
-class OverlapWarning(UserWarning):
-    """Two obstacles of different materials overlap."""
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -132,23 +126,14 @@ class Scene:
         object.__setattr__(self, "obstacles", members("Scene.obstacles", obstacles, Obstacle))
         object.__setattr__(self, "observation_plane", observation_plane)
         object.__setattr__(self, "name", name)
-        for field, places in _everything(self):
-            _require_within(field, places)
+        for field, places in everything_of(self):
+            require_within(field, places)
         object.__setattr__(self, "domain", self._bounds() if domain is None else _corners(domain))
-        most = _MOST_ABSORPTION / self.wavelength
-        if medium.absorption > most:
-            accepted = f"must be at most {most:.4g} dB/m, {_MOST_ABSORPTION:g} dB per wavelength"
-            if self.frequency < _LOWEST:
-                accepted += f"; is the frequency, {self.frequency:g}, in Hz, 40 kHz as 40e3?"
-            raise invalid("Scene.medium.absorption", medium.absorption, accepted, "dB/m")
-        _require_waves_inside(self)
+        require_waves(self)
         object.__setattr__(self, "reflectors", members("Scene.reflectors", reflectors, Reflector))
         require_arrangement(self.reflectors, self.complex_wavenumber)
-        _require_in_front(self)
-        _require_separate_points(self)
-        _require_in_domain(self)
-        _warn_of_overlaps(self.obstacles)
-        warn_of_implausible(self)
+        require_places(self)
+        warn_of_doubts(self)
 
     @suggesting
     def moved(
@@ -254,7 +239,7 @@ class Scene:
         return " x ".join(f"{(high - low) / unit:.{digits}g}" for low, high in zip(lower, upper, strict=True))
 
     def _bounds(self) -> tuple[Vector, Vector]:
-        points = torch.cat([points for _, points in _everything(self)])
+        points = torch.cat([points for _, points in everything_of(self)])
         margin = _DEFAULT_MARGIN * self.wavelength
         return _corners(torch.stack([points.amin(dim=0) - margin, points.amax(dim=0) + margin]))
 
@@ -281,167 +266,5 @@ def _corners(domain: ArrayLike) -> tuple[Vector, Vector]:
     lower, upper = (finite_vector("Scene.domain", corner) for corner in corners)
     if not all(low < high for low, high in zip(lower, upper, strict=True)):
         raise invalid("Scene.domain", (lower, upper), "lower must be below upper on every axis", "m")
-    _require_within("Scene.domain", corners)
+    require_within("Scene.domain", corners)
     return lower, upper
-
-
-def _contents(scene: Scene) -> list[tuple[str, torch.Tensor]]:
-    """Return names and points (N, 3) [m] of everything that must be inside the domain."""
-    positions, reach = scene.array.positions, scene.array.half_extents
-    contents = [
-        ("Scene.array.positions", positions),
-        ("Scene.control_points", scene.control_points),
-        ("Scene.array disc's lower edge", positions - reach),
-        ("Scene.array disc's upper edge", positions + reach),
-    ]
-    if scene.observation_plane is not None:
-        contents.append(("Scene.observation_plane corner", scene.observation_plane.corners))
-    return contents
-
-
-def _everything(scene: Scene) -> list[tuple[str, torch.Tensor]]:
-    """Return names and points (N, 3) [m] of the contents and of the obstacles' bounding boxes."""
-    bounds = [
-        (f"Scene.obstacles[{index}] corner", scene.control_points.new_tensor([body.lower, body.upper]))
-        for index, body in enumerate(scene.obstacles)
-    ]
-    return _contents(scene) + bounds
-
-
-def _require_within(name: str, points: torch.Tensor) -> None:
-    far = ~(points.abs() <= _FARTHEST).all(dim=-1)
-    if far.any():
-        first = points[far][0].detach()
-        raise invalid(name, first, f"every coordinate must be in {-_FARTHEST:g} to {_FARTHEST:g}", "m")
-
-
-def _require_waves_inside(scene: Scene) -> None:
-    """Refuse absorptions that leave no wave in an obstacle, which an impedance describes better."""
-    for index, obstacle in enumerate(scene.obstacles):
-        if obstacle.absorption and obstacle.sound_speed is not None:
-            most = _MOST_OF_OBSTACLE * scene.frequency / obstacle.sound_speed.real
-            if obstacle.absorption > most:
-                accepted = f"must be at most {most:.4g} dB/m, {_MOST_OF_OBSTACLE:g} dB per wavelength inside"
-                accepted += "; porous() and impedance= describe what absorbs more"
-                raise invalid(f"Scene.obstacles[{index}].absorption", obstacle.absorption, accepted, "dB/m")
-
-
-def _require_in_front(scene: Scene) -> None:
-    """Refuse what lies behind a reflector; obstacles that cross one are cut."""
-    if not scene.reflectors:
-        return
-    contents = [*_contents(scene)[:2], ("Scene.array.nodes", scene.array.nodes.positions.reshape(-1, 3))]
-    if scene.observation_plane is not None:
-        contents.append(("Scene.observation_plane corner", scene.observation_plane.corners))
-    for number, reflector in enumerate(scene.reflectors):
-        for name, places in contents:
-            require_in_front([reflector], name, places, number)
-        for index, obstacle in enumerate(scene.obstacles):
-            highest = float(reflector.mirror.height(obstacle.surface()[0]).max())
-            if highest <= LENGTH_TOLERANCE:
-                accepted = f"is wholly behind reflector {number}, must be in front of it, at least in part"
-                raise ValueError(f"Scene.obstacles[{index}]: {extent_of(obstacle)}; {accepted}")
-
-
-def require_in_front(
-    reflectors: Sequence[Reflector], name: str, points: torch.Tensor, first_number: int = 0
-) -> None:
-    """Refuse points (N, 3) [m] behind a reflector."""
-    for number, reflector in enumerate(reflectors, first_number):
-        height = reflector.mirror.height(points)
-        if (height < -LENGTH_TOLERANCE).any():
-            lowest = int(height.argmin())
-            accepted = f"is {-1e3 * float(height[lowest]):.4g} mm behind reflector {number}"
-            accepted += ", must be in front of it"
-            if (height < 0).all():
-                accepted += "; its normal points into the space that is simulated"
-            raise invalid(f"{name}[{lowest}]", points[lowest], accepted, "m")
-
-
-def _require_separate_points(scene: Scene) -> None:
-    """Refuse coincident points and points in or on an obstacle; on it, rounding would choose the side."""
-    require_distinct("Scene.control_points", scene.control_points)
-    array, points = scene.array, scene.control_points
-    require_clear(array, "Scene.control_points", points)
-    groups = {"array.positions": array.positions, "control_points": points}
-    radius = float(radii_of(array).max())
-    if any(obstacle.near(array.positions, radius).any() for obstacle in scene.obstacles):
-        groups["array.nodes"] = array.nodes[0]
-    for name, group in groups.items():
-        for index, obstacle in enumerate(scene.obstacles):
-            if _is_of_medium(scene, obstacle):
-                continue
-            inside = obstacle.contains(group, margin=LENGTH_TOLERANCE)
-            if inside.any():
-                inside &= ~_in_later_medium(scene, index, group)
-            if inside.any():
-                first = tuple(inside.nonzero()[0].tolist())
-                accepted = f"lies in or on obstacle {index}, {extent_of(obstacle)}, must be outside it"
-                accepted += unit_hint(scene, obstacle)
-                raise invalid(f"Scene.{name}{list(first)}", group[first], accepted, "m")
-
-
-def _is_of_medium(scene: Scene, obstacle: Obstacle) -> bool:
-    """Return whether an obstacle is of the medium's material: it cuts earlier ones, and hides no point."""
-    material = obstacle.density, obstacle.sound_speed, obstacle.absorption
-    return material == (scene.medium.density, scene.medium.sound_speed, 0.0)
-
-
-def _in_later_medium(scene: Scene, index: int, points: torch.Tensor) -> torch.Tensor:
-    """Return whether points (..., 3) are within an obstacle of the medium's material that follows `index`."""
-    cleared = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu")
-    for later in scene.obstacles[index + 1 :]:
-        if _is_of_medium(scene, later):
-            cleared |= later.signed_distance(points) < -LENGTH_TOLERANCE
-    return cleared
-
-
-def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
-    """Warn of overlapping pairs of different material, where the order of the list matters."""
-    material = attrgetter("density", "sound_speed", "rigid", "absorption", "impedance")
-    pairs = [
-        f"{index} overlaps {earlier}"
-        for index, obstacle in enumerate(obstacles)
-        for earlier, other in enumerate(obstacles[:index])
-        if material(obstacle) != material(other) and overlap(obstacle, other)
-    ]
-    if pairs:
-        text = f"{', '.join(pairs)}, of another material; where both are, the later counts"
-        warn_user(f"Scene.obstacles: {text}", OverlapWarning)
-
-
-def require_clear(array: TransducerArray, name: str, points: torch.Tensor) -> None:
-    """Refuse points (N, 3) [m] on a transducer."""
-    reach = radii_of(array)[:, None]
-    axes = torch.cat([torch.eye(3, **REAL), array.normals[:1]])  # flat arrays are thin along their normal
-    half = reach * (1 - (array.normals @ axes.mT) ** 2).clamp(min=0).sqrt() + LENGTH_TOLERANCE
-    centers, along = array.positions @ axes.mT, points.cpu() @ axes.mT
-    near = (along >= (centers - half).amin(dim=0)) & (along <= (centers + half).amax(dim=0))
-    for some in torch.split(near.all(dim=1).nonzero()[:, 0], 1 + _AT_ONCE // len(array)):
-        between = points[some].cpu()[:, None] - array.positions
-        height = (between * array.normals).sum(dim=-1).abs()
-        on = (height < LENGTH_TOLERANCE) & (between.norm(dim=-1) < reach[:, 0] + LENGTH_TOLERANCE)
-        if on.any():
-            row, transducer = on.nonzero()[0].tolist()
-            accepted = f"lies on transducer {transducer}, must be at least {LENGTH_TOLERANCE:g} m away"
-            raise invalid(f"{name}[{int(some[row])}]", points[some[row]], accepted, "m")
-
-
-def require_inside(domain: tuple[Vector, Vector], name: str, points: torch.Tensor, fix: str = "") -> None:
-    """Refuse points (N, 3) [m] outside the corners (lower, upper) of a domain; `fix` says what would help."""
-    lower, upper = (torch.tensor(corner, **REAL) for corner in domain)
-    outside = ((points < lower - LENGTH_TOLERANCE) | (points > upper + LENGTH_TOLERANCE)).any(dim=-1)
-    if outside.any():
-        first = int(outside.nonzero()[0, 0])
-        accepted = f"must be inside the domain, {domain[0]} to {domain[1]} m{fix}"
-        raise invalid(f"{name}[{first}]", points[first], accepted, "m")
-
-
-def _require_in_domain(scene: Scene) -> None:
-    for name, points in _contents(scene):
-        require_inside(scene.domain, name, points, "; domain=None fits it to the scene")
-    for index, obstacle in enumerate(scene.obstacles):
-        if shared_box((obstacle.lower, obstacle.upper), scene.domain) is None:
-            accepted = f"must be at least partly inside the domain, {scene.domain[0]} to {scene.domain[1]} m"
-            accepted += unit_hint(scene, obstacle)
-            raise ValueError(f"Scene.obstacles[{index}]: {extent_of(obstacle)}; {accepted}")

@@ -84,15 +84,19 @@ def places_on(corners: Array, count: int) -> Array:
     return np.asarray(first + a * (second - first) + b * (third - first))
 
 
-def parts_of(vertices: Array, triangles: Index) -> list[Array]:
-    """Return the corners (T, 3, 3) of each part of a surface, vertices (V, 3) [m], that touches no other."""
+def connected_parts(pairs: AnyArray | tuple[AnyArray, AnyArray], count: int) -> Index:
+    """Return the number of the part (count,) of each of `count` things, of which pairs (2, n) are joined."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
+    graph = coo_array((np.ones(len(pairs[0])), pairs), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+
+
+def parts_of(vertices: Array, triangles: Index) -> list[Array]:
+    """Return the corners (T, 3, 3) of each part of a surface, vertices (V, 3) [m], that touches no other."""
     joined = distinct_rows(np.round(vertices / LENGTH_TOLERANCE).astype(np.int64))[1][triangles]
-    sides = sides_of(joined)
-    graph = coo_array((np.ones(len(sides)), sides.T), shape=(len(vertices),) * 2)
-    label = connected_components(graph, directed=False)[1][joined[:, 0]]
+    label = connected_parts(sides_of(joined).T, len(vertices))[joined[:, 0]]
     order = np.argsort(label, kind="stable")
     starts = np.flatnonzero(np.diff(label[order])) + 1
     return np.split(vertices[triangles[order]], starts)

@@ -12,12 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from autdtorch.fdtd.shapes import Shape
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.spatial import doubled_normals, sides_of
+from autdtorch.utils.spatial import connected_parts, doubled_normals, sides_of
 
 _SHARP = np.radians(20)  # Smallest angle between the normals of two faces that meet in an edge
 _REACH = 1.2  # Distance from an edge within which the stiffness is reduced [cells]
@@ -110,8 +108,7 @@ def edges_of(shape: Shape, others: Sequence[Shape] = ()) -> list[Segment | Circl
     _, once, number = np.unique(corners.round(9), axis=0, return_index=True, return_inverse=True)
     places = corners[once]
     first, second = number.reshape(-1, 2).T
-    graph = coo_array((np.ones(len(ends)), (first, second)), shape=(len(places),) * 2)
-    _, part = connected_components(graph, directed=False)
+    part = connected_parts((first, second), len(places))
     edges: list[Segment | Circle] = []
     # 1 - pi / w is a third for a cuboid, whose normals are pi / 2 apart
     shares = _REDUCTION * 3 * angles / (np.pi + angles)

@@ -13,11 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from scipy.ndimage import label
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from autdtorch.fdtd.assembly.element import (
     PAIRS,
@@ -28,15 +24,13 @@ from autdtorch.fdtd.assembly.element import (
 )
 from autdtorch.fdtd.assembly.elements import Elements
 from autdtorch.fdtd.assembly.losses import COUPLING, GROUND, MASS, condensed_loss
-from autdtorch.fdtd.shapes import Shape
-from autdtorch.fdtd.stencil import Stencil, flat_offsets, places_of
-from autdtorch.utils.array_types import AnyArray, Array, Index
+from autdtorch.fdtd.assembly.neighbours import GridShape, enclosed_cells, in_parts, neighbours
+from autdtorch.fdtd.stencil import Stencil, places_of
+from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.spatial import distinct_cells, distinct_rows, places_among
 
 logger = logging.getLogger(__name__)
 
-GridShape = tuple[int, int, int]
-_TOGETHER = 50_000  # Cells whose neighbours are looked at together
 # Sum of coupling coefficients, relative to air, up to which a cell in a rigid body is excluded. Cells at a
 # surface have 0.3 or more, all others 0.03 or less. Vertices of finite elements inside a body remain
 # unknowns, except in slivers: the least sum is relative to the densest fluid, and above the body's 1e-5.
@@ -119,7 +113,7 @@ def heterogeneous_cells(
     mass = _transferred_mass(coupling, mass, elements, touched, shape, largest)
     coupling /= mass[:, None]
     weight, air = coupling, stencil.weights
-    changed = [(np.abs(part - air) > _ROW_ROUNDING).any(axis=1) for part in _in_parts(weight)]
+    changed = [(np.abs(part - air) > _ROW_ROUNDING).any(axis=1) for part in in_parts(weight)]
     changed = np.concatenate(changed) | (mass != 1)
     loss = _touched_losses(elements, interface, touched, hard, shape, stencil)
     changed |= loss.any(axis=1)
@@ -129,8 +123,8 @@ def heterogeneous_cells(
     index, weight, mass, loss = (np.concatenate(part) for part in zip(surface, uniform, strict=True))
     order = np.argsort(index)
     around = np.zeros(math.prod(shape), bool)
-    for part in _in_parts(touched):
-        around[_neighbours(part, shape)] = True
+    for part in in_parts(touched):
+        around[neighbours(part, shape)] = True
     shell = np.flatnonzero(around & hard)
     shell = shell[_inner(shell, shape)]
     rows = index[order], weight[order], mass[order]
@@ -143,11 +137,6 @@ def lossy_cells(loss: Array) -> LossyCells | None:
     """Return the lossy of n cells, from the losses of all (n, 29): coupling, mass and ground."""
     place = np.flatnonzero(loss.any(axis=1))
     return LossyCells(place, loss[place, :27], *loss[place, 27:].T) if len(place) else None
-
-
-def _neighbours(index: Index, shape: GridShape) -> Index:
-    """Return flat indices (n, 27) of cells and their neighbours."""
-    return np.asarray(index[:, None] + flat_offsets(shape), np.int64)
 
 
 def _inner(index: Index, shape: GridShape) -> NDArray[np.bool_]:
@@ -230,9 +219,7 @@ def _densest(elements: Elements) -> float:
 
 def _both_open(hard: NDArray[np.bool_], touched: Index, shape: GridShape) -> NDArray[np.bool_]:
     """Return the mask (n, 27) of neighbours of touched cells where neither is in `hard` (k,)."""
-    return np.concatenate(
-        [~(hard[part, None] | hard[_neighbours(part, shape)]) for part in _in_parts(touched)]
-    )
+    return np.concatenate([~(hard[part, None] | hard[neighbours(part, shape)]) for part in in_parts(touched)])
 
 
 def condensed(interface: InterfaceElements, out: NDArray[np.bool_]) -> InterfaceElements:
@@ -301,7 +288,7 @@ def _transferred_mass(
         light = np.flatnonzero(need > mass)
         if len(light) == 0:
             break
-        neighbour = _neighbours(touched[light], shape)
+        neighbour = neighbours(touched[light], shape)
         place = np.searchsorted(touched, neighbour).clip(max=len(touched) - 1)
         spare = np.maximum(mass - need, 0)
         offer = np.abs(coupling[light]) * np.where(touched[place] == neighbour, spare[place], 0)
@@ -326,13 +313,13 @@ def _needed_mass(
     is limited to 1: a uniform material needs no more than its mass next to a lighter one.
     """
     material, place_of = _cell_material(elements), places_among(touched, math.prod(shape))
-    need = np.concatenate([np.abs(part).sum(axis=1) for part in _in_parts(coupling)]) / largest
+    need = np.concatenate([np.abs(part).sum(axis=1) for part in in_parts(coupling)]) / largest
     most = np.flatnonzero(need > mass)  # all others have more mass than they need
     everyone = np.arange(len(need))
     for some in (*[most] * (_NEED_ITERATIONS - 1), everyone):
         final = np.maximum(mass, need)
-        for part in _in_parts(some):
-            neighbour, pairs = _neighbours(touched[part], shape), coupling[part]
+        for part in in_parts(some):
+            neighbour, pairs = neighbours(touched[part], shape), coupling[part]
             place, uniform = place_of[neighbour], elements.materials.mass[material[neighbour]]
             around = np.where(touched[place] != neighbour, uniform, final[place])
             ratio = np.divide(final[part, None], around, out=np.ones_like(around), where=around > 0)
@@ -340,11 +327,6 @@ def _needed_mass(
             row = np.maximum(pairs.sum(axis=1), 0)
             need[part] = (row + (np.abs(pairs) * lighter).sum(axis=1)) / (2 * largest)
     return np.asarray(need)
-
-
-def _in_parts(rows: AnyArray) -> list[AnyArray]:
-    """Return rows in parts, which take little memory each."""
-    return np.array_split(rows, 1 + len(rows) // _TOGETHER)
 
 
 def _uniform_cells(
@@ -362,95 +344,3 @@ def _uniform_cells(
     index = np.flatnonzero(inside)
     number = material[index := index[_inner(index, shape)]]
     return index, factor[number, None] * stencil.weights, materials.mass[number], loss[number]
-
-
-# Coupling of two cells, relative to the sum of either, up to which nothing passes: 1e-5 or less through a
-# thin rigid body, and more through a heavy fluid. Slivers have the sum of a cell of the densest fluid.
-_BLOCKED = 1e-4
-# Steps from a place to a cell beside it, and the distance [cells] at which a wall is reached
-_STEPS, _TOUCHING = 60, 1e-3
-
-
-def enclosed_cells(
-    coupling: Array,
-    touched: Index,
-    hard: NDArray[np.bool_],
-    shape: GridShape,
-    usual: float,
-    sources: Array | None = None,
-) -> Index:
-    """Return the flat indices of cells that are not connected with the outermost ones.
-
-    Outermost cells in several parts count where they are connected with `sources`, positions (M, 3) [cells].
-    The `touched` cells (n,) have `coupling` (n, 27), whose sum is at least `usual` but in slivers. All others
-    are connected with the six beside them, unless they are rigid.
-    """
-    free = ~hard
-    uniform = free.copy()
-    uniform[touched] = False
-    regions, count = label(uniform.reshape(shape))
-    number = regions.ravel()  # of each connected region of uniform cells, from 1 on; 32 bits
-    places = np.flatnonzero(free[touched])
-    number[touched[places]] = count + 1 + np.arange(len(places))
-    one, other = _connections(coupling, touched, places, free, shape, usual)
-    size = count + 1 + len(places)
-    ends = number[one], number[other]
-    _, connected = connected_components(coo_array((np.ones(len(one)), ends), (size, size)), directed=False)
-    inner = np.zeros(shape, bool)
-    inner[1:-1, 1:-1, 1:-1] = True
-    rim = inner & ~np.pad(inner[2:-2, 2:-2, 2:-2], 2)
-    outside = np.zeros(size, bool)
-    outside[connected[number[rim.ravel() & free]]] = True
-    if sources is not None and len(sources) and outside.sum() > 1:  # a wall parts the grid
-        beside = flat_index(corners_around(sources), shape)
-        reached = np.zeros(size, bool)
-        reached[connected[number[beside[free[beside]]]]] = True
-        outside &= reached
-    return np.flatnonzero(free & inner.ravel() & ~outside[connected][number])
-
-
-def corners_around(points: Array) -> Index:
-    """Return the eight cells (N, 8, 3) around positions (N, 3) [cells]."""
-    corners = np.indices((2, 2, 2)).reshape(3, 8).T
-    return np.asarray(np.floor(points).astype(np.int64)[:, None] + corners, np.int64)
-
-
-def flat_index(cells: Index, shape: GridShape) -> Index:
-    """Return flat indices (...) of cells (..., 3); of those outside the grid, of the nearest cells."""
-    inside = cells.clip(0, np.array(shape) - 1)
-    return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(inside, -1, 0)), shape), np.int64)
-
-
-def sees(begin: Array, end: Array, walls: Sequence[Shape], spacing: float) -> NDArray[np.bool_]:
-    """Return whether no wall is between places (..., 3) and cells beside them (..., 3) [m] of `spacing` [m].
-
-    Each step goes as far as the distance from the nearest wall.
-    """
-    begin, end = np.broadcast_arrays(begin, end)
-    length = np.linalg.norm(end - begin, axis=-1)
-    gone, blocked = np.zeros(length.shape), np.zeros(length.shape, bool)
-    for _ in range(_STEPS):
-        share = np.divide(gone, length, out=np.ones_like(gone), where=length > 0)
-        places = torch.from_numpy(begin + share[..., None] * (end - begin))
-        distance = torch.stack([wall.signed_distance(places) for wall in walls]).amin(dim=0).numpy()
-        blocked |= (distance < _TOUCHING * spacing) & (gone < length)
-        gone = np.minimum(gone + np.maximum(distance, _TOUCHING * spacing), length)
-    return ~blocked
-
-
-def _connections(
-    coupling: Array, touched: Index, places: Index, free: NDArray[np.bool_], shape: GridShape, usual: float
-) -> tuple[Index, Index]:
-    """Return the pairs of cells (k,) and (k,) between which sound passes, of the touched ones at `places`."""
-    row = np.concatenate([np.abs(part).sum(axis=1) for part in _in_parts(coupling)]).clip(min=usual)
-    place_of = places_among(touched, math.prod(shape))
-    pairs = []
-    for part in _in_parts(places):
-        neighbour = _neighbours(touched[part], shape)
-        place = place_of[neighbour]
-        theirs = np.where(touched[place] == neighbour, row[place], np.inf)
-        passes = np.abs(coupling[part]) > _BLOCKED * np.minimum(row[part, None], theirs)
-        first, offset = np.nonzero(passes & free[neighbour])
-        pairs.append((touched[part[first]], neighbour[first, offset]))
-    one, other = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
-    return one, other

@@ -26,7 +26,7 @@ from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.medium import Medium
-from autdtorch.scene.scene import require_in_front
+from autdtorch.scene.reflectors import require_in_front
 from autdtorch.utils.images import Image
 from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import ArrayLike, integer_at_least, invalid, require_kind

@@ -22,7 +22,9 @@ from autdtorch.propagators.tmatrix.bodies import ObstacleGroup, are_outside, bod
 from autdtorch.propagators.tmatrix.body import Placed, Solver, placed
 from autdtorch.propagators.tmatrix.scattering import scattered_waves, waves_at
 from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
-from autdtorch.scene.scene import Scene, require_clear, require_in_front
+from autdtorch.scene.checks import require_clear
+from autdtorch.scene.reflectors import require_in_front
+from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.images import Image
 from autdtorch.utils.process import cached_property, one_library_thread

@@ -27,8 +27,7 @@ from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import composed_rotation
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle
-from autdtorch.scene.reflectors import Reflector, require_arrangement
-from autdtorch.scene.scene import require_in_front
+from autdtorch.scene.reflectors import Reflector, require_arrangement, require_in_front
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.files import read_arrays, write_arrays
 from autdtorch.utils.hints import renamed_keywords

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.csgraph import breadth_first_order
 
 from autdtorch.scene.obstacles.mesh_file import Polygons, triangulated
 from autdtorch.scene.obstacles.mesh_solid import (
@@ -25,7 +25,7 @@ from autdtorch.scene.obstacles.mesh_solid import (
     winding_number,
 )
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.spatial import areas_of, paired_sides, sides_of
+from autdtorch.utils.spatial import areas_of, connected_parts, paired_sides, sides_of
 
 _FARTHEST = 1.0001e-3  # distance between vertices that are taken as one, relative to the extent
 _STRAY = 1e-3  # share of all area below which an open piece is no part of the body
@@ -89,17 +89,16 @@ def _oriented(vertices: Array, faces: Index, done: list[str]) -> Index:
     ends, pairs = sides_of(faces), paired_sides(faces)
     one, other = pairs.T % len(faces)
     opposed = (ends[pairs[:, 0]] == ends[pairs[:, 1]]).all(axis=1)  # both run along the edge the same way
-    graph = coo_array((np.ones(len(one)), (one, other)), shape=(len(faces),) * 2).tocsr()
     against = coo_array((np.where(opposed, 2.0, 1.0), (one, other)), shape=(len(faces),) * 2).tocsr()
     against = against.maximum(against.T)
-    number, label = connected_components(graph, directed=False)
+    label = connected_parts((one, other), len(faces))
     turned = np.zeros(len(faces), bool)
     for root in np.unique(label, return_index=True)[1]:
         along, before = breadth_first_order(against, root, directed=False)
         for face in along[1:]:
             turned[face] = turned[before[face]] ^ (against[before[face], face] == 2)
     faces = np.where(turned[:, None], faces[:, ::-1], faces)
-    for piece in range(number):
+    for piece in range(label.max() + 1):
         in_piece = label == piece
         corners = vertices[faces[in_piece]]
         if np.linalg.det(corners - corners.mean(axis=(0, 1))).sum() < 0:  # six times the volume
@@ -189,5 +188,4 @@ def _pieces(faces: Index) -> Index:
     """Return the number of the piece, joined by edges, of each face (F,)."""
     edges, edge = np.unique(np.sort(sides_of(faces), axis=1), axis=0, return_inverse=True)
     owner = np.tile(np.arange(len(faces)), 3)
-    graph = coo_array((np.ones(len(owner)), (owner, edge.reshape(-1))), shape=(len(faces), len(edges)))
-    return np.asarray(connected_components(graph @ graph.T, directed=False)[1], np.int64)
+    return connected_parts((owner, len(faces) + edge.reshape(-1)), len(faces) + len(edges))[: len(faces)]

@@ -13,11 +13,9 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.spatial import areas_of, doubled_normals, paired_sides, sides_of
+from autdtorch.utils.spatial import areas_of, connected_parts, doubled_normals, paired_sides, sides_of
 
 Triangles: TypeAlias = tuple[Array, Index]
 """Vertices (V, 3) and the indices of each triangle's vertices (F, 3)."""
@@ -129,8 +127,7 @@ def _near(vertices: Array, some: Index, distance: float) -> Index:
     from scipy.spatial import KDTree
 
     pairs = KDTree(vertices[some]).query_pairs(distance, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(some),) * 2)
-    label = connected_components(graph, directed=False)[1]
+    label = connected_parts(pairs.T, len(some))
     _, first = np.unique(label, return_index=True)
     nearest = np.arange(len(vertices))
     nearest[some] = some[first[label]]
@@ -210,8 +207,7 @@ def _labels(vertices: Array, faces: Index) -> Index:
         raise ValueError(f"{open_sides} ({where}); {why}; repair=True may mend it")
     owner = np.tile(np.arange(len(faces)), 3)
     one, other = (owner[chosen][np.lexsort((owner[chosen], edge[chosen]))] for chosen in (upwards, ~upwards))
-    graph = coo_array((np.ones(len(one)), (one, other)), shape=(len(faces),) * 2)
-    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+    return connected_parts((one, other), len(faces))
 
 
 def _split(faces: Index, label: Index) -> list[Index]:
