@@ -27,7 +27,7 @@ _REGULARISATION = 1e-5  # Keeps weights small where the fit does not determine t
 # than waves of the drive's wavenumber.
 _ONE_SIDED_REGULARISATION = 1e-2
 # Distance [cells] along each axis of the cells that are then fitted: larger systems take long
-_ONE_SIDED_REACH = 3
+ONE_SIDED_REACH = 3
 _ABSCISSA, _QUADRATURE = np.polynomial.legendre.leggauss(24)  # of wavenumbers up to the drive's
 
 
@@ -74,7 +74,7 @@ def exclude_cells(
     whole += _ONE_SIDED_REGULARISATION**2 * np.eye(len(whole))
     for row in rows:
         off = np.abs(places_of(points.index[row], shape) - cells[row])
-        left = np.flatnonzero(~excluded[row] & (off < _ONE_SIDED_REACH).all(axis=1))
+        left = np.flatnonzero(~excluded[row] & (off < ONE_SIDED_REACH).all(axis=1))
         if (off[left] < 1).all(axis=1).any():
             target = np.sinc(kappa / np.pi * off[left]).prod(axis=-1)
             weight[row, left] = solve(whole[np.ix_(left, left)], target, assume_a="pos", check_finite=False)

@@ -27,6 +27,10 @@ CLEARANCE = 4.5
 The Huygens surface is up to 4 cells from the bodies, and must not meet its own image."""
 
 
+_AS_HEAVY = 1.1
+"""Ratio of densities up to which cells on both sides of a surface interpolate better than those on one."""
+
+
 class Fluid(NamedTuple):
     """Density [kg/m^3] and sound speed [m/s] of a fluid, complex where it absorbs.
 
@@ -121,6 +125,20 @@ class Region:
     def walls(self) -> list[Shape]:
         """Shapes of the bodies that no sound enters."""
         return [body.shape for body in self.bodies if body.fluid is None]
+
+    @property
+    def kinked(self) -> list[Shape]:
+        """Shapes of the bodies at whose surface the pressure gradient jumps."""
+        return [body.shape for body in self.bodies if not self.is_as_heavy(body, _AS_HEAVY)]
+
+    def extending(self, spacing: float) -> list[Shape]:
+        """Return the shapes of rigid bodies at an angle to cells [m], which extend the pressure outside."""
+        hard = (body for body in self.bodies if body.fluid is None)
+        return [body.shape for body in hard if not body.is_along(np.eye(3), spacing)]
+
+    def is_as_heavy(self, body: Body, ratio: float) -> bool:
+        """Return whether the density of a body is air's, within a ratio > 1."""
+        return body.fluid is not None and 1 / ratio < body.fluid.inertia / self.fluid.inertia < ratio
 
     @property
     def sound_speeds(self) -> dict[str, float]:

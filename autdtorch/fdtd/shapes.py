@@ -9,6 +9,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from autdtorch.utils.array_types import Array
@@ -16,6 +17,8 @@ from autdtorch.utils.process import cached_property
 from autdtorch.utils.validation import Vector
 
 _SAGITTA = 1.5  # Growth of a bounding box, relative to the distance of triangles from a curved surface
+# Steps from a place to another, and the distance, relative to the precision, at which a shape is reached
+_STEPS, _TOUCHING = 60, 1e-3
 
 
 class Shape(Protocol):
@@ -40,6 +43,35 @@ def bounds(shapes: Sequence[Shape]) -> tuple[Array, Array]:
     """Return the lower and upper corner (3,) [m] of the bounding box of shapes."""
     lower = np.array([shape.lower for shape in shapes], np.float64).min(axis=0)
     return lower, np.array([shape.upper for shape in shapes], np.float64).max(axis=0)
+
+
+def distance_from(shapes: Sequence[Shape], points: Tensor) -> Tensor:
+    """Return the distance (...) [m] of points (..., 3) to the nearest of shapes, negative inside."""
+    return torch.stack([shape.signed_distance(points) for shape in shapes]).amin(dim=0)
+
+
+def sees(begin: Array, end: Array, shapes: Sequence[Shape], precision: float) -> NDArray[np.bool_]:
+    """Return whether no shape is between places (..., 3) and others (..., 3) [m], to a precision [m].
+
+    Each step goes as far as the distance from the nearest shape.
+    """
+    begin, end = np.broadcast_arrays(begin, end)
+    grid, (begin, end) = begin.shape[:-1], (begin.reshape(-1, 3), end.reshape(-1, 3))
+    length, least = np.linalg.norm(end - begin, axis=1), _TOUCHING * precision
+    gone, seen = np.zeros(len(length)), np.ones(len(length), bool)
+    going = np.flatnonzero(length > 0)
+    for step in range(_STEPS):
+        if not len(going):
+            break
+        share = (gone[going] / length[going])[:, None]
+        places = torch.from_numpy((1 - share) * begin[going] + share * end[going])
+        distance = distance_from(shapes, places).numpy()
+        if step:  # a place on a shape looks away from it
+            seen[going] = distance >= least
+        on = seen[going] & (gone[going] < length[going])
+        going = going[on]
+        gone[going] = np.minimum(gone[going] + np.maximum(distance[on], least), length[going])
+    return seen.reshape(grid)
 
 
 class Bounded(ABC):

@@ -15,17 +15,23 @@ from torch import Tensor
 
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
-from autdtorch.fdtd.assembly.neighbours import corners_around, flat_index, sees
+from autdtorch.fdtd.assembly.neighbours import corners_around, flat_index
 from autdtorch.fdtd.boundary import layer_columns, tuned_profile
 from autdtorch.fdtd.damping import at_time_step, fewest_stable_steps
 from autdtorch.fdtd.grid import Grid, make_grid
-from autdtorch.fdtd.interpolation import Interpolation, average_nodes, exclude_cells, interpolate_points
+from autdtorch.fdtd.interpolation import (
+    ONE_SIDED_REACH,
+    Interpolation,
+    average_nodes,
+    exclude_cells,
+    interpolate_points,
+)
 from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, WaveState, uniform_state
 from autdtorch.fdtd.region import Region
-from autdtorch.fdtd.shapes import Shape
+from autdtorch.fdtd.shapes import Shape, distance_from, sees
 from autdtorch.fdtd.stability import whole_steps
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
-from autdtorch.utils.array_types import REAL, Index
+from autdtorch.utils.array_types import REAL, Array, Index
 from autdtorch.utils.validation import invalid
 
 logger = logging.getLogger(__name__)
@@ -42,6 +48,7 @@ RAMP_PERIODS = 8
 # into subnormal numbers, on which processors are slow (2.4 times, measured at 120^3 in float32).
 _BACKGROUND = 1e-20
 _FEWEST_IDLE = 32  # Cells of a row from which it is quicker to skip them than to step them
+_LOOKING = 512  # Points whose kernels are looked at together
 _TOGETHER = 16_384  # Receivers whose records in double precision stay in the cache
 _ONE_NODE = torch.ones(1, **REAL)  # Weight of a point with a single node
 
@@ -51,6 +58,7 @@ class Assembly:
     """A region on a grid, ready to step."""
 
     grid: Grid
+    region: Region  # in the coordinates of the grid
     stencil: Stencil  # weights in air
     # time steps per period of the drive: steps (numerator) and periods (denominator) of a block
     steps_per_period: Fraction
@@ -71,9 +79,34 @@ class Assembly:
         """Return cells and weights of points (P, 3) [m], or of nodes (P, n, 3) with `weights` (n,)."""
         nodes, grid = points.reshape(-1, 3), self.grid
         kernels = interpolate_points(grid.to_cells(nodes), grid.shape, grid.first, grid.last, grid.kappa)
-        rigid = np.isin(kernels.index, self.heterogeneous.rigid)  # their pressure is not defined
-        kernels = exclude_cells(kernels, grid.to_cells(nodes), rigid, grid.shape, grid.kappa)
+        excluded = np.isin(kernels.index, self.heterogeneous.rigid)  # their pressure is not defined
+        excluded |= self._behind_surfaces(nodes.numpy(), kernels.index, excluded)
+        kernels = exclude_cells(kernels, grid.to_cells(nodes), excluded, grid.shape, grid.kappa)
         return average_nodes(kernels, weights.numpy())
+
+    def _behind_surfaces(self, points: Array, cells: Index, rigid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return which cells (P, n) a surface parts from points (P, 3) [m]: the pressure has a kink there.
+
+        Points in bodies see all cells, and so do those in gaps where only `rigid` cells (P, n) are in sight.
+        """
+        region, spacing = self.region, self.grid.spacing
+        behind, reach = np.zeros(cells.shape, bool), ONE_SIDED_REACH * spacing
+        if not (shapes := region.kinked):
+            return behind
+        distance = distance_from(shapes, torch.from_numpy(points)).numpy()
+        near = np.flatnonzero((distance > 0) & (distance < math.sqrt(3) * reach))
+        for first in range(0, len(near), _LOOKING):
+            some = near[first : first + _LOOKING]
+            centers = self.grid.centers_of(cells[some])
+            off = np.abs(centers - points[some, None]).max(axis=2)
+            row, cell = np.nonzero((off < reach) & ~rigid[some])
+            seen = sees(points[some[row]], centers[row, cell], shapes, spacing)
+            if extending := region.extending(spacing):
+                seen |= distance_from(extending, torch.from_numpy(centers[row, cell])).numpy() < 0
+            beside = np.bincount(row, seen & (off[row, cell] < spacing), len(some)) > 0
+            hidden = ~seen & beside[row]
+            behind[some[row[hidden]], cell[hidden]] = True
+        return behind
 
     def is_enclosed(self, points: Tensor, walls: Sequence[Shape]) -> NDArray[np.bool_]:
         """Return whether points (N, 3) [m] are nearer to enclosed cells than to others of air.
@@ -186,7 +219,7 @@ def assembly_of(
         grid.shape, grid.spacing * 1e3, len(cells.index), steps_per_period.numerator,
         steps_per_period.denominator, 1e6 / (steps * frequency), 100 * fewest / steps,
     )  # fmt: skip
-    return Assembly(grid, stencil, steps_per_period, coefficients, cells)
+    return Assembly(grid, region, stencil, steps_per_period, coefficients, cells)
 
 
 def _idle(grid: Grid, cells: HeterogeneousCells) -> Index:

@@ -77,8 +77,7 @@ def warn_of_thin_walls(region: Region, spacing: float, grids: Iterable[tuple[Ite
     for numbers, axes in grids:
         for number in numbers:
             body = region.bodies[number]
-            ratio = 0.0 if body.fluid is None else body.fluid.inertia / region.fluid.inertia
-            if 1 / _ALIKE < ratio < _ALIKE or body.is_along(axes, spacing):
+            if region.is_as_heavy(body, _ALIKE) or body.is_along(axes, spacing):
                 continue
             if (wall := thin_wall(body.shape, spacing)) is not None:
                 thickness, place = wall

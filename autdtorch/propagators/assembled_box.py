@@ -54,7 +54,7 @@ def assembled_box(
 
     medium = region.fluid, region.attenuation, region.frequency
     key = key_of("box", bodies, axes, here, *medium, str(dtype), time_step)
-    return replace(BODIES.get(key, assembled).assembly, grid=grid)
+    return replace(BODIES.get(key, assembled).assembly, grid=grid, region=part)
 
 
 def _shifted(body: Body, grid: Grid, axes: Array) -> Body:

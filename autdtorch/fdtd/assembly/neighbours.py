@@ -1,16 +1,13 @@
-"""Neighbours of cells: between which sound passes, which cells rigid bodies enclose, and what places see."""
+"""Neighbours of cells: between which sound passes, and which cells rigid bodies enclose."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from autdtorch.fdtd.shapes import Shape
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.utils.array_types import AnyArray, Array, Index
 from autdtorch.utils.spatial import connected_parts, places_among
@@ -20,8 +17,6 @@ _TOGETHER = 50_000  # Cells whose neighbours are looked at together
 # Coupling of two cells, relative to the sum of either, up to which nothing passes: 1e-5 or less through a
 # thin rigid body, and more through a heavy fluid. Slivers have the sum of a cell of the densest fluid.
 _BLOCKED = 1e-4
-# Steps from a place to a cell beside it, and the distance [cells] at which a wall is reached
-_STEPS, _TOUCHING = 60, 1e-3
 
 
 def neighbours(index: Index, shape: GridShape) -> Index:
@@ -81,23 +76,6 @@ def flat_index(cells: Index, shape: GridShape) -> Index:
     """Return flat indices (...) of cells (..., 3); of those outside the grid, of the nearest cells."""
     inside = cells.clip(0, np.array(shape) - 1)
     return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(inside, -1, 0)), shape), np.int64)
-
-
-def sees(begin: Array, end: Array, walls: Sequence[Shape], spacing: float) -> NDArray[np.bool_]:
-    """Return whether no wall is between places (..., 3) and cells beside them (..., 3) [m] of `spacing` [m].
-
-    Each step goes as far as the distance from the nearest wall.
-    """
-    begin, end = np.broadcast_arrays(begin, end)
-    length = np.linalg.norm(end - begin, axis=-1)
-    gone, blocked = np.zeros(length.shape), np.zeros(length.shape, bool)
-    for _ in range(_STEPS):
-        share = np.divide(gone, length, out=np.ones_like(gone), where=length > 0)
-        places = torch.from_numpy(begin + share[..., None] * (end - begin))
-        distance = torch.stack([wall.signed_distance(places) for wall in walls]).amin(dim=0).numpy()
-        blocked |= (distance < _TOUCHING * spacing) & (gone < length)
-        gone = np.minimum(gone + np.maximum(distance, _TOUCHING * spacing), length)
-    return ~blocked
 
 
 def _connections(

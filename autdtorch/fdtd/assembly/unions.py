@@ -15,7 +15,7 @@ from autdtorch.fdtd.assembly.element import MaterialLosses, Materials
 from autdtorch.fdtd.assembly.losses import STEP
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Body, Fluid, Region
-from autdtorch.fdtd.shapes import Shape, bounds
+from autdtorch.fdtd.shapes import Shape, bounds, distance_from
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.thin_walls import thickened
 from autdtorch.fdtd.turning import slender_faces
@@ -43,8 +43,7 @@ class Union:
     def distance(self, cell: Array, grid: Grid) -> Array:
         """Return the signed distance [cells] of positions (..., 3) in cells."""
         places = np.array(grid.origin) + grid.spacing * (grid.clip(cell) if self.continued else cell)
-        each = [shape.signed_distance(torch.from_numpy(places)) for shape in self.shapes]
-        distance = torch.stack(each).amin(dim=0).numpy() / grid.spacing - _CONTACT_GAP
+        distance = distance_from(self.shapes, torch.from_numpy(places)).numpy() / grid.spacing - _CONTACT_GAP
         if self.continued:
             return np.asarray(distance)
         beyond = np.maximum(np.array(grid.first) - cell, cell - np.array(grid.last) + 1).max(axis=-1) + 0.5
