@@ -41,7 +41,7 @@ _SMALL = 1e-5  # Phase up to which a difference of two waves is two terms of its
 
 def disc_numbers(places: Tensor | Discs, wavenumber: complex, number: type) -> tuple[AnyArray, ...]:
     """Return the waves of discs and the number (N,) of each disc's for `turn_into_disc`; points have none."""
-    if not isinstance(places, Discs):
+    if not isinstance(places, Discs) or not len(places.centers):
         return np.zeros((0, 0, 9), number), np.zeros((0, 0, 2), number), np.zeros(0, np.int64)
     radii, kind = places.kinds()
     k = complex(wavenumber)
