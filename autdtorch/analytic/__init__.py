@@ -6,15 +6,8 @@ They are complex where the obstacle absorbs.
 """
 
 from autdtorch.analytic.green import green, piston_directivity, piston_field, piston_on_axis
-from autdtorch.analytic.impedance_plane import impedance_plane
-from autdtorch.analytic.planes import (
-    fluid_half_space,
-    fluid_slab,
-    rigid_plane,
-    slab_coefficients,
-    soft_plane,
-    step_coefficients,
-)
+from autdtorch.analytic.layering import slab_coefficients, step_coefficients
+from autdtorch.analytic.planes import fluid_half_space, fluid_slab, impedance_plane, rigid_plane, soft_plane
 from autdtorch.analytic.sphere import fluid_sphere, impedance_sphere, rigid_sphere, soft_sphere
 
 __all__ = [
