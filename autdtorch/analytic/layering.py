@@ -1,4 +1,4 @@
-"""The response of a fluid half-space or slab to plane waves and, as an integral of these, to point sources."""
+"""Fluid half-spaces and slabs: their response to plane waves and, as an integral of these, to sources."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from autdtorch.analytic.disc_waves import MeanWaves, powers_needed
+from autdtorch.analytic.discs import MeanWaves, powers_needed
 from autdtorch.analytic.momentum import angular_momentum, linear_momentum
 from autdtorch.analytic.spherical_waves import outgoing_waves
 from autdtorch.scene.arrays import TransducerArray, apertures_of, complex_strengths_of, radii_of
