@@ -206,7 +206,8 @@ def _placed(
 def _offsets(targets: torch.Tensor, origins: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:
     """Return the distances (P, M) [m] along the plane."""
     between = targets[:, None] - origins
-    return (between - (between @ axis)[..., None] * axis).norm(dim=-1)
+    offsets: torch.Tensor = (between - (between @ axis)[..., None] * axis).norm(dim=-1)
+    return offsets
 
 
 def _heights(
