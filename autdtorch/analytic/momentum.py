@@ -11,6 +11,7 @@ import functools
 import torch
 
 from autdtorch.analytic.spherical_waves import degrees, ladder, orders
+from autdtorch.utils.array_types import REAL
 
 
 def linear_momentum(waves: torch.Tensor) -> torch.Tensor:
@@ -33,6 +34,30 @@ def angular_momentum(waves: torch.Tensor) -> torch.Tensor:
     order, place, factor = _steps(_degree(waves))
     up, down = (factor[:, side, None] * waves.index_select(-2, place[:, side]) for side in (0, 1))
     return torch.stack([(up + down) / 2, (up - down) / 2j, order[:, None] * waves])
+
+
+def pose_gradient(
+    wavenumber: complex, axes: torch.Tensor, waves: torch.Tensor, gradient: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the gradients (..., 3) by the centre and (..., 3, 3) by the axes of regular waves around a body.
+
+    A shift or a turn of the body changes the coefficients as the gradient, or x cross gradient, of the field.
+
+    Args:
+        wavenumber: k [rad/m].
+        axes: of the body, columns (..., 3, 3).
+        waves: coefficients (..., K, R), for all gradients with a degree more than `gradient`.
+        gradient: by the coefficients (..., N, R), N <= K.
+    """
+    count = gradient.shape[-2]
+    weights = 1j * gradient.conj()
+
+    def weighed(slopes: torch.Tensor) -> torch.Tensor:  # (3, ..., K, R) to (..., 3, 1)
+        return (weights * slopes[..., :count, :]).sum(dim=(-2, -1)).real.movedim(0, -1)[..., None]
+
+    by_place = (axes @ weighed(wavenumber * linear_momentum(waves)))[..., 0]
+    turn = weighed(angular_momentum(waves)).mT.expand(*axes.shape)
+    return by_place, axes @ torch.linalg.cross(turn, torch.eye(3, **REAL).expand_as(turn)).mT / 2
 
 
 def _degree(waves: torch.Tensor) -> int:

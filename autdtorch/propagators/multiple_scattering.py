@@ -1,10 +1,10 @@
 """Multiple scattering between bodies apart, each a linear map from incoming to outgoing waves.
 
 Body i has the map T_i and the incident waves d_i, and body j sends it the waves S_ij b_j. The outgoing waves
-are b_i = T_i (d_i + sum_j S_ij b_j) (Waterman and Truell 1961, doi:10.1063/1.1703737). Matrices are solved
-for; maps that cost a run are iterated. A pass of the iteration adds one scattering order, and the orders are
-combined by the least residual (`extrapolated`); weakly coupled bodies need three or four passes. Later passes
-contribute little, and are simulated to looser tolerances.
+are b_i = T_i (d_i + sum_j S_ij b_j) (Waterman and Truell 1961, doi:10.1063/1.1703737). Here each map costs a
+run; for T-matrices see `tmatrix.coupling`. A pass of the iteration adds one scattering order, and the orders
+are combined by the least residual (`extrapolated`); weakly coupled bodies need three or four passes. Later
+passes contribute little, and are simulated to looser tolerances.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import torch
 
 from autdtorch.fdtd.grouping import MOST_PASSES
 from autdtorch.fdtd.steady_state import SteadyState
-from autdtorch.utils.array_types import COMPLEX, REAL
+from autdtorch.utils.array_types import REAL
 
 logger = logging.getLogger(__name__)
 
@@ -61,43 +61,6 @@ class Scatterer(Protocol):
         From a body to itself, they are those that reflectors send back and that its runs do not include.
         """
         ...
-
-
-def solved(
-    maps: Sequence[torch.Tensor],
-    between: Sequence[Sequence[torch.Tensor | None]],
-    incident: Sequence[torch.Tensor],
-) -> torch.Tensor:
-    """Return the outgoing waves (..., N, M) of all bodies, given their maps T_i (n, n) and S_ij as matrices.
-
-    `incident` are the waves (..., n, M) on each body. The diagonal of `between` is what reflectors send back
-    to a body; None stands for no waves.
-    """
-    pairs = zip(maps, incident, strict=True)
-    answers = [(waves.mT @ matrix.mT).mT for matrix, waves in pairs]  # one product for all poses
-    alone = torch.cat(answers, dim=-2)
-    if all(each is None for row in between for each in row):
-        return alone
-    rows = []
-    for matrix, row in zip(maps, between, strict=True):
-        blocks = [
-            torch.zeros((len(matrix), len(other)), **COMPLEX) if each is None else matrix @ each
-            for each, other in zip(row, maps, strict=True)
-        ]
-        rows.append(torch.cat([each.expand(*alone.shape[:-2], -1, -1) for each in blocks], dim=-1))
-    coupled = torch.cat(rows, dim=-2)
-    if between[-1][-1] is not None:
-        return _fixed(coupled, alone)
-    rest = coupled.shape[-1] - len(maps[-1])  # the last body's waves follow from those of the others
-    there, back = coupled[..., :rest, rest:], coupled[..., rest:, :rest]
-    others = _fixed(coupled[..., :rest, :rest] + there @ back, alone[..., :rest, :] + there @ answers[-1])
-    return torch.cat([others, answers[-1] + back @ others], dim=-2)
-
-
-def _fixed(matrix: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
-    """Return x = start + matrix x."""
-    solution: torch.Tensor = torch.linalg.solve(torch.eye(matrix.shape[-1], **COMPLEX) - matrix, start)
-    return solution
 
 
 def iterated(

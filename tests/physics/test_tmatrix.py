@@ -24,10 +24,10 @@ from autdtorch.analytic.spherical_waves import (
     regular_waves,
     sphere_coefficients,
 )
-from autdtorch.analytic.wave_frames import translation
+from autdtorch.analytic.wave_translation import Translation, WaveFrame
 from autdtorch.propagators import make_propagator
 from autdtorch.propagators.tmatrix.bodies import enough_degrees
-from autdtorch.scene.geometry import rotation_matrix
+from autdtorch.scene.geometry import composed_rotation, rotation_matrix
 
 AIR = at.Medium(density=1.2, sound_speed=340.0)
 FREQUENCY = 40e3
@@ -120,10 +120,32 @@ def test_waves_around_one_centre_are_waves_around_another(degree, distance, mirr
     shift = torch.nn.functional.normalize(torch.randn(3, generator=generator).double(), dim=0) * distance
     near = distance / 20 * unit_vectors(4)
     outgoing = outgoing_waves(degree, WAVENUMBER, (near + shift) @ other_axes)
-    moved = translation(WAVENUMBER, shift, (15, axes), (degree, other_axes))
+    frames = WaveFrame(shift[None], axes[None], 15), WaveFrame(0 * shift[None], other_axes[None], degree)
+    each = torch.eye((degree + 1) ** 2, dtype=torch.complex128)
+    moved = Translation(WAVENUMBER, *frames).applied(each[:, None])[:, 0]
     regular = regular_waves(15, WAVENUMBER, near @ axes)
     # higher degrees are left out: j_16(k r) / j_3(k r) is below 1e-10 at r = 2.5 mm
     assert relative_error(regular @ moved, outgoing) < 1e-9
+
+
+def test_derivatives_of_translations_are_those_of_finite_differences():
+    mirror, random = torch.eye(3).double() * torch.tensor([1.0, -1.0, 1.0]), torch.Generator().manual_seed(0)
+
+    def moved(waves: torch.Tensor, *poses: torch.Tensor) -> torch.Tensor:  # lengths in units of 1 / k
+        shift, other_shift, *angles = poses
+        axes, other_axes = (composed_rotation(each.cos(), each.sin()) for each in angles)
+        frames = (
+            WaveFrame(shift / WAVENUMBER, axes @ mirror, 2),
+            WaveFrame(other_shift / WAVENUMBER, other_axes, 3),
+        )
+        return Translation(WAVENUMBER, *frames).applied(waves)
+
+    waves = torch.randn(16, 2, 2, dtype=torch.complex128, generator=random)
+    poses = [torch.randn(2, 3, dtype=torch.float64, generator=random) for _ in range(4)]
+    poses[0] += 10
+    arguments = [each.requires_grad_(True) for each in (waves, *poses)]
+    assert torch.autograd.gradcheck(moved, arguments)
+    assert torch.autograd.gradgradcheck(moved, arguments, fast_mode=True)
 
 
 MATERIALS = [

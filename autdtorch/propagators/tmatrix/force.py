@@ -163,7 +163,6 @@ class _Driven:
         forces = self.cluster.by_poses(
             every,
             len(self.array),
-            len(self.images) > 1,
             lambda bodies, part: of_drives(bodies, flat[part]),
         )
         return forces.reshape(*every, 3)
@@ -182,7 +181,7 @@ class _Driven:
         poses = self.cluster.poses
         if not poses:
             return of_units(self.cluster.bodies)
-        matrices = self.cluster.by_poses(poses, len(self.array), len(self.images) > 1, of_units)
+        matrices = self.cluster.by_poses(poses, len(self.array), of_units)
         return matrices.reshape(*poses, *matrices.shape[-3:])
 
     def _to_scene(self, bodies: Sequence[TMatrix], momentum: _Momentum) -> torch.Tensor:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from autdtorch.analytic.discs import MeanWaves, powers_needed
-from autdtorch.analytic.momentum import angular_momentum, linear_momentum
+from autdtorch.analytic.momentum import pose_gradient
 from autdtorch.analytic.spherical_waves import outgoing_waves
 from autdtorch.scene.arrays import TransducerArray, apertures_of, complex_strengths_of, radii_of
-from autdtorch.utils.array_types import COMPLEX, REAL
+from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.images import Image, distinct
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
@@ -37,10 +37,7 @@ def incoming_waves(
 
 
 class _Driven(torch.autograd.Function):
-    """Waves (..., R, K) with a degree more, whose gradient is left out.
-
-    A shift or a turn of the body changes the coefficients as the gradient, or x cross gradient, of the field.
-    """
+    """Waves (..., R, K) with a degree more, whose gradient is left out."""
 
     @staticmethod
     def forward(
@@ -66,16 +63,8 @@ class _Driven(torch.autograd.Function):
             waves = _Driven.apply(center, axes, drive, body, array, images, degree + 1)  # type: ignore[no-untyped-call]
         by_place = by_turn = by_drive = None
         count = (degree + 1) ** 2
-        weights = -1j * gradient[..., :count].mT
-
-        def weighed(slopes: torch.Tensor) -> torch.Tensor:  # (3, ..., K, R) to (..., 3, 1)
-            return (weights.conj() * slopes[..., :count, :]).sum(dim=(-2, -1)).real.movedim(0, -1)[..., None]
-
-        if ctx.needs_input_grad[0]:
-            by_place = (axes @ weighed(body.wavenumber * linear_momentum(waves.mT)))[..., 0]
-        if ctx.needs_input_grad[1]:
-            turn = weighed(angular_momentum(waves.mT)).mT.expand(*axes.shape)
-            by_turn = axes @ torch.linalg.cross(turn, torch.eye(3, **REAL).expand_as(turn)).mT / 2
+        if any(ctx.needs_input_grad[:2]):
+            by_place, by_turn = pose_gradient(body.wavenumber, axes, waves.mT, gradient[..., :count].mT)
         if ctx.needs_input_grad[2]:
             placed = replace(body, center=center, axes=axes)
             each = IncomingWaves.of(placed, array, images, degree).matrix

@@ -6,30 +6,24 @@ and outgoing waves W at the points. It is computed from the side with fewer colu
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
 
-from autdtorch.analytic.spherical_waves import degrees, outgoing_waves
-from autdtorch.analytic.wave_frames import translation
-from autdtorch.propagators.multiple_scattering import solved
+from autdtorch.analytic.spherical_waves import degrees, mirrored, outgoing_waves
+from autdtorch.propagators.tmatrix.coupling import Ways, received, solved, ways_between
 from autdtorch.propagators.tmatrix.incoming import IncomingWaves, incoming_waves, offsets_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.images import NO_MIRRORS, Image
-from autdtorch.utils.process import require_memory
 
 if TYPE_CHECKING:
     from autdtorch.propagators.tmatrix.tmatrix import TMatrix
 
 _AT_ONCE = 200_000
 """Waves at points that are computed at once: 3 MB, which fit into a cache."""
-
-_ENTRY_BYTES = 48.0
-"""Memory of a pair of waves in the system of equations [bytes]."""
 
 
 def parts_of(points: torch.Tensor, waves: int) -> tuple[torch.Tensor, ...]:
@@ -68,20 +62,48 @@ def scattered_field(
 
 
 def _weights(bodies: Sequence[TMatrix], waves: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:
-    """Return the weights (..., P, N) of incoming waves in what waves (..., P, N) bring to points."""
-    maps = [body.matrix.mT for body in bodies]
-    between = [
-        [None if each is None else each.mT for each in column]
-        for column in zip(*_between(bodies, images), strict=True)
+    """Return the weights (..., P, N) of incoming waves in what waves (..., P, N) bring to points.
+
+    By reciprocity they are scattered by bodies with transposed maps, as waves of opposite orders.
+    """
+    signs = [mirrored(body.degree) for body in bodies]
+    maps = [
+        sign[:, None] * body.matrix.mT[place][:, place] * sign
+        for body, (place, sign) in zip(bodies, signs, strict=True)
     ]
-    return solved(maps, between, torch.split(waves.mT, [len(matrix) for matrix in maps], dim=-2)).mT
+    parts = torch.split(waves.mT, [len(each) for each in maps], dim=-2)
+
+    def opposite(each: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+        return [sign[:, None] * part[..., place, :] for part, (place, sign) in zip(each, signs, strict=True)]
+
+    weights = _scattered(maps, ways_between(bodies, images), opposite(parts))
+    return torch.cat(opposite(weights), dim=-2).mT
+
+
+def _scattered(
+    maps: Sequence[torch.Tensor], ways: Ways, incident: Sequence[torch.Tensor]
+) -> list[torch.Tensor]:
+    """Return the outgoing waves (..., n, R) of all bodies under incident ones (..., n, R); see `solved`."""
+    poses = incident[0].shape[:-2]
+    return [_in_poses(waves, poses) for waves in solved(maps, ways, [_flat(waves) for waves in incident])]
+
+
+def _flat(waves: torch.Tensor) -> torch.Tensor:
+    """Return waves (N, B, R) of waves (..., N, R)."""
+    return waves.reshape(-1, *waves.shape[-2:]).movedim(1, 0).contiguous()
+
+
+def _in_poses(waves: torch.Tensor, poses: Sequence[int]) -> torch.Tensor:
+    """Return waves (..., N, R) of waves (N, B, R)."""
+    return waves.movedim(0, 1).reshape(*poses, len(waves), waves.shape[-1])
 
 
 def joined(bodies: Sequence[TMatrix], images: Sequence[Image]) -> torch.Tensor:
     """Return the map (N, N) from the regular waves on all bodies to the outgoing waves of all."""
     maps = [body.matrix for body in bodies]
     sizes = [len(matrix) for matrix in maps]
-    return solved(maps, _between(bodies, images), torch.split(torch.eye(sum(sizes), **COMPLEX), sizes))
+    identity = torch.split(torch.eye(sum(sizes), **COMPLEX), sizes)
+    return torch.cat(_scattered(maps, ways_between(bodies, images), identity))
 
 
 def waves_of_body(
@@ -98,19 +120,25 @@ def waves_of_body(
     transducer alone. Both have one degree more than T, up to which regular waves exchange momentum with the
     outgoing ones. `together` maps the array's waves on all bodies to both, if it is known; see `joined_on`.
     """
-    bodies = _with_next_degree(bodies, number)
+    raised = [_with_next_degree(body) if index == number else body for index, body in enumerate(bodies)]
     if drive is None:
-        incident = [IncomingWaves.of(body, array, images).matrix for body in bodies]
+        incident = [IncomingWaves.of(body, array, images).matrix for body in raised]
     else:
-        incident = [incoming_waves(body, array, images, drive) for body in bodies]
+        incident = [incoming_waves(body, array, images, drive) for body in raised]
     if together is not None:
         waves = torch.cat(incident, dim=-2).mT
         flat = waves.reshape(-1, waves.shape[-1])  # one product for all poses
         regular, outgoing = ((flat @ part.mT).reshape(*waves.shape[:-1], -1).mT for part in together)
         return regular, outgoing
-    between, sizes = _between(bodies, images), [len(body.matrix) for body in bodies]
-    scattered = torch.split(solved([body.matrix for body in bodies], between, incident), sizes, dim=-2)
-    return incident[number] + _echoes(between[number], scattered), scattered[number]
+    order = [number, *(index for index in range(len(bodies)) if index != number)]  # the first is quickest
+    maps = [bodies[index].matrix for index in order]
+    bodies, poses = [bodies[index] for index in order], incident[0].shape[:-2]
+    first, *others = (_flat(incident[index]) for index in order)
+    sent = solved(maps, ways_between(bodies, images), [first[: len(maps[0])], *others])
+    echoes = received(ways_between(bodies, images, 1)[0], sent)
+    regular = first if echoes is None else first + echoes
+    outgoing = torch.nn.functional.pad(sent[0], (0, 0, 0, 0, 0, len(regular) - len(sent[0])))
+    return _in_poses(regular, poses), _in_poses(outgoing, poses)
 
 
 def joined_on(
@@ -120,34 +148,26 @@ def joined_on(
 
     `every` is what `joined` returns. As in `waves_of_body`, one degree more of this body counts.
     """
-    end, before = sum(len(body.matrix) for body in bodies[: number + 1]), len(every)
-    bodies = _with_next_degree(bodies, number)
-    sizes = [len(body.matrix) for body in bodies]
-    more = sum(sizes) - before
-    every = _with_zeros(_with_zeros(every, end, more).mT, end, more).mT
-    parts = torch.split(every, sizes)
-    direct = torch.split(torch.eye(len(every), **COMPLEX), sizes)[number]
-    return direct + _echoes(_between(bodies, NO_MIRRORS)[number], parts), parts[number]
+    more, sizes = 2 * bodies[number].degree + 3, [len(body.matrix) for body in bodies]
+    end = sum(sizes[: number + 1])
+    columns = _with_zeros(every.mT, end, more).mT
+    sent = [part[:, None] for part in torch.split(columns, sizes)]
+    echoes = received(ways_between(bodies, NO_MIRRORS, 1)[number], sent)
+    sizes[number] += more
+    direct = torch.split(torch.eye(sum(sizes), **COMPLEX), sizes)[number]
+    outgoing = torch.nn.functional.pad(sent[number][:, 0], (0, 0, 0, more))
+    return direct if echoes is None else direct + echoes[:, 0], outgoing
 
 
-def _with_next_degree(bodies: Sequence[TMatrix], number: int) -> list[TMatrix]:
-    """Return bodies, one of them with a degree more, which it does not scatter."""
-    body = bodies[number]
+def _with_next_degree(body: TMatrix) -> TMatrix:
+    """Return a body with a degree more, which it does not scatter."""
     more = 2 * body.degree + 3
-    raised = replace(body, matrix=torch.nn.functional.pad(body.matrix, (0, more, 0, more)))
-    return [*bodies[:number], raised, *bodies[number + 1 :]]
+    return replace(body, matrix=torch.nn.functional.pad(body.matrix, (0, more, 0, more)))
 
 
 def _with_zeros(rows: torch.Tensor, place: int, count: int) -> torch.Tensor:
     """Return rows (N + count, K) with so many of zeros at a place."""
     return torch.cat([rows[:place], rows.new_zeros(count, rows.shape[1]), rows[place:]])
-
-
-def _echoes(between: Sequence[torch.Tensor | None], scattered: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Return the regular waves on a body that the outgoing waves of all bodies bring to it."""
-    pairs = zip(between, scattered, strict=True)
-    parts = [part @ waves for part, waves in pairs if part is not None]
-    return torch.stack(parts).sum(dim=0) if parts else torch.zeros((), **COMPLEX)
 
 
 def waves_at(bodies: Sequence[TMatrix], points: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:
@@ -176,34 +196,9 @@ def scattered_waves(
     no unknowns: their waves are its own, mirrored.
     """
     incident = [IncomingWaves.of(body, array, images).matrix for body in bodies]
-    between = _between(bodies, images)
-    return [
-        solved([_without_highest(body, fewer) for body in bodies], between, incident) for fewer in left_out
-    ]
-
-
-def _between(bodies: Sequence[TMatrix], images: Sequence[Image]) -> list[list[torch.Tensor | None]]:
-    """Return S_ij (..., n, n): waves of body j's images as regular waves around body i; None without any."""
-    if len(bodies) > 1 or len(images) > 1:
-        count = sum(len(body.matrix) for body in bodies)
-        poses = max(math.prod(body.center.shape[:-1]) for body in bodies)
-        require_memory("bodies", f"{count} waves", _ENTRY_BYTES * poses * count**2)
-    return [
-        [_regular_waves(body, other, images[1:] if other is body else images) for other in bodies]
-        for body in bodies
-    ]
-
-
-def _regular_waves(body: TMatrix, other: TMatrix, images: Sequence[Image]) -> torch.Tensor | None:
-    """Return S (..., N, K): outgoing waves of another body's images as regular waves around this one."""
-    waves: torch.Tensor | None = None
-    for image in images:
-        center = (other.center - image.offset) @ image.matrix
-        axes = image.matrix.mT @ other.axes
-        shift = body.center - center
-        part = translation(body.wavenumber, shift, (body.degree, body.axes), (other.degree, axes))
-        waves = image.weight * part if waves is None else waves + image.weight * part
-    return waves
+    ways = ways_between(bodies, images)
+    maps = ([_without_highest(body, fewer) for body in bodies] for fewer in left_out)
+    return [torch.cat(_scattered(each, ways, incident), dim=-2) for each in maps]
 
 
 def _without_highest(body: TMatrix, fewer: int) -> torch.Tensor:

@@ -344,7 +344,7 @@ class TMatrixCluster:
         def of_poses(bodies: Sequence[TMatrix], part: slice) -> torch.Tensor:
             return scattered_field(bodies, array, sets[part], images, self.together)
 
-        scattered = self.by_poses(every, len(array), len(images) > 1, of_poses)
+        scattered = self.by_poses(every, len(array), of_poses)
         return direct + scattered.reshape(*every, *direct.shape[-2:])
 
     @property
@@ -367,17 +367,15 @@ class TMatrixCluster:
         self,
         poses: Sequence[int],
         columns: int,
-        echoes: bool,
         work: Callable[[Sequence[TMatrix], slice], torch.Tensor],
     ) -> torch.Tensor:
         """Return what `work` does for the bodies in each of the poses (...), flat, a few poses at a time.
 
-        It has so many columns of waves, and `echoes` if the bodies' waves come back to them.
+        It has so many columns of waves.
         """
         bodies = [body._in_poses(poses) for body in self.bodies]
         waves = sum(len(body.matrix) for body in bodies)
-        coupled = self.together is None and (len(bodies) > 1 or echoes)
-        count = 1 + _AT_ONCE // (waves * max(columns, waves if coupled else 1))
+        count = 1 + _AT_ONCE // (waves * columns)
         gradients = torch.is_grad_enabled()
 
         def part(first: int) -> torch.Tensor:
