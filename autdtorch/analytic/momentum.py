@@ -36,28 +36,32 @@ def angular_momentum(waves: torch.Tensor) -> torch.Tensor:
     return torch.stack([(up + down) / 2, (up - down) / 2j, order[:, None] * waves])
 
 
-def pose_gradient(
+def gradient_by_place(
     wavenumber: complex, axes: torch.Tensor, waves: torch.Tensor, gradient: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the gradients (..., 3) by the centre and (..., 3, 3) by the axes of regular waves around a body.
-
-    A shift or a turn of the body changes the coefficients as the gradient, or x cross gradient, of the field.
+) -> torch.Tensor:
+    """Return the gradient (..., 3) by the centre of regular waves: a shift changes them as that of the field.
 
     Args:
         wavenumber: k [rad/m].
-        axes: of the body, columns (..., 3, 3).
-        waves: coefficients (..., K, R), for all gradients with a degree more than `gradient`.
-        gradient: by the coefficients (..., N, R), N <= K.
+        axes: of the waves, columns (..., 3, 3).
+        waves: their coefficients (..., K, R), with a degree more than `gradient`.
+        gradient: by the coefficients (..., N, R).
     """
-    count = gradient.shape[-2]
-    weights = 1j * gradient.conj()
+    by_place: torch.Tensor = axes @ _weighed(wavenumber * linear_momentum(waves), gradient)[..., None]
+    return by_place[..., 0]
 
-    def weighed(slopes: torch.Tensor) -> torch.Tensor:  # (3, ..., K, R) to (..., 3, 1)
-        return (weights * slopes[..., :count, :]).sum(dim=(-2, -1)).real.movedim(0, -1)[..., None]
 
-    by_place = (axes @ weighed(wavenumber * linear_momentum(waves)))[..., 0]
-    turn = weighed(angular_momentum(waves)).mT.expand(*axes.shape)
-    return by_place, axes @ torch.linalg.cross(turn, torch.eye(3, **REAL).expand_as(turn)).mT / 2
+def gradient_by_turn(axes: torch.Tensor, waves: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
+    """Return the gradient (..., 3, 3) by the axes of regular waves (..., N, R); see `gradient_by_place`."""
+    turn = _weighed(angular_momentum(waves), gradient)[..., None, :].expand(*axes.shape)
+    by_turn: torch.Tensor = axes @ torch.linalg.cross(turn, torch.eye(3, **REAL).expand_as(turn)).mT
+    return by_turn / 2
+
+
+def _weighed(slopes: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
+    """Return (..., 3), the changes with i times slopes (3, ..., K, R) by the gradient (..., N, R)."""
+    some = slopes[..., : gradient.shape[-2], :]
+    return -(gradient.conj() * some).sum(dim=(-2, -1)).imag.movedim(0, -1)
 
 
 def _degree(waves: torch.Tensor) -> int:

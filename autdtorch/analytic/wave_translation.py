@@ -18,11 +18,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from scipy.linalg import block_diag
 
-from autdtorch.analytic.momentum import pose_gradient
+from autdtorch.analytic.momentum import gradient_by_place, gradient_by_turn
 from autdtorch.analytic.spherical_waves import harmonics, mirrored, orders
 from autdtorch.analytic.wave_frames import turns
 from autdtorch.utils.array_types import AnyArray
+
+_AT_ONCE = 64
+"""Waves of several degrees that are turned by one product, as small ones take long."""
 
 
 class WaveFrame(NamedTuple):
@@ -41,13 +45,14 @@ class Translation:
         wavenumber: k [rad/m].
         here: the frame of the regular waves.
         there: that of the outgoing waves.
+        is_conjugate: whether radial functions are conjugated, as in the adjoint.
     """
 
     wavenumber: complex
     here: WaveFrame
     there: WaveFrame
+    is_conjugate: bool = False
     _shared: dict[bool, _Factors] = field(default_factory=dict, repr=False)  # with copies of equal frames
-    _is_back: bool = False
 
     def applied(self, waves: torch.Tensor) -> torch.Tensor:
         """Return the coefficients (N, B, R) of regular waves, from those of outgoing ones (K, B, R)."""
@@ -56,18 +61,17 @@ class Translation:
         return regular[: (degree + 1) ** 2]
 
     @property
-    def reversed(self) -> Translation:
-        """The map of outgoing waves here to regular ones there."""
-        return Translation(self.wavenumber, self.there, self.here, self._shared, not self._is_back)
+    def adjoint(self) -> Translation:
+        """The adjoint map: a translation back, with conjugate radial functions, as turns are unitary."""
+        return Translation(self.wavenumber, self.there, self.here, not self.is_conjugate, self._shared)
 
     @property
     def factors(self) -> _Factors:
         """Its factors, up to a degree more here, from which `_Translated` takes the gradient."""
-        if self._is_back not in self._shared:
+        if self.is_conjugate not in self._shared:
             with torch.no_grad():
-                factors = _Factors.of(self.wavenumber, _with_next_degree(self.here), self.there)
-            self._shared[self._is_back] = factors
-        return self._shared[self._is_back]
+                self._shared[self.is_conjugate] = _Factors.of(self)
+        return self._shared[self.is_conjugate]
 
 
 class _Translated(torch.autograd.Function):
@@ -94,60 +98,63 @@ class _Translated(torch.autograd.Function):
         (waves, regular), translation = ctx.saved_tensors, ctx.translation
         here, there = translation.here, translation.there
         gradient = gradient[: (here.degree + 1) ** 2]
-        # the transpose is the way back, of waves of opposite orders
-        by_waves = _opposite(translation.reversed.applied(_opposite(gradient.conj()))).conj()
-        by_place = by_turn = by_other_turn = None
-        if any(ctx.needs_input_grad[1:]):
-            if torch.is_grad_enabled():  # for derivatives of the gradient
-                more = Translation(translation.wavenumber, _with_next_degree(here), there)
-                regular = more.applied(waves)
-            by_place, by_turn = pose_gradient(
-                translation.wavenumber, here.axes, regular.movedim(0, -2), gradient.movedim(0, -2)
-            )
-            _, turned_back = pose_gradient(
-                translation.wavenumber, there.axes, waves.movedim(0, -2), by_waves.movedim(0, -2)
-            )
-            by_other_turn = -turned_back
-        return by_waves, by_place, by_turn, None if by_place is None else -by_place, by_other_turn, None
+        by_waves = translation.adjoint.applied(gradient)
+        by_place = by_turn = by_other_place = by_other_turn = None
+        _, *needed = ctx.needs_input_grad[:5]
+        if any(needed[:3]) and torch.is_grad_enabled():  # for derivatives of the gradient
+            more = translation.wavenumber, _with_next_degree(here), there, translation.is_conjugate
+            regular = Translation(*more).applied(waves)
+        weights = gradient.movedim(0, -2)
+        if needed[0] or needed[2]:
+            wavenumber = complex(translation.wavenumber)
+            wavenumber = wavenumber.conjugate() if translation.is_conjugate else wavenumber
+            by_place = gradient_by_place(wavenumber, here.axes, regular.movedim(0, -2), weights)
+            by_other_place = -by_place
+        if needed[1]:
+            by_turn = gradient_by_turn(here.axes, regular.movedim(0, -2), weights)
+        if needed[3]:
+            by_other_turn = -gradient_by_turn(there.axes, waves.movedim(0, -2), by_waves.movedim(0, -2))
+        return by_waves, by_place, by_turn, by_other_place, by_other_turn, None
 
 
 class _Turn(NamedTuple):
     """The turn to a frame from one whose z has another direction, up to a phase that the way back takes away.
 
-    It is `around` Q `tilt` Q^T with the quarter turns Q.
+    It is `around` Q `tilt` Q^T with the quarter turns Q, and phases (N, B, 1) of all waves.
     """
 
-    around: torch.Tensor  # phases of all waves (N, B, 1)
-    tilt: torch.Tensor  # of all orders (2 L + 1, B, 1)
+    around: torch.Tensor
+    tilt: torch.Tensor
 
 
 class _Factors(NamedTuple):
     """A translation in factors: a turn, a shift along z by blocks (B, C) of all orders, and a turn back."""
 
     here: _Turn
-    there: _Turn
+    there: _Turn  # its conjugate, back
     twist: torch.Tensor  # about z, between both (K, B, 1)
     blocks: torch.Tensor
     degrees: tuple[int, int]
     are_left_handed: tuple[bool, bool]
 
     @classmethod
-    def of(cls, wavenumber: complex, here: WaveFrame, there: WaveFrame) -> _Factors:
-        """Compute the factors between frames."""
+    def of(cls, translation: Translation) -> _Factors:
+        """Compute the factors of a translation to a frame with a degree more."""
+        here, there = _with_next_degree(translation.here), translation.there
         shift = here.center - there.center
         distance = torch.linalg.vector_norm(shift, dim=-1)
         parts = [_turn(frame, shift / distance[:, None]) for frame in (here, there)]
         (turn, across, is_left), (other_turn, other_across, is_other_left) = parts
         twist = torch.einsum("bij,bi->jb", across, other_across[..., 0])
         degrees = here.degree, there.degree
-        radial = torch.view_as_real(_outgoing_radial(sum(degrees), wavenumber * distance))
+        radial = torch.view_as_real(_outgoing_radial(sum(degrees), translation.wavenumber * distance))
         along = _along_z(*degrees)
         real, imaginary = (part.mT @ along.terms for part in radial.unbind(dim=-1))
         return cls(
             turn,
-            other_turn,
+            _Turn(*(each.conj().resolve_conj() for each in other_turn)),
             _phases(orders(there.degree)[along.others], torch.atan2(twist[1], twist[0])),
-            torch.complex(real, imaginary),
+            torch.complex(real, -imaginary if translation.is_conjugate else imaginary),
             degrees,
             (is_left, is_other_left),
         )
@@ -157,7 +164,7 @@ class _Factors(NamedTuple):
         is_left, is_other_left = self.are_left_handed
         waves = _opposite(waves) if is_other_left else waves.resolve_conj()
         turn, other_turn = self.here, self.there
-        waves = _tilted(waves * other_turn.around.conj(), other_turn.tilt.conj())
+        waves = _tilted(waves * other_turn.around, other_turn.tilt)
         waves = self._shifted(waves)
         waves = _tilted(waves, turn.tilt)
         waves = waves * turn.around
@@ -182,7 +189,7 @@ def _with_next_degree(frame: WaveFrame) -> WaveFrame:
 
 
 def _opposite(waves: torch.Tensor) -> torch.Tensor:
-    """Return waves (N, B, R) of opposite orders, as conjugation or mirrored axes make them."""
+    """Return waves (N, B, R) of opposite orders, as mirrored axes make them."""
     place, sign = mirrored(math.isqrt(len(waves)) - 1)
     return sign[:, None, None] * waves[place]
 
@@ -198,8 +205,7 @@ def _turn(frame: WaveFrame, along: torch.Tensor) -> tuple[_Turn, torch.Tensor, b
     second = torch.stack([-around.sin(), around.cos(), none], dim=-1)
     across = axes @ torch.stack([first, second], dim=-1)
     every = orders(frame.degree)
-    turn = _Turn(_phases(every, around + math.pi / 2), _phases(every[frame.degree**2 :], tilt))
-    return turn, across, is_left
+    return _Turn(_phases(every, around + math.pi / 2), _phases(every, tilt)), across, is_left
 
 
 def _phases(order: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
@@ -210,12 +216,11 @@ def _phases(order: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
 
 
 def _tilted(waves: torch.Tensor, tilt: torch.Tensor) -> torch.Tensor:
-    """Return Q `tilt` Q^T of waves (N, B, R)."""
-    middle, parts = len(tilt) // 2, []
-    for n, quarter in enumerate(_quarter_turns(len(tilt) // 2)[: math.isqrt(len(waves))]):
-        part = _real_product(quarter.mT, waves[n * n : (n + 1) ** 2])
-        parts.append(_real_product(quarter, tilt[middle - n : middle + n + 1] * part))
-    return torch.cat(parts)
+    """Return Q `tilt` Q^T of waves (N, B, R), with the phases (N, B, 1) of the tilt."""
+    result = torch.empty_like(waves)
+    for rows, quarter in _quarter_turns(math.isqrt(len(waves)) - 1):
+        result[rows] = _real_product(quarter, tilt[rows] * _real_product(quarter.mT, waves[rows]))
+    return result
 
 
 def _real_product(matrix: torch.Tensor, waves: torch.Tensor) -> torch.Tensor:
@@ -226,12 +231,18 @@ def _real_product(matrix: torch.Tensor, waves: torch.Tensor) -> torch.Tensor:
 @functools.lru_cache(8)
 @torch.inference_mode(False)
 @torch.no_grad()
-def _quarter_turns(degree: int) -> list[torch.Tensor]:
-    """Return the turn Q (2 l + 1, 2 l + 1) of each degree that brings z to x about y; it is real."""
+def _quarter_turns(degree: int) -> list[tuple[slice, torch.Tensor]]:
+    """Return the rows and the turn Q (n, n) of a few degrees each; it brings z to x about y, and is real."""
     axes = torch.tensor(
         [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]], dtype=torch.float64, device="cpu"
     )
-    return [each.real.contiguous() for each in turns(degree, axes)]
+    blocks, result, begin = turns(degree, axes), list[tuple[slice, torch.Tensor]](), 0
+    while blocks:
+        few = max(1, int((np.cumsum([len(block) for block in blocks]) <= _AT_ONCE).sum()))
+        joined = torch.from_numpy(block_diag(*(block.real.numpy() for block in blocks[:few])))
+        result.append((slice(begin, begin + len(joined)), joined))
+        begin, blocks = begin + len(joined), blocks[few:]
+    return result
 
 
 def _outgoing_radial(degree: int, x: torch.Tensor) -> torch.Tensor:

@@ -11,6 +11,7 @@ Gradients are those of one more step: they solve the adjoint system.
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -79,12 +80,12 @@ def _seen(frame: WaveFrame, image: Image) -> WaveFrame:
 def received(ways: Sequence[Sequence[Way]], sent: Sequence[torch.Tensor | None]) -> torch.Tensor | None:
     """Return the regular waves (N, B, R) that come to a body from the outgoing ones (K, B, R) of bodies."""
     parts = [
-        way.weight * way.translation.applied(waves)
+        way.translation.applied(waves) if way.weight == 1 else way.weight * way.translation.applied(waves)
         for each, waves in zip(ways, sent, strict=True)
         for way in each
         if waves is not None
     ]
-    return torch.stack(parts).sum(dim=0) if len(parts) > 1 else parts[0] if parts else None
+    return functools.reduce(torch.add, parts) if parts else None
 
 
 def solved(maps: Sequence[torch.Tensor], ways: Ways, incident: Sequence[torch.Tensor]) -> list[torch.Tensor]:
@@ -264,22 +265,48 @@ def _solution(system: _System) -> torch.Tensor:
 
 def _by_steps(system: _System, start: torch.Tensor) -> torch.Tensor | None:
     """Return x, each right side with the least residual, or None if it has not converged."""
-    residual, solution = start, torch.zeros_like(start)
-    accepted = _ACCURACY * start.norm(dim=0)
-    before: list[tuple[torch.Tensor, torch.Tensor]] = []
+    residual, accepted = start, _ACCURACY * _norm(start)
+    residuals, images = list[torch.Tensor](), list[torch.Tensor]()  # the latter orthonormal
+    triangle, shares = list[list[torch.Tensor]](), list[torch.Tensor]()
     for _ in range(_MOST_STEPS):
-        direction, image = residual, residual - system.linear(residual)
-        for each, its_image in before:
-            share = (its_image.conj() * image).sum(dim=0)
-            direction, image = direction - share * each, image - share * its_image
-        size = image.norm(dim=0).clamp_min(_TINY)
-        direction, image = direction / size, image / size
-        before.append((direction, image))
-        share = (image.conj() * residual).sum(dim=0)
-        solution, residual = solution + share * direction, residual - share * image
-        if (residual.norm(dim=0) <= accepted).all():
-            return solution
+        residuals.append(residual)
+        image, column = residual - system.linear(residual), list[torch.Tensor]()
+        for each in images:
+            column.append(_product(each, image))
+            image = image.addcmul(column[-1], each, value=-1)
+        size = _norm(image).clamp_min(_TINY)
+        image = image / size
+        images.append(image)
+        triangle.append([*column, size])
+        shares.append(_product(image, residual))
+        residual = residual.addcmul(shares[-1], image, value=-1)
+        if (_norm(residual) <= accepted).all():
+            return _combined(residuals, triangle, shares)
     return None
+
+
+def _combined(
+    residuals: Sequence[torch.Tensor], triangle: Sequence[Sequence[torch.Tensor]], shares: list[torch.Tensor]
+) -> torch.Tensor:
+    """Return the sum of residuals whose images have these shares of the orthonormal ones."""
+    solution, shares = torch.zeros_like(residuals[0]), list(shares)
+    for number in reversed(range(len(shares))):
+        *column, size = triangle[number]
+        weight = shares[number] / size
+        for other, entry in enumerate(column):
+            shares[other] = shares[other] - entry * weight
+        solution = solution.addcmul(weight, residuals[number])
+    return solution
+
+
+def _product(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+    """Return the inner products (B, R) of waves (N, B, R)."""
+    return (one.conj() * other).sum(dim=0)
+
+
+def _norm(waves: torch.Tensor) -> torch.Tensor:
+    """Return the norms (B, R) of waves (N, B, R); quicker than those of complex numbers."""
+    return torch.view_as_real(waves.resolve_conj()).square().sum(dim=(0, -1)).sqrt()
 
 
 def _by_matrix(system: _System, start: torch.Tensor) -> torch.Tensor:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from autdtorch.analytic.discs import MeanWaves, powers_needed
-from autdtorch.analytic.momentum import pose_gradient
+from autdtorch.analytic.momentum import gradient_by_place, gradient_by_turn
 from autdtorch.analytic.spherical_waves import outgoing_waves
 from autdtorch.scene.arrays import TransducerArray, apertures_of, complex_strengths_of, radii_of
 from autdtorch.utils.array_types import COMPLEX
@@ -63,8 +63,10 @@ class _Driven(torch.autograd.Function):
             waves = _Driven.apply(center, axes, drive, body, array, images, degree + 1)  # type: ignore[no-untyped-call]
         by_place = by_turn = by_drive = None
         count = (degree + 1) ** 2
-        if any(ctx.needs_input_grad[:2]):
-            by_place, by_turn = pose_gradient(body.wavenumber, axes, waves.mT, gradient[..., :count].mT)
+        if ctx.needs_input_grad[0]:
+            by_place = gradient_by_place(body.wavenumber, axes, waves.mT, gradient[..., :count].mT)
+        if ctx.needs_input_grad[1]:
+            by_turn = gradient_by_turn(axes, waves.mT, gradient[..., :count].mT)
         if ctx.needs_input_grad[2]:
             placed = replace(body, center=center, axes=axes)
             each = IncomingWaves.of(placed, array, images, degree).matrix

@@ -52,6 +52,9 @@ from autdtorch.utils.validation import (
 _AT_ONCE = 200_000
 """Waves of transducers in many poses that are computed at once: 3 MB, which fit into a cache."""
 
+_FEWEST = 64
+"""Fewest poses at once of bodies that send one another waves, whose operations on a pose are small."""
+
 _ARRAYS = ("matrix", "center", "axes", "radius", "wavenumber")
 
 
@@ -375,7 +378,8 @@ class TMatrixCluster:
         """
         bodies = [body._in_poses(poses) for body in self.bodies]
         waves = sum(len(body.matrix) for body in bodies)
-        count = 1 + _AT_ONCE // (waves * columns)
+        is_coupled = self.together is None and (len(bodies) > 1 or self.reflectors)
+        count = max(1 + _AT_ONCE // (waves * columns), _FEWEST if is_coupled else 1)
         gradients = torch.is_grad_enabled()
 
         def part(first: int) -> torch.Tensor:
