@@ -11,7 +11,7 @@ import numpy as np
 from autdtorch.fdtd.grid import domain_extent
 from autdtorch.fdtd.grouping import USUAL_PERIODS, Grouping
 from autdtorch.fdtd.interpolation import interpolation_width
-from autdtorch.fdtd.kernels.choice import make_kernel
+from autdtorch.fdtd.kernels import make_kernel
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import MOST_JUDGED, phasors_kept
 from autdtorch.utils.process import cached_property, thread_count

@@ -8,7 +8,7 @@ import torch
 
 from autdtorch.fdtd.adjoint import recorded
 from autdtorch.fdtd.grid import make_grid, require_fine, warn_if_coarse
-from autdtorch.fdtd.kernels.choice import available_kernel, make_kernel, precision_of
+from autdtorch.fdtd.kernels import available_kernel, make_kernel, precision_of
 from autdtorch.fdtd.material_gradients import cells_of_maps, cells_of_obstacles, domain_cells
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import block_of, fewest_periods

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from autdtorch.fdtd.grouping import domain_grid
-from autdtorch.fdtd.kernels.choice import make_kernel
+from autdtorch.fdtd.kernels import make_kernel
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stepping import assemble, drive_signal
 from autdtorch.propagators.plan import plan

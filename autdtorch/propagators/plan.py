@@ -13,7 +13,7 @@ from autdtorch.fdtd.costs import Costs
 from autdtorch.fdtd.grid import coarsest_spacing, require_cells, require_spacing, second_spacing
 from autdtorch.fdtd.grid_errors import Law
 from autdtorch.fdtd.grouping import Grouping, choose_grids
-from autdtorch.fdtd.kernels.choice import available_kernel, precision_of
+from autdtorch.fdtd.kernels import available_kernel, precision_of
 from autdtorch.fdtd.placement import fitting_spacing
 from autdtorch.fdtd.region import Region
 from autdtorch.propagators.free_space import PAIR_BYTES

@@ -14,7 +14,7 @@ import torch
 
 from autdtorch.fdtd.absorption import Absorption
 from autdtorch.fdtd.grouping import USUAL_PERIODS
-from autdtorch.fdtd.kernels.choice import make_kernel
+from autdtorch.fdtd.kernels import make_kernel
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import SILENCE, SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from autdtorch.analytic.spherical_waves import mirrored
-from autdtorch.fdtd.kernels.choice import available_kernel
+from autdtorch.fdtd.kernels import available_kernel
 from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.propagators.store import store_in
 from autdtorch.propagators.tmatrix.body import Solver, placed

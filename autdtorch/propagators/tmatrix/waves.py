@@ -16,7 +16,7 @@ import torch
 
 from autdtorch.analytic.spherical_waves import mirrored, outgoing_waves, parities, real_waves, regular_waves
 from autdtorch.fdtd.grouping import Grouping, one_box
-from autdtorch.fdtd.kernels.choice import make_kernel
+from autdtorch.fdtd.kernels import make_kernel
 from autdtorch.fdtd.scattered_field import ScatteredField
 from autdtorch.fdtd.steady_state import MOST_JUDGED, SteadyState, run_to_steady_state
 from autdtorch.fdtd.symmetry import symmetries
