@@ -93,19 +93,24 @@ class Assembly:
         behind, reach = np.zeros(cells.shape, bool), ONE_SIDED_REACH * spacing
         if not (shapes := region.kinked):
             return behind
-        distance = distance_from(shapes, torch.from_numpy(points)).numpy()
-        near = np.flatnonzero((distance > 0) & (distance < math.sqrt(3) * reach))
+        around = distance_from(shapes, torch.from_numpy(points)).numpy()
+        near = np.flatnonzero((around > 0) & (around < math.sqrt(3) * reach))
         for first in range(0, len(near), _LOOKING):
             some = near[first : first + _LOOKING]
-            centers = self.grid.centers_of(cells[some])
-            off = np.abs(centers - points[some, None]).max(axis=2)
-            row, cell = np.nonzero((off < reach) & ~rigid[some])
-            seen = sees(points[some[row]], centers[row, cell], shapes, spacing)
+            numbers, place = np.unique(cells[some], return_inverse=True)
+            place = place.reshape(len(some), -1)
+            centers = torch.from_numpy(self.grid.centers_of(numbers))
+            free = distance_from(shapes, centers).numpy()
+            ends = centers.numpy()[place]
+            way = ends - points[some, None]
+            seen = np.linalg.norm(way, axis=2) <= around[some, None] + free[place]
+            off = np.abs(way).max(axis=2)
+            row, cell = np.nonzero((off < reach) & (free[place] > 0) & ~seen)
+            seen[row, cell] = sees(points[some[row]], ends[row, cell], shapes, spacing)
             if extending := region.extending(spacing):
-                seen |= distance_from(extending, torch.from_numpy(centers[row, cell])).numpy() < 0
-            beside = np.bincount(row, seen & (off[row, cell] < spacing), len(some)) > 0
-            hidden = ~seen & beside[row]
-            behind[some[row[hidden]], cell[hidden]] = True
+                seen |= (distance_from(extending, centers).numpy() < 0)[place]
+            beside = (seen & ~rigid[some] & (off < spacing)).any(axis=1)
+            behind[some] = ~seen & (off < reach) & beside[:, None]
         return behind
 
     def is_enclosed(self, points: Tensor, walls: Sequence[Shape]) -> NDArray[np.bool_]:
