@@ -68,9 +68,10 @@ def exclude_cells(
         return points
     weight = points.weight.copy()
     weight[rows] = 0
-    # The cells of all points have one arrangement: a single matrix holds the systems of all.
-    places = places_of(points.index[rows[0]], shape)
-    whole = np.sinc(kappa / np.pi * (places[:, None] - places)).prod(axis=-1)
+    # The cells of all points have one arrangement, a product of three axes: one matrix holds all systems.
+    axes = map(np.unique, places_of(points.index[rows[0]], shape).T)
+    x, y, z = (np.sinc(kappa / np.pi * (along[:, None] - along)) for along in axes)
+    whole = np.kron(np.kron(x, y), z)
     whole += _ONE_SIDED_REGULARISATION**2 * np.eye(len(whole))
     for row in rows:
         off = np.abs(places_of(points.index[row], shape) - cells[row])
