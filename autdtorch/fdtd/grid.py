@@ -35,16 +35,17 @@ MAX_CELLS = 10**9  # Most cells of a grid: more would take over 30 GB in single 
 # two are the Huygens surface, and the last two serve the interpolation of points next to it
 # (`scattered_field.py`).
 AROUND = 5
-# Cells of the boundary layer of a domain from 6 cells per wavelength on, and of coarser grids. Reflection to
+# Cells of the boundary layer from 6 cells per wavelength on, and on coarser grids of a domain. Reflection to
 # 60 degrees is below -68 dB (-82 dB from 8.5 cells per wavelength on); of coarser grids -66 dB at 4.25 cells
 # and -32 dB at 3.
 FINE_LAYER_CELLS, COARSE_LAYER_CELLS = 6, 8
-# Cells by which the layer of a box is thinner, up to a longest side of its bodies [wavelengths]. Its
-# reflection of the scattered field is then a small part of the error: at 1 mm it raises 0.11 to 0.12 % for
-# the paper's three cubes, and leaves 0.45 % for a rigid sphere. In the shadow of a larger body incident and
-# scattered field cancel: behind a plate of 0.1 m, 12 wavelengths, the error at 1 mm is 1.1 %, and 0.3 % with
-# the whole layer.
-_THINNER, _SMALL_BODIES = 2, 4
+# Cells of the layer of a box around bodies with longest sides up to so many wavelengths. Its reflection of
+# the scattered field is then a small part of the error: at 1 mm it raises 0.11 to 0.12 % for the paper's
+# three cubes, and leaves 0.45 % for a rigid sphere. In the shadow of a larger body incident and scattered
+# field cancel: behind a plate of 0.1 m, 12 wavelengths, the error at 1 mm is 1.1 %, and 0.3 % with 6 cells.
+# Coarser boxes have 6 cells. With 8, half of such a grid is layers, and the error of a hand differs by less
+# than 0.1 %, of 4 % at 5.4 cells per wavelength and 23 % at 3.4.
+_THIN_LAYER_CELLS, _SMALL_BODIES = 4, 4
 # Places on the few separate surfaces in a box, as many on each however small, and the share of their pairs
 # between which sound has arrived before a run may end. Sources drive all of them at once; what later comes
 # from corner to corner of a plate or a cube is below 5e-4 of the field. More surfaces fill their box.
@@ -134,12 +135,13 @@ class Extent:
     lower: Sequence[float]  # corner with the smallest coordinates (3,) [m]
     upper: Sequence[float]  # corner with the largest coordinates (3,) [m]
     margin: int  # cells around that, before the boundary layer begins
-    thinner: int  # cells by which the boundary layer is thinner
+    layers: tuple[int, int]  # cells of the boundary layer from 6 cells per wavelength on, and of coarser grids
     path: float  # way of sound before it has arrived everywhere [m]
 
     def layer_cells(self, kappa: float) -> int:
         """Return the thickness of the boundary layer at a wavenumber times spacing `kappa` [rad]."""
-        return (FINE_LAYER_CELLS if kappa <= 2 * math.pi / 6 else COARSE_LAYER_CELLS) - self.thinner
+        fine, coarse = self.layers
+        return fine if kappa <= 2 * math.pi / 6 else coarse
 
     def interior(self, spacing: float, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> tuple[int, int, int]:
         """Return the cells per axis that cover it, the first `offset` (3,) [cells] below the lower corner."""
@@ -157,15 +159,17 @@ def domain_extent(region: Region, spacing: float) -> Extent:
     """
     margin, (lower, upper) = interpolation_width(region.wavenumber * spacing) // 2 - 1, region.domain
     crossing = math.dist(lower, upper) + 2 * math.sqrt(3) * margin * spacing
-    return Extent(lower, upper, margin, thinner=0, path=crossing * (2 if region.bodies else 1))
+    layers, path = (FINE_LAYER_CELLS, COARSE_LAYER_CELLS), crossing * (2 if region.bodies else 1)
+    return Extent(lower, upper, margin, layers, path)
 
 
 def bodies_extent(region: Region) -> Extent:
     """Return the extent of the region's bodies and the air around them in a box."""
     lower, upper = bounds(region.shapes)
-    thinner = _THINNER if (upper - lower).max() <= _SMALL_BODIES * region.wavelength else 0
+    small = (upper - lower).max() <= _SMALL_BODIES * region.wavelength
+    layers = (_THIN_LAYER_CELLS if small else FINE_LAYER_CELLS), FINE_LAYER_CELLS
     path = round(path_between(region.shapes) + region.wavelength, 6)  # alike wherever the bodies are
-    return Extent(lower.tolist(), upper.tolist(), AROUND, thinner, path)
+    return Extent(lower.tolist(), upper.tolist(), AROUND, layers, path)
 
 
 def path_between(shapes: Sequence[Shape]) -> float:

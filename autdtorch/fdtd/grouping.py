@@ -212,7 +212,7 @@ def cheapest_boxes(region: Region, spacing: float, tolerance: float, runs: int) 
 def _partitions(region: Region, spacing: float, tolerance: float) -> Iterator[Grouping]:
     """Yield one box, and those apart."""
     yield one_box(region, spacing)
-    if len(region.bodies) > _MOST_OBSTACLES:
+    if not 1 < len(region.bodies) <= _MOST_OBSTACLES:
         return
     boxes = [box_grid(region, [index], spacing) for index in range(len(region.bodies))]
     while len(boxes) > 1:

@@ -25,10 +25,10 @@ from autdtorch.utils.process import cached_property, one_library_thread
 from autdtorch.utils.units import angles
 from autdtorch.utils.validation import ArrayLike, boolean, finite_vector, invalid, require_kind, within
 
-_COARSER, _COARSEST = 1.6, 2.5
+_COARSER, _COARSEST = 1.7, 2.5
 """Cells of the coarser grids, relative to the propagator's. For a hand at 1 mm, moved by 1 mm and 2 degrees,
-errors are 0.5 to 0.8 % at 40 % of the time; with 2.0 and 2.5 they are 1.4 to 2.5 %, with 1.25 and 2.0 0.1 to
-0.3 % at 70 % of the time."""
+errors are 0.5 to 0.7 %; with 2.0 and 2.5 they are 0.8 to 1.2 %, with 1.6 and 2.5 0.3 to 0.4 % in 1.5 times
+the time."""
 
 _LOOSER = 4.0
 """Tolerance of runs on the coarsest grid, relative to the others: its part in a matrix is about a fifth."""
@@ -66,6 +66,7 @@ class NearbyPoses:
             accepted = f"must be at most {most:.4g} m: {_COARSEST:g} times coarser grids must serve"
             raise invalid("propagator.spacing", spacing, accepted, "m")
         self.spacings = _COARSER * spacing, _COARSEST * spacing
+        self._coarser = propagator.coarser(_COARSER), propagator.coarser(_COARSEST, _LOOSER)
 
     def __repr__(self) -> str:
         """The propagator, and the spacings."""
@@ -138,7 +139,5 @@ class NearbyPoses:
 
     def _coarse(self, scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the matrix (P, M) on the finer of the coarse grids, and its difference from the other."""
-        here = self.propagator.for_scene(scene)
-        first, second = here.coarser(_COARSER), here.coarser(_COARSEST, _LOOSER)
-        matrix = first.transfer_matrix()
-        return matrix, matrix - second.transfer_matrix()
+        matrix, other = (each.for_scene(scene).transfer_matrix() for each in self._coarser)
+        return matrix, matrix - other

@@ -62,7 +62,7 @@ def test_runs_from_and_to_points_beside_a_body_agree(body, gap, first):
     apart = free[(free - point).norm(dim=1) > 2e-3]
     source = apart[first % len(apart)][None]
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(grid, "_THINNER", -6)  # what thinner layers reflect depends on the way
+        patched.setattr(grid, "_THIN_LAYER_CELLS", 12)  # what thinner layers reflect depends on the way
         forward, backward = both_ways(point, source, body, "float64", 1e-6)
     # of the field in free space, as both may cancel; 5e-4 measured next to resonances, else a tenth of it
     assert (backward - forward).abs() < 2e-3 / (point - source).norm()

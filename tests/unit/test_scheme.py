@@ -92,7 +92,7 @@ def test_source_factor_tends_to_that_of_the_continuum_on_fine_grids():
     assert stencil.source_factor(40) == pytest.approx(4 * math.pi * courant**2, rel=5e-3)
 
 
-DOMAIN, BOX = (Extent((0, 0, 0), (1, 1, 1), 0, thinner, 1) for thinner in (0, 2))
+DOMAIN, BOX = (Extent((0, 0, 0), (1, 1, 1), 0, layers, 1) for layers in ((6, 8), (4, 6)))
 # cells per wavelength and steps per period: largest reflection up to 60 degrees and at 75 [dB], and largest
 # energy that evanescent fields gain: measured 0.08, 0.02, 0.01 and 0.02, in a box 0.17, 0.12, 0.05 and 0.03.
 # With a tenth of the frequency shift it is 0.48, 0.35, 0.28 and 0.19.

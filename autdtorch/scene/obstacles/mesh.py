@@ -163,13 +163,13 @@ class Mesh(Obstacle):
             np.savetxt(file, self.triangles[0], fmt="v %.17g %.17g %.17g")
             np.savetxt(file, self.triangles[1] + 1, fmt="f %d %d %d")
 
-    @property
+    @cached_property
     def lower(self) -> Vector:
         """Lower corner of the bounding box (3,) [m]."""
         x, y, z = self.vertices.amin(dim=0).tolist()
         return x, y, z
 
-    @property
+    @cached_property
     def upper(self) -> Vector:
         """Upper corner of the bounding box (3,) [m]."""
         x, y, z = self.vertices.amax(dim=0).tolist()
