@@ -135,7 +135,7 @@ class Extent:
     lower: Sequence[float]  # corner with the smallest coordinates (3,) [m]
     upper: Sequence[float]  # corner with the largest coordinates (3,) [m]
     margin: int  # cells around that, before the boundary layer begins
-    layers: tuple[int, int]  # cells of the boundary layer from 6 cells per wavelength on, and of coarser grids
+    layers: tuple[int, int]  # cells of the boundary layer on fine grids, and on those below 6 a wavelength
     path: float  # way of sound before it has arrived everywhere [m]
 
     def layer_cells(self, kappa: float) -> int:
