@@ -135,7 +135,12 @@ class Simulation(ABC):
     """
 
     def __init__(self, plan: Plan, store: Store) -> None:
-        """Make the simulation of a plan, whose results are in a store; nothing is computed yet."""
+        """Make the simulation of a plan, whose results are in a store; a plan with a refusal raises it.
+
+        Nothing is computed yet.
+        """
+        if plan.refusal:
+            raise ValueError(plan.refusal)
         self.plan, self._store = plan, store
         self.runs: list[Run] = []
         self.loaded_from: Path | None = None

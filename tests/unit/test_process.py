@@ -170,6 +170,13 @@ def test_a_chosen_spacing_is_refused_by_the_tolerance(monkeypatch: pytest.Monkey
     assert at.estimate(scene, reached.spacing, method="box").memory < 6 * coarse
 
 
+def test_the_simulation_of_a_body_is_refused_as_that_of_a_scene(monkeypatch: pytest.MonkeyPatch) -> None:
+    propagator = at.make_propagator(small_scene((CUBE,)), "tmatrix", spacing=0.7e-3)
+    monkeypatch.setattr(process, "available_memory", lambda: int(propagator.plan.memory / 2))
+    with pytest.raises(ValueError, match=r"^spacing: 0\.0007 m; needs about"):
+        propagator.transfer_matrix()
+
+
 def group(folder: Path, most: object, used: int, inactive: int) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     files = {"memory.max": most, "memory.current": used, "memory.stat": f"inactive_file {inactive}"}
