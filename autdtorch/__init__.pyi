@@ -41,6 +41,7 @@ from .methods.run import run
 from .methods.solution import Solution
 from .methods.state_file import load_state, save_state
 from .objectives.bound import focus_bound
+from .objectives.force_sensor import ForceSensor
 from .objectives.forces import ForceObjective, Levitate, Push, Trap
 from .objectives.goals import Goal, MeanPressure, TargetPressures, WeakestFocus
 from .objectives.haptics import HapticMetrics, haptic_metrics
@@ -97,6 +98,7 @@ __all__ = [
     "FocusMetrics",
     "FocusProblem",
     "ForceObjective",
+    "ForceSensor",
     "Goal",
     "GradientAscent",
     "HapticMetrics",

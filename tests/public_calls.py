@@ -350,6 +350,8 @@ ARGUMENTS: dict[str, Any] = {
 OTHERS: dict[str, Any] = {
     "FailedTransducers.transducers": [1],
     "ForceObjective.goal": at.Trap([(22e-3, 7e-3, 14e-3)], BEAD),
+    "ForceSensor.noise": 1e-6,
+    "ForceSensor.objective": Made(lambda _: force_objective()),
     "OverScenes.scenes": 1,
     "PoseBall.propagator": Made(lambda _: at.make_propagator(BALL, "tmatrix")),
     "PoseBall.radius": 1e-4,
@@ -507,6 +509,7 @@ INSTANCES = {
     "TMatrix": Made(lambda _: operator()),
     "TMatrixCluster": Made(lambda _: at.TMatrixCluster([operator()])),
     "ForceObjective": Made(lambda _: force_objective()),
+    "ForceSensor": Made(lambda _: at.ForceSensor(force_objective())),
     "HeatInversion": Made(lambda _: heat_inversion()),
     "Picture": Made(lambda _: picture()),
     "OpenMPDBoard": Made(lambda folder: at.OpenMPDBoard.load(board_file(folder))),

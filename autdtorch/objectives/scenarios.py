@@ -196,7 +196,7 @@ class Scenarios:
 def observed_goal(objective: Objective, goal: GoalFunction) -> tuple[GoalFunction, int]:
     """Return the goal for the pressures that an objective observes, and their number.
 
-    Where `goal` is the paper's, an objective may have another.
+    Where `goal` is the paper's, an objective may have another, and another number of readings.
     """
     inside, matrix = innermost(objective), simulated_matrix(objective)
     if isinstance(inside, Scenarios):
@@ -204,7 +204,8 @@ def observed_goal(objective: Objective, goal: GoalFunction) -> tuple[GoalFunctio
         return inside.over(each), len(inside) * points
     if goal is WEAKEST_FOCUS:
         goal = _goal_inside(objective)
-    return goal, len(objective.scene.control_points if matrix is None else matrix)
+    points = len(objective.scene.control_points if matrix is None else matrix)
+    return goal, getattr(inside, "readings", points)
 
 
 def _goal_inside(objective: Objective) -> GoalFunction:

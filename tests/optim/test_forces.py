@@ -86,6 +86,54 @@ def test_a_push_is_the_force_on_a_body_and_has_a_bound():
         assert 0.9 * bound < at.gradient_ascent(objective, starts=4).score.item() <= bound
 
 
+@pytest.fixture(scope="module")
+def pushed():
+    array = at.TransducerArray.grid((3, 3), 10e-3, (0, 0, 0), (0, 0, 1), source_strength=1.0)
+    ball = at.Sphere((0.002, 0, 0.05), 6e-3, rigid=True)
+    scene = at.Scene(array, MEDIUM, 40e3, [(0, 0, 0.04), (0.01, 0, 0.045)], [ball])
+    return at.ForceObjective(at.make_propagator(scene, "tmatrix"), at.Push((1, 0, 0)))
+
+
+def test_methods_push_by_the_readings_of_a_balance_alone(pushed):
+    bound = pushed.goal.bound(pushed.transfer_matrix)
+    sensor = at.ForceSensor(pushed, load=bound)
+    exact, read = at.gabs(pushed, levels=8, seed=1), at.gabs(sensor, levels=8, seed=1)
+    assert torch.equal(read.drive, exact.drive)
+    assert read.score.item() == pytest.approx(exact.score.item(), rel=1e-9)
+    assert sensor.evaluations == read.evaluations.item()
+    noisy = at.ForceSensor(pushed, load=bound, noise=0.02 * bound, seed=3)
+    several = {
+        "gabs": at.gabs(noisy, passes=2),
+        "lssg": at.lssg(noisy, levels=8),
+        "bo": at.bayes_opt(at.Quantised(noisy, 32), evaluations=24, initial=20),
+        "random": at.random_search(noisy, evaluations=50),
+    }
+    for name, solution in several.items():
+        force = pushed.goal(pushed(solution.drive)).item()
+        assert abs(force - solution.score.item()) < 6 * 0.02 * bound, (
+            name
+        )  # the luckiest of some 300 readings
+        assert force > (0.7 if name == "gabs" else 0.0) * bound, name
+    for method in (at.identify, at.phase_stepping, at.gradient_ascent):
+        with pytest.raises(ValueError, match="must"):
+            method(sensor)
+
+
+def test_a_balance_reads_the_force_with_its_load_and_noise_and_0_when_the_body_is_off(pushed):
+    drive = drives(2000, 9)
+    force = pushed.goal(pushed(drive))
+    sigma, load = 0.02 * force.abs().max().item(), 0.2 * force.abs().max().item()
+    sensor = at.ForceSensor(pushed, load=load, noise=sigma)
+    reading = sensor(drive.reshape(2, 1000, 9)).reshape(-1)
+    clear = force > 6 * sigma - load
+    error = (sensor.goal(reading[:, None]) - force)[clear]
+    # Six deviations of the mean and of the deviation of so many readings
+    assert abs(error.mean().item()) < 6 * sigma / len(error) ** 0.5
+    assert error.std().item() == pytest.approx(sigma, rel=6 / (2 * len(error)) ** 0.5)
+    assert (force < -load - 6 * sigma).any()
+    assert (reading[force < -load - 6 * sigma] == 0).all()
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 10**6),
