@@ -63,6 +63,7 @@ from .plot.scene_figure import plot_scene
 from .plot.trials import plot_convergence, plot_poses, plot_trials
 from .plot.view3d import animate3d, view3d
 from .propagators import SteadyStateWarning, cell_centers, differentiable_field, make_propagator, volume_field
+from .propagators.equilibrium import equilibrium
 from .propagators.estimate import Estimate, estimate
 from .propagators.gorkov import gorkov
 from .propagators.nearby import NearbyPoses
@@ -160,6 +161,7 @@ __all__ = [
     "differentiable_field",
     "drive_from_phases",
     "drive_sequence",
+    "equilibrium",
     "estimate",
     "explore",
     "focus_bound",
