@@ -256,6 +256,14 @@ def ring_mesh(center: Array, normal: list[float], inner: float, outer: float) ->
     return pyvista.Disc(center=center, inner=inner, outer=outer, normal=normal, c_res=48)
 
 
+def arrow_mesh(start: Array, direction: Array, length: float) -> pyvista.PolyData:
+    """Return an arrow; lengths in mm."""
+    import pyvista
+
+    shape = {"shaft_radius": 0.03, "tip_radius": 0.09, "tip_length": 0.3}
+    return pyvista.Arrow(start=start, direction=direction, scale=length, **shape)
+
+
 def add_bar(
     plotter: pyvista.Plotter, mesh: pyvista.Actor, title: str, *, position: float, labels: int, fmt: str
 ) -> None:

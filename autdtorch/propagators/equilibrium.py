@@ -92,8 +92,9 @@ def equilibrium(
     start = torch.tensor(finite_vector("point", point), **REAL)
     upwards = torch.zeros(3, **REAL) if up is None else torch.tensor(unit_vector("up", up), **REAL)
     others = propagator.bodies.bodies if isinstance(propagator, TMatrixPropagator) else ()
-    material = {"density": particle.density, "sound_speed": particle.sound_speed}
-    sphere = Sphere((0.0, 0.0, 0.0), particle.radius, **material)
+    sphere = Sphere(
+        (0.0, 0.0, 0.0), particle.radius, density=particle.density, sound_speed=particle.sound_speed
+    )
     ball = TMatrix.of(sphere, scene.medium, scene.frequency, error=_ERROR)
 
     def force(place: torch.Tensor) -> torch.Tensor:
@@ -140,4 +141,5 @@ def _step(force: torch.Tensor, stiffness: torch.Tensor) -> torch.Tensor:
     if float(values[0]) > 0:
         solved: torch.Tensor = torch.linalg.solve(stiffness, force)
         return solved
-    return axes @ ((axes.mT @ force) / values.abs().clamp_min(_TINY))
+    along: torch.Tensor = axes @ ((axes.mT @ force) / values.abs().clamp_min(_TINY))
+    return along

@@ -24,12 +24,12 @@ from autdtorch.propagators import Run
 from autdtorch.utils.digest import digest_of, package_versions, source_digest
 from autdtorch.utils.files import line_of, replace_file, row_of
 from autdtorch.utils.text import counted, decimals_of, html_table
+from autdtorch.utils.units import prefixed
 from autdtorch.utils.validation import invalid, real_tensor
 
 PROVENANCE_FILE = "provenance.json"
 
 _NEWTONS = "N", "N/m"  # units that are shown with a prefix
-_PREFIXES = ("", 1.0), ("m", 1e3), ("µ", 1e6), ("n", 1e9)
 _TYPES = {"config": str, "seed": int, "versions": dict, "source_digest": str, "date": str}
 
 
@@ -275,11 +275,8 @@ def with_prefixes(results: StudyResult) -> StudyResult:
     for unit in _NEWTONS:
         of_unit = {name: scene for name, scene in scenes.items() if scene.unit == unit}
         sizes = [_largest(scene) for scene in of_unit.values()]
-        prefix, factor = next(
-            ((prefix, factor) for prefix, factor in _PREFIXES if factor * max(sizes, default=0.0) >= 1),
-            _PREFIXES[-1],
-        )
-        scenes |= {name: _scaled(scene, factor, f"{prefix}{unit}") for name, scene in of_unit.items()}
+        scale = prefixed(max(sizes, default=0.0), unit)
+        scenes |= {name: _scaled(scene, *scale) for name, scene in of_unit.items()}
     return replace(results, scenes=scenes)
 
 

@@ -24,6 +24,8 @@ from autdtorch.utils.validation import (
 DECIBELS = 20 / math.log(10)
 """Decibels in a neper."""
 
+_PREFIXES = ("", 1.0), ("m", 1e3), ("µ", 1e6), ("n", 1e9)
+
 _place: ContextVar[str] = ContextVar("place of what is warned of", default="")
 _LEAST_DEGREES = 10.0  # beyond a turn in rad, so that whole numbers of rad, as a loop over turns has, are few
 _BETWEEN = {"autdtorch", "contextlib", "dataclasses", "functools"}  # call for the user, as `replace` does
@@ -39,6 +41,13 @@ def warn_user(text: str, category: type[Warning] = ScaleWarning) -> None:
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _BETWEEN:
         depth, frame = depth + 1, frame.f_back
     warnings.warn(_place.get() + text, category, stacklevel=depth)
+
+
+def prefixed(size: float, unit: str) -> tuple[float, str]:
+    """Return the factor and the unit, with a prefix from m to n if it needs one, that show a size >= 1."""
+    fitting = ((factor, f"{prefix}{unit}") for prefix, factor in _PREFIXES if factor * size >= 1)
+    prefix, factor = _PREFIXES[-1]
+    return next(fitting, (factor, f"{prefix}{unit}"))
 
 
 def angle(name: str, value: object) -> float:

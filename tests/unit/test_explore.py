@@ -15,7 +15,7 @@ import autdtorch as at
 from autdtorch.plot.explore import calculation
 from autdtorch.plot.explore import situation as situation_module
 from autdtorch.plot.explore.calculation import Calculator, Finished, Request, Result
-from autdtorch.plot.explore.display import offered
+from autdtorch.plot.explore.display import _force_text, offered
 from autdtorch.plot.explore.picture import followed
 from autdtorch.plot.explore.situation import SCENE_PLANE, Body, History, Situation, in_phase
 
@@ -58,6 +58,18 @@ def test_bodies_stand_for_their_obstacles():
     body = Body(ball, (1e-3, 0, 0), (1.0, 0, 0))
     assert body.obstacle.center == (1e-3, 0, 0)
     assert not body.turns
+
+
+def test_the_weight_of_a_body_is_that_of_its_volume_where_its_density_is_known():
+    fluid = {"density": 100.0, "sound_speed": 340.0}
+    box = at.Box((0, 0, 0), (3e-3, 4e-3, 5e-3), (0.3, -0.2, 0.5), **fluid)
+    ball = at.Sphere((0, 0, 0), 2e-3, **fluid)
+    assert Body.of(box).weight == pytest.approx(100 * 60e-9 * 9.81)
+    assert Body.of(ball).weight == pytest.approx(100 * 4 / 3 * math.pi * 8e-9 * 9.81)
+    assert Body.of(BRICK).weight is None  # rigid
+    assert _force_text(np.array([3e-3, 0, -4e-3]), 5.89e-5) == (
+        "Force of the sound 5.00 mN: (3.00, 0.00, -4.00) mN. Weight 58.9 µN."
+    )
 
 
 def test_a_plane_without_observation_plane_passes_through_the_foci():
@@ -202,7 +214,9 @@ def test_a_plane_that_takes_long_is_shown_coarse_before_the_error_and_sharp_afte
     made, reports = calculator
     scene = small_scene((CUBE,))
     made.ask(Request(1, Situation.of(scene, in_phase(scene))))
-    first, second, last = until_finished(reports, 1)
+    first, second, with_forces, last = until_finished(reports, 1)
+    assert (first.forces, second.forces) == (None, None)
+    assert torch.equal(with_forces.forces, last.forces)
     assert (first.error, second.error, last.error) == (None, last.error, pytest.approx(second.error))
     assert first.field.shape == second.field.shape
     assert last.field.size > 2 * first.field.size

@@ -31,6 +31,7 @@ from autdtorch.propagators import (
     volume_field,
 )
 from autdtorch.propagators.propagator import are_shown
+from autdtorch.propagators.surrounding_force import forces_on_obstacles
 from autdtorch.scene.geometry import Plane
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.progress import Stopped, stopping_when
@@ -85,6 +86,7 @@ class Result:
         field: complex pressure on the plane (Nu, Nv) [Pa], NaN in obstacles and next to transducers.
         bound: upper bound of the weakest focus over all drives [Pa]; None if coarse.
         error: relative error of the transfer matrix; None while it is unknown.
+        forces: of the sound on each obstacle (K, 3) [N], NaN if unknown; None while something is dragged.
         volume: pressure in the domain (Nx, Ny, Nz) [Pa]; None while it is unknown, or if not requested.
         seconds: time since the request [s].
     """
@@ -96,6 +98,7 @@ class Result:
     field: Array
     bound: float | None = None
     error: float | None = None
+    forces: torch.Tensor | None = None
     volume: torch.Tensor | None = None
     seconds: float = 0.0
 
@@ -209,6 +212,9 @@ class Calculator:
         pressure = (matrix @ drive).abs()  # of the matrix, so that it does not depend on the plane
         result = replace(result, pressure=pressure, bound=float(focus_bound(matrix)), error=error)
         yield replace(result, seconds=time.monotonic() - begun)
+        if situation.bodies and not self._is_old():
+            result = replace(result, forces=forces_on_obstacles(propagator, drive))
+            yield replace(result, seconds=time.monotonic() - begun)
         if first > step and self._rests():  # readings first, then a sharper picture
             result = replace(result, field=_field(request, propagator, drive, cells, step).field)
             yield replace(result, seconds=time.monotonic() - begun)

@@ -18,6 +18,9 @@ from autdtorch.plot.explore.picture import Picture, Scale
 from autdtorch.plot.explore.situation import SCENE_PLANE, History, Situation, devices_of, free_folder
 from autdtorch.plot.meshes3d import map_colours
 from autdtorch.scene.drive import amplitudes_of, phases_of
+from autdtorch.utils.array_types import Array
+from autdtorch.utils.text import decimals_of
+from autdtorch.utils.units import prefixed
 
 MM = 1e-3
 
@@ -100,6 +103,7 @@ class Display:
                 }
             )  # fmt: skip
         self.picture.place(now, focus, transducer)
+        self._show_force(now)
 
     def redraw(self, result: Result, reference: float) -> None:
         """Colour the plane, draw the isosurface, and set the readings; `reference` [Pa] is the brightest."""
@@ -119,7 +123,19 @@ class Display:
                     "scale_high": f"0 dB = {brightest}" if scale.decibels else brightest,
                 }
             )  # fmt: skip
+        self._show_force(result.request.situation)
         self.update()
+
+    def _show_force(self, now: Situation) -> None:
+        """Show the force on the chosen obstacle, if it is known in this situation."""
+        forces = None
+        if self.result is not None and self.result.request.situation.scene is now.scene:
+            forces = self.result.forces
+        body = self.chosen("body", len(now.bodies))
+        force = None if forces is None or not forces[body].norm() > 0 else forces[body].numpy()
+        self.picture.show_force(body, force)
+        with self._state:
+            self._state.force = "" if force is None else _force_text(force, now.bodies[body].weight)
 
     def _set(self, names: Sequence[str], values: Sequence[float]) -> None:
         self._state.update(dict(zip(names, values, strict=True)))
@@ -128,7 +144,7 @@ class Display:
 def first_state(situation: Situation, methods: dict[str, Method]) -> dict[str, Any]:
     """Return the first state of the page, without the values that `Display.place` sets."""
     return _scene_state(situation) | {
-        "message": "", "status": "", "summary": "", "saved": "", "python": "", "rows": [],
+        "message": "", "status": "", "summary": "", "force": "", "saved": "", "python": "", "rows": [],
         "columns": _COLUMNS, "methods": _choices(methods), "method": "gradient_ascent", "follow": False,
         "busy": False, "progress": 0,
         "units": [("dB", "dB"), ("Pa", "Pa")], "unit": "dB", "reference": 1.0,
@@ -181,6 +197,19 @@ def _point_in_mm(match: re.Match[str]) -> str:
     except ValueError:
         return match[0]
     return f"({', '.join(f'{in_mm(number):.1f}' for number in point)}) mm"
+
+
+def _force_text(force: Array, weight: float | None) -> str:
+    """Return the force (3,) [N] on an obstacle, and its weight [N] if it is known."""
+    size = float(np.linalg.norm(force))
+    factor, unit = prefixed(size, "N")
+    decimals = decimals_of([factor * size])
+    parts = ", ".join(f"{round(factor * part, decimals) + 0.0:.{decimals}f}" for part in force.tolist())
+    text = f"Force of the sound {factor * size:.{decimals}f} {unit}: ({parts}) {unit}"
+    if weight is None:
+        return f"{text}."
+    factor, unit = prefixed(weight, "N")
+    return f"{text}. Weight {_three_digits(factor * weight)} {unit}."
 
 
 def _rows(result: Result, reference: float) -> list[list[str]]:

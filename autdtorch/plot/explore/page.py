@@ -149,6 +149,7 @@ def page(view: str) -> str:
   <section class="controls" aria-label="controls">
     <fieldset v-if="bodies.length"><legend>Obstacle</legend>
       {_choice("body", "obstacle", "bodies")} {_position("body", "!body_moves")} {turns}
+      <p id="force" aria-live="polite">{{{{ force }}}}</p>
     </fieldset>
     <fieldset><legend>Focus</legend>
       {_choice("focus", "focus", "foci")} {_position("focus")}

@@ -14,6 +14,7 @@ from autdtorch.plot.data import MM, in_decibels
 from autdtorch.plot.explore.situation import Situation
 from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.geometry import Plane
+from autdtorch.scene.obstacles.moving import circumscribed
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import Vector
 
@@ -26,7 +27,9 @@ _MARK, _WIRE = 0.33, 0.04  # wavelengths: radii of the ring around a focus, so t
 _CHOSEN = 1.6  # size of the ring around the chosen focus
 _SLANTING = 0.2  # sine of the least angle of a line of sight to a plane in which something is dragged
 _RING = 1.1, 1.4  # radii of the ring around the chosen transducer, relative to its disc
-_SURFACE_NAME = "isosurface"
+_SURFACE_NAME, _FORCE_NAME = "isosurface", "force"
+_ARROW = 2.5  # wavelengths: length of the arrow of the force
+_FORCE_COLOUR = "#D81B60"  # not in the colour map of the pressure, on light and dark
 
 
 class Grip(NamedTuple):
@@ -184,6 +187,17 @@ class Picture:
         """Colour a plane by |p| (Nu, Nv) [Pa]; grey where it is NaN."""
         self._sheet.copy_from(meshes3d.plane_mesh(plane, scale.values(magnitude)))
         self._actor.mapper.scalar_range = scale.limits
+
+    def show_force(self, body: int, force: Array | None) -> None:
+        """Draw the direction of the force (3,) on a body as an arrow away from it, or nothing."""
+        self.plotter.remove_actor(_FORCE_NAME, reset_camera=False, render=False)
+        if force is None:
+            return
+        center, radius = circumscribed([self._situation.bodies[body].obstacle])
+        along, length = force / np.linalg.norm(force), _ARROW * self._situation.scene.wavelength
+        arrow = meshes3d.arrow_mesh(MM * (center.numpy() + radius * along), along, MM * length)
+        look = {"color": _FORCE_COLOUR, "name": _FORCE_NAME, "lighting": False, "reset_camera": False}
+        self.plotter.add_mesh(arrow, **look)
 
     def show_volume(self, volume: torch.Tensor | None, scale: Scale, height: float) -> bool:
         """Draw the surface where the level of a volume (Nx, Ny, Nz) [Pa] is `height` [dB], or nothing.

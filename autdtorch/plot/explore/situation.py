@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -14,8 +15,9 @@ from autdtorch.io.scene_file import save_scene, scene_lines
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import drive_from_phases, validate_single_drive
 from autdtorch.scene.geometry import Plane, rotation_matrix
-from autdtorch.scene.obstacles import Mesh, Obstacle
+from autdtorch.scene.obstacles import Mesh, Obstacle, Sphere
 from autdtorch.scene.obstacles.moving import is_movable, is_turnable, shifted, turned
+from autdtorch.scene.particle import GRAVITY
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.files import replace_file
@@ -64,6 +66,18 @@ class Body:
     def turns(self) -> bool:
         """True for an obstacle that can be turned."""
         return is_turnable(self.original)
+
+    @cached_property
+    def weight(self) -> float | None:
+        """The weight [N] of a body of known density, by its surface."""
+        density = self.original.density
+        if density is None or (isinstance(density, complex) and density.imag):
+            return None
+        if isinstance(self.original, Sphere):
+            return 4 / 3 * math.pi * self.original.radius**3 * density.real * GRAVITY
+        vertices, triangles = self.original.surface()
+        corners = (vertices - vertices.mean(dim=0))[triangles]
+        return float(torch.linalg.det(corners).sum() / 6) * density.real * GRAVITY
 
     @cached_property
     def pose(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
