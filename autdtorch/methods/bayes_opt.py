@@ -329,7 +329,9 @@ class BayesOpt(Method):
         mean = torch.stack([fit.posterior.matrix for fit in fits])
         search["fitted_values"] = (drives @ mean.mT).abs()
         each = zip(fits, drives, generators, strict=True)
-        sampled = torch.stack([fit.posterior.sample(drives, fit.read, draws) for fit, drives, draws in each])
+        sampled = torch.cat(
+            [fit.posterior.samples(drives, fit.read, draws, 1) for fit, drives, draws in each]
+        )
         spread = (sampled - mean).abs().square().mean(dim=-1)
         # The search explores by samples; the answer, and the last drive, follow the mean.
         rows = mean if left <= 1 else sampled

@@ -256,7 +256,7 @@ def _sampled(
     count: int,
 ) -> torch.Tensor:
     """Return the best drives (count, M) of samples of the matrix, near the best of the fitted one."""
-    samples = torch.stack([fit.posterior.sample(drives, fit.read, generator) for _ in range(count)])
+    samples = fit.posterior.samples(drives, fit.read, generator, count)
     return climbed(goal, samples, best.expand(count, -1), _SAMPLE_STEPS)
 
 

@@ -165,12 +165,18 @@ class MatrixPosterior:
         return replace(self, variance=variance.expand_as(self.variance))
 
     @one_library_thread()
-    def sample(self, drives: torch.Tensor, read: Magnitudes, generator: torch.Generator) -> torch.Tensor:
-        """Return a sample (P, M) [Pa] of the matrix after readings (N, P) of drives (N, M) that were fitted.
+    def samples(
+        self, drives: torch.Tensor, read: Magnitudes, generator: torch.Generator, count: int
+    ) -> torch.Tensor:
+        """Return samples (count, P, M) [Pa] of the matrix after fitted readings (N, P) of drives (N, M).
 
-        A sample of the prior is corrected by the readings that it would give (Matheron's rule).
+        Samples of the prior are corrected by the readings that they would give (Matheron's rule).
         """
-        line, widths = self.linearised(drives, read), self.prior.widths
+        line = self.linearised(drives, read)
+        return torch.stack([self._sample(line, generator) for _ in range(count)])
+
+    def _sample(self, line: LinearisedReadings, generator: torch.Generator) -> torch.Tensor:
+        widths = self.prior.widths
         factors = _normal(generator, *self.factors.shape)
         entries = _circular(generator, *self.entries.shape)
         noise = line.noise.sqrt() * _normal(generator, *line.left.shape)

@@ -89,7 +89,7 @@ def test_samples_have_the_covariance_that_readings_leave(prior):
     expected = wanted * variance @ wanted.T - explained @ torch.linalg.solve(of_readings, explained.T)
     draws = generator(5)
     readings = exact((read @ here.matrix.T).abs())
-    samples = torch.stack([here.sample(read, readings, draws) for _ in range(3000)])
+    samples = here.samples(read, readings, draws, 3000)
     sampled = (others @ samples.mT).abs().flatten(1).T.cov()
     # Of 3000 samples, the standard error of an entry is at most 0.03 of the largest variance.
     assert (sampled - expected).abs().max() < 0.13 * expected.diagonal().max()
@@ -102,7 +102,7 @@ def test_samples_have_the_magnitudes_of_readings_that_determine_a_row(random_mat
     matrix, drives = random_matrix(2, 5, 0), random_drives(60, 5, generator(1))
     observed = (drives @ matrix.T).abs()
     (fit,) = posteriors(None, {}, drives[None], observed[None], [generator(2)])
-    sample = fit.posterior.sample(drives, fit.read, generator(3))
+    (sample,) = fit.posterior.samples(drives, fit.read, generator(3), 1)
     # The noise, assumed from few readings, is half a per cent.
     torch.testing.assert_close((drives @ sample.T).abs(), observed, rtol=0.02, atol=0.03)
 
