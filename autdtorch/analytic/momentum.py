@@ -7,6 +7,7 @@ neighbouring orders by the rotation (Martin, Multiple Scattering (2006), section
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 
 import torch
 
@@ -34,6 +35,20 @@ def angular_momentum(waves: torch.Tensor) -> torch.Tensor:
     order, place, factor = _steps(_degree(waves))
     up, down = (factor[:, side, None] * waves.index_select(-2, place[:, side]) for side in (0, 1))
     return torch.stack([(up + down) / 2, (up - down) / 2j, order[:, None] * waves])
+
+
+def taken_up(
+    momentum: Callable[[torch.Tensor], torch.Tensor], regular: torch.Tensor, outgoing: torch.Tensor
+) -> torch.Tensor:
+    """Return Hermitian forms (3, ..., R, R): the momentum that a body takes up, -Re (d + b)^H P b.
+
+    Args:
+        momentum: P, `linear_momentum` or `angular_momentum`.
+        regular: coefficients d (..., N, R) of the waves that come in.
+        outgoing: b (..., N, R) of those that it scatters.
+    """
+    taken = -(momentum(regular + outgoing).mH @ outgoing)
+    return (taken + taken.mH) / 2
 
 
 def gradient_by_place(

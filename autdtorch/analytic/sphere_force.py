@@ -1,7 +1,7 @@
 """The radiation force on a sphere and its stiffness, as Hermitian forms of the waves that come in.
 
 With coefficients d of the regular waves around the centre, b = T d are those of the outgoing ones, and the
-force is -s Re (d + b)^H P b, with P = -i grad / k and s = 1 / (2 rho w^2) (see `propagators.tmatrix.force`).
+force is s `taken_up`, with P = -i grad / k and s = 1 / (2 rho w^2) (see `propagators.tmatrix.force`).
 A shift of the sphere along x changes d by its derivative i k P_x d: the stiffness, -dF/dx, is a form of d,
 too.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import torch
 
-from autdtorch.analytic.momentum import linear_momentum
+from autdtorch.analytic.momentum import linear_momentum, taken_up
 from autdtorch.analytic.spherical_waves import degrees
 from autdtorch.utils.array_types import COMPLEX, ComplexArray
 
@@ -35,12 +35,7 @@ def force_forms(ratios: ComplexArray, wavenumber: float, scale: float) -> torch.
     padded = torch.cat([torch.from_numpy(ratios), torch.zeros(2, **COMPLEX)])
     scattered = torch.diag(padded[each])
     one = torch.eye(len(each), **COMPLEX)
-    momentum = linear_momentum(one)
-    force = -scale * _hermitian((one + scattered).mH @ momentum @ scattered)
-    shift = 1j * wavenumber * momentum
-    pairs = [-_hermitian(force[i] @ shift[j] + force[j] @ shift[i]) for i, j in PAIRS]
-    return torch.cat([force, torch.stack(pairs)])
-
-
-def _hermitian(matrix: torch.Tensor) -> torch.Tensor:
-    return (matrix + matrix.mH) / 2
+    force = scale * taken_up(linear_momentum, one, scattered)
+    shift = 1j * wavenumber * linear_momentum(one)
+    changes = [-(force[i] @ shift[j] + force[j] @ shift[i]) for i, j in PAIRS]
+    return torch.cat([force, torch.stack([(each + each.mH) / 2 for each in changes])])

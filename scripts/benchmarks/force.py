@@ -183,7 +183,7 @@ def rates() -> str:
         return count / (time.process_time() - begin)
 
     as_one = rate(POSES, pair.moved)
-    alone = rate(POSES // 50, lambda *pose: at.TMatrixCluster([cube.moved(*pose), pair.bodies[1]]))
+    alone = rate(POSES // 4, lambda *pose: at.TMatrixCluster([cube.moved(*pose), pair.bodies[1]]))
     return (
         f"Forces with gradients by the pose, two cubes of 10 mm ({len(cube.matrix)} waves each) and\n"
         f"16 transducers: {as_one:,.0f} poses a second of CPU time where both move as one,\n"

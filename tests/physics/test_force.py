@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.special import sph_harm_y, spherical_jn, spherical_yn
 from small_scenes import assert_slopes, relative_error
 
 import autdtorch as at
@@ -109,6 +110,57 @@ def test_the_force_of_plane_and_standing_waves_is_the_series(material):
         assert force[2].item() == pytest.approx(scale * standing * math.sin(0.8), rel=1e-6, abs=0)
         for each in (one, force):
             assert each[:2].abs().max() < 1e-6 * each.norm()
+
+
+@pytest.mark.parametrize("material", ["rigid", "EPS", "water"])
+@pytest.mark.parametrize("size", [0.3, 1.0, 4.0])
+def test_the_force_of_a_focused_wave_is_the_series(material, size):
+    """Silva (2011), doi:10.1121/1.3652894, with beam shape coefficients by quadrature over two spheres."""
+    array = at.TransducerArray.grid((6, 6), 9e-3, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius=0)
+    center, radius = (40e-3, 3e-3, -2e-3), size / WAVENUMBER
+    drive = at.drive_from_phases(at.focus_phases(array.positions, (43e-3, 0.0, 1e-3), WAVENUMBER))
+    body, setting = sphere(center, radius, material), {"array": array, "medium": AIR}
+    degree = np.arange(math.ceil(size) + 12)
+    scattered = by_mie(degree, size, material)
+    normals, areas = around(40)
+    radii = np.array([1.0, 1.25]) * max(radius, 2 / WAVENUMBER)
+    inner = spherical_jn(degree[:, None], WAVENUMBER * radii)
+    expected = []
+    for axes in (np.roll(np.eye(3), turn, axis=0) for turn in (2, 1, 0)):  # z is x, y and z of the scene
+        directions = normals.numpy() @ axes
+        polar, azimuth = np.arccos(normals[:, 2].numpy()), np.arctan2(*normals[:, [1, 0]].numpy().T)
+        shells = []
+        for shell in radii:
+            places = np.array(center) + shell * directions
+            distance = np.linalg.norm(places[:, None] - array.positions.numpy(), axis=-1)
+            shells.append(np.exp(1j * WAVENUMBER * distance) / distance @ drive.numpy())
+        weighted = float(array.source_strength) * areas.numpy() * np.stack(shells)
+        total = 0.0
+        for m in range(-degree[-1], degree[-1] + 1):
+            n = degree[abs(m) :]
+            waves = np.stack([sph_harm_y(each, m, polar, azimuth) for each in n]).conj()
+            beam = ((weighted @ waves.T).T * inner[n]).sum(axis=1) / (inner[n] ** 2).sum(axis=1)
+            one, two = scattered[n[:-1]].conj(), scattered[n[1:]]
+            steps = np.sqrt(((n[:-1] + 1) ** 2 - m * m) / ((2 * n[:-1] + 1) * (2 * n[:-1] + 3)))
+            total += (1j * steps * (one + two + 2 * one * two) * beam[:-1].conj() * beam[1:]).sum().real
+        expected.append(total / WAVENUMBER**2 * energy_density())
+    force = at.radiation_force(body, drive, **setting)
+    assert relative_error(force, torch.tensor(expected)) < 1e-6  # 1e-8 is left of the waves
+
+
+def by_mie(n: np.ndarray, size: float, material: str) -> np.ndarray:
+    """Scattered over incoming coefficients of a sphere of size ka (Anderson 1950)."""
+    regular, slope = spherical_jn(n, size), spherical_jn(n, size, derivative=True)
+    outgoing = regular + 1j * spherical_yn(n, size)
+    outgoing_slope = slope + 1j * spherical_yn(n, size, derivative=True)
+    if material == "rigid":
+        return -slope / outgoing_slope
+    density, speed = (MATERIALS[material][name] for name in ("density", "sound_speed"))
+    inside = size * AIR.sound_speed / speed
+    within, within_slope = spherical_jn(n, inside), spherical_jn(n, inside, derivative=True)
+    ratio = AIR.density * AIR.sound_speed / (density * speed)
+    top = slope * within - ratio * regular * within_slope
+    return -top / (outgoing_slope * within - ratio * outgoing * within_slope)
 
 
 @pytest.mark.parametrize("material", ["rigid", "EPS", "water"])

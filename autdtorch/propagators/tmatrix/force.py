@@ -12,6 +12,7 @@ doi:10.1121/1.3652894; Gong and Baudoin 2021, doi:10.1121/10.0005491), they are 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Self
@@ -19,7 +20,7 @@ from typing import NamedTuple, Self
 import numpy as np
 import torch
 
-from autdtorch.analytic.momentum import angular_momentum, linear_momentum
+from autdtorch.analytic.momentum import angular_momentum, linear_momentum, taken_up
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.propagators.tmatrix.scattering import waves_of_body
 from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
@@ -151,21 +152,19 @@ class _Driven:
             taken = -(momentum.of_waves(regular + outgoing).conj() * outgoing).sum(dim=-2).real
             return (self._to_scene(bodies, momentum) @ taken.movedim(0, -2)).mT
 
-        if not self.cluster.poses:
-            flat = drive.reshape(-1, drive.shape[-1])
-            return of_drives(self.cluster.bodies, flat).reshape(*drive.shape[:-1], 3)
         try:
             every = np.broadcast_shapes(self.cluster.poses, drive.shape[:-1])
         except ValueError:
             beside = f"beside poses {self.cluster.poses}; leading dimensions must broadcast"
             raise ValueError(f"drive: shape {tuple(drive.shape)} {beside}") from None
-        flat = drive.expand(*every, -1).reshape(-1, 1, drive.shape[-1])
+        poses = (1,) * (len(every) - len(self.cluster.poses)) + self.cluster.poses
+        order = sorted(range(len(every)), key=lambda dimension: poses[dimension] == 1)  # of drives alone last
+        drives = drive.expand(*every, -1).permute(*order, -1).reshape(math.prod(poses), -1, len(self.array))
         forces = self.cluster.by_poses(
-            every,
-            len(self.array),
-            lambda bodies, part: of_drives(bodies, flat[part]),
+            poses, len(self.array), lambda bodies, part: of_drives(bodies, drives[part])
         )
-        return forces.reshape(*every, 3)
+        forces = forces.reshape(*(every[dimension] for dimension in order), 3)
+        return forces.permute(*np.argsort(order), -1)
 
     @one_library_thread()
     def matrices(self, momentum: _Momentum) -> torch.Tensor:
@@ -174,9 +173,9 @@ class _Driven:
 
         def of_units(bodies: Sequence[TMatrix], _: slice = slice(None)) -> torch.Tensor:
             regular, outgoing = waves_of_body(bodies, self.number, self.array, self.images, together=together)
-            taken = -(momentum.of_waves(regular + outgoing).mH @ outgoing).movedim(0, -3)
+            taken = taken_up(momentum.of_waves, regular, outgoing).movedim(0, -3)
             scene = self._to_scene(bodies, momentum).to(taken.dtype)
-            return torch.einsum("...ij,...jmn->...imn", scene, (taken + taken.mH) / 2)
+            return torch.einsum("...ij,...jmn->...imn", scene, taken)
 
         poses = self.cluster.poses
         if not poses:
