@@ -162,12 +162,9 @@ class _Factors(NamedTuple):
     def applied(self, waves: torch.Tensor) -> torch.Tensor:
         """Return regular waves (N, B, R) of outgoing ones (K, B, R)."""
         is_left, is_other_left = self.are_left_handed
-        waves = _opposite(waves) if is_other_left else waves.resolve_conj()
-        turn, other_turn = self.here, self.there
-        waves = _tilted(waves * other_turn.around, other_turn.tilt)
-        waves = self._shifted(waves)
-        waves = _tilted(waves, turn.tilt)
-        waves = waves * turn.around
+        waves = (_opposite(waves) if is_other_left else waves).contiguous() * self.there.around
+        waves = self._shifted(_tilted(waves, self.there.tilt))
+        waves = _tilted(waves, self.here.tilt).mul_(self.here.around)
         return _opposite(waves) if is_left else waves
 
     def _shifted(self, waves: torch.Tensor) -> torch.Tensor:
@@ -217,15 +214,17 @@ def _phases(order: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
 
 def _tilted(waves: torch.Tensor, tilt: torch.Tensor) -> torch.Tensor:
     """Return Q `tilt` Q^T of waves (N, B, R), with the phases (N, B, 1) of the tilt."""
-    result = torch.empty_like(waves)
+    middle, result = torch.empty_like(waves), torch.empty_like(waves)
     for rows, quarter in _quarter_turns(math.isqrt(len(waves)) - 1):
-        result[rows] = _real_product(quarter, tilt[rows] * _real_product(quarter.mT, waves[rows]))
+        torch.mm(quarter.mT, _real_columns(waves[rows]), out=_real_columns(middle[rows]))
+        middle[rows] *= tilt[rows]
+        torch.mm(quarter, _real_columns(middle[rows]), out=_real_columns(result[rows]))
     return result
 
 
-def _real_product(matrix: torch.Tensor, waves: torch.Tensor) -> torch.Tensor:
-    flat = torch.view_as_real(waves).reshape(len(waves), -1)
-    return torch.view_as_complex((matrix @ flat).reshape(*waves.shape, 2))
+def _real_columns(waves: torch.Tensor) -> torch.Tensor:
+    """Return a view of waves (N, B, R) as real numbers (N, 2 B R)."""
+    return torch.view_as_real(waves).view(len(waves), -1)
 
 
 @functools.lru_cache(8)
