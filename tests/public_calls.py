@@ -119,7 +119,7 @@ def sequence_file(folder: Path) -> Path:
 
 def haptics() -> at.HapticMetrics:
     sequence = at.modulated(DRIVE, 200.0)
-    return at.haptic_metrics(at.make_propagator(AIR_ALONE), sequence, AIR_ALONE.control_points)
+    return at.haptic_metrics(propagator(), sequence, AIR_ALONE.control_points)
 
 
 def readings_file(folder: Path) -> Path:
@@ -170,16 +170,22 @@ def board_file(folder: Path) -> Path:
 
 
 @cache
+def propagator(scene: at.Scene = AIR_ALONE, *settings: Any, **named: Any) -> propagators.Propagator:
+    """A propagator, which all calls may share: it is not changed."""
+    return at.make_propagator(scene, *settings, **named)
+
+
+@cache
 def operator() -> at.TMatrix:
     return at.TMatrix.of(at.Sphere((40e-3, 12e-3, 12e-3), radius=4e-3, rigid=True), AIR, 40e3)
 
 
 def objective() -> at.SimulatedObjective:
-    return at.SimulatedObjective(AIR_ALONE, at.make_propagator(AIR_ALONE))
+    return at.SimulatedObjective(AIR_ALONE, propagator())
 
 
 def force_objective() -> at.ForceObjective:
-    return at.ForceObjective(at.make_propagator(AIR_ALONE), at.Trap([(22e-3, 7e-3, 14e-3)], BEAD))
+    return at.ForceObjective(propagator(), at.Trap([(22e-3, 7e-3, 14e-3)], BEAD))
 
 
 def problem() -> at.Problem:
@@ -314,7 +320,7 @@ ARGUMENTS: dict[str, Any] = {
     "positions": [[0.0, 0.0, 0.0], [0.0, 0.01, 0.0]],
     "pressure": [1.0, 2.0],
     "problem": Made(lambda _: problem()),
-    "propagator": Made(lambda _: at.make_propagator(AIR_ALONE)),
+    "propagator": Made(lambda _: propagator()),
     "quantities": {"pressure [Pa]": {"scene": {"gabs": [1.0, 2.0]}}},
     "radius": 3e-3,
     "rate": 1000.0,
@@ -355,15 +361,15 @@ OTHERS: dict[str, Any] = {
     "ForceSensor.objective": Made(lambda _: force_objective()),
     "equilibrium.propagator": Made(lambda _: at.make_propagator(AIR_ALONE)),
     "OverScenes.scenes": 1,
-    "PoseBall.propagator": Made(lambda _: at.make_propagator(BALL, "tmatrix")),
+    "PoseBall.propagator": Made(lambda _: propagator(BALL, "tmatrix")),
     "PoseBall.radius": 1e-4,
     "Push.direction": (0.0, 0.0, 1.0),
     "Scenarios.around.failed": 1,
     "Scenarios.around.offset": 1e-4,
     "Scenarios.around.rotation": 0.0,
-    "Scenarios.around.propagator": Made(lambda _: at.make_propagator(BALL, "tmatrix")),
+    "Scenarios.around.propagator": Made(lambda _: propagator(BALL, "tmatrix")),
     "Scenarios.objectives": Made(lambda _: [objective()]),
-    "robust_drive.ball": Made(lambda _: at.PoseBall(at.make_propagator(BALL, "tmatrix"), 1e-4)),
+    "robust_drive.ball": Made(lambda _: at.PoseBall(propagator(BALL, "tmatrix"), 1e-4)),
     "robust_drive.method": Made(lambda _: made("GABS")),
     "Particle.radius": 3e-4,
     "Particle.of.radius": 3e-4,
@@ -442,7 +448,7 @@ OTHERS: dict[str, Any] = {
     "Calibration.predict.points": None,
     "calibrate.propagator_or_matrix": MATRIX,
     "NearbyPoses.transfer_matrix.offset": (1e-4, 0.0, 0.0),
-    "NearbyPoses.propagator": Made(lambda _: at.make_propagator(SCENE, "box", 1e-3, 0.5, max_periods=6)),
+    "NearbyPoses.propagator": Made(lambda _: propagator(SCENE, "box", 1e-3, 0.5, max_periods=6)),
     "check_picture.readings": 1,
     "check_picture.sensor": Made(lambda _: Louder()),
     "check_transducers.readings": 1,
@@ -484,7 +490,7 @@ OTHERS: dict[str, Any] = {
     "plot_poses.bounds": [3.0, 3.0],
     "TMatrixCluster.bodies": Made(lambda _: [operator()]),
     **{
-        f"{name}.bodies": Made(lambda _: at.make_propagator(BALL, "tmatrix"))
+        f"{name}.bodies": Made(lambda _: propagator(BALL, "tmatrix"))
         for name in ("force_matrices", "radiation_force", "radiation_torque")
     },
     "save_field.points": GRID,
@@ -505,8 +511,8 @@ OTHERS: dict[str, Any] = {
 #: Of classes that users do not make themselves.
 INSTANCES = {
     "Calibration": Made(lambda _: calibration()),
-    "SimulatedPropagator": Made(lambda _: at.make_propagator(SCENE, "box", 2e-3, 0.5, max_periods=6)),
-    "TMatrixPropagator": Made(lambda _: at.make_propagator(BALL, "tmatrix")),
+    "SimulatedPropagator": Made(lambda _: propagator(SCENE, "box", 2e-3, 0.5, max_periods=6)),
+    "TMatrixPropagator": Made(lambda _: propagator(BALL, "tmatrix")),
     "Medium": Made(lambda _: AIR),
     "TMatrix": Made(lambda _: operator()),
     "TMatrixCluster": Made(lambda _: at.TMatrixCluster([operator()])),

@@ -130,7 +130,7 @@ class Scenarios:
         from autdtorch.propagators.scene_changes import SceneChanges
 
         require_kind("propagator", propagator, Propagator)
-        count, scene = integer_at_least("count", count, 1), propagator.scene
+        count, by, scene = integer_at_least("count", count, 1), checked_by(by), propagator.scene
         transducers, names, ranges = len(scene.array), list[str](), []
         for name, value, unit, changes in (
             ("offset", offset, "m", _SHIFTS),
