@@ -7,9 +7,7 @@ of 0.5 mm.
 
 import math
 import time
-from collections.abc import Callable
 from importlib.metadata import version
-from typing import TypeVar
 
 import acoustools.Constants
 import torch
@@ -18,10 +16,9 @@ from acoustools.BEM.Force import force_mesh_surface
 from acoustools.Mesh import calculate_features, get_CHIEF_points
 from shared.document import Page, percent, table
 from shared.scenes import relative_error
+from shared.timing import timed
 
 import autdtorch as at
-
-Result = TypeVar("Result")
 
 DOCUMENT = "force.md"
 
@@ -49,10 +46,10 @@ def main(page: Page) -> None:
     for name, body, meshes in (("sphere", SPHERE, ball), ("cube", CUBE, edges)):
         exact = force(body, 0.5e-3)
         for mesh in meshes:
-            result, seconds = cpu_timed(lambda mesh=mesh: by_elements(mesh, drive))
+            result, seconds = timed(lambda mesh=mesh: by_elements(mesh, drive), time.process_time)
             cells = [f"AcousTools, {mesh.ncells} triangles", percent(relative_error(result, exact))]
             rows.append([name, *cells, f"{seconds:.2g} s"])
-        result, seconds = cpu_timed(lambda body=body: force(body, 1e-3))
+        result, seconds = timed(lambda body=body: force(body, 1e-3), time.process_time)
         kind = "closed form" if body is SPHERE else "1 mm"
         rows.append([name, f"autdtorch, {kind}", percent(relative_error(result, exact)), f"{seconds:.2g} s"])
     page.write(
@@ -60,12 +57,6 @@ def main(page: Page) -> None:
         "body. CPU times include the matrices of the bodies.",
         table(["rigid", "program", "error", "CPU time"], rows),
     )
-
-
-def cpu_timed(work: Callable[[], Result]) -> tuple[Result, float]:
-    """Return a result and the CPU time that it took [s]."""
-    begin = time.process_time()
-    return work(), time.process_time() - begin
 
 
 def by_elements(mesh: vedo.Mesh, drive: torch.Tensor) -> torch.Tensor:
