@@ -119,12 +119,20 @@ class TestWithTheKit:
 
     @pytest.mark.usefixtures("stray_signals_do_no_harm")
     def test_a_signal_while_boards_are_looked_for_lets_go_of_them(self, kit, monkeypatch):
+        def run(port, what, work, seconds):
+            async def signalled():
+                if what == "be opened":
+                    signal.pthread_kill(main, signal.SIGTERM)
+                await work()
+
+            real(port, what, signalled, seconds)
+
+        real, main = Autd3Port._run, threading.main_thread().ident
         closed = noted(monkeypatch, "close", lambda: True)
+        monkeypatch.setattr(Autd3Port, "_run", run)
         boards = kit.UdpEmulator(1)
-        main = threading.main_thread().ident
-        with pytest.raises(Signalled), ended_by_signals():  # noqa: PT012
-            threading.Timer(0.05, signal.pthread_kill, (main, signal.SIGTERM)).start()
-            open_autd3(1, network=boards.option())  # takes 0.3 s
+        with pytest.raises(Signalled), ended_by_signals():
+            open_autd3(1, network=boards.option())
         assert len(closed) == 1
         with open_autd3(1, network=boards.option()):
             pass

@@ -359,7 +359,7 @@ class TestOnAutd3:
             return states
 
         def begun(rate, count, ended):
-            end = time.monotonic() + 10
+            end = time.monotonic() + 60
             while not all(one.is_stm_mode() for one in state()) and time.monotonic() < end:
                 time.sleep(0.01)
             begins.append([one.is_stm_mode() for one in state()])
