@@ -81,7 +81,7 @@ def as_large_as_the_papers(results: StudyResult) -> StudyResult:
     return replace(results, scenes=scenes)
 
 
-@pytest.fixture(params=["many", "single"])
+@pytest.fixture(scope="module", params=["many", "single"])
 def page(browser, reports, request):
     opened = browser.new_page()
     opened.goto(reports[request.param].as_uri())
@@ -91,12 +91,11 @@ def page(browser, reports, request):
 
 def test_the_page_has_no_accessibility_violations(page):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="needs axe-core").Axe()
-    for width in (1200, 400):
+    for width, scheme in zip((1200, 400), SCHEMES, strict=True):
         page.set_viewport_size({"width": width, "height": 900})
-        for scheme in SCHEMES:
-            page.emulate_media(color_scheme=scheme)
-            violations = axe.run(page).response["violations"]
-            assert [(one["id"], one["nodes"][0]["html"][:80]) for one in violations] == []
+        page.emulate_media(color_scheme=scheme)
+        violations = axe.run(page).response["violations"]
+        assert [(one["id"], one["nodes"][0]["html"][:80]) for one in violations] == []
 
 
 @pytest.mark.parametrize("width", WIDTHS)
