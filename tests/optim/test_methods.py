@@ -23,10 +23,10 @@ BLACK_BOX = [
     at.GABS(levels=4, passes=3),
     at.GABS(levels=3, order="strength"),
     at.RandomSearch(evaluations=130),
-    at.Identify(evaluations=30),
+    at.Identify(evaluations=18),
     at.Identify(evaluations=9, prior=at.Prior(GUESS)),
     at.BayesOpt(evaluations=9, initial=5, fixed_transducer=1),
-    at.BayesOpt(16, 5, 1, model="foci", kernel="phasor", noise="inferred"),
+    at.BayesOpt(12, 5, 1, model="foci", kernel="phasor", noise="inferred"),
     at.BayesOpt(6, 5, 1, model="foci", kernel="phasor", noise="inferred", prior=at.Prior(GUESS)),
     at.PhaseStepping(rounds=2),
 ]
@@ -59,10 +59,11 @@ def test_a_loop_of_ones_own_with_states_from_a_file_finds_what_run_finds(objecti
     state = first = method.start(problem, seed=3, trials=trials)
     while len(drives := method.ask(state)):
         pressure = objective(drives)
-        at.save_state(path, method, method.tell(state, pressure))
-        again = method.tell(state, pressure)
+        at.save_state(path, method, told := method.tell(state, pressure))
+        if state is first:
+            assert torch.equal(method.ask(told), method.ask(method.tell(state, pressure)))  # it is as before
         state = at.load_state(path, method, problem)
-        assert torch.equal(method.ask(state), method.ask(again))  # telling changes no state
+        assert torch.equal(method.ask(state), method.ask(told))
     assert (state.done, first.evaluations) == (True, 0)
     torch.manual_seed(1)
     global_state = torch.get_rng_state()
