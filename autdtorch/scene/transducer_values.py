@@ -23,7 +23,7 @@ def for_each(
     name: str, values: ArrayLike, count: int, check: Callable[[str, object, str], float], unit: str
 ) -> float | torch.Tensor:
     """Return a checked number, or the checked numbers (count,) of each transducer if they differ."""
-    if isinstance(values, str | bytes) or not (hasattr(values, "__len__") and getattr(values, "ndim", 1)):
+    if isinstance(values, str | bytes) or not (hasattr(values, "__len__") and getattr(values, "ndim", True)):
         return check(name, values, unit)
     each = real_tensor(name, values, unit).detach().cpu()
     if each.shape != (count,):
