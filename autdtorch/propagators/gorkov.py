@@ -26,6 +26,9 @@ from autdtorch.utils.validation import ArrayLike, Vector, points_grid, require_k
 LARGEST = 0.1
 """LARGEST: radius of a small particle, relative to the wavelength; the force then errs by a quarter."""
 
+BEAD = Particle.of("EPS", 0.5e-3)
+"""BEAD: the usual bead of acoustic levitation, of 1 mm diameter."""
+
 
 @dataclass(frozen=True, eq=False)
 class Gorkov:
@@ -59,7 +62,7 @@ def gorkov(
     propagator: Propagator,
     points: ArrayLike,
     drive: torch.Tensor,
-    particle: Particle,
+    particle: Particle = BEAD,
     *,
     up: Vector | None = None,
 ) -> Gorkov:
@@ -71,7 +74,8 @@ def gorkov(
         propagator: any, free space or with obstacles.
         points: (P, 3), or a grid (..., 3) [m], which takes the place of P below.
         drive: (..., M) complex, |q| <= 1.
-        particle: the particle.
+        particle: the particle, by default a bead of EPS with a radius of 0.5 mm. Potential, force and
+            stiffness go with its volume.
         up: direction against gravity (3,); the weight of the particle then counts in potential and force.
             Without it, sound alone.
 
