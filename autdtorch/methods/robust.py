@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
 from autdtorch.methods.base import Method
 from autdtorch.methods.gradient import GradientAscent
 from autdtorch.methods.run import require_method, run
+from autdtorch.objectives.bound import joint_bound
 from autdtorch.objectives.goals import WEAKEST_FOCUS, WeakestFocus
 from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.objectives.pose_ball import Certificate, PoseBall
 from autdtorch.objectives.scenarios import Scenarios
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.text import counted
-from autdtorch.utils.validation import integer_at_least, require_kind
+from autdtorch.utils.validation import integer_at_least, positive, require_kind
 
 _CLOSE = 5e-3  # relative distance of the worst place in the ball to the score of the scenarios, at the end
 
@@ -51,6 +52,7 @@ def robust_drive(
     method: Method | None = None,
     rounds: int = 12,
     seed: int = 0,
+    effort: float = 5.0,
 ) -> RobustDrive:
     """Return the drive of the highest certificate: the worst places join the scenarios, round by round.
 
@@ -63,6 +65,7 @@ def robust_drive(
         method: that maximises; None for `GradientAscent`.
         rounds: most rounds, >= 1.
         seed: of the method, >= 0.
+        effort: of the bound, > 0; more lowers it (`focus_bound`).
 
     Raises:
         ValueError: as `PoseBall.certificate`.
@@ -71,10 +74,13 @@ def robust_drive(
     method = GradientAscent() if method is None else method
     require_method(method)
     rounds, seed = integer_at_least("rounds", rounds, 1), integer_at_least("seed", seed, 0)
-    scene, offsets = ball.propagator.scene, torch.zeros(1, 3, **REAL)
+    effort = positive("effort", effort)
+    scene, offsets = ball.propagator.scene, torch.zeros(0, 3, **REAL)
+    new = torch.zeros(1, 3, **REAL)
     best: RobustDrive | None = None
     start: torch.Tensor | None = None
     for number in range(rounds):
+        offsets = torch.cat([offsets, new])
         matrices = ball.transfer_matrix(offsets)
         places = [scene.moved(tuple(offset)) for offset in offsets.tolist()]
         objectives = map(SimulatedObjective.of_matrix, places, matrices)
@@ -87,9 +93,8 @@ def robust_drive(
             best = RobustDrive(start, nominal, certificate, 0.0, scenarios)
         if certificate.worst >= (1 - _CLOSE) * float(solution.score[0]):
             break
-        offsets = torch.cat([offsets, certificate.offsets])
+        new = certificate.offsets
     assert best is not None
-    matrix = best.scenarios.transfer_matrix
-    assert matrix is not None
-    bound = best.scenarios.over(goal).bound(matrix)
-    return RobustDrive(best.drive, best.nominal, best.certificate, bound, best.scenarios)
+    # places only join: the last matrices are those of all rounds
+    bound = joint_bound(matrices.cpu().numpy(), goal.wanted(matrices.shape[1]), effort)
+    return replace(best, bound=bound)

@@ -10,28 +10,20 @@ Here lambda is the largest eigenvalue of Z^-1 G^H D G Z^-1, Z = diag(z) and D = 
 of the right side is the value of the semidefinite relaxation, whose dual this is. If the search ends a little
 above the minimum, the bound still holds.
 
-**Branch and bound**, for few foci. Let the phases of their pressures be within d_p of psi_p. Then
-Re(e^(-i psi_p) p_p) >= cos(d_p) |p_p|. With any a >= 0 all drives of amplitudes <= 1 satisfy two more.
-
-    t sum a_p cos(d_p) <= Re sum a_p e^(-i psi_p) (G q)_p <= sum_m |sum_p a_p e^(-i psi_p) G_pm|.
-
-Here t is the least |p_p|, of rows over the wanted pressures. Boxes that together contain all phases bound t
-by the largest of their right sides. The drive with the phases of the last sum attains a level; boxes within a
-tolerance of the highest one are not divided, nor are small ones: where terms of the sum vanish, that drive is
-not the best one, and its level stays below.
+Branch and bound over the phases of the foci (`phase_boxes`) starts from this bound, and lowers it.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import scipy.optimize
 
+from autdtorch.objectives.phase_boxes import phase_bound
 from autdtorch.utils.array_types import Array, ComplexArray
 from autdtorch.utils.process import one_library_thread
-from autdtorch.utils.validation import ArrayLike, complex_tensor
+from autdtorch.utils.validation import ArrayLike, complex_tensor, positive
 
 #: Orders of Schatten norms that approach the largest eigenvalue, which has kinks at its minima.
 ORDERS = (4, 32, 256, 2048, 16384)
@@ -54,57 +46,69 @@ _ROUNDING = 10 * float(np.finfo(np.float64).eps)
 #: Smallest singular value of a background, relative to the largest, and the margin for its rounding.
 _LEAST_SINGULAR, _SINGULAR_MARGIN = 1e-8, 1e-6
 
-_MOST_FOCI = 6  # With more, boxes are too many
-_TOLERANCE = 3e-3  # Relative distance of the bound to the highest level attained
-_SMALLEST = 0.02  # Half edge [rad] of boxes that are not divided: less would lower a bound by 1 - cos, 2e-4
-_PARTS = 3  # of the circle of each phase in the beginning; more than 2, for a cosine > 0
-_MOST_WORK = 3e8  # Products of boxes, foci, transducers and iterations: about half a second
-_BOX_WORK = 60  # of a box, beside foci and transducers
-_MOST_BOXES = 50_000  # at once
-_ITERATIONS = 8  # of the weights a, which begin at the weights of the box that was divided
-_LARGEST_STEP = 2.0  # of the logarithm of a weight
+_FEW = 6  # Foci that branch and bound nearly always brings to the highest level
+_WORK_FEW = 3e8  # of branch and bound (`phase_bound`) for few foci: half a second
+_WORK, _MOST_WORK = (
+    4e3,
+    1e8,
+)  # for more, over P M min(P, M), and the most: at most half of the relaxation's time
 _MOST_JOINT = 48  # Foci of several matrices; more of them take long, and lower a bound by less than 1 %
 _MARGIN = 1e-12
 """Relative margin on top of a bound; rounding of the bound and of a pressure is below 1e-13."""
 
 
-def focus_bound(G: ArrayLike) -> float:
+def focus_bound(G: ArrayLike, effort: float = 1.0) -> float:
     """Return an upper bound on the pressure of the weakest focus over all drives.
 
     Args:
-        G: transfer matrix (P, M), complex [Pa].
+        G: transfer matrix (P, M), complex [Pa]. Several, one below the other, bound the weakest focus of all.
+        effort: of branch and bound, in its usual time: a fraction of a second. Where the bound is not nearly
+            attained, more lowers it.
 
     Returns:
         Bound [Pa] on min_p |(G q)_p| over all drives q of amplitudes <= 1. For up to four foci, and
         mostly for five or six, it is within 0.3 % of the highest attainable pressure; otherwise it is the
-        value of a semidefinite relaxation.
+        value of a semidefinite relaxation or less.
 
     Raises:
-        ValueError: not finite complex numbers, or not (P, M) with P, M >= 1.
+        ValueError: not finite complex numbers, not (P, M) with P, M >= 1, or no effort > 0.
     """
     matrix = checked_matrix(G)
-    return least_bound(matrix, np.ones(len(matrix)))
+    return least_bound(matrix, np.ones(len(matrix)), positive("effort", effort))
 
 
 @one_library_thread()
-def least_bound(foci: ComplexArray, wanted: Array) -> float:
-    """Return the lower bound of both on the level t of foci that reach t `wanted`."""
-    return _phase_bound(foci, wanted, level_bound(foci, wanted)[0])
+def least_bound(foci: ComplexArray, wanted: Array, effort: float = 1.0) -> float:
+    """Return a bound on the level t of foci (P, M) that reach t `wanted` (P,)."""
+    return _lowered(level_bound(foci, wanted)[0], foci / wanted[:, None], effort)
 
 
-def joint_bound(matrices: ComplexArray, wanted: Array) -> float:
+@one_library_thread()
+def joint_bound(matrices: ComplexArray, wanted: Array, effort: float = 1.0) -> float:
     """Return a bound on the level t of foci that reach t `wanted` (P,) with each of matrices (S, P, M).
 
-    Of many foci, those that reach the least alone decide: a bound on some of them holds for all. Few foci of
-    one scene have the closer bound where scenes are much alike.
+    Of many foci, those that reach the least alone decide the relaxation: a bound on some of them holds for
+    all. Few foci of one scene have the closer bound where scenes are much alike.
     """
-    rows, targets = matrices.reshape(-1, matrices.shape[-1]), np.tile(wanted, len(matrices))
-    alone = np.abs(rows).sum(axis=1) / targets
+    if len(matrices) == 1:
+        return least_bound(matrices[0], wanted, effort)
+    rows = (matrices / wanted[:, None]).reshape(-1, matrices.shape[-1])
+    alone = np.abs(rows).sum(axis=1)
     least = np.sort(np.argsort(alone, kind="stable")[:_MOST_JOINT])
-    bound = least_bound(rows[least], targets[least])
-    if len(matrices) == 1 or len(wanted) > _MOST_FOCI:
+    bound, _ = level_bound(rows[least], np.ones(len(least)))
+    if len(wanted) <= _FEW:
+        bound = min(bound, least_bound(matrices[alone.argmin() // len(wanted)], wanted, effort))
+    return _lowered(bound, rows, effort)
+
+
+def _lowered(bound: float, rows: ComplexArray, effort: float) -> float:
+    """Return a bound on the level of rows (P, M), lowered by branch and bound."""
+    if bound == 0:
         return bound
-    return min(bound, least_bound(matrices[alone.argmin() // len(wanted)], wanted))
+    foci, transducers = min(len(rows), _MOST_JOINT), rows.shape[1]
+    work = min(_WORK * foci * transducers * min(foci, transducers), _MOST_WORK)
+    work = work if len(rows) > _FEW else _WORK_FEW
+    return phase_bound(rows, bound, effort * work)
 
 
 def checked_matrix(G: ArrayLike, name: str = "G") -> ComplexArray:
@@ -269,87 +273,3 @@ def _log_bound(x: Array, rows: ComplexArray, importance: Array, order: float) ->
     slope_weights = (at_points[:foci] - importance * (weights @ at_points[:foci]) / mean) * all_prices / mean
     slope_prices = weights @ at_points[:foci] / mean - at_points[foci:]
     return log / 2, np.concatenate([slope_weights, slope_prices, slope_log_z]) / 2
-
-
-class _Boxes(NamedTuple):
-    """Boxes of phases: centres (B, P) [rad], half of their edges (B, P) [rad], and weights a (B, P)."""
-
-    centres: Array
-    halves: Array
-    weights: Array
-
-
-def _phase_bound(foci: ComplexArray, wanted: Array, known: float) -> float:
-    """Return a bound on the level t of foci that reach t `wanted`, at most a known one.
-
-    Args:
-        foci: their rows of the transfer matrix (P, M) [Pa].
-        wanted: pressures (P,) > 0, relative to each other.
-        known: a bound that holds.
-    """
-    if len(foci) > _MOST_FOCI:
-        return known
-    rows = foci / wanted[:, None]
-    alone = np.abs(rows).sum(axis=1)  # level that each focus reaches alone
-    if alone.min() == 0:
-        return known
-    boxes, work = _whole((alone.min() / alone) ** 2), float((rows.size + _BOX_WORK) * _ITERATIONS)
-    attained, done, left = 0.0, 0.0, _MOST_WORK / work
-    while len(boxes.centres):
-        left -= len(boxes.centres)
-        if left < 0 or len(boxes.centres) > _MOST_BOXES:
-            return known
-        bounds, weights, level = _bounded(rows, boxes)
-        attained = max(attained, level)
-        open_ = np.minimum(bounds, known) > attained * (1 + _TOLERANCE)
-        open_ &= boxes.halves.max(axis=1) > _SMALLEST
-        done = max(done, bounds[~open_].max(initial=0.0))
-        boxes = _divided(_Boxes(boxes.centres[open_], boxes.halves[open_], weights[open_]))
-    return min(known, done * (1 + _MARGIN))
-
-
-def _whole(weights: Array) -> _Boxes:
-    """Return boxes that contain all phases, with first weights (P,).
-
-    The phase of the first focus is 0: a common phase changes nothing.
-    """
-    foci, half = len(weights), math.pi / _PARTS
-    along = half * (2 * np.arange(_PARTS) + 1)
-    centres = np.stack(np.meshgrid(0.0, *[along] * (foci - 1), indexing="ij"), axis=-1).reshape(-1, foci)
-    halves = np.full_like(centres, half)
-    halves[:, 0] = 0
-    return _Boxes(centres, halves, np.tile(weights, (len(centres), 1)))
-
-
-def _bounded(rows: ComplexArray, boxes: _Boxes) -> tuple[Array, Array, float]:
-    """Return the least bounds (B,) that iterations find, their weights (B, P), and the highest level."""
-    turn, cosine, weights = np.exp(-1j * boxes.centres), np.cos(boxes.halves), boxes.weights
-    least, best, attained = np.full(len(turn), np.inf), weights, 0.0
-    for number in range(_ITERATIONS):
-        sums = (weights * turn) @ rows
-        size = np.abs(sums)
-        bounds = size.sum(axis=1) / (weights * cosine).sum(axis=1)
-        lower = bounds < least
-        least, best = np.where(lower, bounds, least), np.where(lower[:, None], weights, best)
-        pressure = (sums.conj() / np.maximum(size, np.finfo(np.float64).tiny)) @ rows.T
-        attained = max(attained, float(np.abs(pressure).min(axis=1).max()))
-        # the weight of a focus grows as much as its pressure is below the bound
-        missing = 1 - (turn * pressure).real / (cosine * bounds[:, None])
-        weights = weights * np.exp((4 / (2 + number) * missing).clip(-_LARGEST_STEP, _LARGEST_STEP))
-        weights = weights / weights.max(axis=1, keepdims=True)
-    return least, best, attained
-
-
-def _divided(boxes: _Boxes) -> _Boxes:
-    """Return the halves of boxes, divided across their longest edge.
-
-    The weights are no guide: a focus has a small weight as long as its edge is long.
-    """
-    each = np.arange(len(boxes.centres))
-    longest = boxes.halves.argmax(axis=1)
-    halves = boxes.halves.copy()
-    halves[each, longest] /= 2
-    centres = np.concatenate([boxes.centres, boxes.centres])
-    centres[each, longest] -= halves[each, longest]
-    centres[len(each) + each, longest] += halves[each, longest]
-    return _Boxes(centres, np.concatenate([halves, halves]), np.concatenate([boxes.weights, boxes.weights]))

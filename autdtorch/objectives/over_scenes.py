@@ -84,7 +84,9 @@ class OverScenes(Goal):
         """Return the derivatives (..., S P): of each scene's goal, in proportion to the scene's weight.
 
         The weights for the worst scene are those of a smooth minimum. For a quantile, scenes of about its
-        score have weight.
+        score have weight. For the mean all scenes have the same weight, and each climbs what its goal climbs:
+        with targets, ascent ends at the least mean square of the deviations; with contrasts, at the highest
+        mean logarithm.
         """
         apart = self._apart(pressure)
         slope, scores = slope_of(self.goal, apart, smoothing), self.goal(apart)

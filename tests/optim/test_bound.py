@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from autdtorch.methods.functions import gabs, gradient_ascent
 from autdtorch.methods.gradient import climb, random_drives
-from autdtorch.objectives.bound import certified, focus_bound
+from autdtorch.objectives.bound import certified, focus_bound, joint_bound
 from autdtorch.objectives.goals import WeakestFocus
+from autdtorch.objectives.phase_boxes import phase_bound
 from autdtorch.objectives.quiet import QuietPoints
 
 
@@ -110,6 +111,34 @@ def test_few_foci_nearly_attain_their_bound(random_matrix, points, transducers):
         drive = climb(goal, matrix, random_drives(32, transducers, generator), 300)
         score = float(goal((matrix @ drive).abs()))
         assert score <= goal.bound(matrix) < 1.01 * score
+
+
+@settings(max_examples=20)
+@given(
+    foci=st.integers(1, 12),
+    transducers=st.integers(1, 12),
+    alike=st.floats(0, 1),
+    work=st.sampled_from([0.0, 1e4, 1e6]),
+    seed=st.integers(0, 1000),
+)
+def test_branch_and_bound_holds_whenever_it_ends(random_matrix, foci, transducers, alike, work, seed):
+    rows, generator = random_matrix(foci, transducers, seed), torch.Generator().manual_seed(seed)
+    rows = (1 - alike) * rows + alike * rows[:1]
+    drive = climb(WeakestFocus(), rows, random_drives(8, transducers, generator), 100)
+    alone = float(rows.abs().sum(dim=1).min())
+    bound = phase_bound(rows.numpy(), alone, work)
+    assert float((rows @ drive).abs().min()) <= bound * (1 + 1e-13)
+    assert bound <= alone
+
+
+def test_scenes_much_alike_nearly_attain_their_bound(random_matrix):
+    # 0.3 % are left to the search, and gradient ascent misses 0.1 %; the relaxation leaves up to 5 %
+    for seed in range(3):
+        scenes = random_matrix(4, 12, seed) + 0.1 * random_matrix(16, 12, 100 + seed).reshape(4, 4, 12)
+        rows, generator = scenes.reshape(16, 12), torch.Generator().manual_seed(seed)
+        drive = climb(WeakestFocus(), rows, random_drives(32, 12, generator), 300)
+        score = float((rows @ drive).abs().min())
+        assert score <= joint_bound(scenes.numpy(), np.ones(4), effort=10.0) < 1.01 * score
 
 
 @pytest.mark.parametrize("scales", [[1], [1, 100], [1, 1e3, 2e3, 1e3], [1, 0, 1], [1, 1e-200, 1]])
