@@ -215,6 +215,16 @@ def test_a_box_of_offsets_has_its_edges(behind_a_ball):
     assert 2e-3 < away[2] <= 4e-3
 
 
+def test_targets_of_holography_are_those_of_each_scene(scenarios):
+    every = scenarios()
+    drive = at.holography(every, [1.0, 2.0])
+    assert torch.equal(drive, at.holography(every, [1.0, 2.0] * 3))
+    assert torch.equal(drive, at.holography(at.Quantised(every, 256), [1.0, 2.0]))
+    assert not torch.equal(drive, at.holography(every))
+    with pytest.raises(ValueError, match=r"targets: shape \(3,\); must be \(6,\)"):
+        at.holography(every, [1.0, 2.0, 3.0])
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -17,6 +17,8 @@ from autdtorch.methods.holography.algorithms import SOLVERS, TINY, Algorithm, de
 from autdtorch.methods.problem import Problem, known_matrix, require_pressures
 from autdtorch.objectives.goals import Goal
 from autdtorch.objectives.objective import GoalFunction, Objective
+from autdtorch.objectives.perturbations import innermost
+from autdtorch.objectives.scenarios import Scenarios
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import (
     ArrayLike,
@@ -80,7 +82,8 @@ def holography(
     Args:
         G: transfer matrices (..., P, M), complex [Pa], on the CPU or a GPU; or an objective that has one.
         targets: wanted pressures (..., P) or (P,), >= 0 and not all 0: relative to each other, and [Pa] for
-            "diff_pat" and where amplitudes are free. None for 1 everywhere.
+            "diff_pat" and where amplitudes are free. None for 1 everywhere. For `Scenarios` of S scenes
+            those of all (S P,), or of one (P,) for each.
         algorithm: "naive", "gs" (iterative back-propagation), "wgs" (weighted), "gs_pat" or "diff_pat".
         iterations: >= 1; "naive" has none.
         free_amplitudes: whether amplitudes are free in [0, 1]; otherwise all are 1, and pressures at best in
@@ -99,9 +102,10 @@ def holography(
     iterations = integer_at_least("iterations", iterations, 1)
     free = boolean("free_amplitudes", free_amplitudes)
     if isinstance(G, Objective):
-        problem = Problem.of(G)
+        objective, problem = G, Problem.of(G)
         require_pressures(problem, algorithm)
         G = known_matrix(problem)
+        targets = _of_all_scenes(targets, objective, len(G))
     matrix = _checked_matrix(G)
     wanted = checked_targets(targets, matrix)
     solver = "wgs" if algorithm == "diff_pat" else algorithm
@@ -119,6 +123,15 @@ def holography(
         complex_tensor("G", G)
         raise invalid("G", G, "must not overflow in products of its entries")
     return drive[..., 0]
+
+
+def _of_all_scenes(targets: ArrayLike | None, objective: Objective, points: int) -> ArrayLike | None:
+    """Return the targets of the points of all scenes that an objective has; those of one are repeated."""
+    scenarios = innermost(objective)
+    if targets is None or not isinstance(scenarios, Scenarios):
+        return targets
+    wanted = real_tensor("targets", targets, "Pa")
+    return wanted.repeat(len(scenarios)) if wanted.shape == (points // len(scenarios),) else wanted
 
 
 def wanted_pressures(goal: GoalFunction, points: int) -> tuple[torch.Tensor, bool]:
