@@ -21,7 +21,7 @@ from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.particle import Particle
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.units import warn_user
-from autdtorch.utils.validation import ArrayLike, Vector, points_grid, require_kind, unit_vector
+from autdtorch.utils.validation import ArrayLike, Vector, invalid, points_grid, require_kind, unit_vector
 
 LARGEST = 0.1
 """LARGEST: radius of a small particle, relative to the wavelength; the force then errs by a quarter."""
@@ -53,9 +53,17 @@ class Gorkov:
 
     @property
     def displacement(self) -> torch.Tensor:
-        """The place of equilibrium by the stiffness, from each point (..., P, 3) [m]."""
-        solved: torch.Tensor = torch.linalg.solve(self.stiffness, self.force)
-        return solved
+        """The place of equilibrium by the stiffness, from each point (..., P, 3) [m].
+
+        `ValueError` where a stiffness is 0 along some direction, as without sound.
+        """
+        solved, wrong = torch.linalg.solve_ex(self.stiffness, self.force)
+        if wrong.any():
+            index = tuple(wrong.nonzero()[0].tolist())
+            accepted = "must not be 0 along any direction, as it is without sound"
+            raise invalid(f"stiffness{list(index)}", self.stiffness[index].tolist(), accepted, "N/m")
+        displaced: torch.Tensor = solved
+        return displaced
 
 
 def gorkov(

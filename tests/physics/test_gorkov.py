@@ -109,3 +109,14 @@ def test_points_and_particles_out_of_range_are_named():
     with pytest.raises(ValueError, match="material: 'lead'; must be one of"):
         at.Particle.of("lead", 1e-3)
     assert np.isfinite(at.Particle.of("water", 1e-3).weight)
+
+
+def test_without_sound_there_is_no_place_of_equilibrium():
+    propagator = at.make_propagator(scene(), "free_space")
+    field = at.gorkov(propagator, POINTS, 0 * drive(), at.Particle.of("EPS", 0.5e-3), up=(0, 0, 1))
+    with pytest.raises(ValueError, match=r"stiffness\[0, 0\]: .* N/m; must not be 0 along any direction"):
+        field.displacement.norm()
+    figure = at.plot_force(
+        torch.zeros(2, 2, 3), torch.ones(4, 4), at.Plane((0, 0, 0), (1, 0, 0), (4e-3, 4e-3))
+    )
+    assert figure.axes
