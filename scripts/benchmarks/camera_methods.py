@@ -46,24 +46,30 @@ DEVICE, LIMITS = hardware.SONICSURFACE, hardware.Limits(1.0, evaluations=100_000
 def main(page: Page, methods: list[str], seeds: int, bo_seeds: int, logs: Path, processes: int) -> None:
     """Run all trials, print a row for each method and scene, and write the block."""
     logs.mkdir(parents=True, exist_ok=True)
-    cases = [
-        (method, scene, blocks_of(min(seeds, bo_seeds) if method == "bo" else seeds))
-        for method, scene in itertools.product(methods, PAPER)
-    ]
+    counts = {method: min(seeds, bo_seeds) if method == "bo" else seeds for method in methods}
     with ProcessPoolExecutor(processes) as pool:
-        parts = [
-            [pool.submit(weakest_foci, method, scene, block, logs) for block in blocks]
-            for method, scene, blocks in cases
-        ]
+        parts = {
+            (method, scene): [
+                pool.submit(weakest_foci, method, scene, block, logs) for block in blocks_of(counts[method])
+            ]
+            for method, scene in itertools.product(methods, PAPER)
+        }
         rows = printed(
-            [method, scene, *summary(torch.cat([part.result() for part in results], dim=1))]
-            for (method, scene, _), results in zip(cases, parts, strict=True)
+            [
+                method,
+                str(counts[method]),
+                *(
+                    summary(torch.cat([part.result() for part in parts[method, scene]], dim=1))
+                    for scene in PAPER
+                ),
+            ]
+            for method in methods
         )
     strengths = ", ".join(f"{strength:g} ({scene})" for scene, strength in STRENGTHS.items())
     page.write(
-        table(["method", "scene", "seeds", "camera [kPa]", "camera over microphones"], rows),
-        "The true weakest focus by the drive that a method chose: medians (quartiles) of seeds, for the "
-        "method's random choices and the camera's noise. Microphones at the foci have no noise. Source "
+        table(["method", "seeds", *PAPER], rows),
+        "The true weakest focus by the camera's drive [kPa], and its ratio to the one by microphones at the "
+        "foci without noise: medians (quartiles) of seeds, for random choices and the camera's noise. Source "
         f"strengths are {strengths} Pa m, and the screen is {1e3 * SIDE:g} mm wide.",
     )
 
@@ -73,10 +79,9 @@ def blocks_of(seeds: int) -> list[range]:
     return [range(first, min(first + BLOCK, seeds)) for first in range(0, seeds, BLOCK)]
 
 
-def summary(pressure: torch.Tensor) -> list[str]:
-    """Return the cells of a row for pressures (2, T) [Pa] by microphones and by camera."""
-    median = f"{1e-3 * float(pressure[1].quantile(0.5)):.3f}"
-    return [str(pressure.shape[1]), median, quartiles(pressure[1] / pressure[0])]
+def summary(pressure: torch.Tensor) -> str:
+    """Return the cell for pressures (2, T) [Pa] by microphones and by camera."""
+    return f"{1e-3 * float(pressure[1].quantile(0.5)):.3f}: {quartiles(pressure[1] / pressure[0])}"
 
 
 def weakest_foci(method: str, scene: str, trials: range, logs: Path) -> torch.Tensor:

@@ -260,7 +260,8 @@ def write_report(points: Sequence[Point], refusals: Sequence[Refusal], page: Pag
     steady = list(settled(points))
     parts = [
         "![Error over run time](peers.png)",
-        f"Shortest time of steady runs to an error of {percent(ERROR)}, and the least error, on any grid:",
+        f"Shortest time [s] of steady runs to an error of {percent(ERROR)}, and the least error [%], on any "
+        "grid:",
         times(steady),
     ]
     if refusals:
@@ -285,11 +286,14 @@ def times(steady: Sequence[Point]) -> str:
     lines = []
     for case in dict.fromkeys(p.case for p in steady):
         runs = [[p for p in steady if (p.case, p.program) == (case, program)] for program in programs]
-        seconds = [[p.seconds for p in run if p.error <= ERROR] for run in runs]
-        errors = [[100 * p.error for p in run] for run in runs]
-        for title, values in ((f"to {percent(ERROR)} [s]", seconds), ("best error [%]", errors)):
-            lines.append([f"{case}, {title}", *(f"{min(each):.3g}" if each else "" for each in values)])
+        lines.append([case, *map(time_and_error, runs)])
     return table(["scene", *(NAMES.get(program, program) for program in programs)], lines)
+
+
+def time_and_error(run: Sequence[Point]) -> str:
+    """Return the shortest time [s] to `ERROR`, or a dash, and the least error [%]; "" without points."""
+    seconds = [f"{p.seconds:.3g}" for p in sorted(run, key=lambda p: p.seconds) if p.error <= ERROR]
+    return f"{seconds[0] if seconds else '-'}, {100 * min(p.error for p in run):.3g}" if run else ""
 
 
 def figure(points: Sequence[Point]) -> Figure:
