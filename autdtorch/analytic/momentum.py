@@ -54,7 +54,7 @@ def taken_up(
 def gradient_by_place(
     wavenumber: complex, axes: torch.Tensor, waves: torch.Tensor, gradient: torch.Tensor
 ) -> torch.Tensor:
-    """Return the gradient (..., 3) by the centre of regular waves: a shift changes them as that of the field.
+    """Return the gradient (..., 3) by the centre of regular waves, which a shift changes like the field.
 
     Args:
         wavenumber: k [rad/m].
