@@ -185,7 +185,7 @@ def objective() -> at.SimulatedObjective:
 
 
 def force_objective() -> at.ForceObjective:
-    return at.ForceObjective(propagator(), at.Trap([(22e-3, 7e-3, 14e-3)], BEAD))
+    return at.ForceObjective(propagator(), at.Trap([(22e-3, 7e-3, 14e-3)], particle=BEAD))
 
 
 def problem() -> at.Problem:
@@ -356,13 +356,14 @@ ARGUMENTS: dict[str, Any] = {
 #: Where a name means something else.
 OTHERS: dict[str, Any] = {
     "FailedTransducers.transducers": [1],
-    "ForceObjective.goal": at.Trap([(22e-3, 7e-3, 14e-3)], BEAD),
+    "ForceObjective.goal": at.Trap([(22e-3, 7e-3, 14e-3)], particle=BEAD),
     "ForceSensor.noise": 1e-6,
     "ForceSensor.objective": Made(lambda _: force_objective()),
     "equilibrium.propagator": Made(lambda _: at.make_propagator(AIR_ALONE)),
     "OverScenes.scenes": 1,
     "PoseBall.propagator": Made(lambda _: propagator(BALL, "tmatrix")),
     "PoseBall.radius": 1e-4,
+    "Push.body": 0,
     "Push.direction": (0.0, 0.0, 1.0),
     "Scenarios.around.failed": 1,
     "Scenarios.around.offset": 1e-4,

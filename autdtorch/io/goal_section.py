@@ -56,8 +56,8 @@ def load_goal(where: str, section: object) -> Goal | ForceGoal:
         settings["points"] = _span(f"{where}.points", points)
     if "goal" in settings:
         settings["goal"] = load_goal(f"{where}.goal", settings["goal"])
-    if "particle" in settings:
-        settings["particle"] = _particle(f"{where}.particle", settings["particle"])
+    if "particle" in section:
+        settings["particle"] = _particle(f"{where}.particle", section["particle"])
     try:
         return kind(**settings)
     except ValueError as error:

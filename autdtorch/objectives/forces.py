@@ -27,7 +27,7 @@ from autdtorch.propagators.tmatrix.bodies import bodies_of
 from autdtorch.propagators.tmatrix.force import force_matrices
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.geometry import sphere_points
-from autdtorch.scene.particle import Particle
+from autdtorch.scene.particle import BEAD, Particle
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.process import one_library_thread
@@ -143,8 +143,8 @@ class _ParticleGoal(ForceGoal):
     """Base of goals of a small sphere at points, by the force and the stiffness there."""
 
     points: Sequence[Vector] | None
-    particle: Particle
     directions: Sequence[Vector] | None = None
+    particle: Particle = BEAD
     displacement: float = 2e-4
 
     def __post_init__(self) -> None:
@@ -152,7 +152,6 @@ class _ParticleGoal(ForceGoal):
         if self.points is not None:
             points = points_tensor("points", self.points)
             object.__setattr__(self, "points", tuple(tuple(point) for point in points.tolist()))
-        require_kind("particle", self.particle, Particle)
         if self.directions is not None:
             directions = real_tensor("directions", self.directions)
             if directions.ndim != 2 or directions.shape[1] != 3 or not len(directions):
@@ -161,6 +160,7 @@ class _ParticleGoal(ForceGoal):
                 raise invalid("directions", self.directions, "must not be 0")
             directions = directions / directions.norm(dim=1, keepdim=True)
             object.__setattr__(self, "directions", tuple(tuple(each) for each in directions.tolist()))
+        require_kind("particle", self.particle, Particle)
         object.__setattr__(self, "displacement", positive("displacement", self.displacement, "m"))
 
     def check(self, scene: Scene) -> None:
@@ -231,8 +231,8 @@ class Trap(_ParticleGoal):
 
     Attributes:
         points: (P, 3) [m]; None for the control points of the scene.
-        particle: the sphere, of a radius up to 1 / k.
         directions: (D, 3), along which it is held; None for 100, for all.
+        particle: the sphere, of a radius up to 1 / k; a bead of EPS of 1 mm diameter by default.
         displacement: largest distance along a direction from the point to the place of equilibrium [m], > 0.
     """
 
@@ -257,8 +257,8 @@ class Levitate(_ParticleGoal):
 
     Attributes:
         points: (P, 3) [m]; None for the control points of the scene.
-        particle: the sphere, of a radius up to 1 / k.
         directions: (D, 3), along which it is held; None for 100, for all.
+        particle: the sphere, of a radius up to 1 / k; a bead of EPS of 1 mm diameter by default.
         displacement: largest sideways distance from the point to the place of equilibrium [m], > 0.
         reach: distance over which the stiffness must make up the weight [m], > 0; by default 2 mm, a quarter
             of the wavelength at 40 kHz.
@@ -290,20 +290,20 @@ class Push(ForceGoal):
     """The force along a direction on a body of a propagator of method "tmatrix" [N]; see `radiation_force`.
 
     Attributes:
-        direction: (3,); any length.
         body: its index in `TMatrixPropagator.bodies.bodies`.
+        direction: (3,); any length.
     """
 
     name: ClassVar[str] = "push"
     unit: ClassVar[str] = "N"
 
+    body: int
     direction: Vector
-    body: int = 0
 
     def __post_init__(self) -> None:
         """Check the fields."""
-        object.__setattr__(self, "direction", unit_vector("direction", self.direction))
         object.__setattr__(self, "body", integer_at_least("body", self.body, 0))
+        object.__setattr__(self, "direction", unit_vector("direction", self.direction))
 
     def check(self, scene: Scene) -> None:
         """Check that the scene has such a body."""

@@ -18,16 +18,13 @@ import torch
 from autdtorch.propagators.derivatives import Derivatives, field_derivatives, nodes_around
 from autdtorch.propagators.propagator import Propagator
 from autdtorch.scene.drive import validate_drive
-from autdtorch.scene.particle import Particle
+from autdtorch.scene.particle import BEAD, Particle
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import ArrayLike, Vector, invalid, points_grid, require_kind, unit_vector
 
 LARGEST = 0.1
 """LARGEST: radius of a small particle, relative to the wavelength; the force then errs by a quarter."""
-
-BEAD = Particle.of("EPS", 0.5e-3)
-"""BEAD: the usual bead of acoustic levitation, of 1 mm diameter."""
 
 
 @dataclass(frozen=True, eq=False)

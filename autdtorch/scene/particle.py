@@ -72,3 +72,7 @@ class Particle:
         ratio = self.density / medium.density
         f1 = 1 - (medium.sound_speed / self.sound_speed) ** 2 / ratio
         return f1, 2 * (ratio - 1) / (2 * ratio + 1)
+
+
+BEAD = Particle.of("EPS", 0.5e-3)
+"""BEAD: the usual bead of acoustic levitation, of 1 mm diameter."""

@@ -36,7 +36,7 @@ def random_objective(rng: np.random.Generator, transducers: int) -> at.ForceObje
     array = at.TransducerArray(places, -places, source_strength=1.0)
     directions = rng.normal(size=(rng.integers(1, 7), 3))
     bead = at.Particle.of(str(rng.choice(["EPS", "water"])), float(rng.uniform(1e-4, 1.2e-3)))
-    trap = at.Trap([POINT], bead, directions, displacement=float(rng.uniform(1e-4, 1e-3)))
+    trap = at.Trap([POINT], directions, bead, displacement=float(rng.uniform(1e-4, 1e-3)))
     propagator = at.make_propagator(at.Scene(array, AIR, 40e3, [(0.0, 0.0, 0.01)]), "free_space")
     return at.ForceObjective(propagator, trap)
 

@@ -63,6 +63,8 @@ def test_every_goal_has_a_config_of_its_name_with_all_its_settings():
         section = composed(f"goal={name}")["goal"]
         assert section["name"] == name
         assert list(section)[1:] == [field.name for field in dataclasses.fields(goal)]
+        if "particle" in section:
+            assert load_goal("goal", section) == load_goal("goal", name) == goal(None)
 
 
 def test_the_papers_experiment():

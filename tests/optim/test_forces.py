@@ -40,7 +40,7 @@ def exact(propagator, particle, points, drive):
 @pytest.mark.parametrize("radius", [0.2e-3, 1e-3])
 def test_scores_are_those_of_the_force_on_a_sphere_and_its_slope(propagator, radius):
     bead = at.Particle.of("EPS", radius)
-    goal, lift = at.Trap([POINT], bead), at.Levitate([POINT], bead)
+    goal, lift = at.Trap([POINT], particle=bead), at.Levitate([POINT], particle=bead)
     drive, step = drives(4, 16), 1e-5
     steps = torch.cat([torch.zeros(1, 3), torch.eye(3), -torch.eye(3)]).double()
     forces = exact(propagator, bead, torch.tensor(POINT) + step * steps, drive)
@@ -60,7 +60,7 @@ def test_scores_are_those_of_the_force_on_a_sphere_and_its_slope(propagator, rad
 
 def test_methods_maximise_the_goal_of_the_objective(propagator):
     bead = at.Particle.of("EPS", 0.1e-3)
-    objective = at.ForceObjective(propagator, at.Trap([POINT], bead))
+    objective = at.ForceObjective(propagator, at.Trap([POINT], particle=bead))
     climbed, searched = at.gradient_ascent(objective, starts=4), at.gabs(objective)
     bound = objective.goal.bound(objective.transfer_matrix)
     assert 0.7 * bound < climbed.score.item() <= bound
@@ -79,7 +79,7 @@ def test_a_push_is_the_force_on_a_body_and_has_a_bound():
     scene = at.Scene(array, at.Medium.air(), 40e3, [(0, 0, 0.1)], [ball])
     propagator = at.make_propagator(scene, "tmatrix")
     for direction in ((1, 0, 0), (0, 0, -1)):
-        objective, drive = at.ForceObjective(propagator, at.Push(direction)), drives(5, 16)
+        objective, drive = at.ForceObjective(propagator, at.Push(0, direction)), drives(5, 16)
         force = at.radiation_force(propagator, drive) @ torch.tensor(direction, dtype=torch.float64)
         assert torch.allclose(objective.goal(objective(drive)), force, rtol=1e-9, atol=1e-18)
         bound = objective.goal.bound(objective.transfer_matrix)
@@ -91,7 +91,7 @@ def pushed():
     array = at.TransducerArray.grid((3, 3), 10e-3, (0, 0, 0), (0, 0, 1), source_strength=1.0)
     ball = at.Sphere((0.002, 0, 0.05), 6e-3, rigid=True)
     scene = at.Scene(array, MEDIUM, 40e3, [(0, 0, 0.04), (0.01, 0, 0.045)], [ball])
-    return at.ForceObjective(at.make_propagator(scene, "tmatrix"), at.Push((1, 0, 0)))
+    return at.ForceObjective(at.make_propagator(scene, "tmatrix"), at.Push(0, (1, 0, 0)))
 
 
 def test_methods_push_by_the_readings_of_a_balance_alone(pushed):
@@ -161,14 +161,14 @@ def test_a_single_form_of_the_least_size_is_bounded_from_both_sides():
 
 
 def test_whether_a_trap_exists_is_decided(propagator):
-    exists = at.attainable(at.ForceObjective(propagator, at.Trap([POINT], BEAD)))
+    exists = at.attainable(at.ForceObjective(propagator, at.Trap([POINT])))
     assert exists.answer is True
     two = at.TransducerArray([(-0.01, 0, 0), (0.01, 0, 0)], normals=(0, 0, 1), source_strength=1.0)
     scene = at.Scene(two, at.Medium.air(), 40e3, [(0, 0, 0.1)])
-    none = at.attainable(at.ForceObjective(at.make_propagator(scene, "free_space"), at.Trap([POINT], BEAD)))
+    none = at.attainable(at.ForceObjective(at.make_propagator(scene, "free_space"), at.Trap([POINT])))
     assert none.answer is False  # two plane waves hold nothing along y
     assert none.bound == 0
-    drop = at.Levitate([POINT], at.Particle.of("water", 0.5e-3))
+    drop = at.Levitate([POINT], particle=at.Particle.of("water", 0.5e-3))
     heavy = at.attainable(at.ForceObjective(propagator, drop), 1.0)
     assert heavy.answer is False
 
@@ -176,7 +176,7 @@ def test_whether_a_trap_exists_is_decided(propagator):
 def test_a_lifted_bead_stays_near_its_place(propagator):
     """The drive times l^(-1/2), with a lift of l weights, does what `Levitate` says of the score."""
     louder = replace(propagator.scene, array=replace(propagator.scene.array, source_strength=20.0))
-    loud, lift = at.make_propagator(louder, "free_space"), at.Levitate([POINT], BEAD)
+    loud, lift = at.make_propagator(louder, "free_space"), at.Levitate([POINT])
     climbed = at.gradient_ascent(at.ForceObjective(loud, lift), starts=2)
     drive, score = climbed.drive[0], climbed.score.item()
     place = torch.tensor([POINT]).double()

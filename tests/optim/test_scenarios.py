@@ -136,7 +136,7 @@ def test_forces_in_scenes_have_one_goal():
     propagator = at.make_propagator(at.Scene(array, at.Medium.air(), 40e3, [(0, 0, 0.1)]), "free_space")
     bead = at.Particle.of("EPS", 0.5e-3)
     low, same, other = (
-        at.ForceObjective(propagator, at.Trap([(0, 0, 0.03)], bead, directions))
+        at.ForceObjective(propagator, at.Trap([(0, 0, 0.03)], directions, bead))
         for directions in ([(1, 0, 0)], [(1, 0, 0)], [(0, 1, 0)])
     )
     every = at.Scenarios([low, same])

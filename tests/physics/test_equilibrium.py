@@ -20,7 +20,7 @@ def propagator(bodies=(), points=((0, 0, 0.1),)):
 
 def trap(simulated, bead):
     """A drive that holds a bead near the point, with a little more lift there than its weight."""
-    objective = at.ForceObjective(simulated, at.Levitate([POINT], bead))
+    objective = at.ForceObjective(simulated, at.Levitate([POINT], particle=bead))
     drive = at.gradient_ascent(objective, starts=1).drive[0]
     lift = at.equilibrium(simulated, drive, bead, POINT).force[2] / bead.weight
     return drive * (1.1 / lift).sqrt()

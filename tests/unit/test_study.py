@@ -163,15 +163,28 @@ def test_a_study_goes_on_after_the_scenes_that_were_finished(scenes, count_runs,
         ({"plane_spacing": float("nan")}, "plane_spacing: nan m"),
         ({"solver": {"spacing": -1.0}}, r"solver: spacing: -1\.0 m"),
         ({"goal": "mean_pressure"}, "goal: 'mean_pressure'; must be a Goal"),
-        ({"goal": at.Push((1, 0, 0))}, "goal: body: 0; must be a body, and the scene has none"),
-        ({"goal": at.Levitate(None, at.Particle.of("EPS", 2e-3))}, "goal: particle.radius: 0.002 m; must be"),
-        ({"goal": at.Levitate(None, at.Particle.of("EPS", 1e-3)), "scenarios": {}}, "scenarios: {}; must be"),
+        ({"goal": at.Push(0, (1, 0, 0))}, "goal: body: 0; must be a body, and the scene has none"),
         (
-            {"goal": at.Push((1, 0, 0)), "scenes": {"a": scene(None, (CUBE,))}, "solver": {"method": "box"}},
+            {"goal": at.Levitate(None, particle=at.Particle.of("EPS", 2e-3))},
+            "goal: particle.radius: 0.002 m; must be",
+        ),
+        (
+            {"goal": at.Levitate(None, particle=at.Particle.of("EPS", 1e-3)), "scenarios": {}},
+            "scenarios: {}; must be",
+        ),
+        (
+            {
+                "goal": at.Push(0, (1, 0, 0)),
+                "scenes": {"a": scene(None, (CUBE,))},
+                "solver": {"method": "box"},
+            },
             'solver: method: \'box\'; must be "auto" or "tmatrix"',
         ),
         (
-            {"goal": at.Levitate(None, at.Particle.of("EPS", 1e-3)), "methods": {"i": at.Identify()}},
+            {
+                "goal": at.Levitate(None, particle=at.Particle.of("EPS", 1e-3)),
+                "methods": {"i": at.Identify()},
+            },
             "method i: goal: 'levitate'; must be of pressures at control points, which identify fits; for a",
         ),
         ({"goal": at.TargetPressures([3, 4])}, r"goal: targets: \(3\.0, 4\.0\); must be 3 numbers"),
@@ -225,9 +238,9 @@ def test_methods_and_functions_maximise_the_goal_of_the_study(goal, tmp_path):
 
 BEAD = at.Particle.of("EPS", 0.3e-3)
 FORCES = {
-    "push": at.Push((1, 0, 0)),
-    "trap": at.Trap([(22e-3, 7e-3, 14e-3)], BEAD, [(1, 0, 0), (0, 2, 0)]),
-    "levitate": at.Levitate(None, BEAD, [(1, 0, 0)], up=(1, 0, 0)),
+    "push": at.Push(0, (1, 0, 0)),
+    "trap": at.Trap([(22e-3, 7e-3, 14e-3)], [(1, 0, 0), (0, 2, 0)], BEAD),
+    "levitate": at.Levitate(None, [(1, 0, 0)], BEAD, up=(1, 0, 0)),
 }
 
 
