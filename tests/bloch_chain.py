@@ -43,8 +43,8 @@ class HalfSpace:
         return torch.from_numpy(corners), torch.tensor([[0, 1, 2]])
 
 
-def reflection(normal, offset, spacing, incidence, azimuth=0.0, fluid=None):
-    """The reflection coefficient of a half-space, rigid (1 in theory) or of a fluid.
+def reflection(normal, offset, spacing, incidence, azimuth=0.0, fluid=None, impedance=None):
+    """The reflection coefficient of a half-space: rigid (1 in theory), of a fluid, or with an impedance.
 
     The surface is `offset` cells from a cell centre. The wave comes at an angle `incidence` [rad] from the
     normal.
@@ -54,7 +54,8 @@ def reflection(normal, offset, spacing, incidence, azimuth=0.0, fluid=None):
     length, middle = float(np.linalg.norm(normal)), np.array(grid.shape) // 2
     unit = np.array(normal) / length
     shape = HalfSpace(unit, spacing * float(unit @ middle + offset))
-    region = Region(AIR, 0.0, FREQUENCY, (Body(shape, fluid),), ((0.0,) * 3, (1.0,) * 3), np.zeros((1, 3)))
+    body = Body(shape, fluid, impedance=impedance)
+    region = Region(AIR, 0.0, FREQUENCY, (body,), ((0.0,) * 3, (1.0,) * 3), np.zeros((1, 3)))
     cells = heterogeneous_cells(elements_of(region, grid, stencil), stencil)
 
     tangent = np.cross(unit, (math.cos(azimuth), math.sin(azimuth), 0.4))
@@ -79,8 +80,9 @@ def reflection(normal, offset, spacing, incidence, azimuth=0.0, fluid=None):
             matrix[equation, unknown[place]] += value
 
     for equation, place in enumerate([*unknown, bottom, top] if fluid else [*unknown, top]):
-        add(equation, place, stencil.symbol)
-        for step, weight in zip(np.array(OFFSETS), rows[place], strict=True):
+        row, itself = rows[place]
+        add(equation, place, itself)
+        for step, weight in zip(np.array(OFFSETS), row, strict=True):
             if weight:
                 add(equation, place + int(step @ normal), weight * np.exp(1j * along @ step))
                 add(equation, place, -weight)
@@ -101,18 +103,24 @@ def exact_reflection(incidence, fluid):
 
 
 def _rows(cells, stencil, grid, middle, normal):
-    """The stencil rows (27,) by the value of n . x, of cells near the middle that are not rigid."""
+    """The stencil rows (27,) and the factors of the cell itself, both complex where it absorbs.
+
+    They are by the value of n . x, of cells near the middle that are not rigid.
+    """
     around = np.array(list(itertools.product(range(-REACH, REACH + 1), repeat=3)))
     values = around @ normal
     aside = np.linalg.norm(around - values[:, None] * normal / (normal @ normal), axis=1)
     most = math.ceil(DEPTH * np.linalg.norm(normal))
     index = {int(flat): place for place, flat in enumerate(cells.index)}
+    losses = cells.loss_rows / cells.mass[:, None]
+    changed = cells.weight - 1j * losses[:, :27], stencil.symbol + 1j * losses[:, 27] - losses[:, 28]
     rows = {}
     for number in np.argsort(aside, kind="stable"):
         place = int(values[number])
         if abs(place) <= most and place not in rows:
             flat = int(np.ravel_multi_index(tuple(middle + around[number]), grid.shape))
-            rows[place] = cells.weight[index[flat]] if flat in index else stencil.weights
+            row = stencil.weights, stencil.symbol
+            rows[place] = tuple(part[index[flat]] for part in changed) if flat in index else row
             if flat in cells.rigid:
                 rows[place] = None
     return {place: row for place, row in rows.items() if row is not None}

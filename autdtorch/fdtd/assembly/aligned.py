@@ -152,7 +152,8 @@ def aligned_elements(
     coupling, mass = np.zeros((len(kinds), 28)), np.zeros((len(kinds), 8))
     for axis in range(3):
         for make, mask in (
-            (_layered, varied[:, axis] & (varied.sum(axis=1) == 1)),
+            # elements that do not vary have one layer
+            (_layered, (varied[:, axis] | (axis == 0)) & (varied.sum(axis=1) == varied[:, axis])),
             (_prismatic, ~varied[:, axis] & (varied.sum(axis=1) == 2)),
         ):
             coupling[mask], mass[mask] = make(axis, kinds[mask], blocks, materials, stencil)

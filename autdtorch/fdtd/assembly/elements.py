@@ -14,11 +14,13 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from autdtorch.fdtd.assembly.aligned import Blocks, aligned_elements
 from autdtorch.fdtd.assembly.edges import edges_of, reductions
 from autdtorch.fdtd.assembly.element import FAR, LATTICE, SUBCELLS, InterfaceElements, Materials
 from autdtorch.fdtd.assembly.impedance import with_impedance
+from autdtorch.fdtd.assembly.impedance_faces import with_impedance_faces
 from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
 from autdtorch.fdtd.assembly.losses import GROUND, with_losses
 from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, quadratic, roughness
@@ -64,9 +66,13 @@ def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
     material = np.where(beside, material, blocks.at_centers).astype(np.int16)
     cut = np.where(beside, cut, np.any([varied[blocks.kinds] for varied in blocks.varied], axis=0))
     whole = np.where(cut, -1, material)
-    index = np.flatnonzero(cut & ~beside), np.flatnonzero(cut & beside)
+    along = cut & ~beside
+    if materials.reacting.any():
+        # pressures in front of their faces are those of two cells
+        along |= binary_dilation(along) & ~beside & ~materials.rigid[material]
+    index = np.flatnonzero(along), np.flatnonzero(cut & beside)
     parts = (
-        _aligned(bodies, places_of(index[0], cut.shape), blocks, grid, materials, stencil),
+        _aligned(bodies, index[0], ~cut.ravel()[index[0]], blocks, grid, materials, stencil),
         _interface(bodies, index[1], whole, grid, materials, stencil),
     )
     order = np.argsort(np.concatenate(index))
@@ -76,22 +82,25 @@ def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
 
 
 def _aligned(
-    bodies: list[Union], first: Index, blocks: Blocks, grid: Grid, materials: Materials, stencil: Stencil
+    bodies: list[Union],
+    index: Index,
+    uncut: NDArray[np.bool_],
+    blocks: Blocks,
+    grid: Grid,
+    materials: Materials,
+    stencil: Stencil,
 ) -> InterfaceElements:
-    """Return the elements, by their first cells (n, 3), that vary among blocks."""
+    """Return the elements at flat indices (n,): those that vary among blocks, and `uncut` ones (n,)."""
+    shape = tuple(cells - 1 for cells in grid.shape)
+    first = places_of(index, shape)
     elements = with_losses(lambda kinds: aligned_elements(first, blocks, kinds, stencil), materials, stencil)
     if not materials.reacting.any():
         return elements
     numbers = np.array([body.material for body in bodies], np.int64)
-    parts = [slice(begin, begin + _CHUNK) for begin in range(0, len(first), _CHUNK)]
-    reacting = [
-        with_impedance(
-            elements.chosen(np.arange(len(first))[part]), _distances(bodies, first[part], grid), numbers,
-            materials, stencil,
-        )
-        for part in parts
-    ]  # fmt: skip
-    return InterfaceElements.joined([elements.chosen(np.arange(0)), *reacting])
+    return with_impedance_faces(
+        elements, index, shape, uncut, lambda rows: _distances(bodies, first[rows], grid), numbers, materials,
+        stencil,
+    )  # fmt: skip
 
 
 def _blocks(bodies: Sequence[Union], grid: Grid) -> Blocks:

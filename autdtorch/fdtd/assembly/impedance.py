@@ -34,7 +34,7 @@ from autdtorch.utils.array_types import Array, ComplexArray, Index
 
 _GROWTH = 1e-3  # Distance [cells] by which a body grows and shrinks for the area of its surface
 _CENTERS = (np.array(list(np.ndindex((SUBCELLS,) * 3))) + 0.5) / SUBCELLS  # of the sub-cells (64, 3)
-_LARGEST_PHASE = 1.2  # Largest phase between a vertex and a surface [rad]
+LARGEST_PHASE = 1.2  # Largest phase between a vertex and a surface [rad]
 _LEAST_GRADIENT = 0.3  # Least gradient of a signed distance with which a place is moved to the surface
 
 
@@ -121,13 +121,21 @@ def _lumped(
     The air between a vertex and the surface, a distance d away, is in the element's mass. With t = tan(k d),
     the admittance Y behind it acts as Y (1 + t^2) / (1 - i Y t).
     """
+    depth, hats = outer_side(surface, solid)
+    slope = np.tan(np.minimum(kappa * depth, LARGEST_PHASE))
+    behind = admittance * (1 + slope**2) / (1 - 1j * admittance * slope)
+    return np.zeros((len(hats), 28), complex), (surface.area[:, :, None] * hats * behind).sum(axis=1)
+
+
+def outer_side(surface: Facets, solid: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return the depths (n, 64, 8) [cells] of vertices in front of a surface, and their shares in its flow.
+
+    `solid` (n, 8) is the mask of the vertices in rigid bodies. These, and vertices behind, have no share.
+    """
     depth = ((VERTICES - surface.place[:, :, None]) * surface.normal[:, :, None]).sum(axis=3)
     hats = _hats(surface.place) * (~solid[:, None] & (depth > 0))
     whole = hats.sum(axis=2, keepdims=True)
-    hats = np.divide(hats, whole, out=np.zeros_like(hats), where=whole > 0)
-    slope = np.tan(np.minimum(kappa * depth, _LARGEST_PHASE))
-    behind = admittance * (1 + slope**2) / (1 - 1j * admittance * slope)
-    return np.zeros((len(hats), 28), complex), (surface.area[:, :, None] * hats * behind).sum(axis=1)
+    return depth, np.divide(hats, whole, out=np.zeros_like(hats), where=whole > 0)
 
 
 def _hats(place: Array) -> Array:
