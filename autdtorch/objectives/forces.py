@@ -118,9 +118,13 @@ class LeastForm(Goal):
         raise invalid("goal", self.name, "must want pressures, for this method; take gradient_ascent")
 
     def climbed(self, matrix: torch.Tensor, drive: torch.Tensor, iterations: int) -> torch.Tensor:
-        """Return drives (S, M) at local maxima of the goal from drives (S, M), by the rows (N, M)."""
+        """Return drives (S, M) at local maxima of the goal from drives (S, M), by the rows (N, M).
+
+        Silence, which scores 0, replaces those that would score less.
+        """
         each = [ascended(matrix.numpy(), self.weights, start, iterations) for start in drive.numpy()]
-        return torch.from_numpy(np.stack(each))
+        drives = torch.from_numpy(np.stack(each))
+        return torch.where(self(magnitudes(matrix, drives))[:, None] > 0, drives, 0)
 
 
 class ForceGoal(ABC):

@@ -61,7 +61,8 @@ def phase_bound(rows: ComplexArray, known: float, work: float) -> float:
         divided = (bounds > limit) & (weakest >= 0)
         done = max(done, float(bounds[~divided].max(initial=0.0)))
         for box in np.flatnonzero(divided):
-            heapq.heappush(heap, (-bounds[box], next(number), weakest[box], boxes[box]))
+            # a copy, as a view would hold all boxes of its part in memory
+            heapq.heappush(heap, (-bounds[box], next(number), weakest[box], boxes[box].copy()))
         highest = max(done, -heap[0][0]) if heap else done
         if work <= 0 or highest <= max(done, limit) or len(heap) * len(rows) > _MOST_NUMBERS:
             return min(known, highest * (1 + _MARGIN))

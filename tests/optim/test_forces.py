@@ -168,6 +168,8 @@ def test_whether_a_trap_exists_is_decided(propagator):
     none = at.attainable(at.ForceObjective(at.make_propagator(scene, "free_space"), at.Trap([POINT])))
     assert none.answer is False  # two plane waves hold nothing along y
     assert none.bound == 0
+    assert none.score == 0  # silence scores more than any drive
+    assert not none.drive.any()
     drop = at.Levitate([POINT], particle=at.Particle.of("water", 0.5e-3))
     heavy = at.attainable(at.ForceObjective(propagator, drop), 1.0)
     assert heavy.answer is False
