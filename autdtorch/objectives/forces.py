@@ -122,8 +122,7 @@ class LeastForm(Goal):
 
         Silence, which scores 0, replaces those that would score less.
         """
-        each = [ascended(matrix.numpy(), self.weights, start, iterations) for start in drive.numpy()]
-        drives = torch.from_numpy(np.stack(each))
+        drives = torch.from_numpy(ascended(matrix.numpy(), self.weights, drive.numpy(), iterations))
         return torch.where(self(magnitudes(matrix, drives))[:, None] > 0, drives, 0)
 
 

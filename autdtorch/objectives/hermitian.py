@@ -11,6 +11,8 @@ a and z is the value of the semidefinite relaxation, as for foci (`bound`); any 
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 import scipy.optimize
 
@@ -34,6 +36,8 @@ _SMOOTHING = (
 )  # of the least form, relative to the mean size of all
 _START = 0.9  # largest amplitude of the start of an ascent
 _TINY = 1e-300
+
+_Numbers = TypeVar("_Numbers", Array, ComplexArray)
 
 
 @one_library_thread()
@@ -80,8 +84,8 @@ def forms_bound(rows: ComplexArray, weights: Array) -> float:
 
 
 @one_library_thread()
-def ascended(rows: ComplexArray, weights: Array, drive: ComplexArray, iterations: int = 300) -> ComplexArray:
-    """Return the drive (M,) at a local maximum of the least of J forms, from a drive (M,).
+def ascended(rows: ComplexArray, weights: Array, starts: ComplexArray, iterations: int = 300) -> ComplexArray:
+    """Return drives (S, M) at local maxima of the least of J forms, from drives (S, M).
 
     L-BFGS on the smooth least form, smoothed less and less. Drives are z sin|z| / |z|: no amplitude is above
     1, and an amplitude of 1 is no end.
@@ -89,19 +93,38 @@ def ascended(rows: ComplexArray, weights: Array, drive: ComplexArray, iterations
     Args:
         rows: R (N, M).
         weights: W (J, N).
-        drive: the start.
+        starts: drives to start from.
         iterations: most of each stage.
     """
-    (mixing, basis), count = _factors(rows), len(drive)
+    # forms of a point are sums of 9 quantities: their factors are much smaller than the weights
+    factors = *_factors(rows), *_factors(weights)
+    return np.stack([_ascended(*factors, start, iterations) for start in starts])
+
+
+def _ascended(
+    mixing: ComplexArray,
+    basis: ComplexArray,
+    combining: Array,
+    squares: Array,
+    drive: ComplexArray,
+    iterations: int,
+) -> ComplexArray:
+    """Return the drive of `ascended` from a drive (M,), by factors of the rows and of the weights."""
+    count, back, back_mixing = len(drive), basis.conj(), mixing.conj()
+
+    def forms_of(readings: ComplexArray) -> Array:
+        values: Array = combining @ (squares @ np.abs(readings) ** 2)
+        return values
 
     def smooth(x: Array, temperature: float) -> tuple[float, Array]:
         z = x[:count] + 1j * x[count:]
         size = np.abs(z)
         readings = mixing @ (basis @ (z * np.sinc(size / np.pi)))
-        forms = weights @ np.abs(readings) ** 2 / scale
+        forms = forms_of(readings) / scale
         shares = np.exp((forms.min() - forms) / temperature)
         value = forms.min() - temperature * np.log(shares.sum())
-        slope = 2 / scale * ((shares / shares.sum()) @ weights * readings) @ mixing.conj() @ basis.conj()
+        at_readings = (shares / shares.sum()) @ combining @ squares * readings
+        slope = 2 / scale * (at_readings @ back_mixing @ back)
         turn = z / np.maximum(size, _TINY)
         along = slope * turn.conj()
         slope = turn * (along.real * np.cos(size) + 1j * along.imag * np.sinc(size / np.pi))
@@ -111,7 +134,7 @@ def ascended(rows: ComplexArray, weights: Array, drive: ComplexArray, iterations
     z = drive / np.maximum(amplitude, _TINY) * np.arcsin(np.minimum(amplitude, _START))
     for smoothing in _SMOOTHING:
         drive = z * np.sinc(np.abs(z) / np.pi)
-        scale = float(np.abs(weights @ np.abs(rows @ drive) ** 2).mean()) or 1.0
+        scale = float(np.abs(forms_of(mixing @ (basis @ drive))).mean()) or 1.0
         x = scipy.optimize.minimize(
             smooth,
             np.concatenate([z.real, z.imag]),
@@ -125,8 +148,8 @@ def ascended(rows: ComplexArray, weights: Array, drive: ComplexArray, iterations
     return drive / max(float(np.abs(drive).max()), _TINY)
 
 
-def _factors(rows: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """Return factors (N, n) and (n, M) of rows, of their numerical rank n."""
+def _factors(rows: _Numbers) -> tuple[_Numbers, _Numbers]:
+    """Return factors (N, n) and (n, M) of rows (N, M), real or complex, of their numerical rank n."""
     left, singular, right = np.linalg.svd(rows, full_matrices=False)
     rank = singular > _RANK * singular[0]
     return left[:, rank] * singular[rank], right[rank]

@@ -97,7 +97,7 @@ def check_bounds(count: int, rng: np.random.Generator) -> int:
         kind = str(rng.choice(list(kinds)))
         bound = forms_bound(rows, kinds[kind])
         drives = random_drives(rng, 200, rows.shape[1])
-        drives = np.stack([*drives, *(ascended(rows, kinds[kind], start) for start in drives[:2])])
+        drives = np.stack([*drives, *ascended(rows, kinds[kind], drives[:2])])
         highest = (kinds[kind] @ np.abs(rows @ drives.T) ** 2).min(axis=0).max()
         above += highest > bound
         if bound > 0:

@@ -147,7 +147,7 @@ def test_no_drive_exceeds_the_bound_on_forms(seed, transducers, forms, rows):
     weights = rng.normal(size=(forms, rows)) + rng.uniform(-1, 1)
     bound = forms_bound(matrix, weights)
     several = drives(200, transducers, seed).numpy()
-    best = ascended(matrix, weights, several[0])
+    best = ascended(matrix, weights, several[:1])
     scores = (weights @ np.abs(matrix @ np.vstack([several, best]).T) ** 2).min(axis=0)
     assert np.abs(best).max() <= 1 + 1e-12
     assert max(scores.max(), 0) <= bound
