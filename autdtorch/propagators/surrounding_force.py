@@ -57,8 +57,8 @@ def _is_alone(scene: Scene, bodies: list[ObstacleGroup], body: ObstacleGroup) ->
 def _force_on(propagator: Propagator, drive: torch.Tensor, body: ObstacleGroup) -> torch.Tensor:
     """Return the force (3,) [N] on a body by the pressures on two spheres around it."""
     scene = propagator.scene
-    k, radii = scene.wavenumber, [body.radius + share * scene.wavelength for share in _APART]
-    degree = math.ceil(k * radii[1]) + _MORE_DEGREES
+    k, radii = scene.complex_wavenumber, [body.radius + share * scene.wavelength for share in _APART]
+    degree = math.ceil(scene.wavenumber * radii[1]) + _MORE_DEGREES
     nodes, to_waves = _sphere(degree)
     points = torch.cat([body.center + radius * nodes for radius in radii])
     # a grid, which may be near obstacles without a warning

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import pytest
 import torch
 from small_scenes import CUBE, small_scene
 
@@ -22,8 +23,9 @@ class ByField:
         self.scene, self.field = propagator.scene, propagator.field
 
 
-def test_pressures_around_bodies_give_the_force_of_their_t_matrices():
-    propagator = at.make_propagator(small_scene(BALLS), "tmatrix", tolerance=1e-8)
+@pytest.mark.parametrize("absorption", [0.0, 20.0])
+def test_pressures_around_bodies_give_the_force_of_their_t_matrices(absorption):
+    propagator = at.make_propagator(small_scene(BALLS, absorption=absorption), "tmatrix", tolerance=1e-8)
     drive = torch.tensor([1, 0.3 + 0.7j, -0.5, 0.9j], dtype=torch.complex128)
     exact, by_field = (forces_on_obstacles(one, drive) for one in (propagator, ByField(propagator)))
     # Waves of some 10 degrees; rounding is magnified by h_l of the highest
