@@ -12,6 +12,7 @@ from autdtorch.propagators.propagator import Propagator
 from autdtorch.propagators.tmatrix.force import radiation_force
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
+from autdtorch.scene.arrays import TransducerArray, radii_of
 from autdtorch.scene.drive import validate_single_drive
 from autdtorch.scene.obstacles import Sphere
 from autdtorch.scene.particle import Particle
@@ -40,7 +41,7 @@ class Equilibrium:
     Attributes:
         force: at the point, with the weight (3,) [N].
         place: where the force is 0 (3,) [m]; None if the sphere goes away from the point, by half a
-            wavelength or to a body.
+            wavelength or to a body or transducer.
         stiffness: -dF_i/dx_j (3, 3) [N/m], at the place, or at the point without one.
     """
 
@@ -81,8 +82,8 @@ def equilibrium(
         up: direction against gravity (3,); the weight then counts. Without it, sound alone.
 
     Raises:
-        ValueError: an argument of another shape or kind, or a sphere that is not clear of bodies and
-            reflectors at the point.
+        ValueError: an argument of another shape or kind, or a sphere that is not clear of bodies,
+            reflectors and transducers at the point.
     """
     if not isinstance(propagator, TMatrixPropagator | FreeSpacePropagator):
         raise invalid("propagator", propagator, 'must be of method "tmatrix" or "free_space"')
@@ -105,10 +106,13 @@ def equilibrium(
     def is_clear(place: torch.Tensor) -> bool:
         apart = [float((place - one.center).norm()) - one.radius for one in others]
         apart += [float(each.mirror.height(place)) for each in scene.reflectors]
-        return min(apart, default=particle.radius) >= particle.radius
+        apart.append(_from_transducers(scene.array, place))
+        return min(apart) >= particle.radius
 
     if not is_clear(start):
-        raise invalid("point", tuple(start.tolist()), "must leave room for the sphere beside all bodies", "m")
+        raise invalid(
+            "point", tuple(start.tolist()), "must leave room for the sphere beside bodies and array", "m"
+        )
     first, stiffness = _with_stiffness(force, start)
     place, now, at_start, longest = start, first, stiffness, _STEP * scene.wavelength
     for _ in range(_MOST_STEPS):
@@ -121,6 +125,14 @@ def equilibrium(
         if float(step.norm()) < _SETTLED * scene.wavelength:
             return Equilibrium(first, place, stiffness)
     return Equilibrium(first, None, at_start)
+
+
+def _from_transducers(array: TransducerArray, place: torch.Tensor) -> float:
+    """Return the distance [m] of a place (3,) [m] from the nearest transducer, a disc or a point."""
+    offsets = place - array.positions
+    along = (offsets * array.normals).sum(dim=-1)
+    across = torch.linalg.cross(offsets, array.normals).norm(dim=-1)
+    return float(torch.hypot(along, (across - radii_of(array)).clamp_min(0)).min())
 
 
 @torch.inference_mode(False)

@@ -69,6 +69,8 @@ def test_a_bead_that_falls_has_no_place():
     assert not fallen.holds
     assert fallen.force.tolist() == pytest.approx([0, 0, -bead.weight])
     assert not at.equilibrium(simulated, drive, bead, POINT).holds  # it floats, but nothing holds it
+    low = (0.005, 0.005, 0.0012)  # over a transducer at z = 0, to which it falls
+    assert at.equilibrium(simulated, drive, bead, low, up=UP).place is None
 
 
 def test_what_cannot_be_is_refused_in_a_line():
@@ -76,6 +78,8 @@ def test_what_cannot_be_is_refused_in_a_line():
     simulated = propagator((BALL,))
     with pytest.raises(ValueError, match=r"point: \(.*\) m; must leave room for the sphere"):
         at.equilibrium(simulated, drive, bead, (0.008, 0.002, 0.0295))
+    with pytest.raises(ValueError, match=r"point: \(.*\) m; must leave room .* and array"):
+        at.equilibrium(simulated, drive, bead, (0.005, 0.005, 0.0009))
     box = at.make_propagator(replace(simulated.scene, domain=None), "box", spacing=2e-3)
     with pytest.raises(ValueError, match=r'propagator: .*; must be of method "tmatrix" or "free_space"'):
         at.equilibrium(box, drive, bead, POINT)
