@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
 from autdtorch.methods.gradient import GradientAscent
 from autdtorch.methods.problem import Problem, known_matrix
 from autdtorch.methods.run import run
+from autdtorch.objectives.bound import checked_matrix
+from autdtorch.objectives.forces import LeastForm
+from autdtorch.objectives.form_cells import no_drive_above
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.objectives.objective import GoalFunction, Objective
 from autdtorch.utils.validation import finite_number, require_kind
 
-_STARTS = 4, 32  # of ascents; more where the first decide nothing
+_STARTS = 4, 28  # of ascents; the second where the first decide nothing
+_FEW = 4  # transducers, whose drives can be divided into cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +52,8 @@ def attainable(
 ) -> Attainable:
     """Return whether a drive scores above `least`, by gradient ascent and the bound of the goal.
 
+    For forces with up to four transducers, cells of drives decide what these leave open.
+
     Args:
         objective: with a transfer matrix, such as a `ForceObjective` of a trap.
         least: the score.
@@ -61,10 +67,21 @@ def attainable(
     problem = Problem.of(objective, goal)
     require_kind("goal", problem.goal, Goal)
     assert isinstance(problem.goal, Goal)
-    bound = problem.goal.bound(known_matrix(problem))
-    for starts in _STARTS:
-        solution = run(GradientAscent(starts=starts), objective, seed=seed, goal=problem.goal)
-        best = Attainable(least, float(solution.score[0]), solution.drive[0], bound)
+    matrix = known_matrix(problem)
+    bound, best = problem.goal.bound(matrix), None
+    for trial, starts in enumerate(_STARTS):
+        solution = run(GradientAscent(starts=starts), objective, [trial], seed, goal=problem.goal)
+        score = float(solution.score[0])
+        if best is None or score > best.score:
+            best = Attainable(least, score, solution.drive[0], bound)
         if best.answer is not None:
-            break
+            return best
+    assert best is not None
+    if (
+        isinstance(problem.goal, LeastForm)
+        and problem.transducers <= _FEW
+        and least >= 0
+        and no_drive_above(checked_matrix(matrix), problem.goal.weights, least)
+    ):
+        return replace(best, bound=least)
     return best

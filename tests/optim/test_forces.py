@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import autdtorch as at
-from autdtorch.objectives.forces import DIRECTIONS
+from autdtorch.objectives.forces import DIRECTIONS, ForceGoal
+from autdtorch.objectives.form_cells import no_drive_above
 from autdtorch.objectives.hermitian import ascended, forms_bound
 
 BEAD = at.Particle.of("EPS", 0.5e-3)
@@ -173,6 +174,42 @@ def test_whether_a_trap_exists_is_decided(propagator):
     drop = at.Levitate([POINT], particle=at.Particle.of("water", 0.5e-3))
     heavy = at.attainable(at.ForceObjective(propagator, drop), 1.0)
     assert heavy.answer is False
+
+
+def octahedron(mean):
+    """Rows and weights of six forms: mean |q|^2 plus and minus each Pauli matrix.
+
+    With the Stokes vector s of a drive, |s| = |q|^2, the least of them is mean |s| - max |s_i|.
+    """
+    rows = np.array([[1, 1], [1, -1], [1, 1j], [1, -1j], [2**0.5, 0], [0, 2**0.5]]) / 2**0.5
+    pair, sign = np.kron(np.eye(3), np.ones((2, 2))), np.kron(np.eye(3), [[1, -1], [-1, 1]])
+    return rows, mean * pair + sign
+
+
+class Octahedron(ForceGoal):
+    name, unit = "octahedron", "N"
+
+    def forms(self, propagator):
+        rows, weights = octahedron(0.5)
+        return torch.from_numpy(rows), weights
+
+    def check(self, scene):
+        pass
+
+
+def test_cells_of_drives_decide_what_the_relaxation_leaves_open():
+    # max |s_i| >= |s| / 3^(1/2) = 0.577 |s|, but a mixture of drives has s = 0 with |q|^2 > 0
+    rows, weights = octahedron(0.5)
+    assert forms_bound(rows, weights) > 0.9
+    assert no_drive_above(rows, weights, 0.0)
+    # with amplitudes 1 and 0.518, |s| = 1.268, and the least form is 1.268 (0.6 - 0.577) = 0.0287
+    assert not no_drive_above(*octahedron(0.6), 0.025)
+    assert no_drive_above(*octahedron(0.6), 0.035)
+    array = at.TransducerArray([(-0.01, 0, 0), (0.01, 0, 0)], normals=(0, 0, 1), source_strength=1.0)
+    two = at.make_propagator(at.Scene(array, MEDIUM, 40e3, [(0, 0, 0.1)]), "free_space")
+    none = at.attainable(at.ForceObjective(two, Octahedron()))
+    assert none.answer is False
+    assert none.score < 0 == none.bound
 
 
 def test_a_lifted_bead_stays_near_its_place(propagator):
