@@ -209,7 +209,7 @@ def test_cells_of_drives_decide_what_the_relaxation_leaves_open():
     two = at.make_propagator(at.Scene(array, MEDIUM, 40e3, [(0, 0, 0.1)]), "free_space")
     none = at.attainable(at.ForceObjective(two, Octahedron()))
     assert none.answer is False
-    assert none.score < 0 == none.bound
+    assert none.score <= 0 == none.bound  # without sound the score is 0
 
 
 def test_a_lifted_bead_stays_near_its_place(propagator):
