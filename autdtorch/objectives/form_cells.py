@@ -23,6 +23,7 @@ from autdtorch.utils.process import one_library_thread
 _MARGIN = 1e-9  # of eigenvalues; rounding of forms of size 1 is below 1e-12
 _CUTS = 40  # eigenvectors for a cell
 _CELLS = 300
+_NARROW = 2e-3  # forms of discs are below 1.3e5 then, and their rounding below the margin
 _REACH = math.sqrt(2) * (1 + 1e-9)  # of a disc around a square of half width 1
 
 
@@ -47,9 +48,9 @@ def no_drive_above(rows: ComplexArray, weights: Array, least: float) -> bool:
         cells = [(np.zeros(len(others), complex), np.ones(len(others)))]
         while cells:
             left -= 1
-            if left < 0:
-                return False
             centres, widths = cells.pop()
+            if left < 0 or widths.min() < _NARROW:
+                return False
             drive = unit[largest] + centres @ others
             if ((above @ drive) @ drive.conj()).real.min() >= 0:
                 return False
