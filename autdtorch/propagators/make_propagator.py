@@ -116,9 +116,9 @@ def make_propagator(
     """
     seconds = None if seconds is None else positive("seconds", seconds, "s")
     memory = None if memory is None else positive("memory", memory, "bytes")
+    planned = plan(scene, method, spacing, tolerance, kernel, dtype, max_periods, time_step, device)
     if spacing is not None and (seconds, memory) != (None, None):
         raise invalid("spacing", spacing, "must be None where seconds or memory limit its choice", "m")
-    planned = plan(scene, method, spacing, tolerance, kernel, dtype, max_periods, time_step, device)
     store = store_in(cache)
 
     @functools.cache  # T-matrices need it for some points only; its time begins then
