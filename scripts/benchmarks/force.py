@@ -15,6 +15,7 @@ from shared.scenes import relative_error
 
 import autdtorch as at
 from autdtorch.propagators import Propagator
+from autdtorch.utils.process import one_library_thread
 
 DOCUMENT = "force.md"
 
@@ -162,6 +163,7 @@ def of_a_cube() -> str:
     )
 
 
+@one_library_thread()
 def rates() -> str:
     """Return the poses of two cubes a second in words."""
     array = at.TransducerArray.grid((4, 4), 10e-3, (0, 0, 0), (0, 0, 1.0), radius=0)
@@ -184,7 +186,7 @@ def rates() -> str:
     alone = rate(POSES // 4, lambda *pose: at.TMatrixCluster([cube.moved(*pose), pair.bodies[1]]))
     return (
         f"Forces with gradients by the pose, two cubes of 10 mm ({len(cube.matrix)} waves each) and\n"
-        f"16 transducers: {as_one:,.0f} poses a second of CPU time where both move as one,\n"
+        f"16 transducers: {as_one:,.0f} poses a second of a core where both move as one,\n"
         f"{alone:.0f} where one of them moves."
     )
 
