@@ -59,15 +59,17 @@ def sees(begin: Array, end: Array, shapes: Sequence[Shape], precision: float) ->
     grid, (begin, end) = begin.shape[:-1], (begin.reshape(-1, 3), end.reshape(-1, 3))
     length, least = np.linalg.norm(end - begin, axis=1), _TOUCHING * precision
     gone, seen = np.zeros(len(length)), np.ones(len(length), bool)
+    before = np.full(len(length), -np.inf)
     going = np.flatnonzero(length > 0)
-    for step in range(_STEPS):
+    for _ in range(_STEPS):
         if not len(going):
             break
         share = (gone[going] / length[going])[:, None]
         places = torch.from_numpy((1 - share) * begin[going] + share * end[going])
         distance = distance_from(shapes, places).numpy()
-        if step:  # a place on a shape looks away from it
-            seen[going] = distance >= least
+        # a place on a shape looks away from it
+        seen[going] = (distance >= least) | (distance > before[going])
+        before[going] = distance
         on = seen[going] & (gone[going] < length[going])
         going = going[on]
         gone[going] = np.minimum(gone[going] + np.maximum(distance[on], least), length[going])

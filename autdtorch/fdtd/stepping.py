@@ -32,7 +32,7 @@ from autdtorch.fdtd.shapes import Shape, distance_from, sees
 from autdtorch.fdtd.stability import whole_steps
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
 from autdtorch.utils.array_types import REAL, Array, Index
-from autdtorch.utils.validation import invalid
+from autdtorch.utils.validation import LENGTH_TOLERANCE, invalid
 
 logger = logging.getLogger(__name__)
 
@@ -94,7 +94,7 @@ class Assembly:
         if not (shapes := region.kinked):
             return behind
         around = distance_from(shapes, torch.from_numpy(points)).numpy()
-        near = np.flatnonzero((around > 0) & (around < math.sqrt(3) * reach))
+        near = np.flatnonzero((around > -LENGTH_TOLERANCE) & (around < math.sqrt(3) * reach))
         for first in range(0, len(near), _LOOKING):
             some = near[first : first + _LOOKING]
             numbers, place = np.unique(cells[some], return_inverse=True)

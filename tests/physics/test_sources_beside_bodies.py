@@ -100,6 +100,18 @@ def test_points_beside_thin_plates_do_not_read_the_sound_behind_them(material):
         assert relative_error(row, exact) < 0.1
 
 
+@pytest.mark.parametrize("material", [{"rigid": True}, {"density": 120.0, "sound_speed": 1400.0}])
+def test_points_on_a_thin_plate_read_the_sound_on_their_side(material):
+    """Points 2 nm from both faces, where control points begin to be accepted, and 30 um further away."""
+    plate = Box((0, 0, 0), (9e-3, 9e-3, 0.4e-3), **material)
+    heights = [side * (0.2e-3 + gap) for gap in (2e-9, 30e-6) for side in (1, -1)]
+    array = TransducerArray([(3e-3, -4e-3, 30e-3)], (0, 0, -1))
+    scene = Scene(array, AIR, 40e3, [(1e-3, 0.3e-3, height) for height in heights], (plate,))
+    matrix = make_propagator(scene, "box", 1e-3, 1e-3, cache=False).transfer_matrix()
+    # at most 0.5 % measured, as a normal derivative is small there; 24 to 200 % across the plate
+    assert relative_error(matrix[:2], matrix[2:]) < 0.03
+
+
 def test_a_small_disc_alone_in_the_box_is_a_point_source():
     """No source is outside the box, where waves are summed."""
     body = Box((0, 0, 0), (6e-3, 6e-3, 6e-3), rigid=True)
