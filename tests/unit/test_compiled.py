@@ -161,6 +161,24 @@ def test_a_process_that_hangs_is_not_waited_for(kernel, monkeypatch):
     assert time.monotonic() - begin < 60
 
 
+@needs_fork
+def test_a_process_that_works_is_waited_for_however_slow_it_is(kernel, monkeypatch, tmp_path):
+    made, _ = kernel
+    monkeypatch.setattr(compiled, "thread_count", lambda: 2)
+    monkeypatch.setattr(compiled, "_PATIENCE", 0.01)
+    monkeypatch.setattr(compiled, "_processor_seconds", lambda child: time.monotonic())
+    with compiled.meanwhile(lambda: (time.sleep(0.5), (tmp_path / "ended").touch())):
+        made()(3)
+    made("tripled")(3)
+    assert (tmp_path / "ended").exists()
+
+
+@needs_fork
+def test_processor_time_is_that_of_a_process():
+    before = time.process_time()
+    assert before <= compiled._processor_seconds(os.getpid()) <= time.process_time()
+
+
 def test_without_a_folder_to_write_to_kernels_run_and_say_so_once(kernel, monkeypatch, caplog):
     def refusing(cache=False, **options):
         if cache:

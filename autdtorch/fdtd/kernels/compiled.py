@@ -8,6 +8,7 @@ import gc
 import hashlib
 import io
 import logging
+import math
 import os
 import signal
 import sys
@@ -35,7 +36,7 @@ _entries: set[Any] = set()
 # See `meanwhile`; of all threads, because a thread of `spread` may be the first to compile
 _calls: list[Callable[[], object]] = []
 _children: list[int] = []  # processes that compile
-_PATIENCE = 30.0  # [s] after which processes that compile are taken to hang
+_PATIENCE = 30.0  # [s] without processor time after which processes that compile are taken to hang
 _POLL = 0.01  # [s] between looks at them
 
 
@@ -168,15 +169,25 @@ def _fork(call: Callable[[], object]) -> None:
 
 def _wait_for_children() -> None:
     """Wait until no other process compiles for this one."""
-    end = time.monotonic() + _PATIENCE
+    worked, end = -1.0, math.inf
     _forget_ended()
     while _children:
         time.sleep(_POLL)
-        if time.monotonic() > end:
+        if (seconds := sum(map(_processor_seconds, tuple(_children)))) != worked:
+            worked, end = seconds, time.monotonic() + _PATIENCE
+        elif time.monotonic() > end:
             for child in tuple(_children):
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(child, signal.SIGKILL)
         _forget_ended()
+
+
+def _processor_seconds(child: int) -> float:
+    """Return the processor time [s] of a process, 0 once it has ended; see `clock_getcpuclockid` of Linux."""
+    try:
+        return time.clock_gettime(~child << 3 | 2)
+    except OSError:
+        return 0.0
 
 
 def _forget_ended() -> None:
