@@ -44,7 +44,8 @@ FINE_LAYER_CELLS, COARSE_LAYER_CELLS = 6, 8
 # three cubes, and leaves 0.45 % for a rigid sphere. In the shadow of a larger body incident and scattered
 # field cancel: behind a plate of 0.1 m, 12 wavelengths, the error at 1 mm is 1.1 %, and 0.3 % with 6 cells.
 # Coarser boxes have 6 cells. With 8, half of such a grid is layers, and the error of a hand differs by less
-# than 0.1 %, of 4 % at 5.4 cells per wavelength and 23 % at 3.4.
+# than 0.1 %, of 4 % at 5.4 cells per wavelength and 23 % at 3.4. Behind plates of 8 wavelengths 6 cells add
+# 0.2 to 0.3 % at 6 cells per wavelength, where 1.3 to 2 % are claimed, and 2 to 3 % of 5 to 10 % at 4.
 _THIN_LAYER_CELLS, _SMALL_BODIES = 4, 4
 # Places on the few separate surfaces in a box, as many on each however small, and the share of their pairs
 # between which sound has arrived before a run may end. Sources drive all of them at once; what later comes
