@@ -6,7 +6,7 @@ Along z by d, waves of an order m stay of this order:
 
 I is the integral of Y_lm^* Y_nm Y_q0 over all directions (Martin, Multiple Scattering (2006), section 3.7).
 Any other shift is one along z between two turns. A turn by an angle about y is one about z between two
-quarter turns, which are constant, so that waves of degree L take O(L^3) operations and no matrix of a pose.
+quarter turns, which are constant. Waves of degree L thus take O(L^3) operations, and no matrix of a pose.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Translation:
     Attributes:
         wavenumber: k [rad/m].
         here: the frame of the regular waves.
-        there: that of the outgoing waves.
+        there: the frame of the outgoing waves.
         is_conjugate: whether radial functions are conjugated, as in the adjoint.
     """
 
