@@ -13,7 +13,7 @@ import numbers
 import os
 import re
 import sys
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias, TypeGuard
 
@@ -93,11 +93,13 @@ def members(name: str, value: object, kind: type) -> tuple[Any, ...]:
 
 
 def _listed(name: str, value: object, accepted: str) -> list[Any]:
-    """Return the entries of an iterable other than text; a user's class may raise anything."""
+    """Return the entries of an iterable other than text; errors of an iterator, such as a generator, pass."""
+    if isinstance(value, Iterator):
+        return list(value)
     try:
         if not isinstance(value, str | bytes):
             return list(value)  # type: ignore[call-overload, no-any-return]
-    except Exception as error:
+    except Exception as error:  # a user's class may raise anything
         raise invalid(name, value, accepted) from error
     raise invalid(name, value, accepted)
 

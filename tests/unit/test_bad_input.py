@@ -332,3 +332,10 @@ def test_the_largest_scene_is_refused_for_its_memory(method: Any) -> None:
     wide = scene(domain=((-far,) * 3, (far,) * 3), obstacles=[wall])
     with pytest.raises(ValueError, match=r"^spacing: 0\.001 m; (needs about|gives) "):
         at.make_propagator(wide, method)
+
+
+def test_errors_of_a_generator_are_its_own() -> None:
+    array, air = at.TransducerArray([(0, 0, 0)], (0, 0, 1)), at.Medium(1.2, 343.0)
+    spheres = (at.Sphere((0, 0, 0.05), radius, rigid=True) for radius in (1e-3, -1e-3))
+    with pytest.raises(ValueError, match=r"^Sphere\.radius: -0\.001"):
+        at.Scene(array, air, 40e3, [(0, 0, 0.1)], spheres)  # type: ignore[arg-type]
