@@ -108,8 +108,8 @@ def test_points_on_a_thin_plate_read_the_sound_on_their_side(material):
     array = TransducerArray([(3e-3, -4e-3, 30e-3)], (0, 0, -1))
     scene = Scene(array, AIR, 40e3, [(1e-3, 0.3e-3, height) for height in heights], (plate,))
     matrix = make_propagator(scene, "box", 1e-3, 1e-3, cache=False).transfer_matrix()
-    # at most 0.5 % measured, as a normal derivative is small there; 24 to 200 % across the plate
-    assert relative_error(matrix[:2], matrix[2:]) < 0.03
+    # 0.1 % measured, as the normal derivative is small there; 46 % with kernels that cross the plate
+    assert relative_error(matrix[:2], matrix[2:]) < 0.02
 
 
 def test_a_small_disc_alone_in_the_box_is_a_point_source():
