@@ -48,10 +48,8 @@ _LEAST_SINGULAR, _SINGULAR_MARGIN = 1e-8, 1e-6
 
 _FEW = 6  # Foci that branch and bound nearly always brings to the highest level
 _WORK_FEW = 3e8  # of branch and bound (`phase_bound`) for few foci: half a second
-_WORK, _MOST_WORK = (
-    4e3,
-    1e8,
-)  # for more, over P M min(P, M), and the most: at most half of the relaxation's time
+_WORK = 4e3  # for more, over P M min(P, M): with the most, at most half of the relaxation's time
+_MOST_WORK = 1e8
 _MOST_JOINT = 48  # Foci of several matrices; more of them take long, and lower a bound by less than 1 %
 _MARGIN = 1e-12
 """Relative margin on top of a bound; rounding of the bound and of a pressure is below 1e-13."""

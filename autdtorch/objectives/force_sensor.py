@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import torch
 
-from autdtorch.objectives.forces import ForceGoal, ForceObjective
-from autdtorch.objectives.goals import Goal
+from autdtorch.objectives.forces import ForceObjective, GoalOfForce
 from autdtorch.objectives.objective import observe_drives
 from autdtorch.utils.validation import ArrayLike, integer_at_least, not_negative, require_kind
 
 
 @dataclass(frozen=True)
-class ForceReading(Goal):
+class ForceReading(GoalOfForce):
     """The goal of a `ForceSensor`: its reading, less that without sound.
 
     Attributes:
@@ -23,20 +21,7 @@ class ForceReading(Goal):
         load: the reading without sound, in the unit of it, >= 0.
     """
 
-    of_pressures: ClassVar[bool] = False
-
-    of: ForceGoal
     load: float
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        """The name of the trap, lift or push."""
-        return self.of.name
-
-    @property
-    def unit(self) -> str:  # type: ignore[override]
-        """The unit of it."""
-        return self.of.unit
 
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:
         """Return the force (...) of readings (..., 1)."""

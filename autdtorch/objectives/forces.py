@@ -54,18 +54,16 @@ _TRANSPARENT = 1e-14  # Largest entry of T by rounding alone; 1e-10 at k a = 1e-
 
 
 @dataclass(frozen=True, eq=False)
-class LeastForm(Goal):
-    """The goal of a `ForceObjective`: the least of J forms, sums of N squared readings with weights.
+class GoalOfForce(Goal):
+    """Base of goals that score readings of a trap, lift or push, and have its name and unit.
 
     Attributes:
         of: the trap, lift or push.
-        weights: (J, N).
     """
 
     of_pressures: ClassVar[bool] = False
 
     of: ForceGoal
-    weights: Array = field(repr=False)
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -76,6 +74,18 @@ class LeastForm(Goal):
     def unit(self) -> str:  # type: ignore[override]
         """The unit of it."""
         return self.of.unit
+
+
+@dataclass(frozen=True, eq=False)
+class LeastForm(GoalOfForce):
+    """The goal of a `ForceObjective`: the least of J forms, sums of N squared readings with weights.
+
+    Attributes:
+        of: the trap, lift or push.
+        weights: (J, N).
+    """
+
+    weights: Array = field(repr=False)
 
     def __eq__(self, other: object) -> bool:
         """Return whether another goal gives the same scores of readings."""
