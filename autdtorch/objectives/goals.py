@@ -38,8 +38,9 @@ class Goal(ABC):
     of_pressures: ClassVar[bool] = True
 
     def __init_subclass__(cls) -> None:
-        """Name a goal without a name after its class."""
-        cls.name = cls.__dict__.get("name", cls.__name__)
+        """Name a goal without a name after its class, unless its base derives names from values."""
+        if not isinstance(getattr(cls, "name", None), property):
+            cls.name = cls.__dict__.get("name", cls.__name__)
 
     @abstractmethod
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:
