@@ -24,7 +24,7 @@ import autdtorch as at
 OPTIONS = {
     "--moves": {"type": int, "default": 25, "help": "moves that are timed, dragged and let go"},
     "--picture": {"type": Path, "default": DOCS / "explore.png", "help": "of the page"},
-    "--more": {"type": int, "default": 500, "help": "moves while memory is watched"},
+    "--more": {"type": int, "default": 500, "help": "moves while memory is watched, 1 or more"},
 }
 
 _WINDOW = {"width": 1280, "height": 900}  # pixels
@@ -127,12 +127,12 @@ def times(tab: Any, place: Iterator[str], moves: int) -> dict[str, list[float]]:
 
 
 def memory(tab: Any, place: Iterator[str], moves: int) -> list[float]:
-    """Return the memory [MB] of this process, which is the server, at the beginning and after some moves."""
+    """Return the memory [MB] of this process, the server: at the beginning, after some moves and at last."""
     process = psutil.Process()
     megabytes = [process.memory_info().rss / 1e6]
     for move in range(1, moves + 1):
         tab.evaluate(_MOVE, ["body_y", next(place), move % 5 == 0])
-        if move % _SOME == 0:
+        if move % _SOME == 0 or move == moves:
             gc.collect()
             megabytes.append(process.memory_info().rss / 1e6)
     return megabytes
