@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,14 @@ from autdtorch.utils.process import cached_property
 _ROUNDING = 1e-6  # Distance [cells] up to which planes are one
 # Distance [cells] to which planes move from vertices: an edge then lies in an element
 _OFF_VERTICES = 1e-5
+
+
+class Parts(NamedTuple):
+    """Parts of elements along an axis, each in one block."""
+
+    middle: Array  # their centres (n,) [cells]
+    width: Array  # [cells] (n,)
+    block: Index  # (n,)
 
 
 @dataclass(frozen=True)
@@ -59,6 +68,13 @@ class Planes:
         some = np.arange(len(self.begin))[kinds]
         first, last = (some, some) if np.ndim(some) == 0 else (some[0], some[-1])
         return np.asarray(self.places[self.first[first] : self.last[last]] - self.begin[first])
+
+    @property
+    def parts(self) -> Parts:
+        """The parts into which the planes divide the elements."""
+        ends = np.union1d(np.arange(len(self.kind) + 1), self.places)
+        middle = (ends[1:] + ends[:-1]) / 2
+        return Parts(middle, np.diff(ends), np.searchsorted(self.places, middle, side="right"))
 
     @property
     def middles(self) -> Array:

@@ -72,7 +72,7 @@ def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
         along |= binary_dilation(along) & ~beside & ~materials.rigid[material]
     index = np.flatnonzero(along), np.flatnonzero(cut & beside)
     parts = (
-        _aligned(bodies, index[0], ~cut.ravel()[index[0]], blocks, grid, materials, stencil),
+        _aligned(index[0], ~cut.ravel()[index[0]], blocks, grid, materials, stencil),
         _interface(bodies, index[1], whole, grid, materials, stencil),
     )
     order = np.argsort(np.concatenate(index))
@@ -82,7 +82,6 @@ def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
 
 
 def _aligned(
-    bodies: list[Union],
     index: Index,
     uncut: NDArray[np.bool_],
     blocks: Blocks,
@@ -94,13 +93,7 @@ def _aligned(
     shape = tuple(cells - 1 for cells in grid.shape)
     first = places_of(index, shape)
     elements = with_losses(lambda kinds: aligned_elements(first, blocks, kinds, stencil), materials, stencil)
-    if not materials.reacting.any():
-        return elements
-    numbers = np.array([body.material for body in bodies], np.int64)
-    return with_impedance_faces(
-        elements, index, shape, uncut, lambda rows: _distances(bodies, first[rows], grid), numbers, materials,
-        stencil,
-    )  # fmt: skip
+    return with_impedance_faces(elements, index, shape, uncut, blocks, materials, stencil)
 
 
 def _blocks(bodies: Sequence[Union], grid: Grid) -> Blocks:

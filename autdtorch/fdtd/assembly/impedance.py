@@ -39,11 +39,11 @@ _LEAST_GRADIENT = 0.3  # Least gradient of a signed distance with which a place 
 
 
 class Facets(NamedTuple):
-    """The surface of a material in the sub-cells of n elements."""
+    """The surface of a material in q parts of n elements."""
 
-    area: Array  # (n, 64) [cells^2]
-    place: Array  # from the first vertex (n, 64, 3) [cells]
-    normal: Array  # outwards (n, 64, 3)
+    area: Array  # (n, q) [cells^2]
+    place: Array  # from the first vertex (n, q, 3) [cells]
+    normal: Array  # outwards (n, q, 3)
 
     def chosen(self, some: NDArray[np.bool_]) -> Facets:
         """Return the surface in some of the elements."""
@@ -51,7 +51,10 @@ class Facets(NamedTuple):
 
 
 def facets(distance: Array, material: Index, number: int, materials: Materials) -> Facets:
-    """Return the surface of a material towards fluids, from signed distances (K, n, 125) of all bodies."""
+    """Return the surface of a material towards fluids in the sub-cells of n elements.
+
+    Signed distances (K, n, 125) are those of all bodies.
+    """
     same = (material == number)[:, None, None]
 
     def fluid(growth: float) -> Array:
@@ -128,7 +131,7 @@ def _lumped(
 
 
 def outer_side(surface: Facets, solid: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Return the depths (n, 64, 8) [cells] of vertices in front of a surface, and their shares in its flow.
+    """Return the depths (n, q, 8) [cells] of vertices in front of a surface, and their shares in its flow.
 
     `solid` (n, 8) is the mask of the vertices in rigid bodies. These, and vertices behind, have no share.
     """

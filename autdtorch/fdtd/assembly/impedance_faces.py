@@ -17,18 +17,18 @@ times the squared sine of incidence. As a square, T is passive.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from autdtorch.fdtd.assembly.aligned import Blocks
 from autdtorch.fdtd.assembly.element import PAIRS, VERTICES, InterfaceElements, Materials
-from autdtorch.fdtd.assembly.impedance import LARGEST_PHASE, facets, outer_side
+from autdtorch.fdtd.assembly.impedance import LARGEST_PHASE, Facets, outer_side
 from autdtorch.fdtd.stencil import Stencil, flat_strides
 from autdtorch.utils.array_types import Array, ComplexArray, Index
 
-_CHUNK = 8192  # Elements measured at a time
-_ACROSS = 0.99  # Least component along an axis of the normal of a face across it
 # Largest |b Y|, so that time steps stay long, and largest part of it that adds mass, relative to kappa: the
 # second vertex gives this mass, and keeps most of its own
 _LARGEST, _LARGEST_MASS = 0.5, 0.3
@@ -37,50 +37,67 @@ _PAIR[PAIRS[:, 0], PAIRS[:, 1]] = _PAIR[PAIRS[:, 1], PAIRS[:, 0]] = np.arange(le
 _NEXT = (4, 2, 1)  # Difference of the numbers of two vertices along each axis
 
 
+class _Faces(NamedTuple):
+    """n rectangles of surfaces that face up or down an axis, each in one element."""
+
+    material: Index  # number of the material behind (n,)
+    first: Index  # first cell of the element (n, 3)
+    surface: Facets  # one a rectangle
+
+
+def _faces(blocks: Blocks, axis: int, up: int, materials: Materials) -> _Faces:
+    """Return the faces of reacting materials towards fluids, up an axis (`up` 1) or down it (0)."""
+    planes, others = blocks.planes[axis], [other for other in range(3) if other != axis]
+    parts = [blocks.planes[other].parts for other in others]
+    material = np.moveaxis(blocks.material, axis, 0)[:, parts[0].block][:, :, parts[1].block]
+    behind, front = (material[:-1], material[1:]) if up else (material[1:], material[:-1])
+    number, *place = np.nonzero(materials.reacting[behind] & ~materials.rigid[front])
+    middle, area = np.zeros((len(number), 3)), np.ones(len(number))
+    middle[:, axis] = planes.places[number]
+    for other, each, some in zip(others, parts, place, strict=True):
+        middle[:, other] = each.middle[some]
+        area *= each.width[some]
+    first = np.floor(middle).astype(np.int64)
+    normal = np.zeros((len(number), 1, 3))
+    normal[:, :, axis] = 2 * up - 1
+    surface = Facets(area[:, None], (middle - first)[:, None], normal)
+    return _Faces(behind[number, place[0], place[1]], first, surface)
+
+
 def with_impedance_faces(
     elements: InterfaceElements,
     index: Index,
     shape: Sequence[int],
     uncut: NDArray[np.bool_],
-    distances: Callable[[Index], Array],
-    material: Index,
+    blocks: Blocks,
     materials: Materials,
     stencil: Stencil,
 ) -> InterfaceElements:
-    """Return n elements along the grid with the admittances of faces in them.
+    """Return n elements along the grid with the admittances of faces of blocks in them.
 
     `index` (n,) are their flat indices on a grid of `shape` elements, ascending. The mask `uncut` (n,) has
-    those without a face, beside the others. `distances` returns the signed distances (K, k, 125) of bodies of
-    the materials (K,) in some elements (k,).
+    those without a face, beside the others.
     """
-    admittance = np.zeros(0) if materials.losses is None else materials.losses.admittance
-    coupling = np.zeros((2, len(index), 28), complex)  # T off its diagonal, where it adds mass and stiffness
-    mass = np.zeros((2, len(index), 8), complex)  # and sums of its rows
-    cut = np.flatnonzero(~uncut)
-    for begin in range(0, len(cut), _CHUNK):
-        rows = cut[begin : begin + _CHUNK]
-        distance = distances(rows)
-        for number in np.flatnonzero(admittance).tolist():
-            surface = facets(distance, material, number, materials)
-            depth, shares = outer_side(surface, materials.rigid[elements.material[rows]])
-            across = np.abs(surface.normal) > _ACROSS
-            for vertex, axis in np.ndindex(8, 3):
-                step = (2 * VERTICES[vertex, axis] - 1) * flat_strides(shape)[axis]
-                beyond = np.searchsorted(index, index[rows] + step).clip(max=len(index) - 1)
-                linked = uncut[beyond] & (index[beyond] == index[rows] + step)
-                here = across[:, :, axis] if axis else across[:, :, 0] | ~across.any(axis=2)
-                second = np.where(linked[:, None] & across[:, :, axis], 1.0, 0.0)
-                first, second, flow = _face(depth[:, :, vertex], second, admittance[number], stencil.kappa)
-                flow *= surface.area * shares[:, :, vertex] * here
-                for kind, of_kind in enumerate((flow.imag <= 0, flow.imag > 0)):
-                    part = np.where(of_kind, flow, 0)
-                    mass[kind, rows, vertex] += (part * first * (first + second)).sum(axis=1)
-                    mass[kind, beyond, vertex] += (part * second * (first + second)).sum(axis=1)
-                    pair = _PAIR[vertex, vertex ^ _NEXT[axis]]
-                    coupling[kind, beyond, pair] += (part * first * second).sum(axis=1)
+    if materials.losses is None or not materials.reacting.any():
+        return elements
+    # T off its diagonal, and sums of its rows where it adds mass and stiffness
+    coupling, mass = np.zeros((len(index), 28), complex), np.zeros((2, len(index), 8), complex)
+    for axis, up in np.ndindex(3, 2):
+        faces = _faces(blocks, axis, up, materials)
+        row, along = _rows(faces.first @ flat_strides(shape), index)
+        material, row, surface = faces.material[along], row[along], faces.surface.chosen(along)
+        depth, shares = outer_side(surface, materials.rigid[elements.material[row]])
+        beyond, linked = _rows(index[row] + (2 * up - 1) * flat_strides(shape)[axis], index)
+        admittance = materials.losses.admittance[material]
+        first, second, flow = _face(depth.max(axis=(1, 2)), linked & uncut[beyond], admittance, stencil.kappa)
+        kind = np.where(flow.imag > 0, 1, 0)
+        for vertex in np.flatnonzero(VERTICES[:, axis] == up):
+            part = flow * surface.area[:, 0] * shares[:, 0, vertex]
+            np.add.at(mass, (kind, row, vertex), part * first * (first + second))
+            np.add.at(mass, (kind, beyond, vertex), part * second * (first + second))
+            np.add.at(coupling, (beyond, _PAIR[vertex, vertex ^ _NEXT[axis]]), part * first * second)
     factor = stencil.slope.real / 2
-    heavy, stiff = factor * mass
-    links = factor * coupling.sum(axis=0)
+    links, (heavy, stiff) = factor * coupling, factor * mass
     return elements._replace(
         coupling=elements.coupling - links.imag,
         mass=elements.mass - heavy.imag / stencil.symbol,
@@ -88,8 +105,14 @@ def with_impedance_faces(
     )
 
 
+def _rows(flat: Index, index: Index) -> tuple[Index, NDArray[np.bool_]]:
+    """Return the places of flat indices (n,) in an ascending `index`, and a mask of those in it."""
+    row = np.searchsorted(index, flat).clip(max=len(index) - 1)
+    return row, index[row] == flat
+
+
 def _face(
-    depth: Array, linked: Array, admittance: complex, kappa: float
+    depth: Array, linked: NDArray[np.bool_], admittance: ComplexArray, kappa: float
 ) -> tuple[Array, Array, ComplexArray]:
     """Return a, b and Y / (1 - i Y s) of faces at depths [cells]; b is 0 where `linked` is."""
     near = np.clip(kappa * depth, 0, LARGEST_PHASE)
