@@ -34,7 +34,7 @@ from autdtorch.fdtd.stepping import air_stencil, assemble_on
 from autdtorch.propagators import make_propagator
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import strengths_of
-from autdtorch.scene.obstacles import Box, Sphere
+from autdtorch.scene.obstacles import Box, Cylinder, Sphere
 
 CENTER = np.array([0.13e-3, 0.21e-3, -0.32e-3])
 """Centre of bodies between the cells [m]."""
@@ -249,10 +249,11 @@ def test_walls_with_an_impedance_reflect_as_they_should(impedance, thickness):
     assert abs(transmitted) < 1e-6
 
 
-# Twice what is measured. With the pressure of the nearest cell alone, faces 0.65 cells away err by 0.05, and
-# by an amount that grows with the square of the distance.
+# The reaction of the air before the face is exact at the normal alone. At 40 degrees it errs by 0.002 at a
+# depth of 0.35 cells and by 0.003 at 0.65, in third order of the wavenumber: the tolerances are twice that.
+# With the nearest cell alone, 0.65 cells away, the error would be 0.05.
 @pytest.mark.parametrize("impedance", [3.0, 3 - 1j])
-@pytest.mark.parametrize(("depth", "tolerance"), [(0.35, 0.004), (0.65, 0.01)])
+@pytest.mark.parametrize(("depth", "tolerance"), [(0.35, 0.004), (0.65, 0.006)])
 def test_walls_with_an_impedance_reflect_obliquely_wherever_they_are(impedance, depth, tolerance):
     angle = math.radians(40)
     expected = (impedance * math.cos(angle) - 1) / (impedance * math.cos(angle) + 1)
@@ -269,23 +270,38 @@ def test_faces_along_the_grid_are_passive_and_stable(impedance, place):
     require_passive_and_stable(region, make_box(region, 1.1e-3))
 
 
-def test_areas_of_surfaces_are_true():
-    """All vertices together share the area of tilted and of curved surfaces, where waves are long."""
-    for shape, area in (
-        (Sphere(tuple(CENTER), 6.3e-3, rigid=True), 4 * math.pi * 6.3**2),
-        (Box(tuple(CENTER), (9e-3, 7e-3, 8e-3), rotation=(0.5, 0.3, 0.2), rigid=True), 2 * (63 + 72 + 56)),
-        (Box(tuple(CENTER), (9e-3, 7e-3, 8e-3), rigid=True), 2 * (63 + 72 + 56)),
+def surface_of_box(x, y, z):
+    return 2 * (x * y + y * z + z * x)
+
+
+# The sum of the damping is off by the square of the phase between two cells at 4 kHz, 5e-4 and less; along
+# the grid areas are exact. Elsewhere distances are linear in quarters of a cell: edges are rounded by a few
+# hundredths of a cell, 0.4 % of these bodies, and 1.6 % of the plate, whose rim is two edges.
+@pytest.mark.parametrize("spacing", [0.93e-3, 1.1e-3, 1.21e-3, 1.31e-3, 1.6e-3])
+@pytest.mark.parametrize(
+    ("shape", "area", "tolerance"),
+    [
+        (Box(tuple(CENTER), (9e-3, 7e-3, 8e-3), rigid=True), surface_of_box(9, 7, 8), 2e-3),
+        (Box(tuple(CENTER), (9e-3, 0.7e-3, 8e-3), rigid=True), surface_of_box(9, 0.7, 8), 2e-3),
+        (Box(tuple(CENTER), (9e-3, 7e-3, 8e-3), (0.5, 0.3, 0.2), rigid=True), surface_of_box(9, 7, 8), 0.01),
         (
-            Box(tuple(CENTER), (9e-3, 0.7e-3, 8e-3), rotation=(0.5, 0.3, 0.2), rigid=True),
-            2 * (72 + 6.3 + 5.6),
+            Box(tuple(CENTER), (9e-3, 0.7e-3, 8e-3), (0.5, 0.3, 0.2), rigid=True),
+            surface_of_box(9, 0.7, 8),
+            0.03,
         ),
-    ):
-        region = replace(region_of_bodies(Body(shape, None, impedance=1.0)), frequency=4e3)
-        grid = make_box(region, 1e-3)
-        stencil = air_stencil(grid, region)
-        cells = heterogeneous_cells(elements_of(region, grid, stencil), stencil)
-        # edges of a box are rounded by an element's share: 1 %
-        assert cells.loss_rows[:, 27].sum() == pytest.approx(stencil.slope.real / 2 * area, rel=0.01)
+        (Sphere(tuple(CENTER), 4e-3, rigid=True), 4 * math.pi * 4**2, 4e-3),
+        (Cylinder(tuple(CENTER), 4e-3, 6e-3, (0.5, 0.3, 0.2), rigid=True), 2 * math.pi * 4 * (4 + 6), 0.01),
+    ],
+    ids=["box", "plate", "turned box", "turned plate", "sphere", "cylinder"],
+)
+def test_areas_of_surfaces_are_true(shape, area, tolerance, spacing):
+    """All vertices together share the area of surfaces, where waves are long, wherever these fall."""
+    region = replace(region_of_bodies(Body(shape, None, impedance=1.0)), frequency=4e3)
+    grid = make_box(region, spacing)
+    stencil = air_stencil(grid, region)
+    cells = heterogeneous_cells(elements_of(region, grid, stencil), stencil)
+    total = cells.loss_rows[:, 27].sum() / (stencil.slope.real / 2) * (1e3 * spacing) ** 2
+    assert total == pytest.approx(area, rel=tolerance)
 
 
 def test_a_lossy_plate_continues_through_the_boundary_layers():

@@ -12,6 +12,7 @@ mass, and a positive one (a mass) adds stiffness against silence: all are positi
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,6 @@ from autdtorch.fdtd.assembly.element import (
     shares,
     subcell_gradients,
     subcell_means,
-    volume_coverage,
 )
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, ComplexArray, Index
@@ -35,6 +35,7 @@ from autdtorch.utils.array_types import Array, ComplexArray, Index
 _GROWTH = 1e-3  # Distance [cells] by which a body grows and shrinks for the area of its surface
 _CENTERS = (np.array(list(np.ndindex((SUBCELLS,) * 3))) + 0.5) / SUBCELLS  # of the sub-cells (64, 3)
 LARGEST_PHASE = 1.2  # Largest phase between a vertex and a surface [rad]
+_LEAST_WIDTH = 4e-3  # Least change of a distance over a sub-cell [cells]: cubes of it are not rounding
 _LEAST_GRADIENT = 0.3  # Least gradient of a signed distance with which a place is moved to the surface
 
 
@@ -58,7 +59,7 @@ def facets(distance: Array, material: Index, number: int, materials: Materials) 
     same = (material == number)[:, None, None]
 
     def fluid(growth: float) -> Array:
-        share = shares(volume_coverage, distance - growth * same, material, len(materials.density))
+        share = shares(_coverage, distance - growth * same, material, len(materials.density))
         return np.asarray(share[..., ~materials.rigid].sum(axis=2))
 
     area = (fluid(-_GROWTH) - fluid(_GROWTH)) / (2 * _GROWTH) / SUBCELLS**3
@@ -67,6 +68,21 @@ def facets(distance: Array, material: Index, number: int, materials: Materials) 
     steep = np.maximum(np.linalg.norm(gradient, axis=2, keepdims=True), _LEAST_GRADIENT)
     place = _CENTERS - subcell_means(level)[..., None] * gradient / steep**2
     return Facets(np.maximum(area, 0), np.clip(place, 0, 1), gradient / steep)
+
+
+def _coverage(distance: Array) -> Array:
+    """Return the share of each sub-cell (..., 64) inside a body, exact for faces at any tilt.
+
+    Along each axis a linear distance is spread evenly: the share is the distribution of a sum of three.
+    """
+    slopes = np.moveaxis(subcell_gradients(distance), -1, 0)
+    width = np.maximum(np.abs(slopes) / SUBCELLS, _LEAST_WIDTH)
+    level = np.clip(subcell_means(distance), -1, 1)
+    total = np.zeros_like(level)
+    for sides in itertools.product((-1, 1), repeat=3):
+        end = (np.array(sides) / 2) @ width.reshape(3, -1)
+        total += np.prod(sides) * np.maximum(end.reshape(level.shape) - level, 0) ** 3
+    return np.asarray(np.clip(total / (6 * width.prod(axis=0)), 0, 1))
 
 
 def with_impedance(
