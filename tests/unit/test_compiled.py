@@ -44,6 +44,10 @@ def doubled(x):
 @entry(Path(__file__).parent)
 def tripled(x):
     return 3 * x
+
+@entry(Path(__file__).parent)
+def halved(x):
+    return x / 2
 """
 
 
@@ -110,13 +114,16 @@ needs_fork = pytest.mark.skipif(sys.platform != "linux", reason="compiles in one
 @needs_fork
 def test_another_process_compiles_what_is_needed_next(kernel):
     made, _ = kernel
-    ahead = made("tripled")
+    ahead, then = made("tripled"), made("halved")
+    calls = lambda: spread(ahead, (3, 3)), lambda: then(4)
     # a second thread there would wait for numba's lock, which the first holds
-    with threads(2), one_library_thread(), compiled.meanwhile(lambda: spread(ahead, (3, 3))):
+    with threads(2), one_library_thread(), compiled.meanwhile(ahead, *calls):
         assert made()(3) == 6
+    assert len(then.signatures) == 1
     assert ahead(3) == 9
-    assert hits(ahead) == 1
-    with threads(2), compiled.meanwhile(lambda: ahead(3)):
+    assert (hits(ahead), hits(then)) == (1, 0)
+    assert gc.isenabled()
+    with threads(2), compiled.meanwhile(ahead, lambda: ahead(3)):
         made()(3)  # loaded from disk
     assert not compiled._children
 
@@ -126,16 +133,19 @@ def test_what_no_other_process_can_compile_is_compiled_here(kernel, monkeypatch)
     made, _ = kernel
     forks = mock.Mock(side_effect=BlockingIOError("Resource temporarily unavailable"))
     monkeypatch.setattr(os, "fork", forks)
-    with threads(2), compiled.meanwhile(lambda: None):
-        assert made()(3) == 6
-    forks.assert_called_once()
-    assert not compiled._calls
+    first, ahead, then = made(), made("tripled"), mock.Mock()
+    with threads(2), compiled.meanwhile(first, lambda: None, then), compiled.meanwhile(ahead, then, then):
+        assert first(3) == 6
+    forks.assert_called_once()  # for the one that is not compiled here
+    assert not then.called
+    assert not compiled._ahead
 
 
 def test_kernels_are_compiled_ahead_for_the_types_of_a_simulation(monkeypatch):
     calls = []
 
-    def noted(*some):
+    def noted(kernel, *some):
+        assert kernel is cpu._advance
         calls.extend(some)
         return contextlib.nullcontext()
 
@@ -154,7 +164,7 @@ def test_a_process_that_hangs_is_not_waited_for(kernel, monkeypatch):
     made, _ = kernel
     monkeypatch.setattr(compiled, "thread_count", lambda: 2)
     monkeypatch.setattr(compiled, "_PATIENCE", 0.1)
-    with compiled.meanwhile(lambda: time.sleep(600)):
+    with compiled.meanwhile(made("tripled"), lambda: time.sleep(600)):
         made()(3)
     begin = time.monotonic()
     assert made("tripled")(3) == 9
@@ -167,10 +177,22 @@ def test_a_process_that_works_is_waited_for_however_slow_it_is(kernel, monkeypat
     monkeypatch.setattr(compiled, "thread_count", lambda: 2)
     monkeypatch.setattr(compiled, "_PATIENCE", 0.01)
     monkeypatch.setattr(compiled, "_processor_seconds", lambda child: time.monotonic())
-    with compiled.meanwhile(lambda: (time.sleep(0.5), (tmp_path / "ended").touch())):
+    go, ended = tmp_path / "go", tmp_path / "ended"
+
+    def wait():
+        end = time.monotonic() + 60
+        while not go.exists() and time.monotonic() < end:
+            time.sleep(0.01)
+        time.sleep(0.3)
+        ended.touch()
+
+    with compiled.meanwhile(made("tripled"), wait):
         made()(3)
+    assert made("halved")(3) == 1.5
+    assert not ended.exists()  # other kernels do not wait for it
+    go.touch()
     made("tripled")(3)
-    assert (tmp_path / "ended").exists()
+    assert ended.exists()
 
 
 @needs_fork
@@ -189,7 +211,7 @@ def test_without_a_folder_to_write_to_kernels_run_and_say_so_once(kernel, monkey
     compiled._log_once.cache_clear()
     monkeypatch.setattr(compiled, "njit", refusing)
     monkeypatch.setattr(compiled, "_fork", None)  # is not called: another process could save nothing
-    with threads(2), compiled.meanwhile(lambda: None):
+    with threads(2), compiled.meanwhile(made("tripled"), lambda: None):
         assert made()(3) == made()(3) == 6
     assert caplog.text.count("compiled in every process") == 1
     assert not os.path.exists(folder)

@@ -16,15 +16,16 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from numba import njit
 from numba.core import event
-from numba.core.caching import IndexDataCacheFile, NullCache
+from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.compiler_machinery import AnalysisPass, register_pass
+from numba.core.runtime.nrt import rtsys
 from numba.core.typed_passes import AnnotateTypes
 
 from autdtorch.utils.process import hold_at_fork, thread_count
@@ -34,8 +35,8 @@ logger = logging.getLogger(__name__)
 _HERE = Path(__file__).parent
 _entries: set[Any] = set()
 # See `meanwhile`; of all threads, because a thread of `spread` may be the first to compile
-_calls: list[Callable[[], object]] = []
-_children: list[int] = []  # processes that compile
+_ahead: list[_Ahead] = []
+_children: dict[int, str] = {}  # processes that compile a kernel, and the index of its files
 _PATIENCE = 30.0  # [s] without processor time after which processes that compile are taken to hang
 _POLL = 0.01  # [s] between looks at them
 
@@ -91,7 +92,7 @@ class _InnerCompiler(CompilerBase):
 # Options of functions that compiled functions call: no wrappers for Python, no checks of division by zero.
 # `fastmath` must stay off. It lets the compiler reorder sums, in a different way wherever a call is inlined:
 # a kernel loaded from disk then rounds differently from the one just compiled.
-# References to arrays are not counted: those that make arrays must set `_nrt`, and none returns one.
+# References to arrays are not counted, as none of them makes or returns one.
 INNER: Any = {
     "error_model": "numpy",
     "nogil": True,
@@ -102,6 +103,12 @@ INNER: Any = {
 }
 
 
+class _Ahead(NamedTuple):
+    kernel: Any
+    call: Callable[[], object]  # compiles it
+    others: tuple[Callable[[], object], ...]  # compile others
+
+
 class _Compilation(event.Listener):
     """Logs that a kernel is compiled, which takes seconds; loading one from disk takes none.
 
@@ -110,6 +117,7 @@ class _Compilation(event.Listener):
 
     def __init__(self) -> None:
         self._paused = False
+        self._others: list[Callable[[], object]] = []  # that follow what is compiled now
 
     def on_start(self, event: Any) -> None:
         function = event.data["dispatcher"]
@@ -118,12 +126,19 @@ class _Compilation(event.Listener):
             self._paused = gc.isenabled()
             gc.disable()
             with contextlib.suppress(IndexError):  # no more
-                while not isinstance(function._cache, NullCache):  # others could save nothing
-                    _fork(_calls.pop())
+                while not isinstance(function._cache, NullCache):  # another process could save nothing
+                    ahead = _ahead.pop()
+                    if function is not ahead.kernel and _fork(ahead):
+                        self._others.extend(ahead.others)
 
     def on_end(self, event: Any) -> None:
-        if self._paused and event.data["dispatcher"] in _entries:
+        if event.data["dispatcher"] not in _entries:
+            return
+        if self._paused:
             gc.enable()
+        others, self._others = self._others, []
+        for call in others:
+            call()
 
 
 event.register("numba:compile", _Compilation())  # type: ignore[no-untyped-call]
@@ -131,52 +146,54 @@ hold_at_fork(global_compiler_lock)
 
 
 @contextlib.contextmanager
-def meanwhile(*calls: Callable[[], object]) -> Iterator[None]:
-    """Make calls in processes of their own as soon as a kernel is compiled here, so that theirs are too.
+def meanwhile(kernel: Any, call: Callable[[], object], *others: Callable[[], object]) -> Iterator[None]:
+    """Make a call in a process of its own as soon as another kernel is compiled here, so that its is too.
 
-    They write them to disk, from where this process loads them. Without a fork or a second processor, this
-    process compiles all kernels.
+    That process writes the kernel to disk, from where this process loads it. The calls of `others` follow
+    here at once, as their kernels share functions with the one that was compiled. Without a fork or a second
+    processor, kernels are compiled here when they are needed.
     """
+    ahead = _Ahead(kernel, call, others)
     if sys.platform == "linux" and thread_count() > 1:
-        _calls.extend(calls)
+        _ahead.append(ahead)
     try:
         yield
     finally:
-        for call in calls:
-            with contextlib.suppress(ValueError):  # made
-                _calls.remove(call)
+        with contextlib.suppress(ValueError):  # made
+            _ahead.remove(ahead)
         _forget_ended()
 
 
-def _fork(call: Callable[[], object]) -> None:
+def _fork(ahead: _Ahead) -> bool:
+    """Return whether another process compiles a kernel."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of other threads: see utils/process.py
         try:
             child = os.fork()
         except OSError:  # too many processes, or too little memory: this one compiles
-            return
+            return False
     if child:
-        _children.append(child)
-        return
+        _children[child] = ahead.kernel._cache._cache_file._index_path
+        return True
     try:
-        _calls.clear()
+        _ahead.clear()
         _children.clear()
         logging.disable()
-        call()
+        ahead.call()
     finally:
         os._exit(0)
 
 
-def _wait_for_children() -> None:
-    """Wait until no other process compiles for this one."""
+def _wait_for_children(index: str) -> None:
+    """Wait until no other process compiles the kernel with these files for this one."""
     worked, end = -1.0, math.inf
     _forget_ended()
-    while _children:
+    while children := [child for child, theirs in tuple(_children.items()) if theirs == index]:
         time.sleep(_POLL)
-        if (seconds := sum(map(_processor_seconds, tuple(_children)))) != worked:
+        if (seconds := sum(map(_processor_seconds, children))) != worked:
             worked, end = seconds, time.monotonic() + _PATIENCE
         elif time.monotonic() > end:
-            for child in tuple(_children):
+            for child in children:
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(child, signal.SIGKILL)
         _forget_ended()
@@ -197,8 +214,16 @@ def _forget_ended() -> None:
         except ChildProcessError:  # another thread has waited for it
             ended = True
         if ended:
-            with contextlib.suppress(ValueError):  # another thread has removed it
-                _children.remove(child)
+            _children.pop(child, None)  # or another thread has removed it
+
+
+class _Cache(FunctionCache):
+    """Numba's cache of a kernel, which loads it without what only a compilation needs: 0.2 s."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
 
 
 class _CheckedFiles(IndexDataCacheFile):
@@ -209,7 +234,7 @@ class _CheckedFiles(IndexDataCacheFile):
     """
 
     def load(self, key: Any) -> Any:
-        _wait_for_children()
+        _wait_for_children(self._index_path)
         return super().load(key)  # type: ignore[no-untyped-call]
 
     def save(self, key: Any, data: Any) -> None:
@@ -258,6 +283,7 @@ def entry(folder: Path = _HERE, **options: Any) -> Callable[[Callable[..., Any]]
         function.__qualname__ += f"_{_digest(folder)}"
         try:
             dispatcher = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+            dispatcher._cache.__class__ = _Cache
             dispatcher._cache._cache_file.__class__ = _CheckedFiles
         except RuntimeError as error:  # no folder to write to
             _log_once(f"kernels are compiled in every process, 10 to 30 s: {error}")

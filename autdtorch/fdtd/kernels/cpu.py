@@ -16,6 +16,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from typing import Any
 
 import numpy as np
 import torch
@@ -137,40 +138,37 @@ def _finish_chunk(c, q, medium, cells, losses, outermost, sources, row, sound_ha
         q[sound_hard[n]] = 0
 
 
-@njit(**INNER | {"_nrt": True})
-def _stretch_columns(p, columns, beside, place, memory, terms):  # type: ignore[no-untyped-def]
-    """Advance the columns' memory and write their terms (L, m), with summands from `beside` at `place`."""
-    index, offset, weight, b_half, a_half, b_cell, a_cell = columns
+@njit(**INNER)
+def _stretch_columns(p, columns, beside, place, memory):  # type: ignore[no-untyped-def]
+    """Advance the columns' memory and set their terms, with summands from `beside` at `place`."""
+    index, offset, weight, u, terms, b_half, a_half, b_cell, a_cell = columns
     psi, zeta = memory
     count, depths = index.shape
-    more = beside.ravel()
-    u = np.zeros(depths * count, p.dtype)
     for n in range(count):
         for depth in range(1, depths):
             total = p[0] - p[0]
             for m in range(weight.shape[1]):
                 total += weight[n, m] * p[index[n, depth] + offset[n, m]]
-            if place[n, depth] < len(more):
-                total += more[place[n, depth]]
+            if place[n, depth] < len(beside):
+                total += beside[place[n, depth]]
             u[depth * count + n] = total
     zero, profile = np.uint64(0), (b_half, a_half, b_cell, a_cell)
     stretch(
-        u, zero, np.uint64(count), psi.ravel(), zero, zeta.ravel(), zero, terms.ravel(), zero,
-        np.uint64((depths - 2) * count), profile, zero,
-    )  # fmt: skip
+        u, zero, np.uint64(count), psi, zero, zeta, zero, terms, zero, np.uint64(len(terms)), profile, zero
+    )
 
 
-@njit(**INNER | {"_nrt": True})
+@njit(**INNER)
 def _finish_columns(p, q, columns, memory):  # type: ignore[no-untyped-def]
     """Add the terms of interfaces through the layers."""
-    (cut, crossed, crossing), (cut_memory, crossed_memory) = columns, memory
-    shares, beside = np.zeros_like(cut_memory[1]), np.zeros_like(crossed_memory[1])
-    alone, nothing = np.zeros_like(crossed[0]), np.zeros((0, 0), p.dtype)
-    _stretch_columns(p, crossed, nothing, alone, crossed_memory, beside)
-    _stretch_columns(p, cut, beside, crossing, cut_memory, shares)
-    for n in range(len(cut[0])):
-        for depth in range(len(shares)):
-            q[cut[0][n, depth + 1]] += shares[depth, n]
+    (cut, crossed, crossing, nothing, nowhere), (cut_memory, crossed_memory) = columns, memory
+    _stretch_columns(p, crossed, nothing, nowhere, crossed_memory)
+    _stretch_columns(p, cut, crossed[4], crossing, cut_memory)
+    index, terms = cut[0], cut[4]
+    count = len(index)
+    for n in range(count):
+        for depth in range(index.shape[1] - 2):
+            q[index[n, depth + 1]] += terms[depth * count + n]
 
 
 @entry()
@@ -236,9 +234,22 @@ def _idle(runs: AnyArray, shape: torch.Size) -> tuple[AnyArray, AnyArray]:
     return np.stack((np.minimum(first, last), last), axis=1).astype(np.uint64), starts
 
 
-def _columns(c: Coefficients, columns: Columns) -> tuple[AnyArray, ...]:
+def _columns(c: Coefficients) -> tuple[Any, ...]:
+    """Return columns, crossed ones, places of these ones' terms, and for these no terms at no places."""
+    none = torch.zeros_like(c.crossed.index).numpy()
+    return *(_filed(c, each) for each in (c.columns, c.crossed)), c.crossing.numpy(), _zeros(c, 0), none
+
+
+def _filed(c: Coefficients, columns: Columns) -> tuple[AnyArray, ...]:
+    """Return cells, offsets, weights, workspace for sums across and for terms, and profile of columns."""
     parts = columns.index, columns.offset, columns.weight
-    return *(part.contiguous().numpy() for part in parts), *rows_profile(c, len(columns.index))
+    count, cells = len(columns.index), c.layer_cells
+    work = _zeros(c, (cells + 2) * count), _zeros(c, cells * count)
+    return *(part.contiguous().numpy() for part in parts), *work, *rows_profile(c, count)
+
+
+def _zeros(c: Coefficients, count: int) -> AnyArray:
+    return c.layer_decay.new_zeros(count).numpy()
 
 
 def _heterogeneous_cells(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, ...]:
@@ -336,8 +347,8 @@ class CpuKernel:
             _heterogeneous_cells(c, shape),
             _losses(c, plane, cuts, dtype),
             workspace(cuts, shape, c.layer_cells, dtype),
-            (_columns(c, c.columns), _columns(c, c.crossed), c.crossing.numpy()),
-            tuple((psi.numpy(), zeta.numpy()) for psi, zeta in state.memory[4:]),
+            _columns(c),
+            tuple((psi.view(-1).numpy(), zeta.view(-1).numpy()) for psi, zeta in state.memory[4:]),
             _unsigned(c.sound_hard_index),
             # numba compiles again for arrays with gaps, and crashed when it loaded that from disk
             (_unsigned(sources.index), sources.force.mT.contiguous().numpy()),
@@ -352,7 +363,7 @@ class CpuKernel:
         return WaveState(now, before, state.memory), torch.from_numpy(recorded)
 
     def compiled_ahead(self, c: Coefficients) -> AbstractContextManager[None]:
-        """Compile `advance` and the sums over sources in other processes while others are compiled here."""
+        """Compile `advance` in another process while the sums of waves are compiled here."""
         none = torch.zeros((0, 1), dtype=torch.int64, device="cpu")
         silent = torch.zeros((0, 1), dtype=c.layer_decay.dtype, device="cpu")
 
@@ -364,7 +375,7 @@ class CpuKernel:
             places = torch.eye(3, **REAL)
             superposition(places[:1], places[1:], torch.ones((2, 1), **COMPLEX), 1.0, dtype=silent.dtype)
 
-        return meanwhile(step, add)
+        return meanwhile(_advance, step, add)
 
     def _work(self, advance: Callable[[], object], chunks: int) -> None:
         """Step on as many threads as chunks and free processors; workers that wait are slower than one."""
