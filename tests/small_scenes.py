@@ -8,7 +8,7 @@ import torch
 
 from autdtorch.fdtd.kernels.contract import Receivers, Sources, WaveState
 from autdtorch.fdtd.stepping import Assembly, assemble
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.plan import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask

@@ -21,7 +21,8 @@ from autdtorch.objectives.readings import Readings
 from autdtorch.propagators import make_propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.study.run_study import StudyMethod
-from autdtorch.utils.validation import invalid, path_of, require_known, within
+from autdtorch.utils.files import path_of
+from autdtorch.utils.validation import invalid, require_known, within
 
 _SETTINGS = (
     "scene",

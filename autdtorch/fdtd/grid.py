@@ -1,10 +1,9 @@
-"""The grid: cubic cells over a domain, with a boundary layer around it; its spacing and its error."""
+"""The grid: cubic cells over a domain, with a boundary layer around it."""
 
 from __future__ import annotations
 
-import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,16 +19,8 @@ from autdtorch.fdtd.stencil import places_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.process import cached_property
 from autdtorch.utils.spatial import parts_of, places_on
-from autdtorch.utils.validation import invalid, positive
+from autdtorch.utils.validation import invalid
 
-logger = logging.getLogger(__name__)
-
-MIN_CELLS_PER_WAVELENGTH = 3.0  # Fewest cells per wavelength; coarser grids are refused
-# Fewest cells per wavelength without a warning. On coarser grids points would need interpolation over more
-# than 10 cells a side, and the layer reflects more than -61 dB.
-FAIR_CELLS_PER_WAVELENGTH = 4.0
-# Most cells per wavelength. The fit of the boundary layer starts within its bounds up to about 700.
-MAX_CELLS_PER_WAVELENGTH = 500
 MAX_CELLS = 10**9  # Most cells of a grid: more would take over 30 GB in single precision
 # Cells of air between the obstacles and the boundary layer of a box. The first may be heterogeneous, the next
 # two are the Huygens surface, and the last two serve the interpolation of points next to it
@@ -51,7 +42,6 @@ _THIN_LAYER_CELLS, _SMALL_BODIES = 4, 4
 # between which sound has arrived before a run may end. Sources drive all of them at once; what later comes
 # from corner to corner of a plate or a cube is below 5e-4 of the field. More surfaces fill their box.
 _PLACES, _REACHED, _FEW = 256, 0.995, 8
-RATIO = 1.5  # Ratio of the spacings of the two grids: the coarser costs a fifth of the finer
 
 
 @dataclass(frozen=True)
@@ -195,18 +185,8 @@ def make_box(region: Region, spacing: float) -> Grid:
     return _covering(region.unbounded, spacing, bodies_extent(region))
 
 
-def require_spacing(region: Region, spacing: float) -> None:
-    """Check the number of cells per wavelength of a spacing [m]."""
-    positive("spacing", spacing, "m")
-    require_fine(region.sound_speeds, region.frequency, spacing)
-    finest = region.wavelength / MAX_CELLS_PER_WAVELENGTH
-    if spacing < finest:
-        accepted = f"must be at least {finest:.3g} m, {MAX_CELLS_PER_WAVELENGTH} cells per wavelength"
-        raise invalid("spacing", spacing, f"{accepted} in the medium at {region.frequency:g} Hz", "m")
-
-
 def _covering(region: Region, spacing: float, extent: Extent) -> Grid:
-    require_spacing(region, spacing)
+    region.require_spacing(spacing)
     kappa = region.wavenumber * spacing
     offset = grid_offset(region, spacing, extent.lower, extent.upper)
     layer = extent.layer_cells(kappa)
@@ -222,39 +202,3 @@ def require_cells(shape: tuple[int, int, int], spacing: float) -> None:
     if math.prod(shape) > MAX_CELLS:
         cells = " x ".join(map(str, shape))
         raise invalid("spacing", spacing, f"gives {cells} cells, must be at most {MAX_CELLS:.0e} in all", "m")
-
-
-def require_fine(speeds: Mapping[str, float], frequency: float, spacing: float) -> None:
-    """Check that a spacing [m] resolves sound speeds [m/s] by place."""
-    for where, speed in speeds.items():
-        coarsest = speed / frequency / MIN_CELLS_PER_WAVELENGTH
-        if spacing > coarsest:
-            reason = f"{MIN_CELLS_PER_WAVELENGTH:g} cells per wavelength in {where} at {frequency:g} Hz"
-            raise invalid("spacing", spacing, f"must be at most {coarsest:.3g} m, {reason}", "m")
-
-
-def warn_if_coarse(speeds: Mapping[str, float], frequency: float, spacing: float) -> None:
-    """Log the places where a spacing [m] is coarse for sound speeds [m/s] by place."""
-    places: dict[float, list[str]] = {}
-    for where, speed in speeds.items():
-        if spacing > speed / frequency / FAIR_CELLS_PER_WAVELENGTH:
-            places.setdefault(speed / frequency / spacing, []).append(where)
-    coarse = [f"{cells:.3g} cells per wavelength in {', '.join(where)}" for cells, where in places.items()]
-    if coarse:
-        logger.warning(
-            "spacing %.3g mm is coarse, %s: from %g cells to %g the error in air rises from 0.5 to 3 %%, and"
-            " that of the sound speed in obstacles from 0.3 to 1 %%: fields of slow ones are off by tens of"
-            " per cent; transfer_matrix(return_error=True) estimates the error",
-            spacing * 1e3, ", ".join(coarse), FAIR_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH,
-        )  # fmt: skip
-
-
-def coarsest_spacing(region: Region) -> float:
-    """Return the largest spacing [m] with a fair number of cells per wavelength everywhere."""
-    return region.shortest_wavelength / FAIR_CELLS_PER_WAVELENGTH
-
-
-def second_spacing(region: Region, spacing: float) -> float:
-    """Return the spacing [m] of the second grid of an error estimate: coarser where fair, else finer."""
-    coarser = RATIO * spacing
-    return coarser if coarser <= coarsest_spacing(region) else spacing / RATIO

@@ -15,14 +15,8 @@ from itertools import combinations, permutations
 import numpy as np
 import torch
 
-from autdtorch.fdtd.grid import (
-    MAX_CELLS_PER_WAVELENGTH,
-    MIN_CELLS_PER_WAVELENGTH,
-    Extent,
-    bodies_extent,
-    domain_extent,
-)
-from autdtorch.fdtd.region import CLEARANCE, Region
+from autdtorch.fdtd.grid import Extent, bodies_extent, domain_extent
+from autdtorch.fdtd.region import CLEARANCE, MAX_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH, Region
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil

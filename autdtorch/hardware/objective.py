@@ -18,7 +18,8 @@ from autdtorch.objectives.objective import Objective, observe_drives, validate_m
 from autdtorch.objectives.perturbations import Perturbation
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.validation import invalid, path_of, require_callable, require_kind
+from autdtorch.utils.files import path_of
+from autdtorch.utils.validation import invalid, require_callable, require_kind
 
 
 class HardwareObjective:

@@ -15,9 +15,9 @@ from autdtorch.io.ultraino_file import SUFFIX, read_ultraino
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import device_axes, in_plane
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.files import read_arrays
+from autdtorch.utils.files import path_of, read_arrays
 from autdtorch.utils.spatial import closest_pair
-from autdtorch.utils.validation import ArrayLike, path_of, within
+from autdtorch.utils.validation import ArrayLike, within
 
 # Columns of a CSV file with the positions of transducers and the directions of emission, and their units.
 PLACE_COLUMNS = {"x": "m", "y": "m", "z": "m"}

@@ -32,8 +32,8 @@ from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.files import read_arrays, write_arrays
-from autdtorch.utils.validation import invalid, path_of, require_kind, within
+from autdtorch.utils.files import path_of, read_arrays, write_arrays
+from autdtorch.utils.validation import invalid, require_kind, within
 
 _VERSION = 1
 _HEADER, _SCENE = "header", "scene/"

@@ -25,17 +25,9 @@ from autdtorch.scene.drive import (
 )
 from autdtorch.scene.sequence import Sequence
 from autdtorch.utils.array_types import AnyArray, Array
-from autdtorch.utils.files import read_arrays, write_arrays
+from autdtorch.utils.files import path_of, read_arrays, write_arrays
 from autdtorch.utils.units import warn_user, warned_within
-from autdtorch.utils.validation import (
-    ArrayLike,
-    path_of,
-    positive,
-    real_tensor,
-    require_kind,
-    require_one_of,
-    within,
-)
+from autdtorch.utils.validation import ArrayLike, positive, real_tensor, require_kind, require_one_of, within
 
 _FORMATS = (".csv", ".npz")
 _LEVEL_COLUMNS = {f"{name} {column}": "" for name, device in DEVICES.items() for column in device.columns}

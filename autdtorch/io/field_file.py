@@ -16,15 +16,8 @@ import numpy as np
 import torch
 
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.files import replacing
-from autdtorch.utils.validation import (
-    LENGTH_TOLERANCE,
-    ArrayLike,
-    complex_tensor,
-    path_of,
-    positive,
-    real_tensor,
-)
+from autdtorch.utils.files import path_of, replacing
+from autdtorch.utils.validation import LENGTH_TOLERANCE, ArrayLike, complex_tensor, positive, real_tensor
 
 
 class _Grid(NamedTuple):

@@ -18,7 +18,8 @@ from autdtorch.objectives.goals import (
 from autdtorch.objectives.over_scenes import OverScenes
 from autdtorch.objectives.quiet import Contrast, QuietPoints, SeenPoints
 from autdtorch.scene.particle import Particle
-from autdtorch.utils.validation import invalid, require_known, require_name, require_one_of, within
+from autdtorch.utils.files import require_name
+from autdtorch.utils.validation import invalid, require_known, require_one_of, within
 
 _PRESSURES = WeakestFocus, MeanPressure, TargetPressures, QuietPoints, SeenPoints, Contrast, OverScenes
 GOALS: dict[str, type[Goal] | type[ForceGoal]] = {

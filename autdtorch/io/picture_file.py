@@ -11,8 +11,8 @@ from autdtorch.hardware.camera.picture import Picture
 from autdtorch.scene.drive import validate_single_drive
 from autdtorch.scene.geometry import Plane
 from autdtorch.utils.array_types import AnyArray
-from autdtorch.utils.files import read_arrays, write_arrays
-from autdtorch.utils.validation import ArrayLike, complex_tensor, path_of, real_tensor, require_kind, within
+from autdtorch.utils.files import path_of, read_arrays, write_arrays
+from autdtorch.utils.validation import ArrayLike, complex_tensor, real_tensor, require_kind, within
 
 #: Folder of a trial for its pictures: `evaluation_00012.npz` of evaluation 12 (from 0), and `again_0.npz`,
 #: `again_1.npz`, ... of the drive that the search found, when it was played again.

@@ -19,8 +19,8 @@ from autdtorch.io.readings_units import (
     phase_unit,
     pressure_unit,
 )
-from autdtorch.utils.text import counted, within
-from autdtorch.utils.validation import integer_at_least, invalid, require_known
+from autdtorch.utils.text import counted
+from autdtorch.utils.validation import integer_at_least, invalid, require_known, within
 
 QUANTITIES = ("x", "y", "z", "phase", "amplitude", "pressure", "pressure phase")
 """QUANTITIES: what a column may hold."""

@@ -24,12 +24,11 @@ from autdtorch.io.readings_units import angle_unit, phase_unit, pressure_unit
 from autdtorch.objectives.readings import Readings
 from autdtorch.scene.drive import amplitudes_of, phases_of
 from autdtorch.utils.array_types import AnyArray
-from autdtorch.utils.files import read_arrays, write_arrays
+from autdtorch.utils.files import path_of, read_arrays, write_arrays
 from autdtorch.utils.validation import (
     ArrayLike,
     complex_tensor,
     invalid,
-    path_of,
     points_tensor,
     require_kind,
     require_known,

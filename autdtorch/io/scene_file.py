@@ -28,13 +28,12 @@ from autdtorch.scene.medium import porous
 from autdtorch.scene.obstacles import KINDS, Obstacle
 from autdtorch.scene.reflectors import Reflector
 from autdtorch.scene.scene import Medium, Scene
-from autdtorch.utils.files import replace_file
+from autdtorch.utils.files import path_of, replace_file
 from autdtorch.utils.units import warned_within
 from autdtorch.utils.validation import (
     finite_vector,
     invalid,
     members,
-    path_of,
     points_tensor,
     require_kind,
     require_known,

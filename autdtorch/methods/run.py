@@ -17,9 +17,10 @@ from autdtorch.methods.state_file import load_state, save_state
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import GoalFunction, Objective, require_objective
 from autdtorch.objectives.readings import Readings
+from autdtorch.utils.files import path_of
 from autdtorch.utils.hints import did_you_mean, renamed_keywords
 from autdtorch.utils.progress import show_progress
-from autdtorch.utils.validation import invalid, path_of, require_callable, within
+from autdtorch.utils.validation import invalid, require_callable, within
 
 
 @overload

@@ -26,8 +26,8 @@ from autdtorch.objectives.over_scenes import OverScenes
 from autdtorch.objectives.readings import Readings
 from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.files import read_arrays, replace_file
-from autdtorch.utils.validation import invalid, path_of, require_kind, within
+from autdtorch.utils.files import path_of, read_arrays, replace_file
+from autdtorch.utils.validation import invalid, require_kind, within
 
 _BEST, _SEARCH, _READINGS, _HEADER = "best.", "search.", "readings.", "header"
 _OF_READINGS = ("drives", "pressure", "phase", "deviation")

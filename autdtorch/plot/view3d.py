@@ -26,7 +26,7 @@ from autdtorch.plot.colours import FLOOR, WAVE_MAP
 from autdtorch.plot.data import MM, in_decibels, largest, pressure_text, pressure_unit, zero_level
 from autdtorch.plot.meshes3d import STILL_AXES
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.files import in_folder
+from autdtorch.utils.files import in_folder, path_of
 from autdtorch.utils.hints import with_extra
 from autdtorch.utils.process import signals_restored
 from autdtorch.utils.validation import (
@@ -35,7 +35,6 @@ from autdtorch.utils.validation import (
     complex_tensor,
     integer_at_least,
     number_between,
-    path_of,
     require_kind,
 )
 

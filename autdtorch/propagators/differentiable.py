@@ -7,14 +7,14 @@ import math
 import torch
 
 from autdtorch.fdtd.adjoint import recorded
-from autdtorch.fdtd.grid import make_grid, require_fine, warn_if_coarse
+from autdtorch.fdtd.grid import make_grid
 from autdtorch.fdtd.kernels import available_kernel, make_kernel, precision_of
 from autdtorch.fdtd.material_gradients import cells_of_maps, cells_of_obstacles, domain_cells
-from autdtorch.fdtd.region import Region
+from autdtorch.fdtd.region import Region, require_fine, warn_if_coarse
 from autdtorch.fdtd.steady_state import block_of, fewest_periods
 from autdtorch.fdtd.stepping import drive_dft, drive_signal
 from autdtorch.propagators.notices import warn_of_ending_walls, warn_of_near_points
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.plan import region_of
 from autdtorch.scene.arrays import apertures_of, complex_strengths_of
 from autdtorch.scene.checks import require_inside
 from autdtorch.scene.drive import validate_drive

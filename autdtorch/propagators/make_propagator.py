@@ -15,7 +15,6 @@ from typing import Literal
 
 import torch
 
-from autdtorch.fdtd.grid import coarsest_spacing
 from autdtorch.fdtd.region import Region
 from autdtorch.propagators.free_space import FreeSpacePropagator
 from autdtorch.propagators.notices import warn_of_scene
@@ -175,13 +174,13 @@ def _refined(pilot: Plan, budget: _Budget, store: Store) -> SimulatedPropagator:
     known well enough, it is one that does not add to that error. Warnings name the error.
     """
     tolerance, region, law = pilot.tolerance, pilot.region, pilot.law
-    spacing = coarsest_spacing(region)
+    spacing = region.coarsest_spacing
     if budget.is_unlimited:
         spacing /= min(region.wavelength / region.shortest_wavelength, _FINER_IF_SLOW)
         spacing = min(spacing, law.spacing_of(tolerance / _FIRST_ERROR))
     plan = pilot.fitted(spacing, _SETTLED * tolerance, spacing)
     if plan.refusal:
-        raise invalid("tolerance", tolerance, f"its first grid has {plan.refusal}")
+        raise ValueError(f"tolerance: {tolerance}; its first grid has {plan.refusal}")
     others: list[Simulation] = []
     while True:
         begin, propagator = time.perf_counter(), SimulatedPropagator(plan, store, others)
@@ -202,7 +201,7 @@ def _refined(pilot: Plan, budget: _Budget, store: Store) -> SimulatedPropagator:
                 return propagator
             if not math.isfinite(error):
                 reason = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
-                raise invalid("max_periods", plan.max_periods, reason)
+                raise ValueError(f"max_periods: {plan.max_periods}; {reason}")
             aim = max(_AIM * tolerance - known, shape / _SHAPE)
             wanted = aim / (error - known) * law.growth(plan.spacing)
             step = min(max(plan.spacing / law.spacing_of(wanted), _SMALLEST_STEP), _LARGEST_STEP)

@@ -16,7 +16,7 @@ from typing import Literal, overload
 
 import torch
 
-from autdtorch.fdtd.grid import MIN_CELLS_PER_WAVELENGTH
+from autdtorch.fdtd.region import MIN_CELLS_PER_WAVELENGTH
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.scene.changes import seen_from_obstacles
 from autdtorch.scene.scene import Scene

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 
 import torch
 
-from autdtorch.fdtd.grid import warn_if_coarse
+from autdtorch.fdtd.region import warn_if_coarse
 from autdtorch.fdtd.thin_walls import warn_of_thin_walls
 from autdtorch.fdtd.turning import axes_along
-from autdtorch.propagators.plan import Plan
-from autdtorch.propagators.scene_region import walls_of
+from autdtorch.propagators.plan import Plan, walls_of
 from autdtorch.propagators.simulation import Run, Simulation
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array

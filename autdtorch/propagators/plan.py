@@ -1,29 +1,31 @@
-"""The plan of a simulation: its method, its grids and its cost, before anything is allocated."""
+"""The plan of a simulation: its region, method, grids and cost, before anything is allocated."""
 
 from __future__ import annotations
 
 import logging
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Self
+from typing import Self, cast
 
+import numpy as np
 import torch
 
 from autdtorch.fdtd.costs import Costs
-from autdtorch.fdtd.grid import coarsest_spacing, require_cells, require_spacing, second_spacing
+from autdtorch.fdtd.grid import require_cells
 from autdtorch.fdtd.grid_errors import Law
 from autdtorch.fdtd.grouping import Grouping, choose_grids
 from autdtorch.fdtd.kernels import available_kernel, precision_of
 from autdtorch.fdtd.placement import fitting_spacing
-from autdtorch.fdtd.region import Region
+from autdtorch.fdtd.region import Body, Fluid, Region
+from autdtorch.fdtd.shapes import Shape
 from autdtorch.propagators.free_space import PAIR_BYTES
-from autdtorch.propagators.scene_region import region_of, with_rigid
 from autdtorch.propagators.store import key_of
 from autdtorch.propagators.tmatrix.bodies import waves_to_simulate
 from autdtorch.scene.arrays import apertures_of, radii_of
-from autdtorch.scene.obstacles import Mesh
+from autdtorch.scene.obstacles import Mesh, Obstacle
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.process import cached_property, require_memory
+from autdtorch.utils.spatial import mean_thickness
 from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import (
     integer_at_least,
@@ -40,6 +42,12 @@ _TAKEN_AS_RIGID = 0.25
 
 _SLACK = 1.05
 """Room for the change of a body's difference from a rigid one, where a scene changes a little."""
+
+# Ratio of sound speeds from which heavy bodies have no sharp resonances at the drive's frequency
+_STIFF = 2.0
+# Relative difference of a sphere from a rigid one, times its density ratio. Narrow resonances have up to half
+# more, which is still less than the error of a grid at such a contrast.
+_NEAR_RIGID = 1.4
 
 _NO_EFFECT = ("observation_plane", "name")
 """Scene fields that do not affect the pressure; left out of keys."""
@@ -100,7 +108,7 @@ class Plan:
     @property
     def second(self) -> Self:
         """The plan on a second grid, for an estimate of the grid's error."""
-        return self.at(second_spacing(self.region, self.spacing), self.tolerance)
+        return self.at(self.region.second_spacing(self.spacing), self.tolerance)
 
     @cached_property
     def key(self) -> str:
@@ -164,7 +172,7 @@ class Plan:
             require_memory("spacing", self.spacing, self.memory, "m")
             for grid in self.grouping.grids:
                 require_cells(grid.shape, self.spacing)
-            require_spacing(self.region, self.spacing)
+            self.region.require_spacing(self.spacing)
             if self.method == "full":
                 self.region.require_domain()
             for grid in self.grouping.grids:
@@ -192,7 +200,7 @@ def plan(
     if tolerance >= 1:
         raise invalid("tolerance", tolerance, "must be in (0, 1)")
     most = _TAKEN_AS_RIGID * tolerance if spacing is None else tolerance
-    spacing = coarsest_spacing(region) if spacing is None else positive("spacing", spacing, "m")
+    spacing = region.coarsest_spacing if spacing is None else positive("spacing", spacing, "m")
     region = with_rigid(region, most)
     max_periods = integer_at_least("max_periods", max_periods, 1)
     time_step = None if time_step is None else positive("time_step", time_step, "s")
@@ -207,7 +215,7 @@ def plan(
         method = "free_space"
     runs, grouping = min(len(scene.control_points), len(scene.array)), Grouping()
     if method != "free_space":
-        require_spacing(region, spacing)
+        region.require_spacing(spacing)
         by_waves, (chosen, grouping) = None, choose_grids(region, method, spacing, tolerance, runs)
         if method == "tmatrix" or (method == "auto" and not any(body.continued for body in region.bodies)):
             by_waves = waves_to_simulate(scene, tolerance, runs if method == "auto" else None)
@@ -217,3 +225,83 @@ def plan(
     return Plan(
         scene, region, method, spacing, tolerance, kernel, precision, max_periods, time_step, grouping, runs
     )
+
+
+def region_of(scene: Scene) -> Region:
+    """Return the region of a scene; parallel walls across it continue through the boundary layers."""
+    bodies = []
+    for number, (obstacle, (_, continued)) in enumerate(zip(scene.obstacles, walls_of(scene), strict=True)):
+        material = obstacle.fluid_at(scene.frequency)
+        fluid = None if material is None else Fluid(*material)
+        bodies.append(Body(obstacle, fluid, continued, obstacle.uncertainty, 0.0, obstacle.impedance, number))
+    medium, positions = scene.medium, np.asarray(scene.array.positions.numpy())
+    air = Fluid(medium.density, medium.sound_speed)
+    return Region(
+        air, scene.attenuation, scene.frequency, tuple(bodies), scene.domain, positions,
+        tuple(one.mirror for one in scene.reflectors),
+    )  # fmt: skip
+
+
+def with_rigid(region: Region, tolerance: float) -> Region:
+    """Return the region with its hard bodies rigid, where that changes the field by less than a tolerance.
+
+    That is relative to the field in free space: errors count it (`rigid_errors`). A body that a later one
+    may cut into keeps its material: what is left of it may be thin. No sound enters the cavities of rigid
+    bodies, so they are filled.
+    """
+    bodies, hard = [], []
+    for index, body in enumerate(region.bodies):
+        whole = not any(_overlap(body.shape, later.shape) for later in region.bodies[index + 1 :])
+        if body.fluid is not None and whole:
+            difference = difference_from_rigid(body, region)
+            if difference <= tolerance:
+                hard.append(str(index))
+                body = replace(body, fluid=None, rigid_error=difference)
+        if body.fluid is None and whole:
+            body = replace(body, shape=cast(Obstacle, body.shape).filled())
+        bodies.append(body)
+    if hard:
+        logger.debug("obstacle %s is taken as rigid: the difference is below the tolerance", ", ".join(hard))
+    return replace(region, bodies=tuple(bodies))
+
+
+def _overlap(one: Shape, other: Shape) -> bool:
+    """Return whether the bounding boxes of two shapes overlap."""
+    apart = np.maximum(one.lower, other.lower) >= np.minimum(one.upper, other.upper)
+    return not apart.any()
+
+
+def difference_from_rigid(body: Body, region: Region) -> float:
+    """Return the approximate relative difference between the fields of a fluid body and of a rigid one.
+
+    For a density ratio m and an impedance ratio z, complex where the body absorbs, it moves in proportion to
+    1 / |m| and yields in proportion to 1 / |z|. Through a wall of thickness d, 1 / (|m| k d) passes (mass
+    law); here d is the mean thickness.
+    """
+    assert body.fluid is not None
+    heavier = abs(body.fluid.density) / abs(region.fluid.density)
+    stiffer = abs(body.fluid.sound_speed) / abs(region.fluid.sound_speed)
+    if heavier <= 1 or stiffer < _STIFF:
+        return math.inf
+    thickness = mean_thickness(*(part.numpy() for part in body.shape.surface()))
+    moved = 1 + 1 / (region.wavenumber * thickness)
+    return float(_NEAR_RIGID * (moved + 1 / stiffer) / heavier)
+
+
+def walls_of(scene: Scene) -> list[tuple[bool, bool]]:
+    """Return whether each obstacle is a wall, and whether it continues through the boundary layers.
+
+    A wall or slab is aligned with the axes, and crosses the domain on two axes at least. Those parallel to
+    the first one continue. Other shapes were measured to be unstable in the layers, and so were edges where
+    walls of two directions meet.
+    """
+    walls, normal = [], None
+    for obstacle in scene.obstacles:
+        corners = zip(obstacle.lower, obstacle.upper, *scene.domain, strict=True)
+        ends = [axis for axis, (low, high, first, last) in enumerate(corners) if low > first or high < last]
+        wall = obstacle.fills_bounds and len(ends) <= 1
+        continued = wall and (not ends or normal in (None, ends[0]))
+        walls.append((wall, continued))
+        if continued and ends:
+            normal = ends[0]
+    return walls

@@ -19,8 +19,8 @@ import torch
 
 from autdtorch.utils.array_types import AnyArray, ComplexArray
 from autdtorch.utils.digest import digest_of, package_versions, source_digest
-from autdtorch.utils.files import replace_file
-from autdtorch.utils.validation import invalid, path_of
+from autdtorch.utils.files import path_of, replace_file
+from autdtorch.utils.validation import invalid
 
 logger = logging.getLogger(__name__)
 

@@ -25,8 +25,7 @@ from autdtorch.scene.scene import OverlapWarning, ScaleWarning, Scene
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.hints import did_you_mean
 from autdtorch.utils.images import Image
-from autdtorch.utils.text import within
-from autdtorch.utils.validation import Vector, finite_vector, invalid
+from autdtorch.utils.validation import Vector, finite_vector, invalid, within
 
 Amounts: TypeAlias = Mapping[str, float]
 

@@ -31,7 +31,7 @@ from autdtorch.study.results import (
     stored_numbers,
     stored_solution,
 )
-from autdtorch.utils.files import replace_file
+from autdtorch.utils.files import path_of, replace_file, require_name
 from autdtorch.utils.validation import (
     boolean,
     complex_tensor,
@@ -39,10 +39,8 @@ from autdtorch.utils.validation import (
     integer_at_least,
     invalid,
     not_negative,
-    path_of,
     positive,
     require_kind,
-    require_name,
     require_one_of,
 )
 

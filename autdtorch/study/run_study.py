@@ -43,6 +43,7 @@ from autdtorch.study.results import (
     median_trial,
     provenance_now,
 )
+from autdtorch.utils.files import require_name
 from autdtorch.utils.process import require_memory
 from autdtorch.utils.progress import Progress, show_progress
 from autdtorch.utils.spatial import nearest
@@ -54,7 +55,6 @@ from autdtorch.utils.validation import (
     positive,
     require_kind,
     require_known,
-    require_name,
     within,
 )
 

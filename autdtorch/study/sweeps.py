@@ -23,7 +23,8 @@ from autdtorch.study.folder import PREVIOUS
 from autdtorch.study.results import PROVENANCE_FILE, MethodResult, SceneResult, StudyResult, median_trial
 from autdtorch.study.results_file import RESULTS_FILE, load_results
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.validation import members, path_of
+from autdtorch.utils.files import path_of
+from autdtorch.utils.validation import members
 
 logger = logging.getLogger(__name__)
 

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, locks, NumPy files, and append-only files of JSON lines."""
+"""Files: paths, locks, writing whole or not at all, NumPy files, and append-only files of JSON lines."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import tokenize
 import uuid
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,32 @@ from filelock import FileLock, Timeout
 from numpy.lib import format as npy
 
 from autdtorch.utils.array_types import AnyArray
-from autdtorch.utils.text import within
+from autdtorch.utils.validation import invalid, within
 
 logger = logging.getLogger(__name__)
 
 PARTIAL = ".partial"  # suffix of a file that is being written
 ABANDONED = 3600.0  # age [s] after which a killed writer's partial file is removed; writing takes seconds
+_NAME = re.compile(r"(?!\.+$)[\w.+-]+")
+_LONGEST_NAME = 100  # bytes
+
+
+def require_name(field: str, name: object) -> None:
+    """Check a name that becomes part of the names of files and HDF5 groups."""
+    if not isinstance(name, str) or not _NAME.fullmatch(name) or len(name.encode()) > _LONGEST_NAME:
+        accepted = "a name must be text of letters, digits and _ . + -, not of dots alone"
+        raise invalid(field, name, f"{accepted}, with at most {_LONGEST_NAME} bytes")
+
+
+def path_of(name: str, value: object, what: str = "a file", suffixes: Collection[str] = ()) -> Path:
+    """Return `value` as the path of `what`, which ends in one of the `suffixes`, if any."""
+    text = os.fspath(value) if isinstance(value, str | os.PathLike) else None
+    if not isinstance(text, str) or not text or "\0" in text:
+        raise invalid(name, value, f"must be the path of {what}")
+    path = Path(text)
+    if suffixes and not re.fullmatch(f".+({'|'.join(map(re.escape, suffixes))})", path.name.lower()):
+        raise invalid(name, text, f"must end in one of {', '.join(suffixes)}")
+    return path
 
 
 @contextlib.contextmanager

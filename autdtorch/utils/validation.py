@@ -10,11 +10,9 @@ import cmath
 import contextlib
 import math
 import numbers
-import os
-import re
+import reprlib
 import sys
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from pathlib import Path
 from typing import Any, TypeAlias, TypeGuard
 
 import numpy as np
@@ -22,10 +20,6 @@ import numpy.typing as npt
 import torch
 
 from autdtorch.utils.hints import did_you_mean
-from autdtorch.utils.text import DEEPEST, SHOWN_ENTRIES, is_plain
-from autdtorch.utils.text import invalid as invalid
-from autdtorch.utils.text import is_dense as is_dense
-from autdtorch.utils.text import within as within
 
 ArrayLike: TypeAlias = torch.Tensor | npt.ArrayLike
 Vector: TypeAlias = tuple[float, float, float]
@@ -35,31 +29,25 @@ LENGTH_TOLERANCE = 1e-9
 any wavelength."""
 
 _UNIT_ROUNDING = 4 * sys.float_info.epsilon  # by which the computed length of a unit vector may differ from 1
-
-ON_CPU = "the CPU gives the same results, to rounding"
-"""Last words of messages about a missing GPU."""
-
-_NAME = re.compile(r"(?!\.+$)[\w.+-]+")
-_LONGEST_NAME = 100  # bytes
 _LARGEST = 2**63 - 1  # largest integer that NumPy and PyTorch count with
+_DEEPEST = 16  # most axes of an array, or levels of nested lists; some functions of PyTorch take at most 25
+_SHOWN_ENTRIES, _SHOWN_CHARACTERS = 9, 120
+_SHOWN_BITS = 128  # of an integer; Python refuses to write out very large ones
 
 
-def require_name(field: str, name: object) -> None:
-    """Check a name that becomes part of the names of files and HDF5 groups."""
-    if not isinstance(name, str) or not _NAME.fullmatch(name) or len(name.encode()) > _LONGEST_NAME:
-        accepted = "a name must be text of letters, digits and _ . + -, not of dots alone"
-        raise invalid(field, name, f"{accepted}, with at most {_LONGEST_NAME} bytes")
+def invalid(name: str, value: object, accepted: str, unit: str = "") -> ValueError:
+    """Return the error to raise for `value` of field `name`; `accepted` says what is allowed."""
+    message = f"{name}: {_shown(value)}{f' {unit}' if unit else ''}; {accepted}"
+    return ValueError(" ".join(message.split("\n")))
 
 
-def path_of(name: str, value: object, what: str = "a file", suffixes: Collection[str] = ()) -> Path:
-    """Return `value` as the path of `what`, which ends in one of the `suffixes`, if any."""
-    text = os.fspath(value) if isinstance(value, str | os.PathLike) else None
-    if not isinstance(text, str) or not text or "\0" in text:
-        raise invalid(name, value, f"must be the path of {what}")
-    path = Path(text)
-    if suffixes and not re.fullmatch(f".+({'|'.join(map(re.escape, suffixes))})", path.name.lower()):
-        raise invalid(name, text, f"must end in one of {', '.join(suffixes)}")
-    return path
+@contextlib.contextmanager
+def within(place: object) -> Iterator[None]:
+    """Put the name of a place, such as a file, in front of the message of a `ValueError`."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from error
 
 
 def require_one_of(name: str, value: object, accepted: Collection[str]) -> None:
@@ -104,35 +92,6 @@ def _listed(name: str, value: object, accepted: str) -> list[Any]:
     raise invalid(name, value, accepted)
 
 
-def device_type(name: str, value: object) -> str | None:
-    """Return "cpu" or "cuda", the type of a device as text or `torch.device`, or None for None."""
-    if value is None:
-        return None
-    device = None
-    if isinstance(value, str | torch.device):
-        with contextlib.suppress(RuntimeError):  # of text that PyTorch does not know
-            device = torch.device(value)
-    if device is None or device.type not in ("cpu", "cuda"):
-        raise invalid(name, value, "must be 'cpu', 'cuda' or a torch.device of these")
-    if device.type == "cuda":
-        if not torch.cuda.is_available():
-            raise invalid(name, str(device), no_cuda())
-        current = torch.cuda.current_device()
-        if device.index not in (None, current):
-            accepted = f"must be the current one, cuda:{current}; torch.cuda.set_device chooses it"
-            raise invalid(name, str(device), accepted)
-    return device.type
-
-
-def no_cuda() -> str:
-    """Return for messages why PyTorch finds no CUDA device, and what to do."""
-    built = torch.version.cuda is not None
-    why = "it finds no GPU or driver" if built else "it is built for the CPU; pytorch.org has builds for CUDA"
-    return (
-        f"needs an NVIDIA GPU that PyTorch can use, but {why} (torch.cuda.is_available() is false); {ON_CPU}"
-    )
-
-
 def require_callable(name: str, value: object) -> None:
     """Check that `value` can be called."""
     if not callable(value):
@@ -141,9 +100,9 @@ def require_callable(name: str, value: object) -> None:
 
 def finite_number(name: str, value: object, unit: str = "") -> float:
     """Return `value` as a finite float; text, booleans and complex numbers are refused."""
-    if isinstance(value, torch.Tensor | np.ndarray) and value.ndim == 0 and is_plain(value):
+    if isinstance(value, torch.Tensor | np.ndarray) and value.ndim == 0 and _is_plain(value):
         value = value.item()
-    if not is_plain(value) or not isinstance(value, numbers.Real):
+    if not _is_plain(value) or not isinstance(value, numbers.Real):
         raise invalid(name, value, f"must be a real number{_in_unit(unit)}")
     try:
         number = float(value)
@@ -158,9 +117,9 @@ def finite_number(name: str, value: object, unit: str = "") -> float:
 
 def complex_number(name: str, value: object, unit: str = "") -> complex:
     """Return `value` as a finite float, or as a complex number where its imaginary part is not 0."""
-    if isinstance(value, torch.Tensor | np.ndarray) and value.ndim == 0 and is_plain(value):
+    if isinstance(value, torch.Tensor | np.ndarray) and value.ndim == 0 and _is_plain(value):
         value = value.item()
-    if not is_plain(value) or not isinstance(value, numbers.Complex):
+    if not _is_plain(value) or not isinstance(value, numbers.Complex):
         raise invalid(name, value, f"must be a real or complex number{_in_unit(unit)}")
     if isinstance(value, numbers.Real):
         return finite_number(name, value, unit)
@@ -203,7 +162,7 @@ def boolean(name: str, value: object) -> bool:
 
 def integer_at_least(name: str, value: object, minimum: int) -> int:
     """Return `value` as an int >= `minimum`; whole floats are refused too."""
-    number = int(value) if is_plain(value) and isinstance(value, numbers.Integral) else minimum - 1
+    number = int(value) if _is_plain(value) and isinstance(value, numbers.Integral) else minimum - 1
     if not minimum <= number <= _LARGEST:
         most = " and < 2^63" if number > _LARGEST else ""
         raise invalid(name, value, f"must be an integer >= {minimum}{most}")
@@ -272,13 +231,7 @@ def real_tensor(name: str, value: object, unit: str = "") -> torch.Tensor:
 def gappy_tensor(name: str, value: object, unit: str = "") -> torch.Tensor:
     """Return `value` as a float64 tensor of any shape, as `real_tensor` does, where NaN is a gap."""
     accepted = f"must be an array of real numbers{_in_unit(unit)}, NaN for a gap"
-    tensor = _tensor(name, value, accepted)
-    if tensor.is_complex():
-        raise invalid(name, value, accepted)
-    tensor = tensor.to(torch.float64)
-    if tensor.isinf().any():
-        _require_finite(name, torch.where(tensor.isnan(), 0.0, tensor), unit)
-    return tensor
+    return _real(name, value, accepted, unit, gaps=True)
 
 
 def complex_tensor(
@@ -336,12 +289,12 @@ def _entries(name: str, value: object, count: int, unit: str) -> tuple[float, ..
     return tuple(float(entry) for entry in tensor.detach())
 
 
-def _real(name: str, value: object, accepted: str, unit: str) -> torch.Tensor:
+def _real(name: str, value: object, accepted: str, unit: str, gaps: bool = False) -> torch.Tensor:
     tensor = _tensor(name, value, accepted)
     if tensor.is_complex():
         raise invalid(name, value, accepted)
     tensor = tensor.to(torch.float64)
-    _require_finite(name, tensor, unit)
+    _require_finite(name, torch.where(tensor.isnan(), 0.0, tensor) if gaps else tensor, unit)
     return tensor
 
 
@@ -368,8 +321,8 @@ def _holds_numbers(value: object) -> bool:
     twice.
     """
     entries = [value]
-    for _ in range(DEEPEST):
-        if not all(map(is_plain, entries)):
+    for _ in range(_DEEPEST):
+        if not all(map(_is_plain, entries)):
             return False
         lists = {id(entry): entry for entry in entries if _is_list(entry)}
         if not lists:
@@ -391,7 +344,57 @@ def _require_finite(name: str, tensor: torch.Tensor, unit: str = "") -> None:
     # Of complex numbers, `isfinite` takes three times as long.
     if torch.isfinite(torch.view_as_real(values) if values.is_complex() else values).all():
         return
-    if tensor.numel() <= SHOWN_ENTRIES:
+    if tensor.numel() <= _SHOWN_ENTRIES:
         raise invalid(name, tensor, "every entry must be finite", unit)
     index = torch.nonzero(~torch.isfinite(values))[0].tolist()
     raise invalid(f"{name}{index}", tensor[tuple(index)].item(), "every entry must be finite", unit)
+
+
+def is_dense(value: torch.Tensor | npt.NDArray[Any] | np.generic) -> bool:
+    """Check that an array has few axes and holds unmasked numbers or booleans in memory."""
+    if isinstance(value, torch.Tensor):
+        plain = value.layout == torch.strided and not (value.is_quantized or value.is_nested or value.is_meta)
+    else:
+        plain = value.dtype.kind in "biufc" and not np.ma.is_masked(value)
+    return plain and value.ndim <= _DEEPEST
+
+
+def _is_plain(value: object) -> bool:
+    """Check that `value` is no boolean and, if it is an array, a dense array of numbers."""
+    if isinstance(value, torch.Tensor | np.ndarray | np.generic):
+        return is_dense(value) and "bool" not in str(value.dtype)
+    return not isinstance(value, bool)
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, torch.Tensor) and not is_dense(value):
+        return f"tensor of {value.dtype}, {value.layout}, on {value.device}"
+    if isinstance(value, np.ma.MaskedArray):
+        return f"masked array of shape {value.shape}"
+    if isinstance(value, torch.Tensor | np.ndarray):
+        if math.prod(value.shape) > _SHOWN_ENTRIES:
+            return f"array of shape {tuple(value.shape)}"
+        value = value.tolist()
+    if isinstance(value, list):
+        value = tuple(value)
+    text = _Short().repr(value)
+    return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}..."
+
+
+class _Short(reprlib.Repr):
+    """The text of a value, however large or deep the value is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlevel, self.maxtuple, self.maxlist = 3, _SHOWN_ENTRIES, _SHOWN_ENTRIES
+        self.maxstring = self.maxother = _SHOWN_CHARACTERS
+
+    def repr_int(self, value: int, level: int) -> str:
+        bits = value.bit_length()
+        return repr(value) if bits <= _SHOWN_BITS else f"integer of {bits} bits"
+
+    def repr_instance(self, value: Any, level: int) -> str:
+        with contextlib.suppress(Exception):  # of a user's class
+            if isinstance(value, Sequence) and not isinstance(value, memoryview):
+                return self.repr_list(value, level)  # type: ignore[arg-type]
+        return super().repr_instance(value, level)

@@ -19,7 +19,7 @@ from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Kernel, Recei
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import Assembly, assemble, assemble_on
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.plan import region_of
 from autdtorch.utils.process import spread
 
 OPTIONS = {"--seconds": {"type": float, "default": 0.4, "help": "of each repeat"}}

@@ -22,7 +22,7 @@ from triton.runtime.jit import JITFunction
 
 from autdtorch.fdtd.kernels.cuda import Cells, DeviceMedium, DeviceRun, blocks_of
 from autdtorch.fdtd.stepping import assemble, drive_signal
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.plan import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box
 from autdtorch.scene.scene import Medium, Scene

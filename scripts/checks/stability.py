@@ -21,7 +21,7 @@ from tqdm import tqdm
 from autdtorch.fdtd.kernels.contract import Receivers, Sources, WaveState
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, assemble, drive_dft, drive_signal
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.plan import region_of
 from autdtorch.utils.array_types import Array
 
 FEWEST_PERIODS = 3 * RAMP_PERIODS

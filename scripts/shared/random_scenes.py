@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from autdtorch.fdtd.grid import MIN_CELLS_PER_WAVELENGTH, make_grid
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.fdtd.grid import make_grid
+from autdtorch.fdtd.region import MIN_CELLS_PER_WAVELENGTH
+from autdtorch.propagators.plan import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
 from autdtorch.scene.reflectors import Reflector

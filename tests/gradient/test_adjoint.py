@@ -21,7 +21,7 @@ from autdtorch.fdtd.kernels.contract import (
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.material_gradients import cells_of_obstacles
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.plan import region_of
 from autdtorch.scene.obstacles import Box, Sphere
 
 HEAVY = Sphere((4.7e-3, 4.2e-3, 4.6e-3), 1.7e-3, density=20.0, sound_speed=300.0)

@@ -15,7 +15,7 @@ from autdtorch.fdtd.assembly.heterogeneous import heterogeneous_cells
 from autdtorch.fdtd.grid import make_grid
 from autdtorch.fdtd.material_gradients import cells_of_maps
 from autdtorch.fdtd.stepping import air_stencil
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.plan import region_of
 
 SPHERE = at.Sphere((6.2e-3, 5.7e-3, 6.1e-3), 2e-3, density=20.0, sound_speed=300.0)
 RIGID = at.Box((3e-3, 9.5e-3, 9.5e-3), (3e-3, 3e-3, 3e-3), rigid=True)

@@ -14,8 +14,7 @@ from autdtorch.fdtd.grouping import box_grid, cheapest_boxes, one_box
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.propagators import SimulatedPropagator, assembled_box, make_propagator
 from autdtorch.propagators.free_space import free_space_matrix
-from autdtorch.propagators.plan import plan
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.plan import plan, region_of
 from autdtorch.propagators.store import BODIES
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask

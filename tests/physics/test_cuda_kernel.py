@@ -20,8 +20,7 @@ from autdtorch.fdtd.kernels.cuda import BlockSizes, CudaKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import assemble
 from autdtorch.propagators import make_propagator
-from autdtorch.propagators.plan import plan
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.plan import plan, region_of
 from autdtorch.scene.drive import drive_from_phases
 from autdtorch.scene.obstacles import Box
 

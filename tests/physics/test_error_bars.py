@@ -12,13 +12,12 @@ from small_scenes import AIR, CUBE, relative_error, small_scene
 
 import autdtorch as at
 from autdtorch import analytic
-from autdtorch.fdtd.grid import RATIO, coarsest_spacing, second_spacing
 from autdtorch.fdtd.grid_errors import Law, errors_by_grids, grid_errors
+from autdtorch.fdtd.region import RATIO
 from autdtorch.propagators import FreeSpacePropagator, make_propagator
 from autdtorch.propagators import estimate as simulation_estimate
 from autdtorch.propagators.free_space import free_space_matrix
-from autdtorch.propagators.plan import plan
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.plan import plan, region_of
 from autdtorch.scene.obstacles import Sphere, VoxelMask
 
 CENTER, RADIUS = (12.2e-3, 11.9e-3, 12.1e-3), 3.3e-3
@@ -65,7 +64,7 @@ def test_estimates_of_exact_fields_silent_rows_and_grids_that_agree_by_chance():
 def test_a_tolerance_is_met(method):
     scene = small_scene((RIGID,))
     loose, tight = (make_propagator(scene, method, None, tolerance=tolerance) for tolerance in (0.1, 0.01))
-    assert tight.spacing < loose.spacing <= coarsest_spacing(region_of(scene))
+    assert tight.spacing < loose.spacing <= region_of(scene).coarsest_spacing
     for propagator, tolerance in ((loose, 0.1), (tight, 0.01)):
         runs = len(propagator.runs)
         matrix, error = propagator.transfer_matrix(return_error=True)
@@ -112,7 +111,7 @@ def test_the_error_of_each_point():
 @pytest.mark.filterwarnings("ignore:no steady state")
 def test_a_spacing_is_chosen_where_nothing_scatters_and_none_without_an_estimate():
     scene = small_scene((Sphere(CENTER, RADIUS, density=AIR.density, sound_speed=AIR.sound_speed),))
-    assert make_propagator(scene, "box", None, tolerance=0.1).spacing < coarsest_spacing(region_of(scene))
+    assert make_propagator(scene, "box", None, tolerance=0.1).spacing < region_of(scene).coarsest_spacing
     with pytest.raises(ValueError, match=r"^max_periods: 1; "):
         make_propagator(small_scene((RIGID,)), "box", None, tolerance=0.1, max_periods=1)
 
@@ -158,7 +157,7 @@ def test_bodies_of_slow_fluids_start_on_a_finer_grid(ratio):
     ball = Sphere(CENTER, 1.5e-3, density=3 * AIR.density, sound_speed=ratio * AIR.sound_speed)
     scene = small_scene((ball,))
     chosen = make_propagator(scene, "box", None, tolerance=0.5).spacing
-    assert chosen == pytest.approx(coarsest_spacing(region_of(scene)) / 1.6 / min(1 / ratio, 1.6))
+    assert chosen == pytest.approx(region_of(scene).coarsest_spacing / 1.6 / min(1 / ratio, 1.6))
 
 
 def test_a_choice_ends_where_voxels_are_too_coarse(caplog):
@@ -191,8 +190,8 @@ def test_exact_spheres_claim_the_waves_left_out(tolerance):
 
 def test_the_second_grid_is_coarser_where_fair():
     region = region_of(EMPTY)
-    assert second_spacing(region, 1e-3) == RATIO * 1e-3
-    assert second_spacing(region, 2e-3) == 2e-3 / RATIO
+    assert region.second_spacing(1e-3) == RATIO * 1e-3
+    assert region.second_spacing(2e-3) == 2e-3 / RATIO
 
 
 BALL = at.Sphere((12e-3, 20e-3, 5e-3), 3e-3, density=0.2, sound_speed=900.0)

@@ -19,7 +19,7 @@ from autdtorch.fdtd.kernels.cpu_sweep import strips_of
 from autdtorch.fdtd.kernels.cpu_waves import superposition, wave_matrix
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import assemble, drive_signal
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.plan import region_of
 from autdtorch.scene.obstacles import Box
 from autdtorch.utils.apertures import Discs
 from autdtorch.utils.validation import LENGTH_TOLERANCE

@@ -32,7 +32,7 @@ from autdtorch.fdtd.region import Body, Fluid
 from autdtorch.fdtd.stencil import OFFSETS, flat_offsets
 from autdtorch.fdtd.stepping import air_stencil, assemble_on
 from autdtorch.propagators import make_propagator
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.plan import region_of
 from autdtorch.scene.arrays import strengths_of
 from autdtorch.scene.obstacles import Box, Cylinder, Sphere
 

@@ -29,7 +29,7 @@ from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_ste
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
 from autdtorch.fdtd.stepping import assemble, drive_dft, drive_signal
 from autdtorch.propagators import make_propagator
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.plan import region_of
 from autdtorch.scene.obstacles import Box
 
 STENCIL = tuned_stencil(2 * math.pi / 8.5)

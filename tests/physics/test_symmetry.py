@@ -14,7 +14,7 @@ from small_scenes import AIR, relative_error
 from autdtorch.fdtd.grid import make_box
 from autdtorch.io.scene_file import load_scene
 from autdtorch.propagators import make_propagator
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.plan import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import circle_points
 from autdtorch.scene.obstacles import Box, Cylinder, Sphere, VoxelMask

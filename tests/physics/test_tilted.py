@@ -21,7 +21,7 @@ from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import assemble
 from autdtorch.fdtd.turning import axes_along, flat_faces
 from autdtorch.propagators import make_propagator
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.plan import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere

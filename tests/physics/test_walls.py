@@ -16,8 +16,7 @@ from autdtorch.fdtd.stepping import assemble
 from autdtorch.fdtd.thin_walls import Thickened, thickened, thin_wall
 from autdtorch.propagators import make_propagator
 from autdtorch.propagators.free_space import free_space_matrix
-from autdtorch.propagators.plan import plan
-from autdtorch.propagators.scene_region import difference_from_rigid, region_of
+from autdtorch.propagators.plan import difference_from_rigid, plan, region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere
 from autdtorch.scene.scene import Scene

@@ -17,7 +17,7 @@ from autdtorch.fdtd.assembly.sections import MaterialKey, Section, plane_fields
 from autdtorch.fdtd.assembly.unions import speed_factor
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.plan import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Sphere
 from autdtorch.scene.scene import Medium, Scene

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import autdtorch as at
 from autdtorch.io.scene_file import scene_lines
-from autdtorch.propagators.scene_region import region_of, with_rigid
+from autdtorch.propagators.plan import region_of, with_rigid
 from autdtorch.utils.digest import digest_of
 
 AIR = at.Medium(1.2, 343.0)

@@ -21,7 +21,7 @@ from autdtorch.fdtd.interpolation import (
 )
 from autdtorch.fdtd.placement import fitting_spacing, grid_offset
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.plan import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Mesh, Sphere
 from autdtorch.scene.scene import Scene

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from autdtorch.hardware.sensors.sensor import SensorError
+from autdtorch.utils.files import path_of
 from autdtorch.utils.validation import (
     boolean,
     finite_number,
@@ -24,7 +25,6 @@ from autdtorch.utils.validation import (
     integer_at_least,
     invalid,
     number_between,
-    path_of,
     positive,
     require_callable,
 )

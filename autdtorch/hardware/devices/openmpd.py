@@ -25,7 +25,8 @@ from autdtorch.scene.drive import PhaseLevels, validate_drive
 from autdtorch.scene.geometry import in_plane
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid, members, path_of, real_tensor
+from autdtorch.utils.files import path_of
+from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid, members, real_tensor
 
 _BOARD = 256
 _LEVELS = 128  # phase levels of a board

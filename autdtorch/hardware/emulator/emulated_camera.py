@@ -20,10 +20,10 @@ from scipy import ndimage, sparse
 from autdtorch.hardware.camera.screen import Screen
 from autdtorch.hardware.emulator.bench import EmulatedBench
 from autdtorch.scene.geometry import Plane
+from autdtorch.utils.files import path_of
 from autdtorch.utils.validation import (
     integer_at_least,
     number_between,
-    path_of,
     positive_integers,
     require_callable,
     require_kind,

@@ -12,14 +12,8 @@ import torch
 
 from autdtorch.hardware.sensors.sensor import Sensor, SensorConfig, SensorError, Setup
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.validation import (
-    integer_at_least,
-    invalid,
-    not_negative,
-    number_between,
-    path_of,
-    positive,
-)
+from autdtorch.utils.files import path_of
+from autdtorch.utils.validation import integer_at_least, invalid, not_negative, number_between, positive
 
 _LONGEST = 3600.0  # of the times of a reading [s]
 _POLL = 0.02  # [s] between looks at the file

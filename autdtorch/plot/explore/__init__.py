@@ -11,16 +11,9 @@ from typing import TYPE_CHECKING
 from autdtorch.plot.explore.situation import checked_drive
 from autdtorch.plot.view3d import require_rendering
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.files import path_of
 from autdtorch.utils.hints import with_extra
-from autdtorch.utils.validation import (
-    ArrayLike,
-    boolean,
-    integer_at_least,
-    invalid,
-    path_of,
-    positive,
-    require_kind,
-)
+from autdtorch.utils.validation import ArrayLike, boolean, integer_at_least, invalid, positive, require_kind
 
 if TYPE_CHECKING:
     from autdtorch.plot.explore.explorer import Explorer

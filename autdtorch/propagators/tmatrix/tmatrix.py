@@ -29,7 +29,7 @@ from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.reflectors import Reflector, require_arrangement, require_in_front
 from autdtorch.utils.array_types import COMPLEX, REAL
-from autdtorch.utils.files import read_arrays, write_arrays
+from autdtorch.utils.files import path_of, read_arrays, write_arrays
 from autdtorch.utils.hints import renamed_keywords
 from autdtorch.utils.images import NO_MIRRORS, Image, images_of
 from autdtorch.utils.process import cached_property, one_library_thread, spread
@@ -41,7 +41,6 @@ from autdtorch.utils.validation import (
     invalid,
     members,
     number_between,
-    path_of,
     points_grid,
     positive,
     real_tensor,

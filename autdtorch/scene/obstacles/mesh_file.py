@@ -15,7 +15,8 @@ import numpy as np
 
 from autdtorch.scene.obstacles.mesh_solid import FARTHEST, Triangles
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.validation import invalid, path_of
+from autdtorch.utils.files import path_of
+from autdtorch.utils.validation import invalid
 
 # Beginnings, in lower case, of files that are no meshes
 _OTHERS = {

@@ -18,7 +18,7 @@ from autdtorch.scene.obstacles.base import Obstacle
 from autdtorch.scene.obstacles.voxel_surface import ThinError, VoxelCubes, VoxelSurface
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.files import read_arrays, write_arrays
+from autdtorch.utils.files import path_of, read_arrays, write_arrays
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.process import cached_property
 from autdtorch.utils.validation import (
@@ -28,7 +28,6 @@ from autdtorch.utils.validation import (
     finite_vector,
     invalid,
     is_dense,
-    path_of,
     positive,
     positive_entries,
 )
