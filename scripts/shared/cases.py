@@ -104,14 +104,16 @@ def sphere_case(name: str, shift: Sequence[float] = (0.0, 0.0, 0.0)) -> Case:
     return Case(name, scene, scene.control_points, exact, float(scattered.norm()))
 
 
-Ratios = tuple[float, float] | None
-"""Density and sound speed of a fluid relative to air; None for a rigid body."""
+Ratios = tuple[float, float] | complex | None
+"""Density and sound speed of a fluid relative to air; the impedance of a surface; None for a rigid body."""
 
 
 def sphere(center: Sequence[float], radius: float, ratios: Ratios, air: at.Medium) -> at.Sphere:
     """Return a sphere of a centre (3,) and radius [m]."""
     if ratios is None:
         return at.Sphere(tuple(center), radius, rigid=True)
+    if isinstance(ratios, complex):
+        return at.Sphere(tuple(center), radius, impedance=ratios)
     density, speed = ratios[0] * air.density, ratios[1] * air.sound_speed
     return at.Sphere(tuple(center), radius, density=density, sound_speed=speed)
 
@@ -123,6 +125,8 @@ def sphere_matrix(
     where = scene.control_points, scene.array.positions, scene.wavenumber, tuple(center), radius
     if ratios is None:
         field = analytic.rigid_sphere(*where, scattered=scattered)
+    elif isinstance(ratios, complex):
+        field = analytic.impedance_sphere(*where, ratios, scattered=scattered)
     else:
         field = analytic.fluid_sphere(*where, *ratios, scattered=scattered)
     return 4 * math.pi * scene.array.source_strength * field

@@ -5,8 +5,10 @@ Sizes are of things on a bench: paper and phone backs, slits between them, wires
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +28,7 @@ _CLEAR = 4e-3  # Least distance of sources and points from a surface [m]
 
 
 class Exact(NamedTuple):
-    """A sphere whose series is the truth: centre (3,) and radius [m], ratios of density and sound speed."""
+    """A sphere whose series is the truth: centre (3,) and radius [m], and what it is."""
 
     center: Array
     radius: float
@@ -126,7 +128,7 @@ def cylinder(rng: np.random.Generator) -> Drawn:
     return Drawn([at.Cylinder(tuple(center), radius, height, tuple(axis), **_material(rng))])
 
 
-def _ball(rng: np.random.Generator, radius: float, ratios: tuple[float, float]) -> Drawn:
+def _ball(rng: np.random.Generator, radius: float, ratios: Ratios) -> Drawn:
     center = _middle(rng)
     return Drawn([cases.sphere(center.tolist(), radius, ratios, AIR)], Exact(center, radius, ratios))
 
@@ -139,6 +141,23 @@ def sphere(rng: np.random.Generator) -> Drawn:
 def slow(rng: np.random.Generator) -> Drawn:
     """A ball of a fluid in which sound is slow."""
     return _ball(rng, rng.uniform(1e-3, 3e-3), (log_uniform(rng, 0.1, 100), log_uniform(rng, 0.3, 0.6)))
+
+
+def _impedance(rng: np.random.Generator) -> complex:
+    """Draw an impedance from soft to nearly rigid, with a phase of up to 70 degrees."""
+    return cmath.rect(log_uniform(rng, 0.3, 20), rng.uniform(-1.2, 1.2))
+
+
+def absorber(rng: np.random.Generator) -> Drawn:
+    """A cuboid, plate, cylinder or ring whose surface has an impedance."""
+    bodies = (block, plate, cylinder, torus)[rng.integers(4)](rng).bodies
+    surface = {"rigid": False, "density": None, "sound_speed": None, "impedance": _impedance(rng)}
+    return Drawn([replace(body, **surface) for body in bodies])
+
+
+def lined(rng: np.random.Generator) -> Drawn:
+    """A ball whose surface has an impedance."""
+    return _ball(rng, rng.uniform(2e-3, 9e-3), _impedance(rng))
 
 
 def touching(rng: np.random.Generator) -> Drawn:
@@ -191,7 +210,7 @@ FAMILIES: Mapping[str, Family] = {
     each.__name__: each
     for each in (
         *(plate, slit, corner, block, apart, needle, cylinder),
-        *(sphere, slow, touching, torus, shell, voxels, shadow),
+        *(sphere, slow, absorber, lined, touching, torus, shell, voxels, shadow),
     )
 }
 
