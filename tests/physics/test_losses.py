@@ -52,17 +52,16 @@ def ball(radius, **material):
     return Body(Sphere(tuple(CENTER), radius, rigid=True), fluid, impedance=impedance)
 
 
-# the tolerances of lossy fluids and of impedances at 1 mm; rigid and loss-free spheres of 8 mm have 0.3 and
-# 0.2 %
+# twice the errors at 1 mm; rigid and loss-free spheres of 8 mm have 0.3 and 0.2 %
 @pytest.mark.parametrize(
     ("material", "tolerance"),
     [
-        pytest.param({"fluid": FOAM}, 0.005, id="foam"),
-        pytest.param({"fluid": CLOTH}, 0.005, id="cloth"),
-        pytest.param({"fluid": RUBBER}, 0.005, id="rubber"),
-        pytest.param({"impedance": 1.0}, 0.01, id="matched"),
-        pytest.param({"impedance": 3 - 3j}, 0.01, id="mass"),
-        pytest.param({"impedance": 3 + 3j}, 0.01, id="spring"),
+        pytest.param({"fluid": FOAM}, 0.003, id="foam"),
+        pytest.param({"fluid": CLOTH}, 0.004, id="cloth"),
+        pytest.param({"fluid": RUBBER}, 0.003, id="rubber"),
+        pytest.param({"impedance": 1.0}, 0.002, id="matched"),
+        pytest.param({"impedance": 3 - 3j}, 0.004, id="mass"),
+        pytest.param({"impedance": 3 + 3j}, 0.006, id="spring"),
     ],
 )
 def test_spheres_are_their_series_and_take_the_power_that_flows_in(material, tolerance):
@@ -259,6 +258,18 @@ def test_walls_with_an_impedance_reflect_obliquely_wherever_they_are(impedance, 
     expected = (impedance * math.cos(angle) - 1) / (impedance * math.cos(angle) + 1)
     reflected = reflection((0, 0, 1), -depth, 1e-3, angle, 0.3, impedance=impedance)
     assert abs(reflected - expected) < tolerance
+
+
+# Errors of third order remain, 0.004 and less: the tolerance is twice that. Without slopes along the surface
+# the error at the normal would be 0.026.
+@pytest.mark.parametrize("impedance", [1.0, 3 - 1j])
+@pytest.mark.parametrize("incidence", [0, 45, 70])
+@pytest.mark.parametrize(("normal", "offset"), [((1, 1, 0), 0.1), ((1, 1, 0), 0.45), ((2, 1, 0), 0.3)])
+def test_tilted_walls_with_an_impedance_reflect_as_they_should(impedance, incidence, normal, offset):
+    angle = math.radians(incidence)
+    expected = (impedance * math.cos(angle) - 1) / (impedance * math.cos(angle) + 1)
+    reflected = reflection(normal, offset, 0.7e-3, angle, 0.3, impedance=impedance)
+    assert abs(reflected - expected) < 0.008
 
 
 # stiff, massive and resonant with the air before the face, whose mass and stiffness add to those of two cells

@@ -36,6 +36,9 @@ _GROWTH = 1e-3  # Distance [cells] by which a body grows and shrinks for the are
 _CENTERS = (np.array(list(np.ndindex((SUBCELLS,) * 3))) + 0.5) / SUBCELLS  # of the sub-cells (64, 3)
 LARGEST_PHASE = 1.2  # Largest phase between a vertex and a surface [rad]
 _LEAST_WIDTH = 4e-3  # Least change of a distance over a sub-cell [cells]: cubes of it are not rounding
+# Shares of the square of the slope along a surface [cells^2], and of the square of the wavenumber: with both,
+# tilted half-spaces reflect as they should to second order, at any incidence, tilt and place
+_ALONG, _EXCESS = 0.19, 0.03
 _LEAST_GRADIENT = 0.3  # Least gradient of a signed distance with which a place is moved to the surface
 
 
@@ -122,14 +125,19 @@ def _consistent(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return T of finite elements: off its diagonal (n, 28), and sums of its rows (n, 8).
 
-    Linear interpolation underestimates the pressure of a wave between the vertices, along the normal by half
-    the square of its phase times x (1 - x).
+    Linear interpolation underestimates the power of a pressure that varies along the surface: the squares of
+    slopes along it are added.
     """
-    hats = _hats(surface.place)
-    bulge = kappa**2 * (surface.normal**2 * surface.place * (1 - surface.place)).sum(axis=2)
-    weighted = (surface.area * (1 + bulge))[:, :, None] * hats
-    both = admittance * weighted.transpose(0, 2, 1) @ hats
-    return both[:, PAIRS[:, 0], PAIRS[:, 1]], admittance * weighted.sum(axis=1)
+    area, hats = surface.area[:, :, None], _hats(surface.place)
+    both = (1 - _EXCESS * kappa**2) * (area * hats).transpose(0, 2, 1) @ hats
+    total, across = both.sum(axis=2), np.zeros_like(hats)
+    for axis in range(3):
+        slope = _slopes(surface.place, axis)
+        both += _ALONG * (area * slope).transpose(0, 2, 1) @ slope
+        across += surface.normal[:, :, axis, None] * slope
+    both -= _ALONG * (area * across).transpose(0, 2, 1) @ across
+    links = both[:, PAIRS[:, 0], PAIRS[:, 1]]
+    return np.asarray(admittance * links, complex), np.asarray(admittance * total, complex)
 
 
 def _lumped(
@@ -161,3 +169,11 @@ def _hats(place: Array) -> Array:
     """Return the trilinear functions (n, q, 8) of the vertices at places (n, q, 3)."""
     place = place[:, :, None]
     return np.asarray(np.where(VERTICES == 1, place, 1 - place).prod(axis=3))
+
+
+def _slopes(place: Array, axis: int) -> Array:
+    """Return the derivatives (n, q, 8) of these functions along an axis."""
+    place = place[:, :, None]
+    factors = np.where(VERTICES == 1, place, 1 - place)
+    factors[..., axis] = 2 * VERTICES[:, axis] - 1
+    return np.asarray(factors.prod(axis=3))
