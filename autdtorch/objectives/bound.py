@@ -16,6 +16,9 @@ Branch and bound over the phases of the foci (`phase_boxes`) starts from this bo
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 import scipy.optimize
@@ -25,8 +28,11 @@ from autdtorch.utils.array_types import Array, ComplexArray
 from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import ArrayLike, complex_tensor, positive
 
+LogBound: TypeAlias = Callable[[Array, float], tuple[float, Array]]
+
 #: Orders of Schatten norms that approach the largest eigenvalue, which has kinks at its minima.
-ORDERS = (4, 32, 256, 2048, 16384)
+_ORDERS = (4, 32, 256, 2048, 16384)
+_ITERATIONS = 2000  # of each order
 
 #: Smallest weight, relative to its start: no step of the search may end where all weights are 0.
 _LEAST_WEIGHT = 1e-12
@@ -157,21 +163,36 @@ def level_bound(
     log_z, wide = (np.zeros(len(start)), 0.0) if norm else (np.log(start), _RANGE)
     limits += [(0, _MOST_PRICE)] * len(silent) + [(log - wide, log + wide) for log in log_z]
     x = np.concatenate([weights, np.full(len(silent), 1e-3), log_z])
-    for order in ORDERS:
-        x = scipy.optimize.minimize(
-            _log_bound,
-            x,
-            args=(rows, importance, order),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=limits,
-            options={"maxcor": 40, "maxiter": 2000, "ftol": 1e-14, "gtol": 1e-10},
-        ).x
+    x = lowest(partial(_log_bound, rows=rows, importance=importance), x, limits, _ITERATIONS)
     square = certified(x[len(rows) :], rows, _signed(x, rows, importance))
     bound = alone.min() * math.sqrt(square) * (1 + _MARGIN)
     if norm:  # |z|^2 is the number of transducers
         bound /= math.sqrt(len(start))
     return bound, float(x[count : count + len(silent)].sum())
+
+
+def lowest(
+    log_bound: LogBound, x: Array, limits: Sequence[tuple[float, float | None]], iterations: int
+) -> Array:
+    """Return the place of the lowest bound, by orders of the norm of `log_dual` that rise.
+
+    Args:
+        log_bound: of x (n,) and an order, returns the logarithm and its gradient (n,).
+        x: to start from (n,).
+        limits: of each entry.
+        iterations: most of each order.
+    """
+    for order in _ORDERS:
+        x = scipy.optimize.minimize(
+            log_bound,
+            x,
+            args=(order,),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=limits,
+            options={"maxcor": 40, "maxiter": iterations, "ftol": 1e-14, "gtol": 1e-10},
+        ).x
+    return x
 
 
 def contrast_bound(foci: ComplexArray, background: ComplexArray) -> float:
@@ -256,14 +277,14 @@ def _signed(x: Array, rows: ComplexArray, importance: Array) -> Array:
     return np.concatenate((weights * factor, -prices))
 
 
-def _log_bound(x: Array, rows: ComplexArray, importance: Array, order: float) -> tuple[float, Array]:
+def _log_bound(x: Array, order: float, rows: ComplexArray, importance: Array) -> tuple[float, Array]:
     """Return the logarithm of the bound over the least of `alone`, and its gradient; see `log_dual`.
 
     Args:
         x: the weights a over `importance`, up to a factor, b, then log z (P + K + M,).
+        order: >= 2.
         rows: transfer matrix (P + K, M), rows of foci divided by `alone`, those of quiet points by its least.
         importance: (min(alone) / alone)^2 (P,).
-        order: >= 2.
     """
     foci = len(importance)
     log, at_points, slope_log_z = log_dual(x[len(rows) :], rows, _signed(x, rows, importance), order)

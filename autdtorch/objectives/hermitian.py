@@ -16,12 +16,13 @@ from typing import TypeVar
 import numpy as np
 import scipy.optimize
 
-from autdtorch.objectives.bound import ORDERS, certified, log_dual
+from autdtorch.objectives.bound import certified, log_dual, lowest
 from autdtorch.utils.array_types import Array, ComplexArray
 from autdtorch.utils.process import one_library_thread
 
 _LEAST_WEIGHT = 1e-12  # of a form, relative to its start
 _RANGE = 30.0  # of log z
+_ITERATIONS = 500  # of each order; hundreds of forms take milliseconds in each
 _RANK = 1e-13  # Singular value below which the search leaves a combination of rows out; certificates do not
 _MARGIN = 1e-12
 _SMOOTHING = (
@@ -60,7 +61,8 @@ def forms_bound(rows: ComplexArray, weights: Array) -> float:
     forms = len(weights)
     start = np.log(np.linalg.norm(rows, axis=0)) / 2
     x = np.concatenate([np.ones(forms), start])
-    limits = [(_LEAST_WEIGHT, None)] * forms + [(log - _RANGE, log + _RANGE) for log in start]
+    limits: list[tuple[float, float | None]] = [(_LEAST_WEIGHT, None)] * forms
+    limits += [(log - _RANGE, log + _RANGE) for log in start]
 
     def log_bound(x: Array, order: float) -> tuple[float, Array]:
         total = x[:forms].sum()
@@ -69,16 +71,7 @@ def forms_bound(rows: ComplexArray, weights: Array) -> float:
         by_forms = (weights @ by_rows - signed @ by_rows) / total
         return log, np.concatenate([by_forms, by_log_z])
 
-    for order in ORDERS:
-        x = scipy.optimize.minimize(
-            log_bound,
-            x,
-            args=(order,),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=limits,
-            options={"maxcor": 40, "maxiter": 500, "ftol": 1e-12, "gtol": 1e-9},
-        ).x
+    x = lowest(log_bound, x, limits, _ITERATIONS)
     signed = x[:forms] @ weights / x[:forms].sum()
     return scale**2 * certified(x[forms:], rows, signed) * (1 + _MARGIN)
 
