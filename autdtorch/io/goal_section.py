@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from autdtorch.objectives.forces import ForceGoal, LeastForm, Levitate, Push, Trap
+from autdtorch.objectives.forces import ForceGoal, GoalOfForce, Levitate, Push, Trap
 from autdtorch.objectives.goals import (
     WEAKEST_FOCUS,
     Goal,
@@ -92,8 +92,11 @@ def _span(where: str, text: str) -> range:
 
 
 def goal_section(goal: Goal | ForceGoal) -> dict[str, Any]:
-    """Return the section of a goal, from which `load_goal` makes it again."""
-    if isinstance(goal, LeastForm):
+    """Return the section of a goal, from which `load_goal` makes it again.
+
+    For readings of a force it is that of the trap, lift or push.
+    """
+    if isinstance(goal, GoalOfForce):
         return goal_section(goal.of)
     return {"name": goal.name} | _entries(goal)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,12 +12,12 @@ from autdtorch.methods.problem import Problem, known_matrix
 from autdtorch.methods.run import run
 from autdtorch.objectives.bound import checked_matrix
 from autdtorch.objectives.forces import LeastForm
-from autdtorch.objectives.form_cells import no_drive_above
+from autdtorch.objectives.form_cells import search_above
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
-from autdtorch.objectives.objective import GoalFunction, Objective
+from autdtorch.objectives.objective import GoalFunction, Objective, magnitudes
 from autdtorch.utils.validation import finite_number, require_kind
 
-_STARTS = 4, 28  # of ascents; the second where the first decide nothing
+_STARTS = 4, 28  # of ascents; the second where the first decide nothing, nor cells
 _FEW = 4  # transducers, whose drives can be divided into cells
 
 
@@ -52,7 +53,8 @@ def attainable(
 ) -> Attainable:
     """Return whether a drive scores above `least`, by gradient ascent and the bound of the goal.
 
-    For forces with up to four transducers, cells of drives decide what these leave open.
+    For forces with up to four transducers, ascents from cells of drives, and bounds on each, decide what
+    these leave open.
 
     Args:
         objective: with a transfer matrix, such as a `ForceObjective` of a trap.
@@ -68,20 +70,22 @@ def attainable(
     require_kind("goal", problem.goal, Goal)
     assert isinstance(problem.goal, Goal)
     matrix = known_matrix(problem)
-    bound, best = problem.goal.bound(matrix), None
+    best = Attainable(least, -math.inf, torch.zeros_like(matrix[0]), problem.goal.bound(matrix))
     for trial, starts in enumerate(_STARTS):
         solution = run(GradientAscent(starts=starts), objective, [trial], seed, goal=problem.goal)
-        score = float(solution.score[0])
-        if best is None or score > best.score:
-            best = Attainable(least, score, solution.drive[0], bound)
+        if (score := float(solution.score[0])) > best.score:
+            best = replace(best, score=score, drive=solution.drive[0])
         if best.answer is not None:
-            return best
-    assert best is not None
-    if (
-        isinstance(problem.goal, LeastForm)
-        and problem.transducers <= _FEW
-        and least >= 0
-        and no_drive_above(checked_matrix(matrix), problem.goal.weights, least)
-    ):
-        return replace(best, bound=least)
+            break
+        if isinstance(problem.goal, LeastForm) and problem.transducers <= _FEW and least >= 0:
+            return _by_cells(best, matrix, problem.goal)
     return best
+
+
+def _by_cells(best: Attainable, matrix: torch.Tensor, goal: LeastForm) -> Attainable:
+    """Return what cells of drives decide of a force, by the rows (N, M)."""
+    drive, excluded = search_above(checked_matrix(matrix), goal.weights, best.least)
+    if drive is not None:
+        played = torch.from_numpy(drive)
+        return replace(best, score=float(goal(magnitudes(matrix, played[None]))[0]), drive=played)
+    return replace(best, bound=best.least) if excluded else best

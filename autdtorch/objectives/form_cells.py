@@ -1,4 +1,4 @@
-"""The proof that no drive makes all of J Hermitian forms large, by cells of drives, for few transducers.
+"""Whether some drive makes all of J Hermitian forms large, by cells of drives, for few transducers.
 
 The semidefinite relaxation (`hermitian`) can be positive where no drive is: a mixture of drives may make all
 forms positive. Drives with the largest amplitude at transducer r have ratios u_i = q_i / q_r with |u_i| <= 1.
@@ -7,98 +7,143 @@ A cell has each ratio in a square. With its circumscribed disc of centre c and r
     q^H B_i q = d^2 |q_r|^2 - |q_i - c q_r|^2 >= 0
 
 is one more Hermitian form. Where weights w >= 0 make sum w_j A_j + sum w_i B_i negative definite, no drive of
-the cell makes all forms A_j >= 0. Other cells are divided.
+the cell makes all forms A_j >= 0. Other cells have a mixture of drives that makes all these forms positive:
+an ascent starts from its main drive, and the cell is divided where the mixture is widest.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 import scipy.optimize
 
+from autdtorch.objectives.hermitian import ascended
 from autdtorch.utils.array_types import Array, ComplexArray
 from autdtorch.utils.process import one_library_thread
 
 _MARGIN = 1e-9  # of eigenvalues; rounding of forms of size 1 is below 1e-12
 _CUTS = 40  # eigenvectors for a cell
-_CELLS = 300
+_CELLS = 1000
 _NARROW = 2e-3  # forms of discs are below 1.3e5 then, and their rounding below the margin
 _REACH = math.sqrt(2) * (1 + 1e-9)  # of a disc around a square of half width 1
+_TINY = 1e-300
+
+
+class _Cell(NamedTuple):
+    """Drives with the largest amplitude at one transducer, and each ratio to it in a square.
+
+    `vectors` (V, M): of the cell that it is a part of, whose forms decide here too.
+    """
+
+    largest: int
+    centres: ComplexArray
+    widths: Array
+    vectors: ComplexArray
 
 
 @one_library_thread()
-def no_drive_above(rows: ComplexArray, weights: Array, least: float) -> bool:
-    """Return whether it is proved that no drive of amplitudes <= 1 makes all forms larger than `least`.
+def search_above(rows: ComplexArray, weights: Array, least: float) -> tuple[ComplexArray | None, bool]:
+    """Search a drive of amplitudes <= 1 that makes all forms larger than `least`.
 
     Args:
         rows: R (N, M); the effort grows fast with M.
         weights: W (J, N); see `hermitian`.
         least: >= 0.
+
+    Returns:
+        Such a drive (M,), or None, and whether it is proved that there is none.
     """
     forms = np.stack([(rows.conj().T * row) @ rows for row in weights])
     sizes = np.abs(weights) @ (np.abs(rows) ** 2).sum(axis=1)
-    unit, left = np.eye(rows.shape[1]), _CELLS
-    for largest in range(rows.shape[1]):
-        others = np.delete(unit, largest, axis=0)
-        full = np.outer(unit[largest], unit[largest])
+    unit = np.eye(rows.shape[1])
+    whole = np.zeros(len(unit) - 1, complex), np.ones(len(unit) - 1), np.zeros((0, len(unit)), complex)
+    cells = deque(_Cell(largest, *whole) for largest in range(len(unit)))
+    for _ in range(_CELLS):
+        if not cells:
+            return None, True
+        cell = cells.popleft()
+        full = np.diag(unit[cell.largest])
         # of a drive with amplitude 1 at the largest; a lower one has lower forms
         above = (forms - least * full) / (sizes + least)[:, None, None]
-        above = np.concatenate([above, full - others[:, :, None] * others[:, None]])
-        cells = [(np.zeros(len(others), complex), np.ones(len(others)))]
-        while cells:
-            left -= 1
-            centres, widths = cells.pop()
-            if left < 0 or widths.min() < _NARROW:
-                return False
-            drive = unit[largest] + centres @ others
-            if ((above @ drive) @ drive.conj()).real.min() >= 0:
-                return False
-            normals = others - centres.conj()[:, None] * unit[largest]
-            discs = (
-                full - normals[:, :, None] * normals[:, None].conj() / (_REACH * widths[:, None, None]) ** 2
-            )
-            if not _has_negative(np.concatenate([above, discs])):
-                cells += _divided(centres, widths)
-    return True
+        mixture, vectors = _mixture(np.concatenate([above, _limits(cell, unit)]), cell.vectors)
+        if mixture is None:
+            continue
+        main = np.linalg.eigh(mixture)[1][:, -1]
+        drive = ascended(rows, weights, main[None] / np.abs(main).max())[0]
+        if (weights @ np.abs(rows @ drive) ** 2).min() > least:
+            return drive, False
+        if not cell.widths.size or cell.widths.min() < _NARROW:
+            break
+        cells += _divided(cell._replace(vectors=vectors), mixture)
+    return None, False
 
 
-def _divided(centres: ComplexArray, widths: Array) -> list[tuple[ComplexArray, Array]]:
-    """Return the four parts of a cell, by its widest square, without those of ratios above 1."""
-    parts, widest = [], int(widths.argmax())
-    half = widths.copy()
-    half[widest] /= 2
+def _limits(cell: _Cell, unit: Array) -> ComplexArray:
+    """Return forms (2 M - 2, M, M) that are positive in a cell: of amplitudes, and of discs."""
+    others, full = np.delete(unit, cell.largest, axis=0), np.diag(unit[cell.largest])
+    away = others - cell.centres.conj()[:, None] * unit[cell.largest]
+    radii = _REACH * cell.widths[:, None, None]
+    amplitudes = full - others[:, :, None] * others[:, None]
+    return np.concatenate([amplitudes, full - away[:, :, None] * away[:, None].conj() / radii**2])
+
+
+def _divided(cell: _Cell, mixture: ComplexArray) -> list[_Cell]:
+    """Return the four parts of a cell, by the ratio that differs most among the drives of a mixture (M, M).
+
+    Parts with ratios above 1 are left out.
+    """
+    largest = mixture[:, cell.largest]
+    spread = mixture.diagonal().real - np.abs(largest) ** 2 / max(largest[cell.largest].real, _TINY)
+    widest = int(np.delete(spread, cell.largest).argmax())
+    widths = cell.widths.copy()
+    widths[widest] /= 2
+    parts = []
     for corner in (1 + 1j, 1 - 1j, -1 + 1j, -1 - 1j):
-        part = centres.copy()
-        part[widest] += corner * half[widest]
-        x, y = (max(abs(at) - half[widest], 0.0) for at in (part[widest].real, part[widest].imag))
-        if math.hypot(x, y) <= 1:
-            parts.append((part, half))
+        centres = cell.centres.copy()
+        centres[widest] += corner * widths[widest]
+        nearest = (max(abs(at) - widths[widest], 0.0) for at in (centres[widest].real, centres[widest].imag))
+        if math.hypot(*nearest) <= 1:
+            parts.append(cell._replace(centres=centres, widths=widths))
     return parts
 
 
-def _has_negative(forms: ComplexArray) -> bool:
-    """Return whether weights >= 0 are known that make a sum of forms (C, M, M) negative definite.
+def _mixture(forms: ComplexArray, vectors: ComplexArray) -> tuple[ComplexArray | None, ComplexArray]:
+    """Return a mixture of drives that makes all forms positive, as far as is known.
 
-    By cutting planes: linear programs over the weights, with the forms at the eigenvectors so far.
+    Weights >= 0 that make the sum of the forms negative definite rule it out. The search takes cutting
+    planes: linear programs over the weights, with the forms at the eigenvectors so far.
+
+    Args:
+        forms: (C, M, M).
+        vectors: (V, M) to begin with.
+
+    Returns:
+        The mixture (M, M), a sum of x x^H, or None if it is ruled out; and the vectors (V', M) of the search.
     """
-    count, cuts = len(forms), np.zeros((0, len(forms)))
-    weights = np.full(count, 1 / count)
+    count = len(forms)
+    weights, shares = np.full(count, 1 / count), np.zeros(0)
     for _ in range(_CUTS):
-        values, vectors = np.linalg.eigh(np.tensordot(weights, forms, 1))
+        if len(vectors):
+            cuts = np.einsum("vi,cij,vj->vc", vectors.conj(), forms, vectors, optimize=True).real
+            program = scipy.optimize.linprog(
+                np.append(np.zeros(count), 1.0),
+                A_ub=np.hstack([cuts, -np.ones((len(cuts), 1))]),
+                b_ub=np.zeros(len(cuts)),
+                A_eq=np.append(np.ones(count), 0.0)[None],
+                b_eq=[1.0],
+                bounds=[(0, None)] * count + [(None, None)],
+            )
+            if program.x is None:
+                break
+            shares, weights = -program.ineqlin.marginals, np.maximum(program.x[:-1], 0)
+            if program.fun >= -_MARGIN:
+                break
+        values, at = np.linalg.eigh(np.tensordot(weights, forms, 1))
         if values[-1] < -_MARGIN:
-            return True
-        vector = vectors[:, -1]
-        cuts = np.vstack([cuts, ((forms @ vector) @ vector.conj()).real])
-        program = scipy.optimize.linprog(
-            np.append(np.zeros(count), 1.0),
-            A_ub=np.hstack([cuts, -np.ones((len(cuts), 1))]),
-            b_ub=np.zeros(len(cuts)),
-            A_eq=np.append(np.ones(count), 0.0)[None],
-            b_eq=[1.0],
-            bounds=[(0, None)] * count + [(None, None)],
-        )
-        if program.x is None or program.fun >= -_MARGIN:
-            return False
-        weights = np.maximum(program.x[:-1], 0)
-    return False
+            return None, vectors
+        vectors = np.vstack([vectors, at[:, -1]])
+    vectors, shares = vectors[: len(shares)][shares > 0], shares[shares > 0]
+    return (vectors.T * shares) @ vectors.conj(), vectors

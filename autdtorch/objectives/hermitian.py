@@ -11,6 +11,7 @@ a and z is the value of the semidefinite relaxation, as for foci (`bound`); any 
 
 from __future__ import annotations
 
+from operator import itemgetter
 from typing import TypeVar
 
 import numpy as np
@@ -123,8 +124,13 @@ def _ascended(
         slope = turn * (along.real * np.cos(size) + 1j * along.imag * np.sinc(size / np.pi))
         return -value, -np.concatenate([slope.real, slope.imag])
 
+    def loud(drive: ComplexArray) -> tuple[float, ComplexArray]:
+        drive = drive / max(float(np.abs(drive).max()), _TINY)
+        return float(forms_of(mixing @ (basis @ drive)).min()), drive
+
     amplitude = np.abs(drive)
     z = drive / np.maximum(amplitude, _TINY) * np.arcsin(np.minimum(amplitude, _START))
+    highest = loud(drive)
     for smoothing in _SMOOTHING:
         drive = z * np.sinc(np.abs(z) / np.pi)
         scale = float(np.abs(forms_of(mixing @ (basis @ drive))).mean()) or 1.0
@@ -137,8 +143,8 @@ def _ascended(
             options={"maxcor": 20, "maxiter": iterations, "ftol": 1e-11, "gtol": 1e-9},
         ).x
         z = x[:count] + 1j * x[count:]
-    drive = z * np.sinc(np.abs(z) / np.pi)
-    return drive / max(float(np.abs(drive).max()), _TINY)
+        highest = max(highest, loud(z * np.sinc(np.abs(z) / np.pi)), key=itemgetter(0))
+    return highest[1]
 
 
 def _factors(rows: _Numbers) -> tuple[_Numbers, _Numbers]:

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import autdtorch as at
+from autdtorch.io.goal_section import goal_section, load_goal
 from autdtorch.objectives.forces import DIRECTIONS, ForceGoal
-from autdtorch.objectives.form_cells import no_drive_above
+from autdtorch.objectives.form_cells import search_above
 from autdtorch.objectives.hermitian import ascended, forms_bound
 
 BEAD = at.Particle.of("EPS", 0.5e-3)
@@ -102,6 +103,7 @@ def test_methods_push_by_the_readings_of_a_balance_alone(pushed):
     assert torch.equal(read.drive, exact.drive)
     assert read.score.item() == pytest.approx(exact.score.item(), rel=1e-9)
     assert sensor.evaluations == read.evaluations.item()
+    assert load_goal("goal", goal_section(sensor.goal)) == pushed.goal.of
     noisy = at.ForceSensor(pushed, load=bound, noise=0.02 * bound, seed=3)
     several = {
         "gabs": at.gabs(noisy, passes=2),
@@ -149,6 +151,9 @@ def test_no_drive_exceeds_the_bound_on_forms(seed, transducers, forms, rows):
     bound = forms_bound(matrix, weights)
     several = drives(200, transducers, seed).numpy()
     best = ascended(matrix, weights, several[:1])
+    loud = several[0] / np.abs(several[0]).max()
+    climbed, start = ((weights @ np.abs(matrix @ drive) ** 2).min() for drive in (best[0], loud))
+    assert climbed >= start - 1e-12 * np.abs(weights @ np.abs(matrix @ loud) ** 2).max()  # rounding
     scores = (weights @ np.abs(matrix @ np.vstack([several, best]).T) ** 2).min(axis=0)
     assert np.abs(best).max() <= 1 + 1e-12
     assert max(scores.max(), 0) <= bound
@@ -201,10 +206,14 @@ def test_cells_of_drives_decide_what_the_relaxation_leaves_open():
     # max |s_i| >= |s| / 3^(1/2) = 0.577 |s|, but a mixture of drives has s = 0 with |q|^2 > 0
     rows, weights = octahedron(0.5)
     assert forms_bound(rows, weights) > 0.9
-    assert no_drive_above(rows, weights, 0.0)
-    # with amplitudes 1 and 0.518, |s| = 1.268, and the least form is 1.268 (0.6 - 0.577) = 0.0287
-    assert not no_drive_above(*octahedron(0.6), 0.025)
-    assert no_drive_above(*octahedron(0.6), 0.035)
+    assert search_above(rows, weights, 0.0) == (None, True)
+    # with amplitudes 1 and 0.518, |s| = 1.268, and the least form is 1.268 (0.6 - 0.577) = 0.02873
+    rows, weights = octahedron(0.6)
+    drive, excluded = search_above(rows, weights, 0.0287)
+    assert not excluded
+    assert np.abs(drive).max() <= 1 + 1e-12
+    assert (weights @ np.abs(rows @ drive) ** 2).min() > 0.0287
+    assert search_above(rows, weights, 0.035) == (None, True)
     array = at.TransducerArray([(-0.01, 0, 0), (0.01, 0, 0)], normals=(0, 0, 1), source_strength=1.0)
     two = at.make_propagator(at.Scene(array, MEDIUM, 40e3, [(0, 0, 0.1)]), "free_space")
     none = at.attainable(at.ForceObjective(two, Octahedron()))
