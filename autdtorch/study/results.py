@@ -339,10 +339,13 @@ def column_decimals(
 
 
 def _share_of_bound(scene: SceneResult, score: float) -> str:
-    """Return the share of a score in the bound of its scene, and the bound; "none" where it has no such."""
-    if not (math.isfinite(scene.bound) and scene.bound > 0 and score >= 0):
-        return "none"
-    return f"{100 * score / scene.bound:.1f} % of {scene.in_unit(f'{scene.bound:.4g}')}"
+    """Return the share of a score in the bound of its scene, and the bound, as far as there are such."""
+    if not math.isfinite(scene.bound):
+        return "no bound known"
+    bound = scene.in_unit(f"{scene.bound:.4g}")
+    if scene.bound <= 0:
+        return f"no drive above {bound} (certified)"
+    return f"{100 * score / scene.bound:.1f} % of {bound}" if score >= 0 else f"none of {bound}"
 
 
 def with_foci(results: StudyResult) -> bool:

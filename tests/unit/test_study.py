@@ -260,6 +260,10 @@ def test_a_study_of_a_force_has_a_score_and_a_bound_and_no_figures_of_foci(goal,
     number, *unit = first[3].split()
     factor = {"mN": 1e-3, "µN": 1e-6, "nN": 1e-9, "": 1.0}["".join(unit).removesuffix("/m")]
     assert float(number) * factor == pytest.approx(float(scores[0]), rel=5e-3)  # three digits
+    nothing = replace(results.scenes["a"], bound=0.0)  # as of a trap that no drive makes
+    share = summary_rows(replace(results, scenes={"a": nothing}))[1][-1]
+    assert share.startswith("no drive above 0")
+    assert share.endswith("(certified)")
     (row, *_) = map(json.loads, (tmp_path / TRIALS_FILE).read_text().splitlines())
     assert "weakest" not in str(row)
     assert "min" not in row
