@@ -253,7 +253,7 @@ def test_a_study_of_a_force_has_a_score_and_a_bound_and_no_figures_of_foci(goal,
         assert load_goal("goal", found.goal) == goal
         assert (found.simulation.method, found.unit) == ("tmatrix", goal.unit)
         scores = [method.solution.score for method in found.methods.values()]
-        assert max(scores) == scores[0] <= found.bound
+        assert (1 - 1e-12) * max(scores) <= scores[0] <= found.bound  # all transducers in phase are best
         assert all(method.metrics is None for method in found.methods.values())
     head, first, *_ = summary_rows(results)
     assert head == ["scene", "method", "trials", "score", "evaluations", "of the bound"]
