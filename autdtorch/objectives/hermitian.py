@@ -16,6 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 import scipy.optimize
+import scipy.sparse.csgraph
 
 from autdtorch.objectives.bound import certified, log_dual, lowest
 from autdtorch.utils.array_types import Array, ComplexArray
@@ -90,7 +91,8 @@ def ascended(rows: ComplexArray, weights: Array, starts: ComplexArray, iteration
         starts: drives to start from.
         iterations: most of each stage.
     """
-    # forms of a point are sums of 9 quantities: their factors are much smaller than the weights
+    # forms of a point are sums of 9 quantities of 36 waves: factors are much smaller than rows and weights
+    rows, weights = _apart(rows, weights)
     factors = *_factors(rows), *_factors(weights)
     return np.stack([_ascended(*factors, start, iterations) for start in starts])
 
@@ -103,22 +105,36 @@ def _ascended(
     drive: ComplexArray,
     iterations: int,
 ) -> ComplexArray:
-    """Return the drive of `ascended` from a drive (M,), by factors of the rows and of the weights."""
-    count, back, back_mixing = len(drive), basis.conj(), mixing.conj()
+    """Return the drive of `ascended` from a drive (M,).
+
+    Args:
+        mixing: (G, N / G, n), a factor of the rows in groups, as below.
+        basis: (G, n, M), the other.
+        combining: (G, J / G, k), a factor of the weights.
+        squares: (G, k, N / G), the other.
+        drive: to start from.
+        iterations: most of each stage.
+    """
+    count, every = len(drive), basis.reshape(-1, len(drive))
+    back, back_mixing = every.conj(), mixing.conj()
+
+    def readings_of(drive: ComplexArray) -> ComplexArray:
+        values: ComplexArray = mixing @ (every @ drive).reshape(len(mixing), -1, 1)
+        return values
 
     def forms_of(readings: ComplexArray) -> Array:
         values: Array = combining @ (squares @ np.abs(readings) ** 2)
         return values
 
     def smooth(x: Array, temperature: float) -> tuple[float, Array]:
-        z = x[:count] + 1j * x[count:]
+        z: ComplexArray = x[:count] + 1j * x[count:]
         size = np.abs(z)
-        readings = mixing @ (basis @ (z * np.sinc(size / np.pi)))
+        readings = readings_of(z * np.sinc(size / np.pi))
         forms = forms_of(readings) / scale
         shares = np.exp((forms.min() - forms) / temperature)
         value = forms.min() - temperature * np.log(shares.sum())
-        at_readings = (shares / shares.sum()) @ combining @ squares * readings
-        slope = 2 / scale * (at_readings @ back_mixing @ back)
+        at_readings = ((shares / shares.sum()).mT @ combining @ squares).mT * readings
+        slope = 2 / scale * ((at_readings.mT @ back_mixing).ravel() @ back)
         turn = z / np.maximum(size, _TINY)
         along = slope * turn.conj()
         slope = turn * (along.real * np.cos(size) + 1j * along.imag * np.sinc(size / np.pi))
@@ -126,14 +142,14 @@ def _ascended(
 
     def loud(drive: ComplexArray) -> tuple[float, ComplexArray]:
         drive = drive / max(float(np.abs(drive).max()), _TINY)
-        return float(forms_of(mixing @ (basis @ drive)).min()), drive
+        return float(forms_of(readings_of(drive)).min()), drive
 
     amplitude = np.abs(drive)
     z = drive / np.maximum(amplitude, _TINY) * np.arcsin(np.minimum(amplitude, _START))
     highest = loud(drive)
     for smoothing in _SMOOTHING:
         drive = z * np.sinc(np.abs(z) / np.pi)
-        scale = float(np.abs(forms_of(mixing @ (basis @ drive))).mean()) or 1.0
+        scale = float(np.abs(forms_of(readings_of(drive))).mean()) or 1.0
         x = scipy.optimize.minimize(
             smooth,
             np.concatenate([z.real, z.imag]),
@@ -147,8 +163,24 @@ def _ascended(
     return highest[1]
 
 
+def _apart(rows: ComplexArray, weights: Array) -> tuple[ComplexArray, Array]:
+    """Return rows (G, N / G, M) and weights (G, J / G, N / G) of groups that share no form.
+
+    The rows of each of several points are such a group. Groups of other sizes stay together as one.
+    """
+    links = scipy.sparse.block_array([[None, weights], [weights.T, None]])
+    count, groups = scipy.sparse.csgraph.connected_components(links)
+    form_group, row_group = np.split(groups, [len(weights)])
+    members = np.stack([np.bincount(group, minlength=count) for group in (row_group, form_group)])
+    if (members != members[:, :1]).any():
+        return rows[None], weights[None]
+    by_group = row_group.argsort(kind="stable").reshape(count, -1)
+    forms = form_group.argsort(kind="stable").reshape(count, -1)
+    return rows[by_group], weights[forms[:, :, None], by_group[:, None]]
+
+
 def _factors(rows: _Numbers) -> tuple[_Numbers, _Numbers]:
-    """Return factors (N, n) and (n, M) of rows (N, M), real or complex, of their numerical rank n."""
+    """Return factors (..., N, n) and (..., n, M) of rows (..., N, M), real or complex; n is their rank."""
     left, singular, right = np.linalg.svd(rows, full_matrices=False)
-    rank = singular > _RANK * singular[0]
-    return left[:, rank] * singular[rank], right[rank]
+    rank = int((singular > _RANK * singular[..., :1]).sum(axis=-1).max())
+    return left[..., :rank] * singular[..., None, :rank], right[..., :rank, :]

@@ -159,6 +159,19 @@ def test_no_drive_exceeds_the_bound_on_forms(seed, transducers, forms, rows):
     assert max(scores.max(), 0) <= bound
 
 
+def test_ascents_on_several_points_do_not_depend_on_the_order_of_rows_and_forms():
+    rng = np.random.default_rng(0)
+    matrix = rng.normal(size=(12, 5)) + 1j * rng.normal(size=(12, 5))
+    weights = np.kron(np.eye(3), rng.normal(size=(2, 4)) + 0.5)
+    rows, forms, start = rng.permutation(12), rng.permutation(6), drives(1, 5).numpy()
+    scores = [
+        (many @ np.abs(readings @ ascended(readings, many, start)[0]) ** 2).min()
+        for readings, many in ((matrix, weights), (matrix[rows], weights[forms][:, rows]))
+    ]
+    assert scores[0] > 0
+    assert scores[1] == pytest.approx(scores[0], rel=1e-3)  # ascents end within 1e-4 of a maximum
+
+
 def test_a_single_form_of_the_least_size_is_bounded_from_both_sides():
     # |q_1 + q_2|^2 - |q_1 - q_2|^2 = 4 Re q_1 q_2^*, from -4 to 4
     rows, weights = np.array([[1, 1], [1, -1]], dtype=complex), np.array([[1.0, -1.0]])
