@@ -124,7 +124,7 @@ class Costs:
         inner = outer = np.array([[-np.inf] * 3, [np.inf] * 3])
         if not self.in_boxes:
             inner = np.array(region.domain)
-            layer = domain_extent(region, spacing).layer_cells(region.wavenumber * spacing)
+            layer = domain_extent(region, spacing).layer.cells(region.wavenumber * spacing)
             outer = inner + spacing * layer * np.array([[-1.0], [1.0]])
         cut = cells = columns = meshed = assembled = 0.0
         for body, is_mesh in zip(region.bodies, self.meshes, strict=True):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 from torch import Tensor
 
+from autdtorch.fdtd.boundary_layer import DOMAIN_LAYER, Thickness, box_layer
 from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.placement import grid_offset
 from autdtorch.fdtd.region import Region
@@ -26,18 +27,6 @@ MAX_CELLS = 10**9  # Most cells of a grid: more would take over 30 GB in single 
 # two are the Huygens surface, and the last two serve the interpolation of points next to it
 # (`scattered_field.py`).
 AROUND = 5
-# Cells of the boundary layer from 6 cells per wavelength on, and on coarser grids of a domain. Reflection to
-# 60 degrees is below -68 dB (-82 dB from 8.5 cells per wavelength on); of coarser grids -66 dB at 4.25 cells
-# and -32 dB at 3.
-FINE_LAYER_CELLS, COARSE_LAYER_CELLS = 6, 8
-# Cells of the layer of a box around bodies with longest sides up to so many wavelengths. Its reflection of
-# the scattered field is then a small part of the error: at 1 mm it raises 0.11 to 0.12 % for the paper's
-# three cubes, and leaves 0.45 % for a rigid sphere. In the shadow of a larger body incident and scattered
-# field cancel: behind a plate of 0.1 m, 12 wavelengths, the error at 1 mm is 1.1 %, and 0.3 % with 6 cells.
-# Coarser boxes have 6 cells. With 8, half of such a grid is layers, and the error of a hand differs by less
-# than 0.1 %, of 4 % at 5.4 cells per wavelength and 23 % at 3.4. Behind plates of 8 wavelengths 6 cells add
-# 0.2 to 0.3 % at 6 cells per wavelength, where 1.3 to 2 % are claimed, and 2 to 3 % of 5 to 10 % at 4.
-_THIN_LAYER_CELLS, _SMALL_BODIES = 4, 4
 # Places on the few separate surfaces in a box, as many on each however small, and the share of their pairs
 # between which sound has arrived before a run may end. Sources drive all of them at once; what later comes
 # from corner to corner of a plate or a cube is below 5e-4 of the field. More surfaces fill their box.
@@ -126,13 +115,8 @@ class Extent:
     lower: Sequence[float]  # corner with the smallest coordinates (3,) [m]
     upper: Sequence[float]  # corner with the largest coordinates (3,) [m]
     margin: int  # cells around that, before the boundary layer begins
-    layers: tuple[int, int]  # cells of the boundary layer on fine grids, and on those below 6 a wavelength
+    layer: Thickness  # of the boundary layer
     path: float  # way of sound before it has arrived everywhere [m]
-
-    def layer_cells(self, kappa: float) -> int:
-        """Return the thickness of the boundary layer at a wavenumber times spacing `kappa` [rad]."""
-        fine, coarse = self.layers
-        return fine if kappa <= 2 * math.pi / 6 else coarse
 
     def interior(self, spacing: float, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> tuple[int, int, int]:
         """Return the cells per axis that cover it, the first `offset` (3,) [cells] below the lower corner."""
@@ -150,17 +134,15 @@ def domain_extent(region: Region, spacing: float) -> Extent:
     """
     margin, (lower, upper) = interpolation_width(region.wavenumber * spacing) // 2 - 1, region.domain
     crossing = math.dist(lower, upper) + 2 * math.sqrt(3) * margin * spacing
-    layers, path = (FINE_LAYER_CELLS, COARSE_LAYER_CELLS), crossing * (2 if region.bodies else 1)
-    return Extent(lower, upper, margin, layers, path)
+    return Extent(lower, upper, margin, DOMAIN_LAYER, crossing * (2 if region.bodies else 1))
 
 
 def bodies_extent(region: Region) -> Extent:
     """Return the extent of the region's bodies and the air around them in a box."""
     lower, upper = bounds(region.shapes)
-    small = (upper - lower).max() <= _SMALL_BODIES * region.wavelength
-    layers = (_THIN_LAYER_CELLS if small else FINE_LAYER_CELLS), FINE_LAYER_CELLS
+    layer = box_layer(float((upper - lower).max()) / region.wavelength)
     path = round(path_between(region.shapes) + region.wavelength, 6)  # alike wherever the bodies are
-    return Extent(lower.tolist(), upper.tolist(), AROUND, layers, path)
+    return Extent(lower.tolist(), upper.tolist(), AROUND, layer, path)
 
 
 def path_between(shapes: Sequence[Shape]) -> float:
@@ -189,7 +171,7 @@ def _covering(region: Region, spacing: float, extent: Extent) -> Grid:
     region.require_spacing(spacing)
     kappa = region.wavenumber * spacing
     offset = grid_offset(region, spacing, extent.lower, extent.upper)
-    layer = extent.layer_cells(kappa)
+    layer = extent.layer.cells(kappa)
     rim = layer + 1 + extent.margin - 0.5
     x, y, z = (low - (rim + first) * spacing for low, first in zip(extent.lower, offset, strict=True))
     grid = Grid(spacing, extent.interior(spacing, offset), (x, y, z), kappa, layer, extent.path)

@@ -68,7 +68,7 @@ class PlannedGrid:
     @property
     def shape(self) -> tuple[int, int, int]:
         """Cells per axis, boundary layers included."""
-        rim = self.extent.layer_cells(self.kappa) + 1
+        rim = self.extent.layer.cells(self.kappa) + 1
         x, y, z = (length + 2 * rim for length in self.interior)
         return x, y, z
 

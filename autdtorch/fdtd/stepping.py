@@ -16,7 +16,7 @@ from torch import Tensor
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
 from autdtorch.fdtd.assembly.neighbours import corners_around, flat_index
-from autdtorch.fdtd.boundary import layer_columns, tuned_profile
+from autdtorch.fdtd.boundary_layer import layer_columns, tuned_profile
 from autdtorch.fdtd.damping import at_time_step, fewest_stable_steps
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.interpolation import (
@@ -197,7 +197,9 @@ def assembly_of(
     index, weight = cells.index[in_layers], cells.weight[in_layers]
     scale = weight.sum(axis=1) / stencil.total
     rows = weight - scale[:, None] * stencil.weights
-    columns, crossed, crossing = layer_columns(index, rows, stencil, grid, factor, dtype)
+    columns, crossed, crossing = layer_columns(
+        index, rows, stencil, grid.shape, grid.layer_cells, factor, dtype
+    )
     coefficients = Coefficients(
         center=1 + keep - factor * stencil.total,
         face=factor * stencil.face,

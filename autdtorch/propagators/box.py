@@ -22,7 +22,6 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
-from autdtorch.fdtd.absorption import absorption
 from autdtorch.fdtd.coupling import Coupling, coupling_of
 from autdtorch.fdtd.grouping import one_box
 from autdtorch.fdtd.kernels.contract import Sources
@@ -31,7 +30,7 @@ from autdtorch.fdtd.steady_state import MOST_JUDGED, SteadyState, run_to_steady_
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_array, orbits_of_transducers
 from autdtorch.fdtd.turning import is_tilted
-from autdtorch.propagators.absorbed_power import Radiators
+from autdtorch.propagators.absorbed_power import Radiators, absorption
 from autdtorch.propagators.assembled_box import assembled_box
 from autdtorch.propagators.multiple_scattering import Observe, iterated
 from autdtorch.propagators.simulation import (

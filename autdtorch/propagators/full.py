@@ -9,10 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from autdtorch.fdtd.absorption import absorption
 from autdtorch.fdtd.steady_state import MOST_JUDGED, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble
-from autdtorch.propagators.absorbed_power import Radiators
+from autdtorch.propagators.absorbed_power import Radiators, absorption
 from autdtorch.propagators.simulation import AbsorbingCells, Run, Simulation, Stepped
 from autdtorch.scene.checks import require_inside
 from autdtorch.scene.reflectors import require_in_front

@@ -12,7 +12,6 @@ from typing import NamedTuple, Self, TypeVar, cast
 
 import torch
 
-from autdtorch.fdtd.absorption import Absorption
 from autdtorch.fdtd.grouping import USUAL_PERIODS
 from autdtorch.fdtd.kernels import make_kernel
 from autdtorch.fdtd.region import Region
@@ -21,6 +20,7 @@ from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_points, orbits_of_transducers, symmetries
 from autdtorch.propagators.absorbed_power import (
     AbsorbedPower,
+    Absorption,
     Radiators,
     power_into_reflectors,
     radiators_of_array,

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from shared.document import table
 
-from autdtorch.fdtd.boundary import tuned_profile
+from autdtorch.fdtd.boundary_layer import tuned_profile
 from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, uniform_state
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stability import fewest_steps, whole_steps

@@ -23,7 +23,6 @@ from scipy.sparse import coo_array
 from small_scenes import relative_error, small_scene
 
 from autdtorch.analytic import fluid_slab
-from autdtorch.fdtd.absorption import absorption
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import heterogeneous_cells
 from autdtorch.fdtd.assembly.losses import positive_part
@@ -32,6 +31,7 @@ from autdtorch.fdtd.region import Body, Fluid
 from autdtorch.fdtd.stencil import OFFSETS, flat_offsets
 from autdtorch.fdtd.stepping import air_stencil, assemble_on
 from autdtorch.propagators import make_propagator
+from autdtorch.propagators.absorbed_power import absorption
 from autdtorch.propagators.plan import region_of
 from autdtorch.scene.arrays import strengths_of
 from autdtorch.scene.obstacles import Box, Cylinder, Sphere

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import AIR
 
-from autdtorch.fdtd.boundary import reflection, tuned_profile
-from autdtorch.fdtd.grid import FINE_LAYER_CELLS, Extent, make_grid, path_between
+from autdtorch.fdtd.boundary_layer import DOMAIN_LAYER, box_layer, reflection, tuned_profile
+from autdtorch.fdtd.grid import make_grid, path_between
 from autdtorch.fdtd.interpolation import (
     WIDTH_ERROR,
     average_nodes,
@@ -92,28 +92,28 @@ def test_source_factor_tends_to_that_of_the_continuum_on_fine_grids():
     assert stencil.source_factor(40) == pytest.approx(4 * math.pi * courant**2, rel=5e-3)
 
 
-DOMAIN, BOX = (Extent((0, 0, 0), (1, 1, 1), 0, layers, 1) for layers in ((6, 8), (4, 6)))
+BOX_LAYER = box_layer(1.0)
 # cells per wavelength and steps per period: largest reflection up to 60 degrees and at 75 [dB], and largest
 # energy that evanescent fields gain: measured 0.08, 0.02, 0.01 and 0.02, in a box 0.17, 0.12, 0.05 and 0.03.
 # With a tenth of the frequency shift it is 0.48, 0.35, 0.28 and 0.19.
 LAYERS = [
-    (DOMAIN, 34.0, 43, -90, -70, None),
-    (DOMAIN, 17.0, 25, -90, -70, 0.2),
-    (DOMAIN, 8.5, 12, -82, -63, 0.1),
-    (DOMAIN, 6.0, 8.5, -68, -50, 0.1),
-    (DOMAIN, 4.25, 6, -66, -48, 0.1),
-    (DOMAIN, 3.0, 4, -32, -18, None),
-    (BOX, 17.0, 25, -68, None, 0.2),
-    (BOX, 8.5, 12, -56, None, 0.15),
-    (BOX, 6.0, 8.5, -46, None, 0.1),
-    (BOX, 4.25, 6, -49, None, 0.1),
-    (BOX, 3.0, 4, -24, None, None),
+    (DOMAIN_LAYER, 34.0, 43, -90, -70, None),
+    (DOMAIN_LAYER, 17.0, 25, -90, -70, 0.2),
+    (DOMAIN_LAYER, 8.5, 12, -82, -63, 0.1),
+    (DOMAIN_LAYER, 6.0, 8.5, -68, -50, 0.1),
+    (DOMAIN_LAYER, 4.25, 6, -66, -48, 0.1),
+    (DOMAIN_LAYER, 3.0, 4, -32, -18, None),
+    (BOX_LAYER, 17.0, 25, -68, None, 0.2),
+    (BOX_LAYER, 8.5, 12, -56, None, 0.15),
+    (BOX_LAYER, 6.0, 8.5, -46, None, 0.1),
+    (BOX_LAYER, 4.25, 6, -49, None, 0.1),
+    (BOX_LAYER, 3.0, 4, -24, None, None),
 ]
 
 
-@pytest.mark.parametrize(("extent", "cells_per_wavelength", "steps", "bound", "grazing", "energy"), LAYERS)
+@pytest.mark.parametrize(("layer", "cells_per_wavelength", "steps", "bound", "grazing", "energy"), LAYERS)
 def test_a_tuned_layer_reflects_little_at_the_drive_frequency(
-    extent, cells_per_wavelength, steps, bound, grazing, energy
+    layer, cells_per_wavelength, steps, bound, grazing, energy
 ):
     """The frequency shift costs 3 to 8 dB; without it the near field of a light obstacle grows.
 
@@ -121,7 +121,7 @@ def test_a_tuned_layer_reflects_little_at_the_drive_frequency(
     field e^{q j} + r e^{-q j} in air cell j, -2 q Im(r) flows away from the layer.
     """
     kappa, turn = 2 * math.pi / cells_per_wavelength, 2 * math.pi / steps
-    profile = tuned_profile(kappa, steps, extent.layer_cells(kappa))
+    profile = tuned_profile(kappa, steps, layer.cells(kappa))
 
     def decibels(*degrees):
         along = kappa * np.cos(np.radians(degrees))
@@ -138,14 +138,14 @@ def test_a_tuned_layer_reflects_little_at_the_drive_frequency(
 def test_a_layer_absorbs_other_frequencies_and_its_echo_is_measured():
     # waves of half and of 1.5 times the frequency, which the switch-on excites, at normal incidence
     kappa, steps = 2 * math.pi / 8.5, 13
-    profile = tuned_profile(kappa, steps, FINE_LAYER_CELLS)
+    profile = tuned_profile(kappa, steps, DOMAIN_LAYER.fine)
     along = kappa * np.array([0.5, 1.5])
     scale = math.sin(math.pi / steps) / math.sin(kappa / 2)
     turn = 2 * np.arcsin(scale * np.sin(along / 2))
     assert (20 * np.log10(np.abs(reflection(profile, along, turn))) < -40).all()
     # required: -70 dB from 0 to 60 degrees and -45 dB at 75, in at most 10 cells at 8.5 cells per wavelength;
     # the other layers are a wavelength off, so that the grid's edges and corners are in it
-    angles, echo = measured_reflection(8.5, FINE_LAYER_CELLS, np.array((0.0, 30.0, 60.0, 75.0)), 5, aside=9)
+    angles, echo = measured_reflection(8.5, DOMAIN_LAYER.fine, np.array((0.0, 30.0, 60.0, 75.0)), 5, aside=9)
     assert np.allclose(angles, (0, 30, 60, 75), atol=2)  # as whole cells allow
     decibels = 20 * np.log10(echo)
     assert decibels[:3].max() < -70
