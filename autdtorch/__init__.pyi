@@ -56,8 +56,8 @@ from .objectives.scenarios import Scenarios
 from .plot.calibration_figure import plot_calibration
 from .plot.costs import plot_pareto, plot_scaling
 from .plot.explore import explore
-from .plot.force_figure import plot_force
 from .plot.haptics_figure import plot_haptics
+from .plot.plane_figures import plot_force
 from .plot.pressure_maps import plot_plane, plot_planes
 from .plot.scene_figure import plot_scene
 from .plot.trials import plot_convergence, plot_poses, plot_trials
@@ -65,9 +65,9 @@ from .plot.view3d import animate3d, view3d
 from .propagators import SteadyStateWarning, cell_centers, differentiable_field, make_propagator, volume_field
 from .propagators.equilibrium import equilibrium
 from .propagators.estimate import Estimate, estimate
+from .propagators.field_forces import radiation_stress
 from .propagators.gorkov import gorkov
 from .propagators.nearby import NearbyPoses
-from .propagators.stress import radiation_stress
 from .propagators.tmatrix.force import force_matrices, radiation_force, radiation_torque
 from .propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
 from .scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray

@@ -26,8 +26,7 @@ from typing import NamedTuple, Self
 import numpy as np
 import torch
 
-from autdtorch.analytic.spherical_waves import outgoing_waves
-from autdtorch.analytic.wave_frames import turned, turns
+from autdtorch.analytic.spherical_waves import outgoing_waves, turned, turns
 from autdtorch.scene.geometry import plane_basis
 from autdtorch.utils.apertures import (
     RIM_DIGITS,

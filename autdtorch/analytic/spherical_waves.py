@@ -4,7 +4,8 @@ The N = (L + 1)^2 waves up to the degree L are in the order (l, m), m from -l to
 
     e^(ik|r - s|) / |r - s| = 4 pi i k sum j_l(kr) Y_lm(r) h_l(ks) Y_lm(s)*,    |r| < |s|
 
-(Martin, Multiple Scattering (2006), chapter 3).
+(Martin, Multiple Scattering (2006), chapter 3). A turn of the axes maps the harmonics of each degree onto
+themselves; the map is fitted to their values at a few directions.
 """
 
 from __future__ import annotations
@@ -18,10 +19,14 @@ import numpy as np
 import torch
 from scipy.special import jve, spherical_jn, spherical_yn
 
+from autdtorch.scene.geometry import sphere_points
 from autdtorch.utils.array_types import COMPLEX, REAL, AnyArray, ComplexArray
 
 _LOST = 1e-280  # Magnitude below which j_l loses digits to underflow
 _TINY = 1e-12  # distance from the centre [m] below which a point has the direction z
+
+_SAMPLES = 2
+"""Directions for each harmonic of the highest degree, by which a turn is found."""
 
 
 def degrees(degree: int) -> torch.Tensor:
@@ -276,3 +281,27 @@ def sphere_coefficients(
         inner_slope = slope_inside / (density_ratio * speed_ratio)
     outgoing = out_slope * inner - out * inner_slope
     return np.asarray(-(slope * inner - regular * inner_slope) / outgoing, np.complex128)
+
+
+def turns(degree: int, turn: torch.Tensor) -> list[torch.Tensor]:
+    """Return the map R (..., 2 l + 1, 2 l + 1) of the harmonics of each degree, Y' = Y R, differentiable.
+
+    Y' are those along other axes, the columns of `turn` (..., 3, 3) in the coordinates of Y. Their
+    handedness may differ.
+    """
+    directions, inverses = _directions(degree)
+    after = harmonics(degree, directions @ turn)
+    return [inverse @ after[..., n * n : (n + 1) ** 2] for n, inverse in enumerate(inverses)]
+
+
+def turned(waves: torch.Tensor, maps: list[torch.Tensor]) -> torch.Tensor:
+    """Return waves (..., M, N), in rows, times the map of each degree."""
+    return torch.cat([waves[..., n * n : (n + 1) ** 2] @ each for n, each in enumerate(maps)], dim=-1)
+
+
+@functools.lru_cache(8)
+def _directions(degree: int) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Return directions (n, 3), and the inverse (2 l + 1, n) of the harmonics of each degree at these."""
+    directions = sphere_points((0.0, 0.0, 0.0), 1.0, _SAMPLES * (2 * degree + 1))
+    values = harmonics(degree, directions)
+    return directions, [torch.linalg.pinv(values[:, n * n : (n + 1) ** 2]) for n in range(degree + 1)]

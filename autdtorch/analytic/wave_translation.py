@@ -21,8 +21,7 @@ import torch
 from scipy.linalg import block_diag
 
 from autdtorch.analytic.momentum import gradient_by_place, gradient_by_turn
-from autdtorch.analytic.spherical_waves import harmonics, mirrored, orders
-from autdtorch.analytic.wave_frames import turns
+from autdtorch.analytic.spherical_waves import harmonics, mirrored, orders, turns
 from autdtorch.utils.array_types import AnyArray
 
 _AT_ONCE = 64

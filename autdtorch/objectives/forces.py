@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from autdtorch.analytic.sphere_force import PAIRS, force_forms
+from autdtorch.analytic.momentum import PAIRS, force_forms
 from autdtorch.analytic.spherical_waves import sphere_coefficients
 from autdtorch.objectives.bound import checked_matrix
 from autdtorch.objectives.goals import Goal

@@ -12,7 +12,7 @@ from numpy.polynomial import chebyshev
 
 import autdtorch as at
 from autdtorch.methods.gradient import random_drives
-from autdtorch.objectives.least_in_ball import least_in_ball
+from autdtorch.objectives.pose_ball import least_in_ball
 from autdtorch.propagators.tmatrix.shift_polynomial import ShiftPolynomial
 
 RADIUS = 2e-3

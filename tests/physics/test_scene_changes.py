@@ -11,8 +11,8 @@ from small_scenes import AIR, relative_error, small_scene
 
 from autdtorch.propagators import TMatrixPropagator, assembled_box, make_propagator
 from autdtorch.propagators.scene_changes import SceneChanges
+from autdtorch.propagators.tmatrix.body import BodyWaves
 from autdtorch.propagators.tmatrix.tmatrix import TMatrixCluster
-from autdtorch.propagators.tmatrix.waves import BodyWaves
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.changes import KINDS
 from autdtorch.scene.geometry import rotation_matrix

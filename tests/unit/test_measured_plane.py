@@ -10,7 +10,7 @@ from autdtorch.hardware.camera.picture import Picture
 from autdtorch.io.picture_file import PICTURES
 from autdtorch.propagators import Propagator
 from autdtorch.scene.geometry import cell_centers_of
-from autdtorch.study.report.measured_plane import measured_plane
+from autdtorch.study.report.hardware_report import measured_plane
 
 PLANE = at.Plane((0.12, 0.0, 0.0), (1, 0, 0), (0.08, 0.08))
 FOCI = at.circle_points(PLANE.center, 20e-3, 4, PLANE.normal)

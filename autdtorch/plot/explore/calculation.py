@@ -30,8 +30,8 @@ from autdtorch.propagators import (
     make_propagator,
     volume_field,
 )
+from autdtorch.propagators.field_forces import forces_on_obstacles
 from autdtorch.propagators.propagator import are_shown
-from autdtorch.propagators.surrounding_force import forces_on_obstacles
 from autdtorch.scene.geometry import Plane
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.progress import Stopped, stopping_when

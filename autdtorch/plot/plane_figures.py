@@ -1,4 +1,4 @@
-"""A figure of the force on a body or particle over the pressure on a plane."""
+"""Figures over the pressure on a plane: the force on a body or particle, and a camera's picture beside it."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from autdtorch.plot.data import MM
-from autdtorch.plot.pressure_maps import coordinates_in, plot_plane
+from autdtorch.hardware.camera.picture import Picture
+from autdtorch.plot.data import MM, largest
+from autdtorch.plot.pressure_maps import coordinates_in, plot_plane, plot_planes
 from autdtorch.plot.style import styled
 from autdtorch.scene.geometry import Plane, cell_centers_of
 from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import ArrayLike, real_tensor, require_kind
 
 _ARROW = 1.0  # length of the median arrow, relative to the distance of two
@@ -62,3 +65,16 @@ def plot_force(
         pivot="mid", width=0.006, path_effects=[withStroke(linewidth=1.6, foreground="black")],
     )  # fmt: skip
     return figure
+
+
+def camera_figure(picture: Picture, simulated: Array, plane: Plane, scene: Scene) -> Figure:
+    """Draw a picture and |p| (Nu, Nv) [Pa] as `simulated` on a plane, with colours of one scale."""
+    maps = {"camera": picture.pressure.numpy(), "simulation": np.nan_to_num(simulated)}
+    return plot_planes(
+        {name: {"": magnitude} for name, magnitude in maps.items()},
+        {"camera": picture.plane, "simulation": plane},
+        dict.fromkeys(maps, scene.control_points),
+        dict.fromkeys(maps, scene.obstacles),
+        vmax=max(map(largest, maps.values())) or 1.0,
+        reflectors=dict.fromkeys(maps, scene.reflectors),
+    )

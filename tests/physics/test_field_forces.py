@@ -8,7 +8,7 @@ import torch
 from small_scenes import CUBE, small_scene
 
 import autdtorch as at
-from autdtorch.propagators.surrounding_force import forces_on_obstacles
+from autdtorch.propagators.field_forces import forces_on_obstacles
 
 BALLS = (
     at.Sphere((10e-3, 15e-3, 12e-3), 2e-3, rigid=True),
