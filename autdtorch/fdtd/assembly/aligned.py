@@ -28,7 +28,7 @@ _OFF_VERTICES = 1e-5
 
 
 class Parts(NamedTuple):
-    """Parts of elements along an axis, each in one block."""
+    """Parts of elements along an axis, each in one block and in one cell."""
 
     middle: Array  # their centres (n,) [cells]
     width: Array  # [cells] (n,)
@@ -71,8 +71,8 @@ class Planes:
 
     @property
     def parts(self) -> Parts:
-        """The parts into which the planes divide the elements."""
-        ends = np.union1d(np.arange(len(self.kind) + 1), self.places)
+        """The parts into which the planes and the cells divide the elements."""
+        ends = np.union1d(np.arange(2 * len(self.kind) + 1) / 2, self.places)
         middle = (ends[1:] + ends[:-1]) / 2
         return Parts(middle, np.diff(ends), np.searchsorted(self.places, middle, side="right"))
 

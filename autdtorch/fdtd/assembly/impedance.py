@@ -42,19 +42,19 @@ _ALONG, _EXCESS = 0.19, 0.03
 _LEAST_GRADIENT = 0.3  # Least gradient of a signed distance with which a place is moved to the surface
 
 
-class Facets(NamedTuple):
-    """The surface of a material in q parts of n elements."""
+class _Facets(NamedTuple):
+    """The surface of a material in the sub-cells of n elements."""
 
-    area: Array  # (n, q) [cells^2]
-    place: Array  # from the first vertex (n, q, 3) [cells]
-    normal: Array  # outwards (n, q, 3)
+    area: Array  # (n, 64) [cells^2]
+    place: Array  # from the first vertex (n, 64, 3) [cells]
+    normal: Array  # outwards (n, 64, 3)
 
-    def chosen(self, some: NDArray[np.bool_]) -> Facets:
+    def chosen(self, some: NDArray[np.bool_]) -> _Facets:
         """Return the surface in some of the elements."""
-        return Facets(*(part[some] for part in self))
+        return _Facets(*(part[some] for part in self))
 
 
-def facets(distance: Array, material: Index, number: int, materials: Materials) -> Facets:
+def _facets(distance: Array, material: Index, number: int, materials: Materials) -> _Facets:
     """Return the surface of a material towards fluids in the sub-cells of n elements.
 
     Signed distances (K, n, 125) are those of all bodies.
@@ -70,7 +70,7 @@ def facets(distance: Array, material: Index, number: int, materials: Materials) 
     gradient = subcell_gradients(level)
     steep = np.maximum(np.linalg.norm(gradient, axis=2, keepdims=True), _LEAST_GRADIENT)
     place = _CENTERS - subcell_means(level)[..., None] * gradient / steep**2
-    return Facets(np.maximum(area, 0), np.clip(place, 0, 1), gradient / steep)
+    return _Facets(np.maximum(area, 0), np.clip(place, 0, 1), gradient / steep)
 
 
 def _coverage(distance: Array) -> Array:
@@ -95,7 +95,7 @@ def with_impedance(
     materials: Materials,
     stencil: Stencil,
 ) -> InterfaceElements:
-    """Return n elements with the admittances of the surfaces in them; see `facets` for the arguments."""
+    """Return n elements with the admittances of the surfaces in them; see `_facets` for the arguments."""
     if materials.losses is None or not materials.losses.admittance.any():
         return elements
     admittance = materials.losses.admittance
@@ -103,7 +103,7 @@ def with_impedance(
     near = np.asarray((np.abs(distance) < FAR).any(axis=2))
     for number in np.flatnonzero(admittance).tolist():
         some = np.flatnonzero(near[material == number].any(axis=0))
-        surface = facets(distance[:, some], material, number, materials)
+        surface = _facets(distance[:, some], material, number, materials)
         finite = elements.finite[some]
         for make, part in ((_consistent, finite), (_lumped, ~finite)):
             chosen, solid = some[part], materials.rigid[elements.material[some[part]]]
@@ -121,7 +121,7 @@ def with_impedance(
 
 
 def _consistent(
-    surface: Facets, solid: NDArray[np.bool_], admittance: complex, kappa: float
+    surface: _Facets, solid: NDArray[np.bool_], admittance: complex, kappa: float
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return T of finite elements: off its diagonal (n, 28), and sums of its rows (n, 8).
 
@@ -141,21 +141,21 @@ def _consistent(
 
 
 def _lumped(
-    surface: Facets, solid: NDArray[np.bool_], admittance: complex, kappa: float
+    surface: _Facets, solid: NDArray[np.bool_], admittance: complex, kappa: float
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return T of other elements, at the vertices in fluids on the surface's outer side; see `_consistent`.
 
     The air between a vertex and the surface, a distance d away, is in the element's mass. With t = tan(k d),
     the admittance Y behind it acts as Y (1 + t^2) / (1 - i Y t).
     """
-    depth, hats = outer_side(surface, solid)
+    depth, hats = _outer_side(surface, solid)
     slope = np.tan(np.minimum(kappa * depth, LARGEST_PHASE))
     behind = admittance * (1 + slope**2) / (1 - 1j * admittance * slope)
     return np.zeros((len(hats), 28), complex), (surface.area[:, :, None] * hats * behind).sum(axis=1)
 
 
-def outer_side(surface: Facets, solid: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Return the depths (n, q, 8) [cells] of vertices in front of a surface, and their shares in its flow.
+def _outer_side(surface: _Facets, solid: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return the depths (n, 64, 8) [cells] of vertices in front of a surface, and their shares in its flow.
 
     `solid` (n, 8) is the mask of the vertices in rigid bodies. These, and vertices behind, have no share.
     """

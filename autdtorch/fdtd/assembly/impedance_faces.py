@@ -13,6 +13,9 @@ Two forces radiate as the face does for a cos(kappa d) + b cos(kappa (d + 1)) = 
 and normal incidence is exact. With a + b = 1 a pressure that is constant across the face is so too: no
 incidence has an error of second order. From p alone (b = 0) a face would absorb too much by (kappa d)^2
 times the squared sine of incidence. As a square, T is passive.
+
+Each vertex has the part of a face that is in its cell. Interpolation between the vertices would take
+pressures from beyond the edges, where they turn.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.assembly.aligned import Blocks
 from autdtorch.fdtd.assembly.element import PAIRS, VERTICES, InterfaceElements, Materials
-from autdtorch.fdtd.assembly.impedance import LARGEST_PHASE, Facets, outer_side
+from autdtorch.fdtd.assembly.impedance import LARGEST_PHASE
 from autdtorch.fdtd.stencil import Stencil, flat_strides
 from autdtorch.utils.array_types import Array, ComplexArray, Index
 
@@ -38,30 +41,28 @@ _NEXT = (4, 2, 1)  # Difference of the numbers of two vertices along each axis
 
 
 class _Faces(NamedTuple):
-    """n rectangles of surfaces that face up or down an axis, each in one element."""
+    """n rectangles of surfaces that face up or down an axis, each in one cell and in one element."""
 
     material: Index  # number of the material behind (n,)
     first: Index  # first cell of the element (n, 3)
-    surface: Facets  # one a rectangle
+    place: Array  # centre, from the first vertex (n, 3) [cells]
+    area: Array  # [cells^2] (n,)
 
 
 def _faces(blocks: Blocks, axis: int, up: int, materials: Materials) -> _Faces:
-    """Return the faces of reacting materials towards fluids, up an axis (`up` 1) or down it (0)."""
-    planes, others = blocks.planes[axis], [other for other in range(3) if other != axis]
+    """Return the faces of reacting materials towards fluids that face up an axis (`up` 1) or down it (0)."""
+    others = [other for other in range(3) if other != axis]
     parts = [blocks.planes[other].parts for other in others]
     material = np.moveaxis(blocks.material, axis, 0)[:, parts[0].block][:, :, parts[1].block]
     behind, front = (material[:-1], material[1:]) if up else (material[1:], material[:-1])
-    number, *place = np.nonzero(materials.reacting[behind] & ~materials.rigid[front])
+    number, *places = np.nonzero(materials.reacting[behind] & ~materials.rigid[front])
     middle, area = np.zeros((len(number), 3)), np.ones(len(number))
-    middle[:, axis] = planes.places[number]
-    for other, each, some in zip(others, parts, place, strict=True):
-        middle[:, other] = each.middle[some]
-        area *= each.width[some]
+    middle[:, axis] = blocks.planes[axis].places[number]
+    for other, part, place in zip(others, parts, places, strict=True):
+        middle[:, other] = part.middle[place]
+        area *= part.width[place]
     first = np.floor(middle).astype(np.int64)
-    normal = np.zeros((len(number), 1, 3))
-    normal[:, :, axis] = 2 * up - 1
-    surface = Facets(area[:, None], (middle - first)[:, None], normal)
-    return _Faces(behind[number, place[0], place[1]], first, surface)
+    return _Faces(behind[number, places[0], places[1]], first, middle - first, area)
 
 
 def with_impedance_faces(
@@ -78,24 +79,25 @@ def with_impedance_faces(
     `index` (n,) are their flat indices on a grid of `shape` elements, ascending. The mask `uncut` (n,) has
     those without a face, beside the others.
     """
-    if materials.losses is None or not materials.reacting.any():
+    if materials.losses is None or not materials.reacting.any() or len(index) == 0:
         return elements
     # T off its diagonal, and sums of its rows where it adds mass and stiffness
     coupling, mass = np.zeros((len(index), 28), complex), np.zeros((2, len(index), 8), complex)
+    strides = flat_strides(shape)
     for axis, up in np.ndindex(3, 2):
         faces = _faces(blocks, axis, up, materials)
-        row, along = _rows(faces.first @ flat_strides(shape), index)
-        material, row, surface = faces.material[along], row[along], faces.surface.chosen(along)
-        depth, shares = outer_side(surface, materials.rigid[elements.material[row]])
-        beyond, linked = _rows(index[row] + (2 * up - 1) * flat_strides(shape)[axis], index)
-        admittance = materials.losses.admittance[material]
-        first, second, flow = _face(depth.max(axis=(1, 2)), linked & uncut[beyond], admittance, stencil.kappa)
+        row, along = _rows(faces.first @ strides, index)
+        usable = (VERTICES[:, axis] == up) & ~materials.rigid[elements.material[row]]
+        distance = np.linalg.norm(VERTICES - faces.place[:, None], axis=2)
+        vertex = np.where(usable, distance, np.inf).argmin(axis=1)  # of the cell, where it is in a fluid
+        beyond, linked = _rows(index[row] + (2 * up - 1) * strides[axis], index)
+        depth, admittance = np.abs(up - faces.place[:, axis]), materials.losses.admittance[faces.material]
+        first, second, flow = _face(depth, linked & uncut[beyond], admittance, stencil.kappa)
+        flow *= faces.area * (along & usable.any(axis=1))
         kind = np.where(flow.imag > 0, 1, 0)
-        for vertex in np.flatnonzero(VERTICES[:, axis] == up):
-            part = flow * surface.area[:, 0] * shares[:, 0, vertex]
-            np.add.at(mass, (kind, row, vertex), part * first * (first + second))
-            np.add.at(mass, (kind, beyond, vertex), part * second * (first + second))
-            np.add.at(coupling, (beyond, _PAIR[vertex, vertex ^ _NEXT[axis]]), part * first * second)
+        np.add.at(mass, (kind, row, vertex), flow * first * (first + second))
+        np.add.at(mass, (kind, beyond, vertex), flow * second * (first + second))
+        np.add.at(coupling, (beyond, _PAIR[vertex, vertex ^ _NEXT[axis]]), flow * first * second)
     factor = stencil.slope.real / 2
     links, (heavy, stiff) = factor * coupling, factor * mass
     return elements._replace(
