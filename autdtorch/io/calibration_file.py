@@ -18,8 +18,7 @@ import torch
 
 from autdtorch.io.scene_file import load_scene, save_scene
 from autdtorch.methods.calibration.calibration import Calibration, HeldBack
-from autdtorch.methods.calibration.fit import CalibrationFit
-from autdtorch.methods.calibration.simulation import Changes, LinearChanges, Simulation
+from autdtorch.methods.calibration.fit import CalibrationFit, Changes, LinearChanges, Simulation
 from autdtorch.methods.doubtful_readings import Magnitudes
 from autdtorch.methods.matrix_posterior import MatrixPosterior, MatrixPrior
 from autdtorch.methods.prior import Prior

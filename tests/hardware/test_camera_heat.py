@@ -10,10 +10,9 @@ import torch
 from shared.heated_screen import WAVELENGTH, HeatedScreen, focused_drive, magnitudes, pinhole
 
 import autdtorch as at
-from autdtorch.hardware.camera.cosines import Cosines
 from autdtorch.hardware.camera.heat import HeatInversion
 from autdtorch.hardware.camera.picture import Picture
-from autdtorch.hardware.camera.screen import Screen, decay_of, rise_of
+from autdtorch.hardware.camera.screen import Cosines, Screen, decay_of, rise_of
 from autdtorch.utils.array_types import Array
 
 PLANE = at.Plane((0.0, 0.0, 0.12), (0.0, 0.0, 1.0), (0.05, 0.04))

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 import autdtorch as at
 from autdtorch.io.goal_section import goal_section, load_goal
+from autdtorch.methods.attainable import search_above
 from autdtorch.objectives.forces import DIRECTIONS, ForceGoal
-from autdtorch.objectives.form_cells import search_above
 from autdtorch.objectives.hermitian import ascended, forms_bound
 
 BEAD = at.Particle.of("EPS", 0.5e-3)

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from small_scenes import AIR, NO_RECEIVERS, NO_SOURCES, relative_error, small_scene
 
 from autdtorch import analytic
+from autdtorch.fdtd.assembly.unions import Thickened, thickened, thin_wall
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stepping import assemble
-from autdtorch.fdtd.thin_walls import Thickened, thickened, thin_wall
 from autdtorch.propagators import make_propagator
 from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.propagators.plan import difference_from_rigid, plan, region_of

@@ -21,11 +21,10 @@ import numpy as np
 import torch
 from scipy.optimize import least_squares
 
-from autdtorch.hardware.camera.cosines import Cosines
 from autdtorch.hardware.camera.picture import Picture, clarity
 from autdtorch.hardware.camera.pulse_fit import PulseFit
 from autdtorch.hardware.camera.registration import Registration
-from autdtorch.hardware.camera.screen import Screen
+from autdtorch.hardware.camera.screen import Cosines, Screen
 from autdtorch.objectives.readings import deviation_by_square
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import (

@@ -7,8 +7,7 @@ import math
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, cg
 
-from autdtorch.hardware.camera.cosines import Cosines
-from autdtorch.hardware.camera.screen import Screen, decay_of, rise_of
+from autdtorch.hardware.camera.screen import Cosines, Screen, decay_of, rise_of
 from autdtorch.utils.array_types import AnyArray, Array
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import invalid

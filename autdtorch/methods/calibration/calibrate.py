@@ -15,8 +15,7 @@ from autdtorch.methods.calibration.calibration import (
     gain_to,
     relative_error,
 )
-from autdtorch.methods.calibration.fit import CalibrationFit, fitted
-from autdtorch.methods.calibration.simulation import LinearChanges, Simulation
+from autdtorch.methods.calibration.fit import CalibrationFit, LinearChanges, Simulation, fitted
 from autdtorch.methods.doubtful_readings import saturation_doubts
 from autdtorch.methods.prior import Prior, prior_of
 from autdtorch.objectives.readings import Readings

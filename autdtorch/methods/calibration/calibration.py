@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import torch
 
-from autdtorch.methods.calibration.fit import CalibrationFit, prior_around
-from autdtorch.methods.calibration.simulation import Simulation
+from autdtorch.methods.calibration.fit import CalibrationFit, Simulation, prior_around
 from autdtorch.methods.doubtful_readings import Magnitudes
 from autdtorch.methods.prior import Prior
 from autdtorch.objectives.objective import validate_drives
