@@ -40,7 +40,7 @@ _FEW = 4  # transducers, whose drives can be divided into cells
 
 _MARGIN = 1e-9  # of eigenvalues; rounding of forms of size 1 is below 1e-12
 _CUTS = 40  # eigenvectors for a cell
-_CELLS = 1000
+_CELLS = 300  # at most half a minute
 _NARROW = 2e-3  # forms of discs are below 1.3e5 then, and their rounding below the margin
 _REACH = math.sqrt(2) * (1 + 1e-9)  # of a disc around a square of half width 1
 _TINY = 1e-300

@@ -25,7 +25,8 @@ def scenes_of(scenarios: Mapping[str, Any] | None, goal: Goal | ForceGoal) -> Ov
     """Return the goal over the scenes that stand for each, after checking the settings of the scenarios."""
     if isinstance(goal, ForceGoal):
         if scenarios is not None:
-            raise invalid("scenarios", dict(scenarios), "must be null: a goal of force is of one scene")
+            accepted = "must be null: a goal of force is of one scene; Scenarios joins ForceObjectives"
+            raise invalid("scenarios", dict(scenarios), accepted)
         return goal
     if scenarios is None:
         return OverScenes(goal, 1)
