@@ -327,14 +327,12 @@ def summary_rows(results: StudyResult) -> list[list[str]]:
     return rows
 
 
-def column_decimals(
-    results: StudyResult, quantity: Callable[[MethodResult], torch.Tensor | None], digits: int = 3
-) -> int:
-    """Return decimals for a column of a table: the largest value of each scene has some digits or more."""
+def column_decimals(results: StudyResult, quantity: Callable[[MethodResult], torch.Tensor | None]) -> int:
+    """Return decimals for a column of a table: the largest value of each scene has three digits or more."""
     decimals = [0]
     for scene in results.scenes.values():
         values = [value for method in scene.methods.values() if (value := quantity(method)) is not None]
-        decimals.append(decimals_of((float(value.abs().max()) for value in values), digits))
+        decimals.append(decimals_of((float(value.abs().max()) for value in values)))
     return max(decimals)
 
 

@@ -202,11 +202,11 @@ def finite_vector(name: str, value: object, unit: str = "m") -> Vector:
     return x, y, z
 
 
-def positive_entries(name: str, value: object, count: int, unit: str = "m") -> tuple[float, ...]:
-    """Return `value` as `count` finite floats > 0."""
-    entries = _entries(name, value, count, unit)
+def positive_entries(name: str, value: object, count: int) -> tuple[float, ...]:
+    """Return `value` as `count` finite lengths > 0 [m]."""
+    entries = _entries(name, value, count, "m")
     if min(entries) <= 0:
-        raise invalid(name, value, "every entry must be finite and > 0", unit)
+        raise invalid(name, value, "every entry must be finite and > 0", "m")
     return entries
 
 
