@@ -332,7 +332,7 @@ def column_decimals(results: StudyResult, quantity: Callable[[MethodResult], tor
     decimals = [0]
     for scene in results.scenes.values():
         values = [value for method in scene.methods.values() if (value := quantity(method)) is not None]
-        decimals.append(decimals_of((float(value.abs().max()) for value in values)))
+        decimals.append(decimals_of(float(value.abs().max()) for value in values))
     return max(decimals)
 
 

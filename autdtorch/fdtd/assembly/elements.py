@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
+from autdtorch.fdtd.assembly.absorbing_surfaces import with_impedance, with_impedance_faces
 from autdtorch.fdtd.assembly.aligned import Blocks, aligned_elements
 from autdtorch.fdtd.assembly.edges import edges_of, reductions
 from autdtorch.fdtd.assembly.element import FAR, LATTICE, SUBCELLS, InterfaceElements, Materials
-from autdtorch.fdtd.assembly.impedance import with_impedance
-from autdtorch.fdtd.assembly.impedance_faces import with_impedance_faces
 from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
 from autdtorch.fdtd.assembly.losses import GROUND, with_losses
 from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, quadratic, roughness

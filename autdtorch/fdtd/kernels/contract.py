@@ -15,7 +15,6 @@ A step takes the pressures `now` and `before` at two successive times to the nex
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import partial
 from typing import NamedTuple, Protocol
 
 import torch
@@ -59,9 +58,8 @@ class Columns:
         return cls(index, index[:, :1].expand(0, width), torch.zeros((0, width), dtype=dtype, device="cpu"))
 
 
-def _empty(*shape: int, dtype: torch.dtype) -> Any:
-    """Return a field that is a tensor without entries by default."""
-    return field(default_factory=partial(torch.zeros, shape, dtype=dtype, device="cpu"))
+def _empty(*shape: int, dtype: torch.dtype) -> Tensor:
+    return torch.zeros(shape, dtype=dtype, device="cpu")
 
 
 @dataclass(frozen=True)
@@ -87,12 +85,16 @@ class Coefficients:
     # the columns (m, L + 2) int64; L n for none
     crossing: Tensor
     # flat indices (l,) int64 of the lossy cells, ascending, each of them heterogeneous
-    loss_index: Tensor = _empty(0, dtype=torch.int64)
-    loss_weight: Tensor = _empty(0, 27, dtype=torch.float32)  # their rows on the change of a step (l, 27)
-    loss_ground: Tensor = _empty(0, dtype=torch.float32)  # their stiffness against silence (l,)
+    loss_index: Tensor = field(default_factory=lambda: _empty(0, dtype=torch.int64))
+    loss_weight: Tensor = field(
+        default_factory=lambda: _empty(0, 27, dtype=torch.float32)
+    )  # their rows on the change of a step (l, 27)
+    loss_ground: Tensor = field(
+        default_factory=lambda: _empty(0, dtype=torch.float32)
+    )  # their stiffness against silence (l,)
     # runs of cells behind the sound-hard ones, which need no steps: flat indices of the first cell and of one
     # past the last (g, 2) int64, ascending; none of them ends in another row or is in a layer
-    idle: Tensor = _empty(0, 2, dtype=torch.int64)
+    idle: Tensor = field(default_factory=lambda: _empty(0, 2, dtype=torch.int64))
 
     @property
     def layer_cells(self) -> int:
