@@ -16,6 +16,7 @@ from autdtorch.fdtd.assembly.prisms import Prisms, prisms, stacked
 from autdtorch.fdtd.assembly.sections import MaterialKey, Section, plane_fields
 from autdtorch.fdtd.assembly.unions import speed_factor
 from autdtorch.fdtd.grid import Grid
+from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
 from autdtorch.propagators.plan import region_of
 from autdtorch.scene.arrays import TransducerArray
@@ -100,6 +101,15 @@ def test_mass_transfer_conserves_mass(center, radius, ratio):
     # of the elements without the outermost half cell, which is air; rounding of the largest mass
     whole = of_elements.sum() + math.prod(GRID.shape) - math.prod(elements.material.shape)
     assert mass_of_all(elements, cells).sum() == pytest.approx(whole, rel=1e-9)
+
+
+@settings(max_examples=10)
+@given(CENTERS, st.floats(1.5, 2.5), st.sampled_from([None, 0.5, 77.0, 1e5]))
+def test_bodies_of_any_place_take_little_of_the_time_step(center, radius, ratio):
+    _, cells = assembled(sphere(center, radius, ratio))
+    largest = largest_eigenvalue(cells.index, cells.weight, STENCIL, GRID.shape)
+    # eigenvalues of elements up to 1.15, and 1 % for the iteration: 8 % of the steps
+    assert fewest_steps(STENCIL, largest) <= 1.085 * fewest_steps(STENCIL, STENCIL.largest_symbol)
 
 
 def test_only_cells_unlike_air_are_heterogeneous():
