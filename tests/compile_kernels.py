@@ -9,7 +9,7 @@ import autdtorch as at
 
 
 def main(dtype: str) -> None:
-    """Simulate in a box and in free space, differentiate, run holography."""
+    """Simulate in a box and in free space, differentiate, run holography, let spheres scatter."""
     scene = small_scene((CUBE,))
     matrix = at.make_propagator(scene, "box", 2e-3, dtype=dtype, cache=False).transfer_matrix()
     density = torch.tensor([CUBE.density], dtype=torch.float64, requires_grad=True)
@@ -20,6 +20,9 @@ def main(dtype: str) -> None:
     at.make_propagator(small_scene(()), "free_space", cache=False).transfer_matrix(points)
     for algorithm in ("naive", "gs"):
         at.holography(matrix.to(getattr(torch, dtype).to_complex()), algorithm=algorithm)
+    sphere = at.TMatrix.of(at.Sphere((0, 0, 0.05), 2e-3, rigid=True), scene.medium, scene.frequency)
+    pair = at.TMatrixCluster([sphere, sphere.moved((5e-3, 0, 0))])
+    at.radiation_force(pair, drive, array=scene.array, medium=scene.medium)
 
 
 if __name__ == "__main__":

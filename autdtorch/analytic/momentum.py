@@ -11,6 +11,7 @@ shift of the sphere along x changes d by its derivative i k P_x d: the stiffness
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 
 import torch
@@ -29,19 +30,14 @@ def linear_momentum(waves: torch.Tensor) -> torch.Tensor:
     """
     degree = _degree(waves)
     above = torch.nn.functional.pad(waves, (0, 0, 0, 2 * degree + 3))  # the next degree
-    up, down, along = (
-        factor[:, 0, None] * above.index_select(-2, place[:, 0])
-        + factor[:, 1, None] * above.index_select(-2, place[:, 1])
-        for place, factor in ladder(degree)
-    )
-    return torch.stack([0.5j * (up + down), 0.5 * (down - up), 1j * along])
+    parts = _along_axes(*_slopes(degree, above.movedim(-2, 0)))
+    return torch.stack([part.movedim(0, -2) for part in parts])
 
 
 def angular_momentum(waves: torch.Tensor) -> torch.Tensor:
     """Return -i r x grad of waves as coefficients (3, ..., N, R) along x, y, z; see `linear_momentum`."""
-    order, place, factor = _steps(_degree(waves))
-    up, down = (factor[:, side, None] * waves.index_select(-2, place[:, side]) for side in (0, 1))
-    return torch.stack([(up + down) / 2, (up - down) / 2j, order[:, None] * waves])
+    parts = _about_axes(*_rotations(waves.movedim(-2, 0)))
+    return torch.stack([part.movedim(0, -2) for part in parts])
 
 
 def taken_up(
@@ -69,35 +65,78 @@ def gradient_by_place(
         waves: their coefficients (..., K, R), with a degree more than `gradient`.
         gradient: by the coefficients (..., N, R).
     """
-    by_place: torch.Tensor = axes @ _weighed(wavenumber * linear_momentum(waves), gradient)[..., None]
+    rows, weights = _rows(waves), _rows(gradient)
+    slopes = (_weighed(each, weights) for each in _slopes(_degree(gradient), rows))
+    shift = -torch.stack([(wavenumber * part).imag for part in _along_axes(*slopes)], dim=-1)
+    by_place: torch.Tensor = axes @ shift[..., None]
     return by_place[..., 0]
 
 
 def gradient_by_turn(axes: torch.Tensor, waves: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
-    """Return the gradient (..., 3, 3) by the axes of regular waves (..., N, R); see `gradient_by_place`."""
-    turn = _weighed(angular_momentum(waves), gradient)[..., None, :].expand(*axes.shape)
+    """Return the gradient (..., 3, 3) by the axes of regular waves (..., K, R); see `gradient_by_place`."""
+    weights = _rows(gradient)
+    rotations = (_weighed(each, weights) for each in _rotations(_rows(waves)[: len(weights)]))
+    turn = -torch.stack([part.imag for part in _about_axes(*rotations)], dim=-1)[..., None, :]
+    turn = turn.expand(*axes.shape)
     by_turn: torch.Tensor = axes @ torch.linalg.cross(turn, torch.eye(3, **REAL).expand_as(turn)).mT
     return by_turn / 2
 
 
-def _weighed(slopes: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
-    """Return (..., 3), the changes with i times slopes (3, ..., K, R) by the gradient (..., N, R)."""
-    some = slopes[..., : gradient.shape[-2], :]
-    return -(gradient.conj() * some).sum(dim=(-2, -1)).imag.movedim(0, -1)
+def _rows(waves: torch.Tensor) -> torch.Tensor:
+    """Return waves (N, ..., R) of waves (..., N, R), which are quicker."""
+    return waves.movedim(-2, 0).contiguous()
+
+
+def _weighed(slope: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
+    """Return the change (...) with a slope (N, ..., R) by the gradient (N, ..., R)."""
+    products: torch.Tensor = torch.linalg.vecdot(gradient, slope, dim=0)
+    return products.sum(dim=-1)
+
+
+def _slopes(degree: int, rows: torch.Tensor) -> list[torch.Tensor]:
+    """Return (d/dx + i d/dy, d/dx - i d/dy, d/dz) / k, (N, ..., R) each, of waves with a degree more."""
+    return [_neighbours(rows, place, factor) for place, factor in ladder(degree)]
+
+
+def _along_axes(
+    up: torch.Tensor, down: torch.Tensor, along: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    return 0.5j * (up + down), 0.5 * (down - up), 1j * along
+
+
+def _rotations(rows: torch.Tensor) -> list[torch.Tensor]:
+    """Return L_x + i L_y, L_x - i L_y and L_z of waves (N, ..., R)."""
+    return [_neighbours(rows, place, factor) for place, factor in _steps(math.isqrt(len(rows)) - 1)]
+
+
+def _about_axes(
+    up: torch.Tensor, down: torch.Tensor, about: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    return (up + down) / 2, (up - down) / 2j, about
+
+
+def _neighbours(rows: torch.Tensor, place: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
+    """Return sums (N, ..., R) of the waves at places (N, n), times factors (N, n)."""
+    shares = factor.mT.reshape(*factor.mT.shape, *(1,) * (rows.ndim - 1))
+    parts = [share * rows.index_select(0, each) for share, each in zip(shares, place.mT, strict=True)]
+    total: torch.Tensor = functools.reduce(torch.add, parts)
+    return total
 
 
 def _degree(waves: torch.Tensor) -> int:
-    return int(waves.shape[-2] ** 0.5 + 0.5) - 1
+    return math.isqrt(waves.shape[-2]) - 1
 
 
 @functools.lru_cache(8)
-def _steps(degree: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return the orders (N,), and the places and factors (N, 2) of waves that L_x +- i L_y bring to each."""
+def _steps(degree: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Return the places (N, 1) of waves, and factors, that L_x + i L_y, L_x - i L_y and L_z bring to each."""
     n, m = degrees(degree).to(torch.float64), orders(degree).to(torch.float64)
-    factor = torch.stack([((n + m) * (n - m + 1)).sqrt(), ((n - m) * (n + m + 1)).sqrt()], dim=1)
     here = torch.arange(len(m), dtype=torch.int64, device="cpu")
-    place = torch.stack([here - 1, here + 1], dim=1)
-    return m, torch.where(factor != 0, place, 0), factor
+    result = []
+    for step, squared in ((-1, (n + m) * (n - m + 1)), (1, (n - m) * (n + m + 1)), (0, m * m)):
+        place = torch.where(squared != 0, here + step, 0)
+        result.append((place[:, None], (squared.sqrt() if step else m)[:, None]))
+    return result
 
 
 def force_forms(ratios: ComplexArray, wavenumber: float, scale: float) -> torch.Tensor:

@@ -24,9 +24,9 @@ from autdtorch.analytic.spherical_waves import (
     regular_waves,
     sphere_coefficients,
 )
-from autdtorch.analytic.wave_translation import Translation, WaveFrame
 from autdtorch.propagators import make_propagator
 from autdtorch.propagators.tmatrix.bodies import enough_degrees
+from autdtorch.propagators.tmatrix.translation import Translation, WaveFrame
 from autdtorch.scene.geometry import composed_rotation, rotation_matrix
 
 AIR = at.Medium(density=1.2, sound_speed=340.0)

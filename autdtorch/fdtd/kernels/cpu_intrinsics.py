@@ -182,6 +182,41 @@ def _products_added(conjugate: bool) -> Any:
     return add
 
 
+def _set_to_multiples(
+    typing_context: Any, u: Any, to: Any, share: Any, at: Any, x: Any, of: Any, stride: Any, terms: Any
+) -> Any:
+    """Set u to the sum over n of share[at + n] x[of + n stride], a pair of vectors of `VECTOR` bytes each."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        number = context.get_data_type(u.dtype)
+        size = context.get_abi_sizeof(number)
+        lanes = 2 * VECTOR // size
+        vector = ir.VectorType(number, lanes)
+        zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes), None)
+        fused = cgutils.get_or_insert_function(  # type: ignore[no-untyped-call]
+            builder.module, ir.FunctionType(vector, 3 * [vector]), f"llvm.fmuladd.v{lanes}f{8 * size}"
+        )
+        _, first_out, _, first_share, _, first, stride, terms = arguments
+
+        def pointer(array: int, index: Any) -> Any:
+            item = _item(context, builder, signature, arguments, array, index)
+            return builder.bitcast(item, vector.as_pointer())
+
+        total = cgutils.alloca_once_value(builder, ir.Constant(vector, None))  # type: ignore[no-untyped-call]
+        with cgutils.for_range(builder, terms) as loop:
+            place = builder.add(first_share, loop.index)
+            part = builder.load(_item(context, builder, signature, arguments, 2, place))
+            part = builder.insert_element(ir.Constant(vector, ir.Undefined), part, ir.IntType(32)(0))
+            other = builder.load(pointer(4, builder.add(first, builder.mul(loop.index, stride))), align=size)
+            shares = builder.shuffle_vector(part, part, zeros)
+            builder.store(builder.call(fused, [shares, other, builder.load(total)]), total)
+        builder.store(builder.load(total), pointer(0, first_out), align=size)
+        return context.get_dummy_value()
+
+    long = types.uint64
+    return types.void(u, long, share, long, x, long, long, long), generate
+
+
 def _add_atomically(typing_context: Any, counters: Any, place: Any, amount: Any) -> Any:
     """Add to a counter and return its old value."""
 
@@ -204,6 +239,7 @@ def _read_atomically(typing_context: Any, counters: Any, place: Any) -> Any:
 
 add_products: Any = intrinsic(_products_added(False))
 add_conjugate_products: Any = intrinsic(_products_added(True))
+set_to_multiples: Any = intrinsic(_set_to_multiples)
 sum_of_rows: Any = intrinsic(_sum_of_rows)
 sums_of_rows: Any = intrinsic(_sums_of_rows)
 add_four: Any = intrinsic(_add_four)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
 
 import torch
 
-from autdtorch.analytic.wave_translation import Translation, WaveFrame
+from autdtorch.propagators.tmatrix.translation import Translation, WaveFrame
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.images import Image
 from autdtorch.utils.process import cached_property, require_memory
@@ -38,6 +38,9 @@ _MOST_STEPS = 30
 _USUAL_STEPS = 7
 """Steps that most systems take. With more right sides than 1 / 7 of the unknowns, a matrix is quicker."""
 
+_FEWEST_WAVES = 32
+"""Waves in a block of a map, as products of smaller ones take as long."""
+
 _ENTRY_BYTES = 48.0
 """Memory of a pair of waves in a matrix [bytes]."""
 
@@ -49,6 +52,16 @@ class Way(NamedTuple):
 
     weight: complex
     translation: Translation
+
+    def applied(self, waves: torch.Tensor) -> torch.Tensor:
+        """Return the regular waves (N, B, R) of outgoing ones (K, B, R)."""
+        regular = self.translation.applied(waves)
+        return regular if self.weight == 1 else self.weight * regular
+
+    @property
+    def adjoint(self) -> Way:
+        """The way back."""
+        return Way(complex(self.weight).conjugate(), self.translation.adjoint)
 
 
 Ways = list[list[list[Way]]]
@@ -80,7 +93,7 @@ def _seen(frame: WaveFrame, image: Image) -> WaveFrame:
 def received(ways: Sequence[Sequence[Way]], sent: Sequence[torch.Tensor | None]) -> torch.Tensor | None:
     """Return the regular waves (N, B, R) that come to a body from the outgoing ones (K, B, R) of bodies."""
     parts = [
-        way.translation.applied(waves) if way.weight == 1 else way.weight * way.translation.applied(waves)
+        way.applied(waves)
         for each, waves in zip(ways, sent, strict=True)
         for way in each
         if waves is not None
@@ -90,7 +103,7 @@ def received(ways: Sequence[Sequence[Way]], sent: Sequence[torch.Tensor | None])
 
 def solved(maps: Sequence[torch.Tensor], ways: Ways, incident: Sequence[torch.Tensor]) -> list[torch.Tensor]:
     """Return the outgoing waves (n, B, R) of all bodies, given their maps T_i (n, n) and waves (n, B, R)."""
-    sweep = _Sweep(list(maps), ways, list(incident))
+    sweep = _Sweep(list(maps), ways, list(incident), [_blocks(matrix) for matrix in maps])
     carried: torch.Tensor | None = None
     if sweep.carried:
         carried = _Fixed.apply(sweep, *sweep.tensors)  # type: ignore[no-untyped-call]
@@ -113,6 +126,10 @@ class _System(Protocol):
         """Return K x."""
         ...
 
+    def adjoint(self, x: torch.Tensor) -> torch.Tensor:
+        """Return K^H x."""
+        ...
+
     def step(self, x: torch.Tensor) -> torch.Tensor:
         """Return start + K x."""
         ...
@@ -125,6 +142,7 @@ class _Sweep:
     maps: list[torch.Tensor]
     ways: Ways
     incident: list[torch.Tensor]
+    blocks: list[list[_Block]]  # of each map
 
     @cached_property
     def carried(self) -> list[int]:
@@ -145,7 +163,7 @@ class _Sweep:
             return way._replace(translation=replace(way.translation, here=here, there=there))
 
         ways = [[[placed(way) for way in pair] for pair in row] for row in self.ways]
-        return _Sweep(list(tensors[:count]), ways, list(tensors[count : 2 * count]))
+        return replace(self, maps=list(tensors[:count]), ways=ways, incident=list(tensors[count : 2 * count]))
 
     @property
     def _ways(self) -> list[Way]:
@@ -157,26 +175,93 @@ class _Sweep:
     def linear(self, x: torch.Tensor) -> torch.Tensor:
         return self._next(self.after(x, None))
 
+    def adjoint(self, x: torch.Tensor) -> torch.Tensor:
+        later: list[torch.Tensor | None] = self._sent(x)  # by waves after the step
+        before: list[torch.Tensor | None] = [None] * len(self.maps)
+        for number, matrix in reversed(list(enumerate(self.maps))):
+            weights = later[number]
+            if weights is None:
+                continue
+            weights = _scattered_by(matrix, self.blocks[number], weights, is_adjoint=True)
+            for other, ways in enumerate(self.ways[number]):
+                sums = later if other < number else before
+                for way in ways:
+                    part = way.adjoint.applied(weights)
+                    total = sums[other]
+                    sums[other] = part if total is None else total + part
+        return torch.cat([waves for body in self.carried if (waves := before[body]) is not None])
+
     def step(self, x: torch.Tensor) -> torch.Tensor:
         return self._next(self.after(x, self.incident))
+
+    def _sent(self, x: torch.Tensor) -> list[torch.Tensor | None]:
+        """Return the waves of each body that x has."""
+        sent: list[torch.Tensor | None] = [None] * len(self.maps)
+        parts = torch.split(x, [len(self.maps[body]) for body in self.carried])
+        for body, part in zip(self.carried, parts, strict=True):
+            sent[body] = part
+        return sent
 
     def _next(self, waves: Sequence[torch.Tensor]) -> torch.Tensor:
         return torch.cat([waves[body] for body in self.carried])
 
     def after(self, x: torch.Tensor | None, incident: Sequence[torch.Tensor] | None) -> list[torch.Tensor]:
         """Return the outgoing waves of all bodies after a step."""
-        sent: list[torch.Tensor | None] = [None] * len(self.maps)
-        if x is not None:
-            parts = torch.split(x, [len(self.maps[body]) for body in self.carried])
-            for body, part in zip(self.carried, parts, strict=True):
-                sent[body] = part
+        sent: list[torch.Tensor | None] = [None] * len(self.maps) if x is None else self._sent(x)
         for number, matrix in enumerate(self.maps):
             waves = received(self.ways[number], sent)
             if incident is not None:
                 waves = incident[number] if waves is None else incident[number] + waves
             assert waves is not None
-            sent[number] = (matrix @ waves.reshape(len(waves), -1)).reshape(waves.shape)
+            sent[number] = _scattered_by(matrix, self.blocks[number], waves)
         return [waves for waves in sent if waves is not None]
+
+
+class _Block(NamedTuple):
+    """Waves that a map scatters into one another alone, and its part (b, b) for them."""
+
+    waves: torch.Tensor
+    matrix: torch.Tensor
+
+
+def _blocks(matrix: torch.Tensor) -> list[_Block]:
+    """Return the blocks of a map (n, n), of at least `_FEWEST_WAVES` each; none if they are one.
+
+    Nor of a map with gradients, as entries that are 0 have some, too.
+    """
+    if matrix.requires_grad:
+        return []
+    linked = matrix != 0
+    linked = linked | linked.mT
+    label, last = torch.arange(len(matrix), dtype=torch.int64, device="cpu"), None
+    linked.fill_diagonal_(True)
+    while last is None or not torch.equal(label, last):
+        label, last = torch.where(linked, label, len(matrix)).amin(dim=1), label
+    cuts, end = [0], 0
+    for size in label.bincount().tolist():
+        end += size
+        if size and min(end - cuts[-1], len(matrix) - end) >= _FEWEST_WAVES:
+            cuts.append(end)
+    if len(cuts) == 1:
+        return []
+    return [
+        _Block(waves, matrix[waves][:, waves])
+        for waves in torch.tensor_split(label.argsort(stable=True), cuts[1:])
+    ]
+
+
+def _scattered_by(
+    matrix: torch.Tensor, blocks: Sequence[_Block], waves: torch.Tensor, is_adjoint: bool = False
+) -> torch.Tensor:
+    """Return what a map (n, n) of some blocks, or its adjoint, makes of waves (n, B, R)."""
+    flat = waves.reshape(len(waves), -1)
+    if not blocks:
+        return ((matrix.mH if is_adjoint else matrix) @ flat).reshape(waves.shape)
+    order = torch.cat([block.waves for block in blocks])
+    parts = torch.split(flat.index_select(0, order), [len(block.waves) for block in blocks])
+    maps = [block.matrix.mH if is_adjoint else block.matrix for block in blocks]
+    products = torch.cat([each @ part for each, part in zip(maps, parts, strict=True)])
+    return products.index_select(0, order.argsort()).reshape(waves.shape)
 
 
 def _frames(way: Way) -> tuple[WaveFrame, WaveFrame]:
@@ -201,26 +286,13 @@ class _Adjoint:
         return self.gradient
 
     def linear(self, x: torch.Tensor) -> torch.Tensor:
-        place, image = self._image(x.shape[-1])
-        (result,) = torch.autograd.grad(
-            image, place, x, retain_graph=True, create_graph=torch.is_grad_enabled()
-        )
-        return result
+        return self.system.adjoint(x)
+
+    def adjoint(self, x: torch.Tensor) -> torch.Tensor:
+        return self.system.linear(x)
 
     def step(self, x: torch.Tensor) -> torch.Tensor:
         return self.gradient + self.linear(x)
-
-    def _image(self, columns: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return any x and K x, with the graph of the latter."""
-        if columns not in self._images:
-            with torch.enable_grad():
-                place = self.gradient.new_zeros(*self.gradient.shape[:-1], columns).requires_grad_(True)
-                self._images[columns] = place, self.system.linear(place)
-        return self._images[columns]
-
-    @cached_property
-    def _images(self) -> dict[int, tuple[torch.Tensor, torch.Tensor]]:
-        return {}
 
 
 class _Fixed(torch.autograd.Function):
@@ -301,12 +373,13 @@ def _combined(
 
 def _product(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
     """Return the inner products (B, R) of waves (N, B, R)."""
-    return (one.conj() * other).sum(dim=0)
+    products: torch.Tensor = torch.linalg.vecdot(one, other, dim=0)
+    return products
 
 
 def _norm(waves: torch.Tensor) -> torch.Tensor:
-    """Return the norms (B, R) of waves (N, B, R); quicker than those of complex numbers."""
-    return torch.view_as_real(waves.resolve_conj()).square().sum(dim=(0, -1)).sqrt()
+    """Return the norms (B, R) of waves (N, B, R)."""
+    return _product(waves, waves).real.sqrt()
 
 
 def _by_matrix(system: _System, start: torch.Tensor) -> torch.Tensor:

@@ -49,6 +49,8 @@ class _Driven(torch.autograd.Function):
         images: Sequence[Image],
         degree: int,
     ) -> torch.Tensor:
+        if body.center.ndim > 1 and not any(each.stride(0) for each in (body.center, body.axes)):
+            body = replace(body, center=body.center[:1], axes=body.axes[:1])  # at rest in all poses
         return IncomingWaves.of(body, array, images, degree + 1).driven(drive.detach())
 
     @staticmethod

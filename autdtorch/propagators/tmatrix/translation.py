@@ -7,6 +7,7 @@ Along z by d, waves of an order m stay of this order:
 I is the integral of Y_lm^* Y_nm Y_q0 over all directions (Martin, Multiple Scattering (2006), section 3.7).
 Any other shift is one along z between two turns. A turn by an angle about y is one about z between two
 quarter turns, which are constant. Waves of degree L thus take O(L^3) operations, and no matrix of a pose.
+Each column of waves passes all of them in `translation_kernel`.
 """
 
 from __future__ import annotations
@@ -18,14 +19,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.linalg import block_diag
 
 from autdtorch.analytic.momentum import gradient_by_place, gradient_by_turn
-from autdtorch.analytic.spherical_waves import harmonics, mirrored, orders, turns
-from autdtorch.utils.array_types import AnyArray
+from autdtorch.analytic.spherical_waves import harmonics, mirrored, turns
+from autdtorch.utils.array_types import REAL
 
-_AT_ONCE = 64
-"""Waves of several degrees that are turned by one product, as small ones take long."""
+LANES = 8
+"""Poses in a vector of the kernel; see `VECTOR`."""
 
 
 class WaveFrame(NamedTuple):
@@ -56,7 +56,12 @@ class Translation:
     def applied(self, waves: torch.Tensor) -> torch.Tensor:
         """Return the coefficients (N, B, R) of regular waves, from those of outgoing ones (K, B, R)."""
         (center, axes, degree), (other_center, other_axes, _) = self.here, self.there
-        regular: torch.Tensor = _Translated.apply(waves, center, axes, other_center, other_axes, self)  # type: ignore[no-untyped-call]
+        tensors = waves, center, axes, other_center, other_axes
+        regular: torch.Tensor
+        if torch.is_grad_enabled() or any(map(_has_tangent, tensors)):
+            regular = _Translated.apply(*tensors, self)  # type: ignore[no-untyped-call]
+        else:  # much quicker for few waves
+            regular = self.factors.applied(waves)
         return regular[: (degree + 1) ** 2]
 
     @property
@@ -71,6 +76,10 @@ class Translation:
             with torch.no_grad():
                 self._shared[self.is_conjugate] = _Factors.of(self)
         return self._shared[self.is_conjugate]
+
+
+def _has_tangent(tensor: torch.Tensor) -> bool:
+    return torch.autograd.forward_ad.unpack_dual(tensor).tangent is not None  # type: ignore[no-untyped-call]
 
 
 class _Translated(torch.autograd.Function):
@@ -116,24 +125,19 @@ class _Translated(torch.autograd.Function):
         return by_waves, by_place, by_turn, by_other_place, by_other_turn, None
 
 
-class _Turn(NamedTuple):
-    """The turn to a frame from one whose z has another direction, up to a phase that the way back takes away.
+class _Factors(NamedTuple):
+    """A translation in factors: a turn, a shift along z, and a turn back; see `translate`.
 
-    It is `around` Q `tilt` Q^T with the quarter turns Q, and phases (N, B, 1) of all waves.
+    Attributes:
+        turns: numbers of five turns about z (2, 5, M + 1, P) in P poses.
+        shifts: along z (2, C, P).
+        size: N, of the waves that come out.
+        are_left_handed: whether the frames of the regular and of the outgoing waves are.
     """
 
-    around: torch.Tensor
-    tilt: torch.Tensor
-
-
-class _Factors(NamedTuple):
-    """A translation in factors: a turn, a shift along z by blocks (B, C) of all orders, and a turn back."""
-
-    here: _Turn
-    there: _Turn  # its conjugate, back
-    twist: torch.Tensor  # about z, between both (K, B, 1)
-    blocks: torch.Tensor
-    degrees: tuple[int, int]
+    turns: torch.Tensor
+    shifts: torch.Tensor
+    size: int
     are_left_handed: tuple[bool, bool]
 
     @classmethod
@@ -143,41 +147,39 @@ class _Factors(NamedTuple):
         shift = here.center - there.center
         distance = torch.linalg.vector_norm(shift, dim=-1)
         parts = [_turn(frame, shift / distance[:, None]) for frame in (here, there)]
-        (turn, across, is_left), (other_turn, other_across, is_other_left) = parts
+        (around, tilt, across, is_left), (other_around, other_tilt, other_across, is_other_left) = parts
         twist = torch.einsum("bij,bi->jb", across, other_across[..., 0])
+        angles = torch.stack([-other_around, -other_tilt, torch.atan2(twist[1], twist[0]), tilt, around])
+        angles[:-1] += math.pi  # a quarter turn back is one between two half turns about z
         degrees = here.degree, there.degree
+        every = torch.arange(max(degrees) + 1, **REAL)[:, None] * _padded(angles)[:, None]
         radial = torch.view_as_real(_outgoing_radial(sum(degrees), translation.wavenumber * distance))
-        along = _along_z(*degrees)
-        real, imaginary = (part.mT @ along.terms for part in radial.unbind(dim=-1))
-        return cls(
-            turn,
-            _Turn(*(each.conj().resolve_conj() for each in other_turn)),
-            _phases(orders(there.degree)[along.others], torch.atan2(twist[1], twist[0])),
-            torch.complex(real, -imaginary if translation.is_conjugate else imaginary),
-            degrees,
-            (is_left, is_other_left),
-        )
+        shifts = _shifts_along_z(*degrees) @ _padded(radial.movedim(-1, 0).contiguous())
+        if translation.is_conjugate:
+            shifts[1].neg_()
+        turns = torch.stack([every.cos(), -every.sin()])
+        return cls(turns, shifts, (here.degree + 1) ** 2, (is_left, is_other_left))
 
     def applied(self, waves: torch.Tensor) -> torch.Tensor:
         """Return regular waves (N, B, R) of outgoing ones (K, B, R)."""
-        is_left, is_other_left = self.are_left_handed
-        waves = (_opposite(waves) if is_other_left else waves).contiguous() * self.there.around
-        waves = self._shifted(_tilted(waves, self.there.tilt))
-        waves = _tilted(waves, self.here.tilt).mul_(self.here.around)
-        return _opposite(waves) if is_left else waves
+        from autdtorch.propagators.tmatrix.translation_kernel import translate  # loads numba
 
-    def _shifted(self, waves: torch.Tensor) -> torch.Tensor:
-        """Return waves after the twist and the shift along z."""
-        along, (poses, columns) = _along_z(*self.degrees), waves.shape[1:]
-        sorted_waves = (waves[along.others] * self.twist).movedim(1, 0).contiguous()
-        parts, begin = [], 0
-        for block, (rows, others, sides) in along.orders:
-            part = sorted_waves[:, begin : begin + others * sides].reshape(poses, others, -1)
-            shifted = self.blocks[:, block].reshape(poses, rows, others) @ part
-            parts.append(shifted.reshape(poses, -1, columns))
-            begin += others * sides
-        parts.append(waves.new_zeros(poses, 1, columns))  # of orders above those of the waves
-        return torch.cat(parts, dim=1).movedim(1, 0)[along.rows]
+        is_left, is_other_left = self.are_left_handed
+        columns = waves.shape[1:]
+        lanes = (columns[1], 1) if columns[0] == 1 else columns  # columns of one pose make vectors, too
+        waves = (_opposite(waves) if is_other_left else waves).reshape(-1, *lanes).contiguous().resolve_conj()
+        regular = waves.new_empty(self.size, *lanes)
+        quarters = _quarters(self.turns.shape[2] - 1)
+        factors = (each.numpy() for each in (self.turns, self.shifts, quarters))
+        translate(torch.view_as_real(waves).numpy(), *factors, torch.view_as_real(regular).numpy())
+        regular = regular.reshape(-1, *columns)
+        return _opposite(regular) if is_left else regular
+
+
+def _padded(values: torch.Tensor) -> torch.Tensor:
+    """Return values (..., P) of whole vectors of poses, of values (..., B); the last pose is repeated."""
+    more = -values.shape[-1] % LANES
+    return torch.cat([values, values[..., -1:].expand(*values.shape[:-1], more)], dim=-1)
 
 
 def _with_next_degree(frame: WaveFrame) -> WaveFrame:
@@ -190,8 +192,12 @@ def _opposite(waves: torch.Tensor) -> torch.Tensor:
     return sign[:, None, None] * waves[place]
 
 
-def _turn(frame: WaveFrame, along: torch.Tensor) -> tuple[_Turn, torch.Tensor, bool]:
-    """Return the turn from a frame whose z is `along` (B, 3), its x and y (B, 3, 2), and the handedness."""
+def _turn(frame: WaveFrame, along: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, bool]:
+    """Return the turn to a frame from one whose z is `along` (B, 3).
+
+    Its angles (B,) about z and between quarter turns, the x and y (B, 3, 2) of the latter, and whether the
+    frame is left-handed.
+    """
     is_left = bool(torch.linalg.det(frame.axes[0]) < 0)
     axes = frame.axes * frame.axes.new_tensor([1.0, -1.0 if is_left else 1.0, 1.0])
     x, y, z = (axes.mT @ along[..., None])[..., 0].unbind(dim=-1)
@@ -199,48 +205,27 @@ def _turn(frame: WaveFrame, along: torch.Tensor) -> tuple[_Turn, torch.Tensor, b
     none = torch.zeros_like(x)
     first = torch.stack([around.cos() * tilt.cos(), around.sin() * tilt.cos(), -tilt.sin()], dim=-1)
     second = torch.stack([-around.sin(), around.cos(), none], dim=-1)
-    across = axes @ torch.stack([first, second], dim=-1)
-    every = orders(frame.degree)
-    return _Turn(_phases(every, around + math.pi / 2), _phases(every, tilt)), across, is_left
-
-
-def _phases(order: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
-    """Return e^(-i m angle) (n, B, 1) of orders (n,)."""
-    every = torch.arange(-int(order.max()), int(order.max()) + 1, dtype=torch.int64, device="cpu")
-    phase = -every[:, None] * angle
-    return torch.polar(torch.ones_like(phase), phase)[order - every[0], :, None]
-
-
-def _tilted(waves: torch.Tensor, tilt: torch.Tensor) -> torch.Tensor:
-    """Return Q `tilt` Q^T of waves (N, B, R), with the phases (N, B, 1) of the tilt."""
-    middle, result = torch.empty_like(waves), torch.empty_like(waves)
-    for rows, quarter in _quarter_turns(math.isqrt(len(waves)) - 1):
-        torch.mm(quarter.mT, _real_columns(waves[rows]), out=_real_columns(middle[rows]))
-        middle[rows] *= tilt[rows]
-        torch.mm(quarter, _real_columns(middle[rows]), out=_real_columns(result[rows]))
-    return result
-
-
-def _real_columns(waves: torch.Tensor) -> torch.Tensor:
-    """Return a view of waves (N, B, R) as real numbers (N, 2 B R)."""
-    return torch.view_as_real(waves).view(len(waves), -1)
+    return around + math.pi / 2, tilt, axes @ torch.stack([first, second], dim=-1), is_left
 
 
 @functools.lru_cache(8)
 @torch.inference_mode(False)
 @torch.no_grad()
-def _quarter_turns(degree: int) -> list[tuple[slice, torch.Tensor]]:
-    """Return the rows and the turn Q (n, n) of a few degrees each; it brings z to x about y, and is real."""
+def _quarters(degree: int) -> torch.Tensor:
+    """Return a quarter of the real turn that brings z to x about y, flat: of each degree l, (l + 1, l + 1).
+
+    Entries at the orders (m, -n) are (-1)^(l + m) times those at (m, n), and those at (-m, n) are
+    (-1)^(l + n) times them. So columns are for sums and differences of opposite orders, even l + n first.
+    """
     axes = torch.tensor(
         [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]], dtype=torch.float64, device="cpu"
     )
-    blocks, result, begin = turns(degree, axes), list[tuple[slice, torch.Tensor]](), 0
-    while blocks:
-        few = max(1, int((np.cumsum([len(block) for block in blocks]) <= _AT_ONCE).sum()))
-        joined = torch.from_numpy(block_diag(*(block.real.numpy() for block in blocks[:few])))
-        result.append((slice(begin, begin + len(joined)), joined))
-        begin, blocks = begin + len(joined), blocks[few:]
-    return result
+    parts = []
+    for n, each in enumerate(turns(degree, axes)):
+        upper = each.real[n:, n:].clone()
+        upper[:, 0] /= 2  # as the order 0 is added to itself
+        parts.append(torch.cat([upper.flip(1)[:, side::2] for side in (0, 1)], dim=1).flatten())
+    return torch.cat(parts)
 
 
 def _outgoing_radial(degree: int, x: torch.Tensor) -> torch.Tensor:
@@ -253,50 +238,22 @@ def _outgoing_radial(degree: int, x: torch.Tensor) -> torch.Tensor:
     return torch.stack(rows[: degree + 1])
 
 
-class _AlongZ(NamedTuple):
-    """Shifts along z, of waves sorted by m, l and the sign of m.
-
-    Attributes:
-        terms: of h_q in all S_lnm with m >= 0 (Q, C).
-        orders: for each m, its part of C, the numbers of l and n, and of signs: 1 or 2.
-        rows: place of each wave of the result among those sorted, or behind them, where none comes (N,).
-        others: waves in this order (K,).
-    """
-
-    terms: torch.Tensor
-    orders: list[tuple[slice, tuple[int, int, int]]]
-    rows: torch.Tensor
-    others: torch.Tensor
-
-
 @functools.lru_cache(8)
 @torch.inference_mode(False)
 @torch.no_grad()
-def _along_z(degree: int, other: int) -> _AlongZ:
-    """Return the shifts of outgoing waves up to the degree `other`."""
+def _shifts_along_z(degree: int, other: int) -> torch.Tensor:
+    """Return the terms (C, Q) of h_q in S_lnm by m, l and n, for outgoing waves up to the degree `other`."""
     nodes, weights = np.polynomial.legendre.leggauss(degree + other + 1)
     across, most = np.sqrt(1 - nodes**2), degree + other
     values = harmonics(most, torch.from_numpy(np.stack([across, 0 * nodes, nodes], axis=1))).real.numpy()
     q = np.arange(most + 1)
     zonal = 4 * math.pi**1.5 * weights[:, None] * values[:, q * q + q] * np.sqrt(2 * q + 1)
-    every, sizes, begin = list[AnyArray](), [], 0
-    rows, others = list[AnyArray](), list[AnyArray]()
+    every = []
     for m in range(min(degree, other) + 1):
-        n, k = np.arange(m, degree + 1), np.arange(m, other + 1)
-        products = values[:, n * n + n + m, None] * values[:, None, k * k + k + m]
-        terms = (zonal.T @ products.reshape(len(nodes), -1)).reshape(len(q), len(n), len(k))
-        power = q[:, None, None] + n[:, None] - k
-        connected = (power % 2 == 0) & (abs(n[:, None] - k) <= q[:, None, None]) & (power <= 2 * n[:, None])
-        every.append(np.where(connected, (1 - power % 4) * terms, 0.0).reshape(len(q), -1))
-        signs = np.array([m, -m] if m else [0])
-        for places, each in ((rows, n), (others, k)):
-            places.append(((each * each + each)[:, None] + signs).ravel())
-        sizes.append((slice(begin, begin + len(n) * len(k)), (len(n), len(k), len(signs))))
-        begin += len(n) * len(k)
-    sorted_rows = np.concatenate(rows)
-    place = np.full((degree + 1) ** 2, len(sorted_rows))
-    place[sorted_rows] = np.arange(len(sorted_rows))
-    terms = np.concatenate(every, axis=1)
-    return _AlongZ(
-        torch.from_numpy(terms), sizes, torch.from_numpy(place), torch.from_numpy(np.concatenate(others))
-    )
+        n, k = np.arange(m, degree + 1)[:, None], np.arange(m, other + 1)
+        products = values[:, n * n + n + m] * values[:, None, k * k + k + m]
+        terms = np.tensordot(products, zonal, axes=(0, 0))
+        power = q + (n - k)[..., None]
+        connected = (power % 2 == 0) & (abs(n - k)[..., None] <= q) & (power <= 2 * n[..., None])
+        every.append(np.where(connected, (1 - power % 4) * terms, 0.0).reshape(-1, len(q)))
+    return torch.from_numpy(np.concatenate(every))
