@@ -84,14 +84,11 @@ class Coefficients:
     # flat place, among the terms (L, n) of the `crossed`, of the term to add to the sums across each cell of
     # the columns (m, L + 2) int64; L n for none
     crossing: Tensor
-    # flat indices (l,) int64 of the lossy cells, ascending, each of them heterogeneous
+    # flat indices (l,) int64 of the lossy cells, ascending, each of them heterogeneous; their rows on the
+    # change of a step (l, 27), and their stiffness against silence (l,)
     loss_index: Tensor = field(default_factory=lambda: _empty(0, dtype=torch.int64))
-    loss_weight: Tensor = field(
-        default_factory=lambda: _empty(0, 27, dtype=torch.float32)
-    )  # their rows on the change of a step (l, 27)
-    loss_ground: Tensor = field(
-        default_factory=lambda: _empty(0, dtype=torch.float32)
-    )  # their stiffness against silence (l,)
+    loss_weight: Tensor = field(default_factory=lambda: _empty(0, 27, dtype=torch.float32))
+    loss_ground: Tensor = field(default_factory=lambda: _empty(0, dtype=torch.float32))
     # runs of cells behind the sound-hard ones, which need no steps: flat indices of the first cell and of one
     # past the last (g, 2) int64, ascending; none of them ends in another row or is in a layer
     idle: Tensor = field(default_factory=lambda: _empty(0, 2, dtype=torch.int64))
