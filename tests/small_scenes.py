@@ -61,6 +61,13 @@ def scene_of_all_kinds(folder: Path) -> Scene:
     )
 
 
+def random_frames(count: int, transducers: int, seed: int = 0) -> torch.Tensor:
+    """Drives (count, transducers) of random phases and amplitudes."""
+    generator = torch.Generator().manual_seed(seed)
+    phases, amplitudes = torch.rand((2, count, transducers), generator=generator, dtype=torch.float64)
+    return torch.polar(amplitudes, 2 * torch.pi * phases)
+
+
 def assembled_parts(scene: Scene, spacing: float, dtype: torch.dtype) -> tuple[Assembly, Sources, Receivers]:
     """A small scene on its grid, its transducers with four phasors, and its control points."""
     assembly = assemble(region_of(scene), spacing, dtype)

@@ -88,3 +88,25 @@ def write(tmp_path):
         path.write_text(text, encoding="utf-8")
 
     return text_file
+
+
+SCENE = """
+name: two
+frequency: 40e3
+medium: {density: 1.2, sound_speed: 340.0}
+array: {type: grid, shape: [3, 3], pitch: 10.5e-3, center: [0, 0, 0], normal: [1, 0, 0]}
+control_points: {type: points, positions: [[80e-3, 10e-3, 0.0], [80e-3, -20e-3, 5e-3]]}
+"""
+
+
+@pytest.fixture
+def trial(run, write, tmp_path, capsys):
+    """Runs a trial in that scene; returns its status, and what it printed on stdout and stderr."""
+    write("ours/scene/two.yaml", SCENE)
+
+    def command(*words, folder="output=out"):
+        capsys.readouterr()
+        status = run("--config-dir", str(tmp_path / "ours"), "scene=two", folder, *words)
+        return status, *capsys.readouterr()
+
+    return command

@@ -7,18 +7,12 @@ import threading
 
 import pytest
 import torch
+from small_scenes import random_frames
 
 from autdtorch.hardware import AUTD3, LimitedLink, LimitError, Limits, LinkError, open_autd3
 from autdtorch.hardware.devices import autd3 as module
 from autdtorch.hardware.devices.autd3 import Autd3Port
 from autdtorch.hardware.safety import Signalled, ended_by_signals
-from autdtorch.scene.drive import drive_from_phases
-
-
-def random_drive(count: int) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(0)
-    phases, amplitudes = torch.rand((2, count), generator=generator, dtype=torch.float64)
-    return drive_from_phases(2 * torch.pi * phases, amplitudes)
 
 
 def noted(monkeypatch, method, note):
@@ -82,7 +76,7 @@ class TestWithTheKit:
         sent = noted(monkeypatch, "_send", lambda what, command: type(command))
         boards = kit.UdpEmulator(2)
         with open_autd3(2, range(300), boards.option(), settle=0) as link:
-            link.play(random_drive(300))
+            link.play(random_frames(1, 300)[0])
         assert sent == [Clear, *5 * [Pattern]]  # off twice, the drive, off twice
         with pytest.raises(ValueError, match=r"from 0 to 497"):
             open_autd3(2, [498], boards.option())
@@ -92,7 +86,7 @@ class TestWithTheKit:
         boards = kit.UdpEmulator(1)
         with open_autd3(1, network=boards.option(), settle=0) as link:
             limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.02))
-            limited.play(random_drive(249))
+            limited.play(random_frames(1, 249)[0])
             limited._timer.join()
             loops = [thread.daemon for thread in threading.enumerate() if thread.name == "AUTD3"]
             assert loops
@@ -103,7 +97,7 @@ class TestWithTheKit:
 
     @pytest.mark.timeout(120)
     def test_signals_at_any_moment_leave_the_boards_off(self, kit, monkeypatch, signalled_all_the_time):
-        drive, boards = random_drive(249), kit.UdpEmulator(1)
+        drive, boards = random_frames(1, 249)[0], kit.UdpEmulator(1)
         with open_autd3(1, network=boards.option(), settle=0) as link:
             link._port._client = client = Noting(link._port._client, monkeypatch)
             with signalled_all_the_time():
@@ -140,10 +134,10 @@ class TestWithTheKit:
     def test_boards_that_vanish_are_an_error_and_no_hang(self, kit):
         boards = kit.UdpEmulator(1)
         link = open_autd3(1, network=boards.option(), settle=0)
-        link.play(random_drive(249))
+        link.play(random_frames(1, 249)[0])
         del boards
         with pytest.raises(LinkError, match=r"AUTD3 cannot be written to: .*did not reply"):
-            link.play(random_drive(249))
+            link.play(random_frames(1, 249)[0])
         with pytest.raises(LinkError, match=r"the outputs may still be on: switch the device's power off"):
             link.close()
 
@@ -154,9 +148,9 @@ class TestWithTheKit:
         with monkeypatch.context() as impatient:
             impatient.setattr(module, "_TIMEOUT", 0.02)
             with pytest.raises(LinkError, match=r"AUTD3 cannot be written to: no answer within 0.02 s"):
-                link.play(random_drive(249))
+                link.play(random_frames(1, 249)[0])
         link._port._client = client  # the cable is in again
-        link.play(random_drive(249))
+        link.play(random_frames(1, 249)[0])
         link._port._client = Mute()
         monkeypatch.setattr(module, "_TIMEOUT", 0.02)
         with pytest.raises(LinkError, match=r"no answer within 0.02 s; the outputs may still be on"):
@@ -175,7 +169,7 @@ class TestWithTheKit:
         from autd3.commands import SetSilencer
         from autd3_core import Autd3, Duration, Geometry
 
-        drive = random_drive(249)
+        drive = random_frames(1, 249)[0]
 
         def play(recorder):
             recorder.send([SetSilencer.disable(), module.autd3_pattern(AUTD3.frame(drive), 1)])

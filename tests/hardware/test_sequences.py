@@ -6,7 +6,6 @@ import signal
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,21 +14,14 @@ import torch
 from faulty_bus import FAULTS, FaultyBus
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_scenes import random_frames
 
 from autdtorch import hardware as hw
 from autdtorch.hardware import streaming
-from autdtorch.hardware.devices import autd3
 from autdtorch.hardware.emulator.bench import BenchPort
-from autdtorch.scene.sequence import Sequence, modulated
+from autdtorch.scene.sequence import Sequence
 
 COUNT = 16  # transducers of the bench
-
-
-def frames_of(count: int, transducers: int, seed: int = 0) -> torch.Tensor:
-    """Random drives (count, transducers)."""
-    generator = torch.Generator().manual_seed(seed)
-    phases, amplitudes = torch.rand((2, count, transducers), generator=generator, dtype=torch.float64)
-    return torch.polar(amplitudes, 2 * math.pi * phases)
 
 
 def played(bench: hw.EmulatedBench) -> list[torch.Tensor]:
@@ -136,7 +128,7 @@ def test_a_sequence_that_falls_behind_by_a_second_ends(clock):
 def test_frames_together_are_those_of_drives_one_by_one(name):
     device = hw.DEVICES[name]
     device = device.with_boards(2) if device.most_boards != 1 else device
-    drives = frames_of(9, device.transducers)
+    drives = random_frames(9, device.transducers)
     assert [frame.tobytes() for frame in device.frames(drives)] == [device.frame(drive) for drive in drives]
 
 
@@ -148,7 +140,7 @@ def test_every_frame_is_sent_in_order_and_the_outputs_are_off_in_the_end(trial, 
         real(data)
         received.extend(data)
 
-    sequence, received = Sequence(frames_of(3, COUNT), rate), bytearray()
+    sequence, received = Sequence(random_frames(3, COUNT), rate), bytearray()
     bench = hw.EmulatedBench(device, trial.simulated.transfer_matrix, range(COUNT))
     with hw.open_link(device, range(COUNT), backend=bench.bus) as link:
         real, bench.firmware.receive = bench.firmware.receive, receive
@@ -166,7 +158,7 @@ def test_boards_of_openmpd_share_every_transfer(tmp_path):
     boards = [_board(tmp_path, name) for name in ("left", "right")]
     device = hw.openmpd_boards(boards)
     bench = hw.EmulatedBench(device, torch.ones(1, 512).cdouble())
-    sequence = Sequence(frames_of(40, 512), 9000.0, loop=False)
+    sequence = Sequence(random_frames(40, 512), 9000.0, loop=False)
     with hw.open_link(device, backend=bench.bus) as link:
         received = [bytearray(), bytearray()]
         for number, firmware in enumerate(bench._firmwares):
@@ -190,7 +182,7 @@ def _board(folder, name):
 def test_another_thread_ends_a_loop(trial, how):
     bench = trial.bench(hw.OPENMPD)
     with trial.link(bench, hw.OPENMPD) as link:
-        loop, full = Sequence(frames_of(5, COUNT), 1000.0), torch.ones(COUNT).cdouble()
+        loop, full = Sequence(random_frames(5, COUNT), 1000.0), torch.ones(COUNT).cdouble()
         ends = {
             "off": link.off,
             "another drive": lambda: link.play(full),
@@ -217,7 +209,7 @@ def test_a_sequence_ends_though_its_end_comes_while_it_is_prepared(trial, how, m
         watchdog = threading.Timer(100, link.link.off)
         watchdog.start()
         with pytest.raises(hw.LimitError) if how == "limit" else contextlib.nullcontext():
-            link.play_sequence(Sequence(frames_of(5, COUNT), 1000.0))
+            link.play_sequence(Sequence(random_frames(5, COUNT), 1000.0))
         assert watchdog.is_alive()
         watchdog.cancel()
         assert not bench.emitted().any()
@@ -252,7 +244,7 @@ def test_seconds_at_the_limit_are_played_at_any_rate(trial):
 
 
 def test_a_port_that_shows_frames_shows_each(trial):
-    shown, sequence = [], Sequence(frames_of(40, COUNT), 9000.0, loop=False)
+    shown, sequence = [], Sequence(random_frames(40, COUNT), 9000.0, loop=False)
     for device in (hw.AUTD3, hw.OPENMPD):
         bench = trial.bench(device)
         with hw.Link(device, BenchPort(bench, shown.append), range(COUNT), 0, bench.bus.sleep) as link:
@@ -271,7 +263,7 @@ def test_a_signal_ends_a_loop_with_the_outputs_off(trial, number):
     def play() -> None:
         with hw.ended_by_signals(), trial.link(bench, hw.OPENMPD) as link:
             once_it_plays(bench, lambda: signal.pthread_kill(main, number))
-            link.play_sequence(Sequence(frames_of(5, COUNT), 1000.0))
+            link.play_sequence(Sequence(random_frames(5, COUNT), 1000.0))
 
     try:
         with pytest.raises(hw.Signalled):
@@ -283,7 +275,7 @@ def test_a_signal_ends_a_loop_with_the_outputs_off(trial, number):
 
 @pytest.mark.timeout(120)
 def test_signals_at_any_moment_leave_the_outputs_off(trial, signalled_all_the_time):
-    loop, bench = Sequence(frames_of(5, COUNT), 5000.0), trial.bench(hw.OPENMPD)
+    loop, bench = Sequence(random_frames(5, COUNT), 5000.0), trial.bench(hw.OPENMPD)
     emitted = []
     with trial.link(bench, hw.OPENMPD) as link, signalled_all_the_time():
         for _ in range(100):
@@ -298,7 +290,7 @@ def test_a_fault_of_the_bus_ends_a_loop_with_the_outputs_off(trial, fault):
     bench = trial.bench(hw.OPENMPD)
     bench.bus = FaultyBus([bench.chip], fault, 512 * 20 + 300)
     with pytest.raises(hw.LinkError) as raised, trial.link(bench, hw.OPENMPD) as link:
-        link.play_sequence(Sequence(frames_of(5, COUNT), 1000.0))
+        link.play_sequence(Sequence(random_frames(5, COUNT), 1000.0))
     assert bench.bus.struck
     assert "\n" not in str(raised.value)
     if fault == "unplug":
@@ -308,7 +300,7 @@ def test_a_fault_of_the_bus_ends_a_loop_with_the_outputs_off(trial, fault):
 
 
 def test_a_limited_link_scales_a_sequence_and_counts_its_time(trial):
-    sequence = Sequence(frames_of(4, COUNT), 100.0)
+    sequence = Sequence(random_frames(4, COUNT), 100.0)
     with trial.limited(hw.OPENMPD, amplitude=0.5, seconds=50) as (bench, link):
         drives = played(bench)
         link.play_sequence(sequence, 0.08)
@@ -325,7 +317,7 @@ def test_a_limited_link_scales_a_sequence_and_counts_its_time(trial):
 
 
 def test_the_timer_of_a_limited_link_ends_a_loop_and_its_off_is_no_error(trial):
-    loop = Sequence(frames_of(4, COUNT), 100.0)
+    loop = Sequence(random_frames(4, COUNT), 100.0)
     with trial.limited(hw.OPENMPD, seconds_in_a_row=0.06) as (bench, link):
         with pytest.raises(hw.LimitError, match=r"longer than the outputs may stay on, 0.06 s in a row"):
             link.play_sequence(loop)
@@ -335,104 +327,8 @@ def test_the_timer_of_a_limited_link_ends_a_loop_and_its_off_is_no_error(trial):
         link.play_sequence(loop)
 
 
-class TestOnAutd3:
-    """By the kit, against its emulators of the network and of the boards."""
-
-    @pytest.fixture(autouse=True)
-    def kit(self):
-        pytest.importorskip("autd3_modulation", reason="the kit of AUTD3: install autdtorch[autd3]")
-        return pytest.importorskip("autd3", reason="the kit of AUTD3: install autdtorch[autd3]")
-
-    def test_limits_are_those_of_the_kit(self, kit):
-        assert kit.params.EMISSION_MAX_INDICES == autd3._MOST_PATTERNS
-        assert kit.params.MOD_BUFFER_SAMPLES == autd3._MOST_FACTORS
-        assert kit.params.ULTRASOUND_FREQ_HZ == autd3._CLOCK
-
-    @pytest.mark.parametrize("loop", [True, False])
-    def test_boards_play_a_sequence_and_then_a_drive_without_its_modulation(self, kit, loop, monkeypatch):
-        def state():
-            async def read():
-                states.extend(await link._port._client.read_fpga_state())
-
-            states = []
-            link._port._run("be asked", read, 5.0)
-            return states
-
-        def begun(rate, count, ended):
-            end = time.monotonic() + 60
-            while not all(one.is_stm_mode() for one in state()) and time.monotonic() < end:
-                time.sleep(0.01)
-            begins.append([one.is_stm_mode() for one in state()])
-            return real(rate, count, ended)
-
-        begins, real = [], streaming.outlast
-        monkeypatch.setattr("autdtorch.hardware.link.outlast", begun)
-        boards = kit.UdpEmulator(2)
-        with hw.open_autd3(2, network=boards.option(), settle=0) as link:
-            playback = link.play_sequence(Sequence(frames_of(50, 498), 1000.0, loop), seconds=0.05)
-            assert (playback.frames, playback.late) == (50, None)
-            assert begins == [[True, True]]
-            assert not any(one.is_stm_mode() for one in state())
-            link.play_sequence(modulated(frames_of(1, 498)[0], 200.0), seconds=0.01)
-            link.play(torch.ones(498).cdouble())
-            assert all(one.current_mod_bank() == kit.value.ModulationBank.B0 for one in state())
-
-    def recorded(self, sequence, laps):
-        """Phases and pulse widths (M, ticks) of the boards that the kit emulates."""
-        emulator = pytest.importorskip("autd3_emulator", reason="install autdtorch[crosscheck]")
-        from autd3_core import Autd3, Duration, Geometry
-
-        recorder = emulator.Recorder(Geometry([Autd3()]), 0)
-        held = hw.AUTD3.held(sequence.drives, sequence.rate, sequence.loop)
-        recorder.send(autd3.autd3_sequence(held, 1))
-        recorder.tick(Duration.from_nanos(round(1e9 * laps * sequence.duration)))
-        record = recorder.into_record()
-        return [part.to_numpy().astype(int) for part in (record.phase(), record.pulse_width())]
-
-    @pytest.mark.parametrize("rate", [500.0, 4000.0, 40_000.0])
-    def test_the_emulated_boards_emit_every_frame_in_order_at_its_time(self, rate):
-        # Phases that swing: emulator 0.12.0 smooths in the wrong direction where they wind down twice.
-        start, frame = frames_of(1, 249)[0], torch.arange(20)[:, None]
-        drives = start.abs() * torch.polar(
-            torch.ones(20, 249).double(), start.angle() + torch.sin(math.pi * frame / 10)
-        )
-        sequence = Sequence(drives, rate)
-        phases, widths = self.recorded(sequence, 3)
-        ticks = round(40_000 / rate)
-        ends = slice(ticks - 1, None, ticks)  # of each frame, when the silencer has reached it
-        levels = [level.T.repeat(1, 3).numpy() for level in hw.AUTD3.levels(drives)]
-        assert np.array_equal(phases[:, ends], levels[0])
-        pulses = 512 * np.arcsin(levels[1] / 255) / math.pi
-        assert np.abs(widths[:, ends] - pulses).max() <= 1  # counts of 512
-
-    def test_the_emulated_boards_emit_laps_of_a_path_times_factors(self):
-        start, frame = frames_of(1, 249)[0], torch.arange(1220)[:, None]
-        swing = torch.sin(math.pi * frame.double() / 10)
-        factor = 0.6 + 0.4 * torch.cos(2 * math.pi * frame.double() / 61)  # 61 frames, in laps of 20
-        sequence = Sequence(factor * torch.polar(start.abs().expand(1220, -1), start.angle() + swing), 4000.0)
-        phases, widths = self.recorded(sequence, 1)
-        phase, intensity = (level.T.numpy() for level in hw.AUTD3.levels(sequence.drives))
-        assert np.array_equal(phases[:, 9::10][intensity > 0], phase[intensity > 0])
-        emitted = np.sin(math.pi * widths[:, 9::10] / 512)
-        # Half a level of factor and of intensity, and of 512 pulse widths.
-        assert (
-            np.abs(emitted - factor.T.numpy() * start.abs()[:, None].numpy()).max() < 1 / 255 + math.pi / 512
-        )
-
-    def test_amplitude_modulation_has_its_frequency_and_depth_within_a_hundredth(self):
-        sequence = modulated(torch.ones(249).cdouble(), 200.0)
-        widths = self.recorded(sequence, 8)[1]
-        drive = np.sin(math.pi * widths / 512)
-        ends = (drive[:, 9::10] ** 2).mean(axis=0)  # radiation pressure goes with the square
-        wanted = (1 + np.sin(2 * math.pi * np.arange(160) / 20)) / 2
-        # 8 bits of the factor and of the intensity, 9 bits of the pulse width.
-        assert np.abs(ends - wanted).max() < 0.01
-        spectrum = np.abs(np.fft.rfft(ends - ends.mean()))
-        assert spectrum.argmax() * 4000 / 160 == 200.0
-
-
 CLOSED, LIMITED = "closed", "limited"
-SMALL = frames_of(4, COUNT)
+SMALL = random_frames(4, COUNT)
 MISTAKES = [
     (hw.OPENMPD, lambda: SMALL, {}, "sequence: .*must be a Sequence"),
     (hw.OPENMPD, lambda: None, {}, "sequence: None; must be a Sequence"),
@@ -472,7 +368,7 @@ MISTAKES = [
     (hw.AUTD3, lambda: Sequence(SMALL, 0.5), {}, "rate: 0.5 Hz; must be at least 0.61 for AUTD3"),
     (
         hw.AUTD3,
-        lambda: Sequence(frames_of(1025, COUNT), 1e3),
+        lambda: Sequence(random_frames(1025, COUNT), 1e3),
         {},
         "sequence: 1025 frames; must be at most 1024",
     ),
@@ -496,48 +392,6 @@ def test_a_mistake_is_refused_in_one_line_and_nothing_plays(trial, device, make,
             player.play_sequence(make(), **arguments)
         assert "\n" not in str(raised.value)
         assert not any(drive.any() for drive in drives)
-
-
-@given(st.lists(st.sampled_from([0.0, 1e-12, 0.3, 1.0, -1.0, 1j]), min_size=1, max_size=6), st.integers(0, 9))
-def test_what_autd3_holds_emits_the_frames(factors, seed):
-    drives = torch.tensor(factors, dtype=torch.complex128)[:, None] * frames_of(1, 249, seed)
-    held = hw.AUTD3.held(drives, 4000.0, True)
-    levels = held.frames.reshape(len(held.frames), 2, 249).astype(float)
-    patterns = levels[:, 1] / 255 * np.exp(2j * math.pi * levels[:, 0] / 256)
-    number = np.arange(len(factors))
-    emitted = patterns[number % len(patterns)] * (held.modulation[number % len(held.modulation), None] / 255)
-    # Half a level of phase, and of both amplitudes.
-    assert np.abs(emitted - drives.numpy()).max() <= math.pi / 256 + 1 / 255
-
-
-@given(st.integers(3, 40), st.integers(1200, 3000), st.integers(0, 9))
-@settings(max_examples=20)
-def test_autd3_holds_a_loop_of_moving_frames_times_factors(laps, rest, seed):
-    lap, count = frames_of(rest // laps, 16, seed), rest // laps * laps
-    number = torch.arange(count)
-    factors = (0.6 + 0.4 * torch.cos(2 * math.pi * number.double() / count))[:, None]
-    drives = factors * lap[number % len(lap)]
-    device = replace(hw.AUTD3, board=16)
-    held = device.held(drives, 4000.0, True)
-    assert len(held.frames) <= max(len(lap), 2)
-    levels = held.frames.reshape(len(held.frames), 2, 16).astype(float)
-    patterns = levels[:, 1] / 255 * np.exp(2j * math.pi * levels[:, 0] / 256)
-    emitted = patterns[number % len(patterns)] * (held.modulation[number % len(held.modulation), None] / 255)
-    # Half a level of phase, and of both amplitudes.
-    assert np.abs(emitted - drives.numpy()).max() <= math.pi / 256 + 1 / 255
-
-
-def test_a_drive_and_its_opposite_are_two_patterns_for_autd3():
-    drive = frames_of(1, 249)
-    held = hw.AUTD3.held(torch.cat([drive, -drive]), 4000.0, True)
-    assert not np.array_equal(held.frames[0], held.frames[1])
-    assert (held.modulation == 255).all()
-
-
-def test_a_modulation_longer_than_the_memory_of_autd3_is_refused():
-    drives = torch.linspace(0, 1, 65_537, dtype=torch.float64)[:, None] * torch.ones(2).cdouble()
-    with pytest.raises(ValueError, match="sequence: 65537 frames; must be at most 65536 frames"):
-        hw.AUTD3.held(drives, 4000.0, True)
 
 
 def test_a_loop_lasts_as_long_as_asked(trial):
