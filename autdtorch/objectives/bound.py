@@ -108,12 +108,12 @@ def joint_bound(matrices: ComplexArray, wanted: Array, effort: float = 1.0) -> f
 def _lowered(bound: float, rows: ComplexArray, effort: float) -> float:
     """Return a bound on the level of rows (P, M), lowered by branch and bound."""
     if bound == 0:
-        return bound
+        return 0.0
     rows = rows[:, rows.any(axis=0)]  # a failed transducer takes no work
     foci, transducers = min(len(rows), _MOST_JOINT), rows.shape[1]
     work = min(_WORK * foci * transducers * min(foci, transducers), _MOST_WORK)
     work = work if len(rows) > _FEW else _WORK_FEW
-    return phase_bound(rows, bound, effort * work)
+    return float(phase_bound(rows, bound, effort * work))
 
 
 def checked_matrix(G: ArrayLike, name: str = "G") -> ComplexArray:

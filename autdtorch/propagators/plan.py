@@ -24,10 +24,12 @@ from autdtorch.propagators.tmatrix.bodies import waves_to_simulate
 from autdtorch.scene.arrays import apertures_of, radii_of
 from autdtorch.scene.obstacles import Mesh, Obstacle
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.process import cached_property, require_memory
 from autdtorch.utils.spatial import mean_thickness
 from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import (
+    LENGTH_TOLERANCE,
     integer_at_least,
     invalid,
     positive,
@@ -51,6 +53,8 @@ _NEAR_RIGID = 1.4
 
 _NO_EFFECT = ("observation_plane", "name")
 """Scene fields that do not affect the pressure; left out of keys."""
+
+_SIDES = torch.tensor([-1.0, 1.0], **REAL)
 
 
 @dataclass(frozen=True)
@@ -165,9 +169,9 @@ class Plan:
             meshes=tuple(isinstance(shape, Mesh) for shape in region.shapes),
         )  # fmt: skip
 
-    @cached_property
+    @property
     def refusal(self) -> str:
-        """The reason why this machine cannot run it, or why no grid can; empty if one can."""
+        """The reason why this machine cannot run it now, or why no grid can; empty if one can."""
         try:
             require_memory("spacing", self.spacing, self.memory, "m")
             for grid in self.grouping.grids:
@@ -305,3 +309,37 @@ def walls_of(scene: Scene) -> list[tuple[bool, bool]]:
         if continued and ends:
             normal = ends[0]
     return walls
+
+
+def in_rigid(region: Region, points: torch.Tensor) -> torch.Tensor:
+    """Return which points (N, 3) [m] are in rigid bodies, bool (N,); of overlapping bodies the later counts.
+
+    A point on a surface is in the air, if there is air next to it: where rigid bodies touch there is none.
+    """
+    rigid = _in_rigid(region, points, LENGTH_TOLERANCE)
+    place = rigid.nonzero()[:, 0]
+    place = place[_on_surfaces(region, points[place])]
+    around = points[place, None] + 2 * LENGTH_TOLERANCE * torch.cartesian_prod(*[_SIDES] * 3)
+    for mirror in region.mirrors:  # behind it is the image of what is in front
+        behind = mirror.height(around).clamp(max=0.0)
+        around = around - 2 * behind[..., None] * around.new_tensor(mirror.normal)
+    rigid[place] = _in_rigid(region, around.reshape(-1, 3)).reshape(around.shape[:2]).all(dim=1)
+    return rigid
+
+
+def _in_rigid(region: Region, points: torch.Tensor, margin: float = 0.0) -> torch.Tensor:
+    """Return which points (N, 3) [m] are in rigid bodies that are enlarged by a margin [m]."""
+    rigid = torch.zeros(len(points), dtype=torch.bool, device="cpu")
+    for body in region.bodies:
+        inside = cast(Obstacle, body.shape).contains(points, margin)
+        rigid = torch.where(inside, body.fluid is None, rigid)
+    return rigid
+
+
+def _on_surfaces(region: Region, points: torch.Tensor) -> torch.Tensor:
+    """Return which points (N, 3) [m] are on the surface of a body, bool (N,)."""
+    on = torch.zeros(len(points), dtype=torch.bool, device="cpu")
+    for body in region.bodies:
+        near = cast(Obstacle, body.shape).near(points).nonzero()[:, 0]
+        on[near] |= body.shape.signed_distance(points[near]).abs() <= LENGTH_TOLERANCE
+    return on

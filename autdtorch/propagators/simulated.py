@@ -23,7 +23,7 @@ from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.process import cached_property, one_library_thread, require_memory
 from autdtorch.utils.text import counted
-from autdtorch.utils.validation import ArrayLike
+from autdtorch.utils.validation import ArrayLike, invalid
 
 _LONGER = 1.5
 """Ratio of periods from which another grid is next to a resonance that this one is not, and is left out."""
@@ -194,12 +194,18 @@ class SimulatedPropagator(ScenePropagator):
     @cached_property
     def _others(self) -> tuple[Simulation, ...]:
         """Simulations on other grids, for the error estimate."""
-        return self._coarser or (simulation_of(self.plan.second, self._store),)
+        if self._coarser:
+            return self._coarser
+        second = self.plan.second
+        if reason := second.refusal:
+            raise invalid("spacing", self.spacing, f"the second grid of its error estimate has {reason}", "m")
+        return (simulation_of(second, self._store),)
 
     def _results(self, points: torch.Tensor, with_error: bool) -> list[PressureMap]:
         """Return the transfer matrices of points, of this grid and, for its error, of others."""
+        grids = self._others if with_error else ()  # a grid that is refused is so before the first run
         result = self.simulation.transfer_matrix(points)
-        others = [other.transfer_matrix(points) for other in self._others] if with_error else []
+        others = [other.transfer_matrix(points) for other in grids]
         judged = [result] if self._coarser else [result, *others]  # coarse grids on the way do not matter
         warn_of_unsettled([run for each in judged for run in each.runs], self.tolerance)
         return [result, *others]

@@ -25,7 +25,7 @@ from autdtorch.propagators.absorbed_power import (
     power_into_reflectors,
     radiators_of_array,
 )
-from autdtorch.propagators.plan import Plan
+from autdtorch.propagators.plan import Plan, in_rigid
 from autdtorch.propagators.store import Store
 from autdtorch.scene.arrays import apertures_of, complex_strengths_of
 from autdtorch.scene.obstacles import Obstacle
@@ -269,15 +269,9 @@ class Simulation(ABC):
         return 1 / (self.plan.scene.frequency * float(most))
 
     def silent(self, nodes: torch.Tensor) -> torch.Tensor:
-        """Return which receivers (P,), with nodes (P, n, 3) [m], are in a rigid obstacle or enclosed by some.
-
-        Of overlapping obstacles the later counts.
-        """
-        silent = torch.zeros(len(nodes), dtype=torch.bool, device="cpu")
-        for body in self.plan.region.bodies:
-            inside = cast(Obstacle, body.shape).contains(nodes).any(dim=1)
-            silent = torch.where(inside, body.fluid is None, silent)
-        return silent | self.enclosed(nodes).any(dim=1)
+        """Return which receivers (P,), with nodes (P, n, 3) [m], are in rigid bodies or enclosed by some."""
+        rigid = in_rigid(self.plan.region, nodes.reshape(-1, 3)).reshape(nodes.shape[:-1])
+        return (rigid | self.enclosed(nodes)).any(dim=1)
 
     def enclosed(self, points: torch.Tensor) -> torch.Tensor:
         """Return which points (..., 3) are in air that rigid obstacles enclose."""

@@ -43,7 +43,9 @@ def test_foci_that_share_the_power(size):
     # sum_p |p_p|^2 = M sum_i |q_i|^2 <= M^2, and the foci can share it evenly.
     turns = torch.outer(torch.arange(size), torch.arange(size)).double()
     matrix = torch.polar(torch.ones(size, size).double(), 2 * math.pi * turns / size)
-    assert focus_bound(matrix) == pytest.approx(math.sqrt(size), rel=1e-6)
+    bound = focus_bound(matrix)
+    assert bound == pytest.approx(math.sqrt(size), rel=1e-6)
+    assert type(bound) is float
 
 
 def test_phases_units_and_silent_transducers_change_nothing(random_matrix):

@@ -170,6 +170,30 @@ def test_a_chosen_spacing_is_refused_by_the_tolerance(monkeypatch: pytest.Monkey
     assert at.estimate(scene, reached.spacing, method="box").memory < 6 * coarse
 
 
+def test_the_second_grid_of_an_error_is_refused_before_any_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    propagator = at.make_propagator(small_scene((CUBE,)), "box", 2e-3, cache=False)
+    between = (propagator.plan.memory + propagator.plan.second.memory) / 2
+    assert propagator.plan.second.spacing < propagator.spacing
+    for call in (propagator.point_errors, lambda: propagator.transfer_matrix(return_error=True)):
+        monkeypatch.setattr(process, "available_memory", lambda: int(between))
+        with pytest.raises(
+            ValueError, match=r"^spacing: 0\.002 m; the second grid of its error .* needs about"
+        ):
+            call()
+        assert not propagator.runs
+    monkeypatch.undo()  # a refusal is that of its moment
+    assert not propagator.plan.second.refusal
+    assert propagator.transfer_matrix(return_error=True)[1] > 0
+
+
+def test_a_plan_is_refused_by_the_memory_of_the_moment(monkeypatch: pytest.MonkeyPatch) -> None:
+    planned = at.make_propagator(small_scene((CUBE,)), "box", 1e-3).plan
+    monkeypatch.setattr(process, "available_memory", lambda: 1_000_000)
+    assert "needs about" in planned.refusal
+    monkeypatch.undo()
+    assert not planned.refusal
+
+
 def test_the_simulation_of_a_body_is_refused_as_that_of_a_scene(monkeypatch: pytest.MonkeyPatch) -> None:
     propagator = at.make_propagator(small_scene((CUBE,)), "tmatrix", spacing=0.7e-3)
     monkeypatch.setattr(process, "available_memory", lambda: int(propagator.plan.memory / 2))
