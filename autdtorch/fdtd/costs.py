@@ -102,6 +102,7 @@ class Costs:
         assembled = min(_ELEMENTS * filled.cut / len(grouping.grids), _MOST_ELEMENTS * thread_count())
         assembled *= _ALIKE if grouping.aligned else 1
         running = 12 * judged * cells + min(self.runs, self._at_once) * run
+        lasting += 2 * self.itemsize * sum(grid.echo_numbers for grid in grouping.grids)
         return lasting + max(_ELEMENT_BYTES * assembled, running)
 
     @property
@@ -114,8 +115,9 @@ class Costs:
         ringing = USUAL_PERIODS if filled.cells and passes == 1 and self.in_boxes else 1.0
         run = _RUN_STEPS + ringing * passes * stepping
         assembly = _SCENE_STEPS + _ASSEMBLY_STEPS * filled.assembled + _MESH_STEPS * filled.meshed
+        echoes = sum(grid.echo_work(self.runs) for grid in grids)
         pairs = sum(grid.radiating for grid in grids) * self.terms if self.in_boxes else 0
-        return assembly + _PAIR_STEPS * pairs + math.ceil(self.runs / self._at_once) * run
+        return assembly + echoes + _PAIR_STEPS * pairs + math.ceil(self.runs / self._at_once) * run
 
     @cached_property
     def _heterogeneity(self) -> Heterogeneity:

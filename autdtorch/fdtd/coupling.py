@@ -42,6 +42,9 @@ _RATIO = 4.0
 _SEVERAL = 3
 """Successive terms that must be small: a single one may be so by chance."""
 
+_USUAL_RANK = 55
+"""Usual rank of a pair of parts, for estimates."""
+
 
 class Pair(NamedTuple):
     """The waves from some cells of a surface to some points: `left` `right`."""
@@ -61,8 +64,9 @@ class Coupling(NamedTuple):
 
     def field(self, amplitude: Tensor) -> Tensor:
         """Return the fields (n, R) of amplitudes (m, R) [Pa m], without those of the `rest`."""
-        values, total = amplitude.numpy(), torch.zeros((self.places, amplitude.shape[1]), **COMPLEX)
-        fields = total.numpy()
+        total = torch.zeros((self.places, amplitude.shape[1]), **COMPLEX)
+        fields, kind = total.numpy(), self.pairs[0].right.dtype if self.pairs else np.complex128
+        values = amplitude.numpy().astype(kind)
         for pair in self.pairs:
             fields[pair.points] += pair.left @ (pair.right @ values[pair.sources])
         return total
@@ -74,6 +78,7 @@ def coupling_of(target: ScatteredField, source: ScatteredField, images: Sequence
     Images at similar distances are one matrix: the farther, the fewer degrees of freedom it has.
     """
     points, surface, k = target.driven, source.surface[0], source.wavenumber
+    kind = np.complex64 if target.assembly.dtype == torch.float32 else np.complex128
     wavelength = 2 * math.pi / abs(k)
     if not len(points):  # obstacles of air
         return Coupling(0, (), ())
@@ -89,17 +94,36 @@ def coupling_of(target: ScatteredField, source: ScatteredField, images: Sequence
             levels.setdefault(int(math.log(gap / wavelength / _NEAREST, _RATIO)), []).append((gap, image))
     for level in levels.values():
         nearest, alike = min(gap for gap, _ in level), [image for _, image in level]
-        edge = math.sqrt(math.sqrt(_FREEDOM) * wavelength * nearest)
-        approximated = _pairs(points, surface, alike, edge, k)
+        approximated = _pairs(points, surface, alike, _edge(nearest, wavelength), k, kind)
         pairs += approximated or ()
         rest += () if approximated else alike
     return Coupling(len(points), pairs, rest)
 
 
+def usual_numbers(cells: int, spacing: float, gap: float, wavelength: float) -> float:
+    """Return about how many numbers the matrices of waves to a box from an image of it have.
+
+    Its Huygens surface has so many cells of a spacing [m], and is two of them thick; as many are driven. The
+    image is at a distance `gap` [m]; nearer ones have no matrices.
+    """
+    if gap < _NEAREST * wavelength:
+        return 0.0
+    parts = max(1.0, cells / 2 * (spacing / _edge(gap, wavelength)) ** 2)
+    return min(2 * _USUAL_RANK * parts, cells) * cells
+
+
+def _edge(gap: float, wavelength: float) -> float:
+    """Return the edge [m] of parts that few degrees of freedom couple over a distance `gap` [m]."""
+    return math.sqrt(math.sqrt(_FREEDOM) * wavelength * gap)
+
+
 def _pairs(
-    points: Tensor, surface: Tensor, images: Sequence[Image], edge: float, wavenumber: complex
+    points: Tensor, surface: Tensor, images: Sequence[Image], edge: float, wavenumber: complex, kind: type
 ) -> list[Pair] | None:
-    """Return the waves from images of a surface to points, by parts of an edge; None if of too high rank."""
+    """Return the waves from images of a surface to points, by parts of an edge; None if of too high rank.
+
+    Their numbers are of a `kind`: a run applies them every block, in the time that memory takes.
+    """
     weights = torch.tensor([image.weight for image in images], **COMPLEX)
     matrices = torch.stack([image.matrix for image in images])
     offsets = torch.stack([image.offset for image in images])
@@ -116,7 +140,7 @@ def _pairs(
             return _waves(ends, matrices @ starts[number] + offsets, weights, wavenumber)
 
         factors = cross_approximation(row, column, (len(ends), len(starts)), most)
-        return None if factors is None else Pair(*pair, *factors)
+        return None if factors is None else Pair(*pair, *(factor.astype(kind) for factor in factors))
 
     parts = itertools.product(_parts(points.numpy(), edge), _parts(surface.numpy(), edge))
     pairs = spread(approximated, list(parts), thread_count())

@@ -14,7 +14,9 @@ from itertools import combinations, permutations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from autdtorch.fdtd.coupling import usual_numbers
 from autdtorch.fdtd.grid import Extent, bodies_extent, domain_extent
 from autdtorch.fdtd.region import CLEARANCE, MAX_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH, Region
 from autdtorch.fdtd.stability import fewest_steps
@@ -36,6 +38,10 @@ _LARGE, _FLAT = 250_000, 0.5
 # Time of a step of a cell in a boundary layer, of a run in a box beside its steps, and of a term of a sum
 # over Green's function
 _LAYER, _BOX_RUN, _PAIR = 4.0, 2_000_000, 1.0
+# Time of a number of the matrices of waves that mirrors send back: once, and after each block of periods
+_ECHO_MADE, _ECHO_OF_BLOCK, _BLOCK_PERIODS = 60.0, 0.5, 3
+# Ratio of costs up to which a box holds images that it need not hold: their surfaces are assembled too
+_CHEAPER = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +56,7 @@ class PlannedGrid:
         extent: along these axes.
         aligned: whether every face is parallel to the axes.
         spacing: edge of a cell [m].
+        gaps: distances [m] to its images in the other mirrors.
     """
 
     group: tuple[int, ...]
@@ -59,6 +66,7 @@ class PlannedGrid:
     extent: Extent
     aligned: bool
     spacing: float
+    gaps: tuple[float, ...] = ()
 
     @cached_property
     def interior(self) -> tuple[int, int, int]:
@@ -92,8 +100,11 @@ class PlannedGrid:
     @property
     def steps(self) -> int:
         """The fewest steps of a run."""
-        periods = fewest_periods(self.extent.path / self.part.wavelength)
-        return math.ceil(periods * self.steps_per_period)
+        return math.ceil(self._periods * self.steps_per_period)
+
+    @property
+    def _periods(self) -> int:
+        return fewest_periods(self.extent.path / self.part.wavelength)
 
     @property
     def scattering(self) -> int:
@@ -109,6 +120,17 @@ class PlannedGrid:
     def work(self) -> float:
         """Time of the steps of a run."""
         return self.steps * (_LAYER * self.cells + (1 - _LAYER) * math.prod(self.interior))
+
+    @property
+    def echo_numbers(self) -> float:
+        """Numbers of the matrices of waves that mirrors send back to it."""
+        wavelength = self.part.wavelength
+        return sum(usual_numbers(self.radiating, self.spacing, gap, wavelength) for gap in self.gaps)
+
+    def echo_work(self, runs: int) -> float:
+        """Return the time that these matrices take in runs."""
+        blocks = runs * USUAL_PERIODS * self._periods / _BLOCK_PERIODS
+        return (_ECHO_MADE + _ECHO_OF_BLOCK * blocks) * self.echo_numbers
 
     @property
     def is_possible(self) -> bool:
@@ -129,6 +151,11 @@ class PlannedGrid:
         """Return how far its interior reaches from its centre along directions (n, 3) [m], at most."""
         around = (self.extent.margin + 1) * self.spacing  # one for the offset
         return np.asarray(np.abs(directions @ self.axes.T) @ (self.half + around))
+
+    def covers(self, places: Array) -> NDArray[np.bool_]:
+        """Return which places (n, 3) [m] are in its interior."""
+        away = np.abs((places - self.middle) @ self.axes.T)
+        return np.asarray((away <= self.reach(self.axes)).all(axis=1))
 
     def _inner(self, cells: int) -> int:
         return math.prod(max(0, length - cells) for length in self.interior)
@@ -159,7 +186,8 @@ class Grouping:
     def box_cost(self, runs: int) -> float:
         """Return the time of runs in boxes, in steps of a cell; boxes are coupled for all runs at once."""
         steps = sum(grid.work + _BOX_RUN for grid in self.grids)
-        return runs * self.passes * steps + (self.passes - 1) * _PAIR * self.coupled_pairs
+        echoes = sum(grid.echo_work(runs) for grid in self.grids)
+        return runs * self.passes * steps + (self.passes - 1) * _PAIR * self.coupled_pairs + echoes
 
 
 def choose_grids(
@@ -200,7 +228,26 @@ def cheapest_boxes(region: Region, spacing: float, tolerance: float, runs: int) 
     """
     choices = list(_partitions(region, spacing, tolerance))
     possible = [choice for choice in choices if all(grid.is_possible for grid in choice.grids)]
-    return min(possible or choices, key=lambda grouping: grouping.box_cost(runs))
+    cheapest = min(possible or choices, key=lambda grouping: grouping.box_cost(runs))
+    return _with_images(region, cheapest, runs) if len(cheapest.grids) == 1 else cheapest
+
+
+def _with_images(region: Region, alone: Grouping, runs: int) -> Grouping:
+    """Return one box, or one that also holds images in mirrors at a distance if that is much cheaper.
+
+    Sound that goes back and forth between a large body and a mirror costs less on a grid. Faces stay
+    parallel to it, and sources outside, where they cost nothing.
+    """
+    (best,) = alone.grids
+    for number in range(len(region.mirrors)):
+        if number in best.mirrors:
+            continue
+        box = box_grid(region, best.group, best.spacing, (*best.mirrors, number))
+        if not box.is_possible or box.aligned != best.aligned or box.covers(region.sources).any():
+            continue
+        if Grouping((box,)).box_cost(runs) < _CHEAPER * Grouping((best,)).box_cost(runs):
+            best = box
+    return Grouping((best,))
 
 
 def _partitions(region: Region, spacing: float, tolerance: float) -> Iterator[Grouping]:
@@ -218,41 +265,45 @@ def _partitions(region: Region, spacing: float, tolerance: float) -> Iterator[Gr
         boxes[first] = box_grid(region, both, spacing)
 
 
-def box_grid(region: Region, group: Sequence[int], spacing: float) -> PlannedGrid:
+def box_grid(region: Region, group: Sequence[int], spacing: float, held: tuple[int, ...] = ()) -> PlannedGrid:
     """Return the box of a group of bodies, of `spacing` [m], turned along their faces.
 
-    It is not turned where its corners would reach a mirror whose image no grid can hold.
+    It holds the images in mirrors next to it, and in those `held`. It is not turned where its corners would
+    reach a mirror whose image no grid can hold.
     """
-    turned = _box_along(region, group, spacing, along_faces=True)
+    turned = _box_along(region, group, spacing, held, along_faces=True)
     if turned.is_possible:
         return turned
-    straight = _box_along(region, group, spacing, along_faces=False)
+    straight = _box_along(region, group, spacing, held, along_faces=False)
     return straight if straight.is_possible else turned
 
 
-def _box_along(region: Region, group: Sequence[int], spacing: float, along_faces: bool) -> PlannedGrid:
+def _box_along(
+    region: Region, group: Sequence[int], spacing: float, held: tuple[int, ...], along_faces: bool
+) -> PlannedGrid:
     near: tuple[int, ...] | None = None
-    reached: tuple[int, ...] = ()
+    reached = held
     while reached != near:  # the box with images in these mirrors may reach others
         near, part = reached, region.part(group, reached)
         axes = axes_along([body.faces for body in part.bodies]) if along_faces else np.eye(3)
         extent = bodies_extent(part.turned(axes))
-        reached = _mirrors_near(region, extent, axes, spacing)
+        heights = _heights_above_mirrors(region, extent, axes, spacing)
+        reached = tuple(number for number, height in enumerate(heights) if height < 0 or number in held)
+    gaps = tuple(2 * height for number, height in enumerate(heights) if number not in reached)
     aligned = all(body.faces.all_aligned(axes) for body in part.bodies)
     if turns := _turns_to_flat(extent.interior(spacing)):
         axes = np.roll(axes, turns, axis=0)
         roll = functools.partial(np.roll, shift=turns)
         extent = replace(extent, lower=roll(extent.lower), upper=roll(extent.upper))
-    return PlannedGrid(tuple(group), near, part, axes, extent, aligned, spacing)
+    return PlannedGrid(tuple(group), near, part, axes, extent, aligned, spacing, gaps)
 
 
-def _mirrors_near(region: Region, extent: Extent, axes: Array, spacing: float) -> tuple[int, ...]:
-    """Return the mirrors next to an extent along `axes`."""
+def _heights_above_mirrors(region: Region, extent: Extent, axes: Array, spacing: float) -> list[float]:
+    """Return the heights [m] of a box, of an extent along `axes`, above all mirrors; negative if next to."""
     beside = CLEARANCE * spacing
     ends = np.stack([np.array(extent.lower) - beside, np.array(extent.upper) + beside])
     corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3) @ axes
-    heights = [mirror.height(torch.from_numpy(corners)).min() for mirror in region.mirrors]
-    return tuple(number for number, height in enumerate(heights) if height < 0)
+    return [float(mirror.height(torch.from_numpy(corners)).min()) for mirror in region.mirrors]
 
 
 def domain_grid(region: Region, spacing: float) -> PlannedGrid:
