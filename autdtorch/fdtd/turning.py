@@ -106,6 +106,8 @@ _FEWEST_CORNERS = 16  # Fewest corners of a polygon that represents a circle
 _ROUND = 1e-6  # Largest deviation of corners from the circle, relative to the radius
 _STEPS = np.cos((np.arange(4) + 0.5) * np.pi / 8)  # Faces of the staircase, relative to its radius
 _SCALE = 0.957173  # Radius of the staircase over the radius of the circle of equal area
+STAIRCASE = float(8 * _SCALE * _STEPS[0] / (2 * np.pi))
+"""STAIRCASE: perimeter of the staircase over that of the circle."""
 
 
 def slender_faces(corners: Array) -> list[Array] | None:

@@ -302,8 +302,9 @@ def surface_of_box(x, y, z):
         ),
         (Sphere(tuple(CENTER), 4e-3, rigid=True), 4 * math.pi * 4**2, 4e-3),
         (Cylinder(tuple(CENTER), 4e-3, 6e-3, (0.5, 0.3, 0.2), rigid=True), 2 * math.pi * 4 * (4 + 6), 0.01),
+        (Cylinder(tuple(CENTER), 0.5e-3, 15e-3, (0, 0, 1), rigid=True), 2 * math.pi * 0.5 * (0.5 + 15), 0.01),
     ],
-    ids=["box", "plate", "turned box", "turned plate", "sphere", "cylinder"],
+    ids=["box", "plate", "turned box", "turned plate", "sphere", "cylinder", "wire"],
 )
 def test_areas_of_surfaces_are_true(shape, area, tolerance, spacing):
     """All vertices together share the area of surfaces, where waves are long, wherever these fall."""
