@@ -89,7 +89,7 @@ def test_lssg_takes_the_evaluations_of_one_scene(scenarios):
         at.lssg(scenarios(), order=[0, 1, 2, 3, 4, 5])
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(
     by=st.sampled_from(BY),
     scenes=st.integers(1, 6),
