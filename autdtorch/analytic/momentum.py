@@ -30,14 +30,12 @@ def linear_momentum(waves: torch.Tensor) -> torch.Tensor:
     """
     degree = _degree(waves)
     above = torch.nn.functional.pad(waves, (0, 0, 0, 2 * degree + 3))  # the next degree
-    parts = _along_axes(*_slopes(degree, above.movedim(-2, 0)))
-    return torch.stack([part.movedim(0, -2) for part in parts])
+    return torch.stack(_along_axes(*_slopes(degree, above, -2)))
 
 
 def angular_momentum(waves: torch.Tensor) -> torch.Tensor:
     """Return -i r x grad of waves as coefficients (3, ..., N, R) along x, y, z; see `linear_momentum`."""
-    parts = _about_axes(*_rotations(waves.movedim(-2, 0)))
-    return torch.stack([part.movedim(0, -2) for part in parts])
+    return torch.stack(_about_axes(*_rotations(waves, -2)))
 
 
 def taken_up(
@@ -55,7 +53,7 @@ def taken_up(
 
 
 def gradient_by_place(
-    wavenumber: complex, axes: torch.Tensor, waves: torch.Tensor, gradient: torch.Tensor
+    wavenumber: complex, axes: torch.Tensor, waves: torch.Tensor, gradient: torch.Tensor, dim: int = -2
 ) -> torch.Tensor:
     """Return the gradient (..., 3) by the centre of regular waves, which a shift changes like the field.
 
@@ -64,38 +62,36 @@ def gradient_by_place(
         axes: of the waves, columns (..., 3, 3).
         waves: their coefficients (..., K, R), with a degree more than `gradient`.
         gradient: by the coefficients (..., N, R).
+        dim: dimension of both that counts waves.
     """
-    rows, weights = _rows(waves), _rows(gradient)
-    slopes = (_weighed(each, weights) for each in _slopes(_degree(gradient), rows))
+    degree = math.isqrt(gradient.shape[dim]) - 1
+    slopes = (_weighed(each, gradient, dim) for each in _slopes(degree, waves, dim))
     shift = -torch.stack([(wavenumber * part).imag for part in _along_axes(*slopes)], dim=-1)
     by_place: torch.Tensor = axes @ shift[..., None]
     return by_place[..., 0]
 
 
-def gradient_by_turn(axes: torch.Tensor, waves: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
+def gradient_by_turn(
+    axes: torch.Tensor, waves: torch.Tensor, gradient: torch.Tensor, dim: int = -2
+) -> torch.Tensor:
     """Return the gradient (..., 3, 3) by the axes of regular waves (..., K, R); see `gradient_by_place`."""
-    weights = _rows(gradient)
-    rotations = (_weighed(each, weights) for each in _rotations(_rows(waves)[: len(weights)]))
+    some = waves.narrow(dim, 0, gradient.shape[dim])
+    rotations = (_weighed(each, gradient, dim) for each in _rotations(some, dim))
     turn = -torch.stack([part.imag for part in _about_axes(*rotations)], dim=-1)[..., None, :]
     turn = turn.expand(*axes.shape)
     by_turn: torch.Tensor = axes @ torch.linalg.cross(turn, torch.eye(3, **REAL).expand_as(turn)).mT
     return by_turn / 2
 
 
-def _rows(waves: torch.Tensor) -> torch.Tensor:
-    """Return waves (N, ..., R) of waves (..., N, R), which are quicker."""
-    return waves.movedim(-2, 0).contiguous()
-
-
-def _weighed(slope: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
-    """Return the change (...) with a slope (N, ..., R) by the gradient (N, ..., R)."""
-    products: torch.Tensor = torch.linalg.vecdot(gradient, slope, dim=0)
+def _weighed(slope: torch.Tensor, gradient: torch.Tensor, dim: int) -> torch.Tensor:
+    """Return the change (...) with slopes of waves by their gradient."""
+    products: torch.Tensor = torch.linalg.vecdot(gradient, slope, dim=dim)
     return products.sum(dim=-1)
 
 
-def _slopes(degree: int, rows: torch.Tensor) -> list[torch.Tensor]:
-    """Return (d/dx + i d/dy, d/dx - i d/dy, d/dz) / k, (N, ..., R) each, of waves with a degree more."""
-    return [_neighbours(rows, place, factor) for place, factor in ladder(degree)]
+def _slopes(degree: int, waves: torch.Tensor, dim: int) -> list[torch.Tensor]:
+    """Return (d/dx + i d/dy, d/dx - i d/dy, d/dz) / k of waves with a degree more."""
+    return [_neighbours(waves, place, factor, dim) for place, factor in ladder(degree)]
 
 
 def _along_axes(
@@ -104,9 +100,10 @@ def _along_axes(
     return 0.5j * (up + down), 0.5 * (down - up), 1j * along
 
 
-def _rotations(rows: torch.Tensor) -> list[torch.Tensor]:
-    """Return L_x + i L_y, L_x - i L_y and L_z of waves (N, ..., R)."""
-    return [_neighbours(rows, place, factor) for place, factor in _steps(math.isqrt(len(rows)) - 1)]
+def _rotations(waves: torch.Tensor, dim: int) -> list[torch.Tensor]:
+    """Return L_x + i L_y, L_x - i L_y and L_z of waves."""
+    degree = math.isqrt(waves.shape[dim]) - 1
+    return [_neighbours(waves, place, factor, dim) for place, factor in _steps(degree)]
 
 
 def _about_axes(
@@ -115,10 +112,12 @@ def _about_axes(
     return (up + down) / 2, (up - down) / 2j, about
 
 
-def _neighbours(rows: torch.Tensor, place: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
-    """Return sums (N, ..., R) of the waves at places (N, n), times factors (N, n)."""
-    shares = factor.mT.reshape(*factor.mT.shape, *(1,) * (rows.ndim - 1))
-    parts = [share * rows.index_select(0, each) for share, each in zip(shares, place.mT, strict=True)]
+def _neighbours(waves: torch.Tensor, place: torch.Tensor, factor: torch.Tensor, dim: int) -> torch.Tensor:
+    """Return the sums of waves at places (N, n), times factors (N, n)."""
+    shape = [1] * waves.ndim
+    shape[dim] = -1
+    pairs = zip(place.mT, factor.mT, strict=True)
+    parts = [share.reshape(shape) * waves.index_select(dim, each) for each, share in pairs]
     total: torch.Tensor = functools.reduce(torch.add, parts)
     return total
 

@@ -112,16 +112,15 @@ class _Translated(torch.autograd.Function):
         if any(needed[:3]) and torch.is_grad_enabled():  # for derivatives of the gradient
             more = translation.wavenumber, _with_next_degree(here), there, translation.is_conjugate
             regular = Translation(*more).applied(waves)
-        weights = gradient.movedim(0, -2)
         if needed[0] or needed[2]:
             wavenumber = complex(translation.wavenumber)
             wavenumber = wavenumber.conjugate() if translation.is_conjugate else wavenumber
-            by_place = gradient_by_place(wavenumber, here.axes, regular.movedim(0, -2), weights)
+            by_place = gradient_by_place(wavenumber, here.axes, regular, gradient, dim=0)
             by_other_place = -by_place
         if needed[1]:
-            by_turn = gradient_by_turn(here.axes, regular.movedim(0, -2), weights)
+            by_turn = gradient_by_turn(here.axes, regular, gradient, dim=0)
         if needed[3]:
-            by_other_turn = -gradient_by_turn(there.axes, waves.movedim(0, -2), by_waves.movedim(0, -2))
+            by_other_turn = -gradient_by_turn(there.axes, waves, by_waves, dim=0)
         return by_waves, by_place, by_turn, by_other_place, by_other_turn, None
 
 
