@@ -33,8 +33,8 @@ _MOST_OBSTACLES = 64  # Most obstacles that are grouped; more share one box
 # Periods of a usual run among obstacles, relative to the fewest; 1.0 to 3.5 depending on the resonances
 USUAL_PERIODS = 1.7
 # The first axis of a grid of at least so many cells whose shortest axis is at most this part of the next: the
-# kernel is 1.8 times as fast where that is the shortest (432 x 432 x 29 cells)
-_LARGE, _FLAT = 250_000, 0.5
+# kernel is 1.3 to 1.8 times as fast where that is the shortest (60 x 60 x 25 to 432 x 432 x 29 cells)
+_LARGE, _FLAT = 20_000, 0.5
 # Time of a step of a cell in a boundary layer, of a run in a box beside its steps, and of a term of a sum
 # over Green's function
 _LAYER, _BOX_RUN, _PAIR = 4.0, 2_000_000, 1.0

@@ -49,7 +49,7 @@ from autdtorch.utils.process import spread, thread_count
 
 # Fewest cells and planes of a chunk, for which a second thread and the sums at its ends pay
 _CHUNK_CELLS, _CHUNK_PLANES = 200_000, 32
-_FLAT_CELLS, _FLAT_PLANES = 500_000, 12  # The same for two chunks of large planes
+_FLAT_PLANES = 12  # Fewest planes of two chunks of large planes
 # Shares of the processors' time that workers got: below the first a single worker continues, above the second
 # several again
 _CROWDED, _FREE = 0.75, 0.9
@@ -215,8 +215,8 @@ def _cuts(shape: tuple[int, ...]) -> NDArray[np.int64]:
     """Return the first planes of the chunks, each thicker than a boundary layer, and one past the last."""
     planes = shape[0] - 2
     cells = math.prod(shape)
-    flat = min(cells // _FLAT_CELLS, planes // _FLAT_PLANES)
-    most = max(min(cells // _CHUNK_CELLS, planes // _CHUNK_PLANES), min(flat, 2))
+    of_cells = cells // _CHUNK_CELLS
+    most = max(min(of_cells, planes // _CHUNK_PLANES), min(of_cells, planes // _FLAT_PLANES, 2))
     chunks = 1 << max(0, most.bit_length() - 1)  # a power of two, which most numbers of cores divide
     return np.linspace(1, 1 + planes, chunks + 1).astype(np.int64)
 
