@@ -106,8 +106,7 @@ _FEWEST_CORNERS = 16  # Fewest corners of a polygon that represents a circle
 _ROUND = 1e-6  # Largest deviation of corners from the circle, relative to the radius
 _STEPS = np.cos((np.arange(4) + 0.5) * np.pi / 8)  # Faces of the staircase, relative to its radius
 _SCALE = 0.957173  # Radius of the staircase over the radius of the circle of equal area
-STAIRCASE = float(8 * _SCALE * _STEPS[0] / (2 * np.pi))
-"""STAIRCASE: perimeter of the staircase over that of the circle."""
+_PERIMETER = float(8 * _SCALE * _STEPS[0] / (2 * np.pi))  # of the staircase, over that of the circle
 
 
 def slender_faces(corners: Array) -> list[Array] | None:
@@ -115,21 +114,30 @@ def slender_faces(corners: Array) -> list[Array] | None:
 
     `corners` (V, 3) [cells] are the vertices of its surface.
     """
-    extent = np.ptp(corners, axis=0)
-    axis = int(extent.argmax())
-    if np.delete(extent, axis).max() > 2 * _LARGEST_RADIUS:
+    lower, upper = corners.min(axis=0), corners.max(axis=0)
+    at_ends = (np.minimum(corners - lower, upper - corners) < _ROUND).all(axis=0)
+    axis = int(at_ends.argmax())  # not of the largest extent: a cylinder may be as long as it is wide
+    length, across = upper[axis] - lower[axis], np.delete(upper - lower, axis).max()
+    if not at_ends.any() or across > min(2 * _LARGEST_RADIUS, length * (1 + _ROUND)):
         return None
-    low, high = corners[:, axis].min(), corners[:, axis].max()
-    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    middle = (lower + upper) / 2
     from_axis = np.delete(corners - middle, axis, axis=1)
     distance = np.hypot(*from_axis.T)
     radius, on_axis = float(distance.max()), distance < _ROUND * distance.max()
-    at_ends = (np.abs(corners[:, axis] - low) < _ROUND) | (np.abs(corners[:, axis] - high) < _ROUND)
     round_ = np.abs(distance - radius) < _ROUND * radius
-    if not at_ends.all() or not (round_ | on_axis).all():
+    if not (round_ | on_axis).all():
         return None
     corner_count = len(np.unique(np.arctan2(*from_axis[round_].T).round(6)))
     if corner_count < _FEWEST_CORNERS:
         return None
     steps = radius * _SCALE * np.concatenate((-_STEPS, _STEPS))
-    return [np.array([low, high]) if one == axis else middle[one] + steps for one in range(3)]
+    ends = np.array([lower[axis], upper[axis]])
+    return [ends if one == axis else middle[one] + steps for one in range(3)]
+
+
+def staircase_excess(corners: Array) -> float:
+    """Return the area of the faces of `slender_faces` over that of the surface; 1 for other shapes."""
+    if slender_faces(corners) is None:
+        return 1.0
+    *_, across, length = np.sort(np.ptp(corners, axis=0))
+    return 1 + (_PERIMETER - 1) * float(length / (length + across / 2))

@@ -302,9 +302,11 @@ def surface_of_box(x, y, z):
         ),
         (Sphere(tuple(CENTER), 4e-3, rigid=True), 4 * math.pi * 4**2, 4e-3),
         (Cylinder(tuple(CENTER), 4e-3, 6e-3, (0.5, 0.3, 0.2), rigid=True), 2 * math.pi * 4 * (4 + 6), 0.01),
-        (Cylinder(tuple(CENTER), 0.5e-3, 15e-3, (0, 0, 1), rigid=True), 2 * math.pi * 0.5 * (0.5 + 15), 0.01),
+        # slender: a staircase, of more area than theirs along the axis and of as much at the ends
+        (Cylinder(tuple(CENTER), 0.5e-3, 15e-3, (0, 0, 1), rigid=True), 2 * math.pi * 0.5 * (0.5 + 15), 2e-3),
+        (Cylinder(tuple(CENTER), 1e-3, 2e-3, (0, 0, 1), rigid=True), 2 * math.pi * 1 * (1 + 2), 2e-3),
     ],
-    ids=["box", "plate", "turned box", "turned plate", "sphere", "cylinder", "wire"],
+    ids=["box", "plate", "turned box", "turned plate", "sphere", "cylinder", "wire", "stub"],
 )
 def test_areas_of_surfaces_are_true(shape, area, tolerance, spacing):
     """All vertices together share the area of surfaces, where waves are long, wherever these fall."""

@@ -23,7 +23,7 @@ from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Body, Fluid, Region
 from autdtorch.fdtd.shapes import Shape, bounds, distance_from
 from autdtorch.fdtd.stencil import Stencil
-from autdtorch.fdtd.turning import STAIRCASE, slender_faces
+from autdtorch.fdtd.turning import slender_faces, staircase_excess
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.spatial import doubled_normals, extents, mean_thickness, spread_evenly
 from autdtorch.utils.validation import Vector
@@ -139,9 +139,9 @@ def unions_of(region: Region, grid: Grid, stencil: Stencil) -> tuple[list[Union]
 
 def _impedance(body: Body, grid: Grid) -> complex | None:
     """Return the impedance of a body's faces: the staircase of a slender cylinder has more area than it."""
-    if body.impedance is None or slender_faces(grid.to_cells(body.shape.surface()[0])) is None:
-        return body.impedance
-    return body.impedance * STAIRCASE
+    if body.impedance is None:
+        return None
+    return body.impedance * staircase_excess(grid.to_cells(body.shape.surface()[0]))
 
 
 def _require_continuable(number: int, body: Body) -> None:
