@@ -340,6 +340,12 @@ def _on_surfaces(region: Region, points: torch.Tensor) -> torch.Tensor:
     """Return which points (N, 3) [m] are on the surface of a body, bool (N,)."""
     on = torch.zeros(len(points), dtype=torch.bool, device="cpu")
     for body in region.bodies:
-        near = cast(Obstacle, body.shape).near(points).nonzero()[:, 0]
-        on[near] |= body.shape.signed_distance(points[near]).abs() <= LENGTH_TOLERANCE
+        on |= on_surface(cast(Obstacle, body.shape), points)
+    return on
+
+
+def on_surface(obstacle: Obstacle, points: torch.Tensor) -> torch.Tensor:
+    """Return which points (..., 3) [m] are on the surface of an obstacle, bool (...)."""
+    on = obstacle.near(points)
+    on[on.clone()] = obstacle.signed_distance(points[on]).abs() <= LENGTH_TOLERANCE
     return on

@@ -25,7 +25,7 @@ from autdtorch.propagators.absorbed_power import (
     power_into_reflectors,
     radiators_of_array,
 )
-from autdtorch.propagators.plan import Plan, in_rigid
+from autdtorch.propagators.plan import Plan, in_rigid, on_surface
 from autdtorch.propagators.store import Store
 from autdtorch.scene.arrays import apertures_of, complex_strengths_of
 from autdtorch.scene.obstacles import Obstacle
@@ -278,8 +278,10 @@ class Simulation(ABC):
         enclosed = self._in_enclosed_cells(points)
         for obstacle, body in zip(self.plan.scene.obstacles, self.plan.region.bodies, strict=True):
             if body.shape is not obstacle:  # its cavities are filled
-                filled = cast(Obstacle, body.shape).contains(points)
-                enclosed = enclosed | (filled & ~obstacle.contains(points))
+                filled = cast(Obstacle, body.shape)
+                inside = filled.contains(points) & ~obstacle.contains(points)
+                inside[inside.clone()] = ~on_surface(filled, points[inside])  # where rounding would decide
+                enclosed = enclosed | inside
         return enclosed
 
     def _loaded(self, key: str, points: torch.Tensor) -> PressureMap | None:

@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_meshes import ball, inverted, merged
 from small_scenes import relative_error
 
 import autdtorch as at
@@ -91,3 +92,15 @@ def test_the_pressure_has_no_step_at_any_face(body, method):
     assert relative_error(pressure, propagator.field(drive, before)) < 1e-2
     assert relative_error(pressure, propagator.transfer_matrix(on) @ drive) < 1e-2
     assert not propagator.field(drive, inside).any()
+
+
+def test_points_on_a_hollow_body_are_in_the_air_and_those_in_its_cavity_enclosed():
+    parts = ball((0.3e-3, 0.0, 0.0), 6e-3, 1), inverted(ball((0.3e-3, 0.0, 0.0), 4e-3, 1))
+    vertices, faces = map(torch.from_numpy, map(np.ascontiguousarray, merged(*parts)))
+    simulation = at.make_propagator(
+        scene_of([at.Mesh.from_surface((vertices, faces), rigid=True)]), "box", 2e-3, cache=False
+    ).simulation
+    outer, inner = vertices[faces].mean(dim=1).chunk(2)
+    assert not simulation.silent(outer[:, None]).any()
+    assert simulation.silent(inner[:, None]).all()
+    assert simulation.enclosed(0.9 * inner).all()
