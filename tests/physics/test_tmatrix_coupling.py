@@ -80,3 +80,16 @@ def test_gradients_by_poses_of_all_bodies_are_those_of_finite_differences(count,
 def test_a_drive_of_zeros_exerts_no_force_beside_another_body():
     assert not at.radiation_force(at.TMatrixCluster(spheres(1e-3)), 0 * DRIVE, **SETTING).any()
     assert math.isfinite(at.radiation_force(at.TMatrixCluster(spheres(1e-3)), DRIVE, **SETTING).norm())
+
+
+@pytest.mark.parametrize("shape", [(0, 6), (2, 0, 6)])
+@pytest.mark.parametrize("is_one", [False, True])
+def test_no_drives_exert_no_forces(shape, is_one):
+    first, second = spheres(1e-3, error=1e-2)
+    poses = torch.zeros(2, 1, 3)
+    if is_one:
+        cluster = at.TMatrixCluster([first, second]).moved(poses)
+    else:
+        cluster = at.TMatrixCluster([first.moved(poses), second])
+    drives = torch.zeros(shape, dtype=torch.complex128)
+    assert at.radiation_force(cluster, drives, **SETTING).shape == (2, 0, 3)

@@ -92,6 +92,20 @@ def test_what_is_damaged_is_compiled_again(kernel, suffix, caplog):
         assert hits(after) == 1
 
 
+def test_kernels_of_other_folders_are_compiled_again_after_a_change_of_those_they_call(
+    kernel, monkeypatch, tmp_path
+):
+    made, _ = kernel
+    made()(3)
+    (tmp_path / "kernels").mkdir()
+    (tmp_path / "kernels" / "intrinsics.py").write_text("a = 1\n", "utf-8")
+    same = made()
+    assert (same(3), hits(same)) == (6, 1)
+    monkeypatch.setattr(compiled, "_HERE", tmp_path / "kernels")
+    changed = made()
+    assert (changed(3), hits(changed)) == (6, 0)
+
+
 def test_processes_that_compile_two_dtypes_at_once_write_two_files(kernel, monkeypatch):
     made, folder = kernel
     with monkeypatch.context() as patch:

@@ -276,11 +276,11 @@ def entry(folder: Path = _HERE, **options: Any) -> Callable[[Callable[..., Any]]
     """Compile a function that Python calls, and cache its machine code on disk.
 
     Numba checks the file of the function for changes, but not the files of the functions that it calls. The
-    digest in the name covers a whole folder, which must hold them.
+    digest in the name covers its folder and the one here, which must hold them.
     """
 
     def compiled(function: Callable[..., Any]) -> Any:
-        function.__qualname__ += f"_{_digest(folder)}"
+        function.__qualname__ += f"_{_digest(folder, _HERE)}"
         try:
             dispatcher = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
             dispatcher._cache.__class__ = _Cache
@@ -300,8 +300,8 @@ def _log_once(message: str) -> None:
 
 
 @functools.cache
-def _digest(folder: Path) -> str:
+def _digest(*folders: Path) -> str:
     digest = hashlib.sha256()
-    for source in sorted(folder.glob("*.py")):
+    for source in (source for folder in folders for source in sorted(folder.glob("*.py"))):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]

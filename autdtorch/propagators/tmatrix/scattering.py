@@ -90,7 +90,7 @@ def _scattered(
 
 def _flat(waves: torch.Tensor) -> torch.Tensor:
     """Return waves (N, B, R) of waves (..., N, R)."""
-    return waves.reshape(-1, *waves.shape[-2:]).movedim(1, 0).contiguous()
+    return waves.reshape(waves.shape[:-2].numel(), *waves.shape[-2:]).movedim(1, 0).contiguous()
 
 
 def _in_poses(waves: torch.Tensor, poses: Sequence[int]) -> torch.Tensor:
@@ -128,7 +128,7 @@ def waves_of_body(
     if together is not None:
         waves = torch.cat(incident, dim=-2).mT
         flat = waves.reshape(-1, waves.shape[-1])  # one product for all poses
-        regular, outgoing = ((flat @ part.mT).reshape(*waves.shape[:-1], -1).mT for part in together)
+        regular, outgoing = ((flat @ part.mT).reshape(*waves.shape[:-1], len(part)).mT for part in together)
         return regular, outgoing
     order = [number, *(index for index in range(len(bodies)) if index != number)]  # the first is quickest
     maps = [bodies[index].matrix for index in order]

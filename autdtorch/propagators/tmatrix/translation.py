@@ -166,12 +166,13 @@ class _Factors(NamedTuple):
         is_left, is_other_left = self.are_left_handed
         columns = waves.shape[1:]
         lanes = (columns[1], 1) if columns[0] == 1 else columns  # columns of one pose make vectors, too
-        waves = (_opposite(waves) if is_other_left else waves).reshape(-1, *lanes).contiguous().resolve_conj()
+        waves = _opposite(waves) if is_other_left else waves
+        waves = waves.reshape(len(waves), *lanes).contiguous().resolve_conj()
         regular = waves.new_empty(self.size, *lanes)
         quarters = _quarters(self.turns.shape[2] - 1)
         factors = (each.numpy() for each in (self.turns, self.shifts, quarters))
         translate(torch.view_as_real(waves).numpy(), *factors, torch.view_as_real(regular).numpy())
-        regular = regular.reshape(-1, *columns)
+        regular = regular.reshape(self.size, *columns)
         return _opposite(regular) if is_left else regular
 
 
