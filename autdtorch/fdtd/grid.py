@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 from torch import Tensor
 
-from autdtorch.fdtd.boundary_layer import DOMAIN_LAYER, Thickness, box_layer
 from autdtorch.fdtd.interpolation import interpolation_width
+from autdtorch.fdtd.perfectly_matched_layer import DOMAIN_LAYER, Thickness, box_layer
 from autdtorch.fdtd.placement import grid_offset
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.shapes import Shape, bounds

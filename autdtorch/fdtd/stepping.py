@@ -16,7 +16,6 @@ from torch import Tensor
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
 from autdtorch.fdtd.assembly.neighbours import corners_around, flat_index
-from autdtorch.fdtd.boundary_layer import layer_columns, tuned_profile
 from autdtorch.fdtd.damping import at_time_step, fewest_stable_steps
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.interpolation import (
@@ -27,6 +26,7 @@ from autdtorch.fdtd.interpolation import (
     interpolate_points,
 )
 from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, WaveState, uniform_state
+from autdtorch.fdtd.perfectly_matched_layer import layer_columns, tuned_profile
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.shapes import Shape, distance_from, sees
 from autdtorch.fdtd.stability import whole_steps

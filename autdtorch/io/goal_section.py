@@ -94,7 +94,7 @@ def _span(where: str, text: str) -> range:
 def goal_section(goal: Goal | ForceGoal) -> dict[str, Any]:
     """Return the section of a goal, from which `load_goal` makes it again.
 
-    For readings of a force it is that of the trap, lift or push.
+    For readings of a force it is the section of the trap, lift or push that they measure.
     """
     if isinstance(goal, GoalOfForce):
         return goal_section(goal.of)

@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 from shared.document import table
 
-from autdtorch.fdtd.boundary_layer import tuned_profile
 from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, uniform_state
 from autdtorch.fdtd.kernels.cpu import CpuKernel
+from autdtorch.fdtd.perfectly_matched_layer import tuned_profile
 from autdtorch.fdtd.stability import fewest_steps, whole_steps
 from autdtorch.fdtd.stencil import tuned_stencil
 from autdtorch.fdtd.stepping import RAMP_PERIODS, drive_dft, drive_signal

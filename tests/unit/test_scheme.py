@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import AIR
 
-from autdtorch.fdtd.boundary_layer import DOMAIN_LAYER, box_layer, reflection, tuned_profile
 from autdtorch.fdtd.grid import make_grid, path_between
 from autdtorch.fdtd.interpolation import (
     WIDTH_ERROR,
@@ -19,6 +18,7 @@ from autdtorch.fdtd.interpolation import (
     interpolate_points,
     interpolation_width,
 )
+from autdtorch.fdtd.perfectly_matched_layer import DOMAIN_LAYER, box_layer, reflection, tuned_profile
 from autdtorch.fdtd.placement import fitting_spacing, grid_offset
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
 from autdtorch.propagators.plan import region_of

@@ -1,4 +1,4 @@
-"""The boundary layer, perfectly matched to the stencil: its thickness, and its profile at one frequency.
+"""The perfectly matched layer around a grid, its boundary layer: thickness, and profile at one frequency.
 
 Along its axis a layer replaces the second difference d2 by g d(g d), with
 g = 1 / (1 + sigma / (alpha - i w)). In time this takes two memory variables (CPML of second order: Komatitsch
