@@ -343,7 +343,7 @@ def _share_of_bound(scene: SceneResult, score: float) -> str:
     bound = scene.in_unit(f"{scene.bound:.4g}")
     if scene.bound <= 0:
         return f"no drive above {bound} (certified)"
-    return f"{100 * score / scene.bound:.1f} % of {bound}" if score >= 0 else f"none of {bound}"
+    return f"{100 * score / scene.bound:.1f} % of {bound}" if score > 0 else f"none of {bound}"
 
 
 def with_foci(results: StudyResult) -> bool:
