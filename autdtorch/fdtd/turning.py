@@ -106,7 +106,7 @@ _FEWEST_CORNERS = 16  # Fewest corners of a polygon that represents a circle
 _ROUND = 1e-6  # Largest deviation of corners from the circle, relative to the radius
 _STEPS = np.cos((np.arange(4) + 0.5) * np.pi / 8)  # Faces of the staircase, relative to its radius
 _SCALE = 0.957173  # Radius of the staircase over the radius of the circle of equal area
-_PERIMETER = float(8 * _SCALE * _STEPS[0] / (2 * np.pi))  # of the staircase, over that of the circle
+_PERIMETER = float(8 * _SCALE * _STEPS[0] / (2 * np.pi))  # Perimeters: staircase over circle
 
 
 def slender_faces(corners: Array) -> list[Array] | None:
@@ -136,7 +136,7 @@ def slender_faces(corners: Array) -> list[Array] | None:
 
 
 def staircase_excess(corners: Array) -> float:
-    """Return the area of the faces of `slender_faces` over that of the surface; 1 for other shapes."""
+    """Return the ratio of the areas of `slender_faces` and of the surface; 1 for other shapes."""
     if slender_faces(corners) is None:
         return 1.0
     *_, across, length = np.sort(np.ptp(corners, axis=0))
