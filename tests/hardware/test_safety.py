@@ -219,7 +219,7 @@ def test_a_timer_that_cannot_switch_off_says_so_at_once_and_ends_the_trial(trial
     def fail() -> None:
         raise error
 
-    with trial.limited(seconds_in_a_row=0.02) as (bench, link):
+    with trial.limited(seconds_in_a_row=0.5) as (bench, link):
         objective = trial.objective(link, Disturbed(bench, wait))
         monkeypatch.setattr(link.link, "off", fail)
         with pytest.raises(type(error), match="stuck"):

@@ -13,6 +13,7 @@ from small_scenes import AIR, relative_error
 from autdtorch.analytic import rigid_sphere
 from autdtorch.fdtd import grid
 from autdtorch.fdtd.discrete_green import discrete_green
+from autdtorch.fdtd.perfectly_matched_layer import Thickness
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
 from autdtorch.fdtd.symmetry import orbits_of_points, orbits_of_transducers
 from autdtorch.propagators import make_propagator
@@ -62,7 +63,8 @@ def test_runs_from_and_to_points_beside_a_body_agree(body, gap, first):
     apart = free[(free - point).norm(dim=1) > 2e-3]
     source = apart[first % len(apart)][None]
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(grid, "_THIN_LAYER_CELLS", 12)  # what thinner layers reflect depends on the way
+        # what thinner layers reflect depends on the way
+        patched.setattr(grid, "box_layer", lambda _: Thickness(12, 12))
         forward, backward = both_ways(point, source, body, "float64", 1e-6)
     # of the field in free space, as both may cancel; 5e-4 measured next to resonances, else a tenth of it
     assert (backward - forward).abs() < 2e-3 / (point - source).norm()
