@@ -280,7 +280,7 @@ def entry(folder: Path = _HERE, **options: Any) -> Callable[[Callable[..., Any]]
     """
 
     def compiled(function: Callable[..., Any]) -> Any:
-        function.__qualname__ += f"_{_digest(folder, _HERE)}"
+        function.__qualname__ += f"_{_digest(*dict.fromkeys((folder, _HERE)))}"
         try:
             dispatcher = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
             dispatcher._cache.__class__ = _Cache
