@@ -24,7 +24,7 @@ SECTION = {
     "array": {"type": "grid", "shape": [2, 2], "pitch": 10e-3, "center": [0, 0, 0]},
     "control_points": {"type": "points", "positions": [[0.05, 0, 0], [0.05, 0.01, 0]]},
 }
-NO_SOURCES = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((0, 2), dtype=torch.float64))
+NO_SOURCES = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((1, 0, 2), dtype=torch.float64))
 NO_RECEIVERS = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=torch.float64))
 
 

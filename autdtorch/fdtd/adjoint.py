@@ -40,7 +40,7 @@ _ROUNDING = 4  # Singular values below this many roundings of the largest are ze
 def recorded(
     kernel: Kernel, assembly: Assembly, sources: Sources, receivers: Receivers, signal: Tensor
 ) -> Tensor:
-    """Step from silence, once per row of `signal` (steps, S), and return the record (steps, R).
+    """Step one run from silence, once per row of `signal` (steps, S), and return the record (steps, q).
 
     Differentiable, once, by `sources.force`, `heterogeneous_weight`, `loss_weight` and `loss_ground`;
     derivatives by rows in the boundary layers are zero. Sources and receivers, as those of `assembly`, must
@@ -68,10 +68,10 @@ class _Run:
     def advance(
         self, state: WaveState, sources: Sources, receivers: Receivers, signal: Tensor
     ) -> tuple[WaveState, Tensor]:
-        """Step a copy of the state."""
+        """Step a copy of the state of one run; return its record (steps, q)."""
         c = self.assembly.coefficients
         state, record = self.kernel.advance(deepcopy(state), c, sources, receivers, signal)
-        return state, record.cpu()
+        return state, record[0].cpu()
 
     def single(self, cells: Tensor) -> Receivers:
         """Return cells (k,) as receivers."""
@@ -101,7 +101,7 @@ class _Run:
         force = torch.zeros((len(cells), rank), dtype=slope.dtype, device="cpu")
         for point, weight, size_of in zip(place, self.receivers.weight, amplitude, strict=True):
             force.index_add_(0, point, weight[:, None] * size_of)
-        return Sources(cells, force / self.mass(cells)[:, None]), signal.flip(0)
+        return Sources(cells, (force / self.mass(cells)[:, None])[None]), signal.flip(0)
 
 
 @dataclass(frozen=True)
@@ -211,7 +211,7 @@ class _Recorded(torch.autograd.Function):
                 part = run.signal[start:end]
                 state, record = run.advance(state, sources, read, signal[steps - end : steps - start])
                 adjoint = mass * record.flip(0)
-                by_force += adjoint[:, :driven].double().T @ part.double()  # double: as in `drive_dft`
+                by_force[0] += adjoint[:, :driven].double().T @ part.double()  # double: as in `drive_dft`
                 if around is not None:
                     fields = ctx.last
                     if end < steps:

@@ -198,7 +198,7 @@ def windows_of_run(
         driven = sources
         if echo:
             signal = torch.cat([(1 - rising) * signal, rising * signal], dim=1)
-            driven = Sources(sources.index, torch.cat([before.force, sources.force], dim=1))
+            driven = Sources(sources.index, torch.cat([before.force, sources.force], dim=2))
         read = receivers if first >= recorded_from else nothing
         state, recorded = kernel.advance(state, assembly.coefficients, driven, read, signal)
         if read is nothing:
@@ -208,7 +208,7 @@ def windows_of_run(
         inside = (time for time in range(first + 1, first + steps) if _is_needed(time, steps, shift))
         for begin, end in itertools.pairwise((first, *inside, first + steps)):
             part = slice(begin - first, end - first)
-            total = total + fourier_sum(basis[:, part], recorded[part]).cpu()
+            total = total + fourier_sum(basis[:, part], recorded[0, part]).cpu()
             sums[end] = total
         del recorded  # before the next one, as it may be most of a run's memory
         starts = range(-(-(first + 1) // shift) * shift - steps, first + 1, shift)

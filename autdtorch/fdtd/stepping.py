@@ -71,9 +71,9 @@ class Assembly:
         return self.coefficients.heterogeneous_weight.dtype
 
     def silence(self, sources: Sources) -> WaveState:
-        """Return the state before the drive is switched on."""
+        """Return the state of all runs before the drive is switched on."""
         faint = _BACKGROUND * float(sources.force.detach().abs().max())
-        return uniform_state(self.grid.shape, self.coefficients, faint)
+        return uniform_state(self.grid.shape, self.coefficients, faint, len(sources.force))
 
     def interpolation(self, points: Tensor, weights: Tensor = _ONE_NODE) -> Interpolation:
         """Return cells and weights of points (P, 3) [m], or of nodes (P, n, 3) with `weights` (n,)."""
@@ -142,11 +142,12 @@ class Assembly:
     def sources(self, points: Tensor, strength: Tensor, weights: Tensor = _ONE_NODE) -> Sources:
         """Return point sources at (P, 3) [m] with far field strength e^{ikr}/r, strength (P,) complex [Pa m].
 
-        Nodes (P, n, 3) with `weights` (n,) share the strength of a source. Differentiable by strength.
+        They drive one run. Nodes (P, n, 3) with `weights` (n,) share the strength of a source. Differentiable
+        by strength.
         """
         index, force = self.forces(self.interpolation(points, weights), strength)
         force = force / torch.from_numpy(self.heterogeneous.mass_of(index))
-        return Sources(torch.from_numpy(index), torch.view_as_real(force).to(self.dtype))
+        return Sources(torch.from_numpy(index), torch.view_as_real(force)[None].to(self.dtype))
 
     def forces(self, kernels: Interpolation, strength: Tensor) -> tuple[Index, Tensor]:
         """Return the cells (k,) of the kernels of sources, and the forces (k,) as if all were of air."""

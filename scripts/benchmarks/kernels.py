@@ -97,7 +97,7 @@ def cell_rate(
     runs = kernel.at_once(shape)
     states = [uniform_state(shape, coefficients, 1e-20) for _ in range(runs)]
     dtype = coefficients.layer_decay.dtype
-    sources = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((0, 2)))
+    sources = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((1, 0, 2)))
     receivers = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=dtype))
 
     def step(times: int) -> None:

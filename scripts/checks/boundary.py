@@ -111,8 +111,8 @@ def _pressure(
     _, recorded = CpuKernel().advance(
         uniform_state(shape, air.coefficients, 0.0),
         air.coefficients,
-        Sources(torch.tensor([source]), torch.tensor([[air.force, 0.0]], dtype=torch.float64)),
+        Sources(torch.tensor([source]), torch.tensor([[[air.force, 0.0]]], dtype=torch.float64)),
         Receivers(index, torch.ones(index.shape, dtype=torch.float64)),
         drive_signal(steps, 0, blocks * steps.numerator),
     )
-    return drive_dft(recorded[-steps.numerator :], steps.denominator).numpy()
+    return drive_dft(recorded[0, -steps.numerator :], steps.denominator).numpy()

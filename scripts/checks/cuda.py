@@ -69,7 +69,7 @@ def compiled(capability: int, dtype: torch.dtype) -> dict[str, Any]:
     driver.set_active(absent_gpu)
     with patch.object(JITFunction, "run", compile_only):
         shape = Cells(*assembly.grid.shape)
-        medium = DeviceMedium(assembly.coefficients, shape, blocks_of(shape), torch.device("cpu"))
+        medium = DeviceMedium(assembly.coefficients, shape, 1, blocks_of(shape, 1), torch.device("cpu"))
         DeviceRun(medium, assembly.silence(sources), sources, receivers, len(signal)).advance(signal)
     return launches
 

@@ -122,7 +122,7 @@ def run_trial(trial: Trial) -> Outcome:
         (len(trial.scene.array),), trial.scene.array.source_strength, dtype=torch.complex128
     )
     sources = assembly.sources(trial.scene.array.positions, strength)
-    silent = Sources(sources.index[:0], sources.force[:0])
+    silent = Sources(sources.index[:0], sources.force[:, :0])
     receivers = assembly.receivers(trial.scene.control_points)
     start = {"driven": assembly.silence(sources), "free": _random_state(assembly, sources, trial.number)}
     drive = {"driven": sources, "free": silent}
@@ -153,7 +153,7 @@ def _random_state(assembly: Assembly, sources: Sources, seed: int) -> WaveState:
     """Return random pressure at rest in the interior; none in rigid cells, where it would stay."""
     grid, state = assembly.grid, assembly.silence(sources)
     inside = grid.deeper(0)
-    state.now[inside] = torch.from_numpy(np.random.default_rng(seed).standard_normal(grid.interior)).to(
+    state.now[0, *inside] = torch.from_numpy(np.random.default_rng(seed).standard_normal(grid.interior)).to(
         assembly.dtype
     )
     state.now.reshape(-1)[torch.from_numpy(assembly.heterogeneous.rigid)] = 0
@@ -170,7 +170,7 @@ def _course(
     for sample in range(len(norm)):
         signal = drive_signal(assembly.steps_per_period, sample * at_once, at_once).to(assembly.dtype)
         state, observed = CpuKernel().advance(state, assembly.coefficients, sources, receivers, signal)
-        recorded.append(observed)
+        recorded.append(observed[0])
         pressure = state.now.numpy().ravel().astype(np.float64)
         with np.errstate(over="ignore", invalid="ignore"):  # detected below
             norm[sample] = np.sqrt((mass * pressure**2).sum())
@@ -180,7 +180,7 @@ def _course(
         drive_dft(whole[first : first + block], assembly.steps_per_period.denominator)
         for first in range(0, len(whole) - block + 1, block)
     ]
-    peak = np.unravel_index(np.abs(state.now.numpy()).argmax(), assembly.grid.shape)
+    peak = np.unravel_index(np.abs(state.now[0].numpy()).argmax(), assembly.grid.shape)
     where = np.array(peak) - assembly.grid.to_cells(torch.zeros((1, 3), dtype=torch.float64))[0]
     text = "(" + ", ".join(f"{x:.1f}" for x in where) + ")"
     return _Course(norm.reshape(WINDOWS, SAMPLES).max(axis=1), torch.stack(phasor).numpy(), text)

@@ -59,7 +59,7 @@ def gradients(case, kernel):
     assembly, sources = differentiable(assembly, sources)
     if kernel is None:
         state, c = assembly.silence(sources), assembly.coefficients
-        _, record = ReferenceKernel().advance(state, c, sources, receivers, signal)
+        record = ReferenceKernel().advance(state, c, sources, receivers, signal)[1][0]
     else:
         record = recorded(kernel, assembly, sources, receivers, signal)
     slope = torch.randn(record.shape, generator=torch.Generator().manual_seed(0), dtype=record.dtype)
@@ -101,7 +101,7 @@ def test_segments_do_not_change_the_gradients(monkeypatch):
 
 def test_cuts_bound_the_memory():
     """At 100^3 heterogeneous cells the stored states and the record of a segment stay below 1 GiB."""
-    state = WaveState(torch.zeros((118,) * 3), torch.zeros(0), ())
+    state = WaveState(torch.zeros((1, *(118,) * 3)), torch.zeros(0), ())
     cells = 102**3
     for steps in (10, 1000, 10_000):
         cuts = adjoint._cuts(steps, state, cells)
@@ -162,7 +162,7 @@ def pressure(force, weight, steps):
         (torch.cos(torch.arange(steps) * 0.6), torch.sin(torch.arange(steps) * 0.6)), 1
     ).double()
     state = uniform_state(SHAPE, coefficients, 0.0)
-    sources = Sources(torch.tensor([CELL - 1, CELL + 9]), force)
+    sources = Sources(torch.tensor([CELL - 1, CELL + 9]), force[None])
     _, recorded = ReferenceKernel().advance(state, coefficients, sources, receivers, signal)
     return recorded
 

@@ -28,6 +28,7 @@ needs_gpu = pytest.mark.skipif(
     not torch.cuda.is_available(), reason="needs an NVIDIA GPU: torch.cuda.is_available() is false"
 )
 
+RUNS = 2
 SIZE = 9e-3
 """Edge of the domain [m], 9 cells; the layers make it 23 to 28."""
 
@@ -43,7 +44,7 @@ BLOCKS = None if torch.cuda.is_available() else WHOLE
 
 
 def parts(obstacles, dtype, absorption=0.0, lossy=False):
-    """Coefficients of a scene; sources and receivers all over the grid, in special cells too."""
+    """Coefficients of a scene; sources of two runs and receivers all over the grid, in special cells too."""
     assembly = assemble(region_of(small_scene(obstacles, SIZE, absorption)), 1e-3, dtype)
     c, shape = assembly.coefficients, assembly.grid.shape
     generator = torch.Generator().manual_seed(1)
@@ -57,7 +58,7 @@ def parts(obstacles, dtype, absorption=0.0, lossy=False):
     special = c.heterogeneous_index, c.sound_hard_index, c.columns.index[:, 1:-1]
     index = torch.unique(torch.cat((somewhere, *(each.reshape(-1)[::5] for each in special))))
     index = index[torch.randperm(len(index), generator=generator)]
-    force = torch.randn((len(index), 3), dtype=torch.float64, generator=generator)
+    force = torch.randn((RUNS, len(index), 3), dtype=torch.float64, generator=generator)
     weight = torch.rand((len(index) // 2, 2), dtype=torch.float64, generator=generator).to(dtype)
     receivers = Receivers(index[: 2 * len(weight)].reshape(-1, 2), weight)
     return shape, c, Sources(index, force.to(dtype)), receivers
@@ -65,10 +66,10 @@ def parts(obstacles, dtype, absorption=0.0, lossy=False):
 
 def noise(shape, c):
     """Noise in all cells exercises every part of a step."""
-    state = uniform_state(shape, c, 0.0)
+    state = uniform_state(shape, c, 0.0, RUNS)
     generator = torch.Generator().manual_seed(0)
     for field in (state.now, state.before):
-        core = field[1:-1, 1:-1, 1:-1]
+        core = field[:, 1:-1, 1:-1, 1:-1]
         core.copy_(torch.randn(core.shape, generator=generator, dtype=torch.float64))
     return state
 
@@ -81,7 +82,7 @@ def advance(kernel, case, blocks):
     for part in signal.to(coefficients.layer_decay.dtype).split(blocks):
         state, record = kernel.advance(state, coefficients, sources, receivers, part)
         recorded.append(record)
-    return state, torch.cat(recorded)
+    return state, torch.cat(recorded, dim=1)
 
 
 def assert_same(one, other, tolerance):

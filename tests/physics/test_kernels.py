@@ -65,14 +65,28 @@ def test_cpu_kernel_is_the_reference_kernel(dtype, tolerance, steps, lossy):
         assert (value - reference).abs().max() <= tolerance * max(float(reference.abs().max()), 1e-30)
 
 
+@pytest.mark.parametrize("kernel", [CpuKernel(), ReferenceKernel()], ids=["cpu", "reference"])
+def test_runs_side_by_side_are_those_alone(kernel):
+    assembly, sources, receivers = scene_parts(torch.float64, 40.0, True)
+    signal, c = drive_signal(assembly.steps_per_period, 0, 5), assembly.coefficients
+    turned = sources.force, sources.force.flip(2)
+    runs = [replace(sources, force=force) for force in (torch.cat(turned), *turned)]
+    together, *alone = (
+        all_tensors(*kernel.advance(assembly.silence(sources), c, sources, receivers, signal))
+        for sources in runs
+    )
+    for value, parts in zip(together, zip(*alone, strict=True), strict=True):
+        assert torch.equal(value, torch.cat(parts))
+
+
 @pytest.mark.parametrize(("chunks", "lossy"), [(2, False), (4, False), (4, True)])
 def test_chunks_of_planes_are_the_whole(chunks, lossy, monkeypatch):
     """Chunks change the order of sums; the number of threads changes nothing."""
     whole = advance(CpuKernel(), torch.float64, 41, lossy)
-    planes = whole[0].now.shape[0] - 2
+    planes = whole[0].now.shape[1] - 2
     monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._CHUNK_CELLS", 1)
     monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._CHUNK_PLANES", planes // chunks)
-    assert len(_cuts(whole[0].now.shape)) == chunks + 1
+    assert len(_cuts(whole[0].now.shape[1:])) == chunks + 1
     parts = advance(CpuKernel(), torch.float64, 41, lossy)
     for value, reference in zip(all_tensors(*parts), all_tensors(*whole), strict=True):
         assert (value - reference).abs().max() <= 1e-12 * reference.abs().max()
@@ -85,9 +99,9 @@ def test_chunks_of_planes_are_the_whole(chunks, lossy, monkeypatch):
 @pytest.mark.parametrize("lossy", [False, True])
 def test_strips_of_rows_change_no_bit(lossy, monkeypatch):
     whole = advance(CpuKernel(), torch.float32, 41, lossy)
-    _, ny, nz = whole[0].now.shape
+    _, _, ny, nz = whole[0].now.shape
     monkeypatch.setattr("autdtorch.fdtd.kernels.cpu_sweep._STRIP_CELLS", ny * nz // 3)
-    assert len(strips_of(whole[0].now.shape, scene_parts(torch.float32)[0].grid.layer_cells)) > 2
+    assert len(strips_of(whole[0].now.shape[1:], scene_parts(torch.float32)[0].grid.layer_cells)) > 2
     strips = advance(CpuKernel(), torch.float32, 41, lossy)
     assert all(map(torch.equal, all_tensors(*strips), all_tensors(*whole)))
 

@@ -235,10 +235,10 @@ def true_eigenvalue(name):
 
     def apply(pressure):
         state = uniform_state(assembly.grid.shape, c, 0.0)
-        state.now[1:-1, 1:-1, 1:-1] = torch.from_numpy(pressure).reshape(inner)
+        state.now[0, 1:-1, 1:-1, 1:-1] = torch.from_numpy(pressure).reshape(inner)
         before = state.now.clone()
         new = advance(open_ended, state, 1).now
-        return ((2 * before - new)[1:-1, 1:-1, 1:-1] / factor).numpy().ravel()
+        return ((2 * before - new)[0, 1:-1, 1:-1, 1:-1] / factor).numpy().ravel()
 
     inner = [cells - 2 for cells in assembly.grid.shape]
     operator = LinearOperator((math.prod(inner),) * 2, matvec=apply, dtype=np.float64)
@@ -263,7 +263,7 @@ def test_a_run_is_bounded_at_the_chosen_time_step_and_blows_up_above_the_limit(n
 
     def growth(coefficients, steps):
         state = uniform_state(assembly.grid.shape, c, 0.0)
-        inner = state.now[1:-1, 1:-1, 1:-1]
+        inner = state.now[0, 1:-1, 1:-1, 1:-1]
         inner.copy_(torch.randn(inner.shape, generator=torch.Generator().manual_seed(0), dtype=inner.dtype))
         state.before.copy_(state.now)
         start = float(state.now.norm())

@@ -76,7 +76,9 @@ def test_slabs_through_the_layers_are_stable(density, offset, monkeypatch):
     state = assembly.silence(assembly.sources(scene.array.positions, torch.ones(1, dtype=torch.complex128)))
     inside = assembly.grid.deeper(0)
     shape = assembly.grid.interior
-    state.now[inside] = torch.randn(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    state.now[0, *inside] = torch.randn(
+        shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     state.before.copy_(state.now)
     sizes = []
     for _ in range(4):

@@ -1,6 +1,7 @@
-"""The contract of all kernels: tensors, indices and coefficients in, the next state and records out.
+"""The contract of all kernels: tensors, indices and coefficients in, the next states and records out.
 
-A step takes the pressures `now` and `before` at two successive times to the next; all of it is linear:
+R runs in one medium are stepped side by side; none depends on another. A step takes the pressures `now` and
+`before` at two successive times to the next; all of it is linear:
 
 1. new = center now + face F + edge E + corner C - keep before, with F, E, C the sums over the 6, 12 and 8
    neighbours;
@@ -26,10 +27,10 @@ from autdtorch.utils.spatial import distinct_rows
 
 
 class Layer(NamedTuple):
-    """Memory of the low and the high layer of an axis (2, nx, ny, nz), counted inwards, or of m columns."""
+    """Memory of both layers of an axis (R, 2, nx, ny, nz), low first, counted inwards, or of m columns."""
 
-    psi: Tensor  # L + 1 half cells along the axis; (L + 1, m)
-    zeta: Tensor  # L cells; (L, m)
+    psi: Tensor  # L + 1 half cells along the axis; (R, L + 1, m)
+    zeta: Tensor  # L cells; (R, L, m)
 
 
 class Memory(NamedTuple):
@@ -111,24 +112,31 @@ class Coefficients:
 
 @dataclass
 class WaveState:
-    """Two pressure fields (nx, ny, nz) and the memory of the boundary layers."""
+    """The two pressure fields (R, nx, ny, nz) of R runs, and the memory of their boundary layers."""
 
     now: Tensor
     before: Tensor
     memory: Memory
 
+    def chosen(self, runs: slice | Tensor) -> WaveState:
+        """Return the state of some runs, for a slice a view."""
+        memory = (Layer(*(part[runs] for part in layer)) for layer in self.memory)
+        return WaveState(self.now[runs], self.before[runs], Memory(*memory))
 
-def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, pressure: float) -> WaveState:
-    """Return the state of rest at a uniform pressure on a grid of `shape`."""
+
+def uniform_state(
+    shape: tuple[int, int, int], coefficients: Coefficients, pressure: float, runs: int = 1
+) -> WaveState:
+    """Return the state of rest, in all runs at a uniform pressure, on a grid of `shape`."""
     c, cells = coefficients, coefficients.layer_cells
 
     def silent(*size: int, axis: int) -> Layer:
-        psi, zeta = ((*size[:axis], along, *size[axis + 1 :]) for along in (cells + 1, cells))
+        psi, zeta = ((runs, *size[:axis], along, *size[axis + 1 :]) for along in (cells + 1, cells))
         return Layer(c.layer_decay.new_zeros(psi), c.layer_decay.new_zeros(zeta))
 
     sizes = (shape, shape, shape, (*shape[:2], 2 * cells))
     layers = (silent(2, *size, axis=axis + 1) for axis, size in zip((0, 1, 2, 1), sizes, strict=True))
-    core = c.layer_decay.new_full([length - 2 for length in shape], pressure)
+    core = c.layer_decay.new_full([runs, *(length - 2 for length in shape)], pressure)
     now = torch.nn.functional.pad(core, (1,) * 6)
     columns = (silent(0, len(each.index), axis=0) for each in (c.columns, c.crossed))
     return WaveState(now, now.clone(), Memory(*layers, *columns))
@@ -138,29 +146,32 @@ def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, press
 class Sources:
     """Driven cells and their forces by S signals; a drive has cos(w t) and sin(w t), with its envelope."""
 
-    index: Tensor  # flat indices (n,) int64, ascending, distinct
-    # force by each signal (n, S) [Pa]; of a drive, real and imaginary part of the phasors
+    index: Tensor  # flat indices (n,) int64, ascending, distinct; those of all runs
+    # force by each signal (R, n, S) [Pa]; of a drive, real and imaginary part of the phasors
     force: Tensor
 
 
 @dataclass(frozen=True)
 class Receivers:
-    """R receivers: flat `index` (R, n) int64 and `weight` (R, n) of their cells."""
+    """q receivers in each run: flat `index` (q, n) int64 and `weight` (q, n) of their cells."""
 
     index: Tensor
     weight: Tensor
 
 
 class Kernel(Protocol):
-    """Advances a state by whole steps."""
+    """Advances the states of runs by whole steps."""
 
     def at_once(self, shape: tuple[int, int, int]) -> int:
-        """Return the number of runs on a grid of `shape` that threads may step concurrently."""
+        """Return the number of calls on a grid of `shape` that threads may make concurrently."""
+
+    def together(self, shape: tuple[int, int, int], receivers: int) -> int:
+        """Return the number of runs on a grid of `shape`, with q receivers each, that a call should step."""
 
     def advance(
         self, state: WaveState, c: Coefficients, sources: Sources, receivers: Receivers, signal: Tensor
     ) -> tuple[WaveState, Tensor]:
-        """Step once per row of `signal` (steps, S); return the new state and the record (steps, R).
+        """Step R runs once per row of `signal` (steps, S); return their new state and record (R, steps, q).
 
         The new state may share memory with `state`, which must not be used again. The record holds the
         pressure at the receivers after each step.

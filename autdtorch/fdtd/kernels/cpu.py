@@ -317,11 +317,27 @@ class CpuKernel:
         chunks = len(_cuts(shape)) - 1
         return max(1, thread_count() // chunks) if chunks <= 2 else 1
 
+    def together(self, shape: tuple[int, int, int], receivers: int) -> int:
+        """Return 1: the fields of several runs would share the caches."""
+        return 1
+
     def advance(
         self, state: WaveState, c: Coefficients, sources: Sources, receivers: Receivers, signal: torch.Tensor
     ) -> tuple[WaveState, torch.Tensor]:
         """See `Kernel.advance`."""
-        shape, cuts = state.now.shape, _cuts(state.now.shape)
+        runs = [slice(run, run + 1) for run in range(len(state.now))]
+        records = [
+            self._stepped(state.chosen(run), c, Sources(sources.index, sources.force[run]), receivers, signal)
+            for run in runs
+        ]
+        now, before = (state.now, state.before) if len(signal) % 2 == 0 else (state.before, state.now)
+        return WaveState(now, before, state.memory), torch.from_numpy(np.stack(records))
+
+    def _stepped(
+        self, state: WaveState, c: Coefficients, sources: Sources, receivers: Receivers, signal: torch.Tensor
+    ) -> AnyArray:
+        """Step a single run; return its record (steps, q)."""
+        shape, cuts = state.now.shape[1:], _cuts(state.now.shape[1:])
         plane = shape[1] * shape[2]
         dtype = c.heterogeneous_weight.numpy().dtype.type
         recorded = np.empty((len(signal), len(receivers.index)), dtype)  # in large pages, unlike PyTorch's
@@ -348,10 +364,10 @@ class CpuKernel:
             _losses(c, plane, cuts, dtype),
             workspace(cuts, shape, c.layer_cells, dtype),
             _columns(c),
-            tuple((psi.view(-1).numpy(), zeta.view(-1).numpy()) for psi, zeta in state.memory[4:]),
+            tuple((psi.reshape(-1).numpy(), zeta.reshape(-1).numpy()) for psi, zeta in state.memory[4:]),
             _unsigned(c.sound_hard_index),
             # numba compiles again for arrays with gaps, and crashed when it loaded that from disk
-            (_unsigned(sources.index), sources.force.mT.contiguous().numpy()),
+            (_unsigned(sources.index), sources.force[0].mT.contiguous().numpy()),
             (_unsigned(receivers.index.mT), receivers.weight.mT.contiguous().numpy()),
             signal.contiguous().numpy(),
             recorded,
@@ -359,8 +375,7 @@ class CpuKernel:
         )
         self._work(lambda: _advance(*arguments), len(cuts) - 1)
         memory.give_back()
-        now, before = (state.now, state.before) if len(signal) % 2 == 0 else (state.before, state.now)
-        return WaveState(now, before, state.memory), torch.from_numpy(recorded)
+        return recorded
 
     def compiled_ahead(self, c: Coefficients) -> AbstractContextManager[None]:
         """Compile `advance` in another process while the sums of waves are compiled here."""
@@ -369,7 +384,7 @@ class CpuKernel:
 
         def step() -> None:
             state = uniform_state((3, 3, 3), c, 0.0)  # no steps: of any shape
-            self.advance(state, c, Sources(none[:, 0], silent), Receivers(none, silent), silent)
+            self.advance(state, c, Sources(none[:, 0], silent[None]), Receivers(none, silent), silent)
 
         def add() -> None:
             places = torch.eye(3, **REAL)

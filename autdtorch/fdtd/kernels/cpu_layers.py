@@ -49,11 +49,11 @@ def plane_profiles(c: Coefficients, shape: torch.Size, planes: int) -> tuple[Pro
 
 
 class FlatMemory:
-    """Memory of the layers, copied from a state: psi and zeta of x, y, ends of rows, and y for these."""
+    """Memory of the layers of a run, from a state: psi and zeta of x, y, ends of rows, and y for these."""
 
     def __init__(self, memory: Memory) -> None:
-        """Copy the memory of a state, except the x layers, which are used in place."""
-        self._layers = [[part.numpy() for part in layer] for layer in memory[:4]]
+        """Copy the memory of the state of one run, except the x layers, which are used in place."""
+        self._layers = [[part[0].numpy() for part in layer] for layer in memory[:4]]
         x, (psi_y, _), (psi_z, _), _ = self._layers
         _, nx, ny, cells = psi_z.shape
         nz, lanes = psi_y.shape[-1], 2 * (cells + 1)

@@ -7,6 +7,7 @@ it. With TRITON_INTERPRET=1 Triton interprets the steps, slowly, on the CPU.
 from __future__ import annotations
 
 import itertools
+import math
 from typing import NamedTuple
 
 import torch
@@ -32,6 +33,9 @@ _GRAPH_STEPS = 16  # Steps of a captured graph; even, so that both fields return
 _MOST_CAPTURED = 2**25
 _MOST_CACHED = 2**22  # Most cells whose two fields, in single precision, stay in 50 MB of cache
 _FEWEST_PROGRAMS = 1000  # That occupy a GPU of 132 multiprocessors
+_MOST_RUNS, _MOST_CELLS = 256, 2**27  # Of a launch; more take their time one after the other
+# Numbers stored for a cell of a run, with its layers, and for a receiver, most of them its record
+_FIELD_NUMBERS, _RECORD_NUMBERS = 4, 400
 
 
 class BlockSizes(NamedTuple):
@@ -43,13 +47,13 @@ class BlockSizes(NamedTuple):
     lanes: int = 16  # columns through a boundary layer
 
 
-def blocks_of(shape: Cells) -> BlockSizes:
-    """Return the blocks for a grid, by timings on an H100; `docs/decisions/kernels.md` has them."""
+def blocks_of(shape: Cells, runs: int) -> BlockSizes:
+    """Return the blocks for runs on a grid, by timings on an H100; `docs/decisions/kernels.md` has them."""
     nx, ny, nz = shape
-    if nx * ny * nz > _MOST_CACHED:
+    if runs * nx * ny * nz > _MOST_CACHED:
         return BlockSizes(32, 1, 256)
     blocks = BlockSizes()
-    tiles = triton.cdiv(ny, blocks.y) * triton.cdiv(nz, blocks.z)
+    tiles = runs * triton.cdiv(ny, blocks.y) * triton.cdiv(nz, blocks.z)
     # a march takes its time however few programs there are
     while blocks.x > 1 and triton.cdiv(nx, blocks.x) * tiles < _FEWEST_PROGRAMS:
         blocks = blocks._replace(x=blocks.x // 2)
@@ -67,11 +71,13 @@ class Ends(NamedTuple):
 
 
 class DeviceMedium:
-    """A medium on the device, and workspace."""
+    """A medium on the device, and workspace for some runs."""
 
-    def __init__(self, c: Coefficients, shape: Cells, blocks: BlockSizes, device: torch.device) -> None:
+    def __init__(
+        self, c: Coefficients, shape: Cells, runs: int, blocks: BlockSizes, device: torch.device
+    ) -> None:
         """Copy the medium `c` of a grid to a device."""
-        self.coefficients, self.shape, self.blocks, self.device = c, shape, blocks, device
+        self.coefficients, self.shape, self.runs, self.blocks, self.device = c, shape, runs, blocks, device
         self.cells, self.depths = c.layer_cells, triton.next_power_of_2(max(1, c.layer_cells))
         self.dtype = c.layer_decay.dtype
         weights = c.center, c.face, c.edge, c.corner, c.keep
@@ -79,11 +85,11 @@ class DeviceMedium:
         padding = 0, 2 * self.depths + 1 - len(c.layer_decay)
         profile = (torch.nn.functional.pad(each, padding) for each in (c.layer_decay, c.layer_gain))
         self.profile = Profile(*(each.to(device) for each in profile))
-        self.heterogeneous = heterogeneous_table(c, device)
+        self.heterogeneous = heterogeneous_table(c, runs, device)
         self.columns = column_table(c.columns, c.crossing, device)
         self.crossed = column_table(c.crossed, c.crossing[:0], device)
         self.settled = settled_table(c, device)
-        self.terms = no_terms(shape, c, device)
+        self.terms = no_terms(shape, runs, c, device)
         nx, ny, nz = shape
         z, y, yz = (2 * triton.cdiv(rows, blocks.lanes) for rows in (nx * ny, nx * nz, 2 * self.cells * nx))
         heterogeneous = triton.cdiv(self.heterogeneous.size, self.depths * blocks.lanes)
@@ -105,8 +111,8 @@ class DeviceRun:
         memory = Memory(*(Layer(*(part.to(device).contiguous() for part in each)) for each in state.memory))
         self._memories = memory, Memory(*(Layer(*map(torch.zeros_like, each)) for each in memory))
         self._driven = driven_table(sources, medium.settled, dtype, device)
-        self._received = receiver_table(receivers, steps, dtype, device)
-        self.signal = torch.zeros((steps, sources.force.shape[1]), dtype=dtype, device=device)
+        self._received = receiver_table(receivers, medium.runs, steps, dtype, device)
+        self.signal = torch.zeros((steps, sources.force.shape[2]), dtype=dtype, device=device)
         self._first = torch.zeros((), dtype=torch.int64, device=device)
         self._turn = 0
         self._graphs: dict[int, torch.cuda.CUDAGraph] = {}
@@ -121,9 +127,11 @@ class DeviceRun:
         for offset in range(steps - done):
             self._step(self._turn + offset, offset)
         self._turn = (self._turn + steps) % 2
-        received, block = self._received, self.medium.depths * self.medium.blocks.lanes
-        grid = (triton.cdiv(received.size, block),)
-        cuda_steps.read_last[grid](self._fields[self._turn], received, steps - 1, LANES=block)
+        m, received, block = self.medium, self._received, self.medium.depths * self.medium.blocks.lanes
+        grid = (m.runs * triton.cdiv(received.size, block),)
+        cuda_steps.read_last[grid](
+            self._fields[self._turn], m.shape, received, m.runs, steps - 1, LANES=block
+        )  # fmt: skip
         now, before = self._fields[self._turn], self._fields[1 - self._turn]
         self.state = WaveState(now, before, self._memories[self._turn])
         return received.recorded.clone()
@@ -154,19 +162,20 @@ class DeviceRun:
         other, new = self._fields[(turn + 1) % 2], self._memories[(turn + 1) % 2]
         lanes = m.depths * blocks.lanes
         sizes = {"CELLS": m.cells, "DEPTHS": m.depths, "LANES": blocks.lanes}
-        cuda_steps.prepare[(m.ends.crossed + triton.cdiv(received.size, lanes),)](
+        cuda_steps.prepare[(m.runs * (m.ends.crossed + triton.cdiv(received.size, lanes)),)](
             now, other, m.shape, m.weights, m.profile, old, new, m.terms, m.heterogeneous, m.crossed,
-            received, m.ends, self._first, offset, LOSSY=len(m.heterogeneous.loss) > 0,
+            received, m.ends, m.runs, self._first, offset, LOSSY=len(m.heterogeneous.loss) > 0,
             CROSSED_WIDTH=len(m.crossed.weight), **sizes,
         )  # fmt: skip
-        cuda_steps.sweep[(m.tiles + triton.cdiv(m.columns.size, blocks.lanes),)](
-            now, other, m.shape, m.weights, m.profile, old, new, m.terms, m.columns, m.tiles,
-            COLUMNS_WIDTH=len(m.columns.weight), X=blocks.x, Y=blocks.y, Z=blocks.z,
+        cuda_steps.sweep[(m.runs * (m.tiles + triton.cdiv(m.columns.size, blocks.lanes)),)](
+            now, other, m.shape, m.weights, m.profile, old, new, m.terms, m.columns, m.crossed, m.tiles,
+            m.runs, COLUMNS_WIDTH=len(m.columns.weight), X=blocks.x, Y=blocks.y, Z=blocks.z,
             num_warps=blocks.y * blocks.z // 32, **sizes,
         )  # fmt: skip
-        cuda_steps.settle[(triton.cdiv(driven.size, lanes),)](
-            other, m.heterogeneous, m.settled, driven, m.terms.columns, self.signal, self._first, offset,
-            SHARES=len(m.settled.share), SIGNALS=len(driven.force), LANES=lanes,
+        cuda_steps.settle[(m.runs * triton.cdiv(driven.size, lanes),)](
+            other, m.shape, m.heterogeneous, m.settled, driven, m.terms, m.columns, self.signal, m.runs,
+            self._first, offset, SHARES=len(m.settled.share), SIGNALS=driven.force.shape[1], CELLS=m.cells,
+            LANES=lanes,
         )  # fmt: skip
 
 
@@ -184,19 +193,30 @@ class CudaKernel:
         self._run: DeviceRun | None = None
 
     def at_once(self, shape: tuple[int, int, int]) -> int:
-        """Return 1: the device holds the last run."""
+        """Return 1: the device holds the last runs."""
         return 1
+
+    def together(self, shape: tuple[int, int, int], receivers: int) -> int:
+        """Return as many as fit half of the free memory, at most enough to occupy the device."""
+        cells = math.prod(shape)
+        most = max(1, min(_MOST_RUNS, _MOST_CELLS // cells))
+        if self._device.type == "cpu":
+            return most
+        numbers = _FIELD_NUMBERS * cells + _RECORD_NUMBERS * receivers
+        free, _ = torch.cuda.mem_get_info()
+        return max(1, min(most, int(free / 2 / (4 * numbers))))
 
     @torch.no_grad()
     def advance(
         self, state: WaveState, c: Coefficients, sources: Sources, receivers: Receivers, signal: Tensor
     ) -> tuple[WaveState, Tensor]:
         """See `Kernel.advance`; the record stays on the device."""
-        shape = Cells(*state.now.shape)
-        medium, run = self._medium, self._run
-        if medium is None or medium.coefficients is not c or medium.shape != shape:
+        (runs, *cells), medium, run = state.now.shape, self._medium, self._run
+        shape = Cells(*cells)
+        if medium is None or medium.coefficients is not c or (medium.shape, medium.runs) != (shape, runs):
             self._run = run = None
-            self._medium = medium = DeviceMedium(c, shape, self._blocks or blocks_of(shape), self._device)
+            blocks = self._blocks or blocks_of(shape, runs)
+            self._medium = medium = DeviceMedium(c, shape, runs, blocks, self._device)
         if (
             run is None or run.state is not state or run.sources is not sources
             or run.receivers is not receivers or len(run.signal) != len(signal)
@@ -223,12 +243,12 @@ class Profile(NamedTuple):
 
 
 class Terms(NamedTuple):
-    """Terms that layers add to the sums across them, low layer first, both counted inwards."""
+    """Terms that layers add to the sums across them in R runs, low layer first, both counted inwards."""
 
-    y: Tensor  # E_y p (nx, 2 L, nz)
-    z: Tensor  # E_z p (nx, ny, 2 L)
-    yz: Tensor  # E_y E_z p (nx, 2 L, 2 L)
-    columns: Tensor  # added to the pressure (L m + 1,), with a zero at the end
+    y: Tensor  # E_y p (R, nx, 2 L, nz)
+    z: Tensor  # E_z p (R, nx, ny, 2 L)
+    yz: Tensor  # E_y E_z p (R, nx, 2 L, 2 L)
+    columns: Tensor  # added to the pressure (R, L m + 1), with a zero at the end
     crossed: Tensor  # likewise, added to the columns
 
 
@@ -239,7 +259,7 @@ class Heterogeneous(NamedTuple):
     cell: Tensor  # flat index (n,)
     weight: Tensor  # stencil rows (27, n)
     scale: Tensor  # of the layers' term, 0 outside of them (n,)
-    settled: Tensor  # workspace: new pressure less `scale` times the result of the sweep (n,)
+    settled: Tensor  # workspace: new pressure less `scale` times the result of the sweep (R, n)
     loss: Tensor  # rows on the change of a step, and ground (28, n); none (0, n) without losses
 
 
@@ -268,20 +288,21 @@ class Driven(NamedTuple):
     settled: int  # k
     size: int  # n
     cell: Tensor  # flat index (n,)
-    force: Tensor  # by each of the S signals (S, n)
+    force: Tensor  # by each of the S signals (R, S, n)
 
 
 class ReceiverTable(NamedTuple):
-    """R receivers of w cells each."""
+    """q receivers of w cells each."""
 
-    size: int  # R
+    size: int  # q
     width: int  # w
-    cell: Tensor  # flat index (w, R)
-    weight: Tensor  # (w, R)
-    recorded: Tensor  # record (steps, R)
+    steps: int  # of the record
+    cell: Tensor  # flat index (w, q)
+    weight: Tensor  # (w, q)
+    recorded: Tensor  # record (R, steps, q)
 
 
-def heterogeneous_table(c: Coefficients, device: torch.device) -> Heterogeneous:
+def heterogeneous_table(c: Coefficients, runs: int, device: torch.device) -> Heterogeneous:
     """Return the heterogeneous cells, with the scale of the layers' term in those in layers."""
     index, count = c.heterogeneous_index.to(device), len(c.heterogeneous_index)
     scale = torch.zeros(count, dtype=c.heterogeneous_weight.dtype, device=device)
@@ -290,7 +311,8 @@ def heterogeneous_table(c: Coefficients, device: torch.device) -> Heterogeneous:
     loss = weight.new_zeros((28 if len(c.loss_index) else 0, count))
     place = torch.searchsorted(index, c.loss_index.to(device).contiguous())
     loss[:, place] = torch.cat((c.loss_weight.T, c.loss_ground[None])).to(weight)[: len(loss)]
-    return Heterogeneous(count, index.contiguous(), weight, scale, torch.zeros_like(scale), loss)
+    settled = scale.new_zeros((runs, count))
+    return Heterogeneous(count, index.contiguous(), weight, scale, settled, loss)
 
 
 def column_table(columns: Columns, crossing: Tensor, device: torch.device) -> ColumnTable:
@@ -328,23 +350,24 @@ def driven_table(sources: Sources, settled: Settled, dtype: torch.dtype, device:
     place = torch.searchsorted(settled.cell, index)
     place[~listed] = torch.arange(len(settled.cell), len(cell), device=device)
     of_sources = sources.force.detach().to(device, dtype)
-    force = torch.zeros((of_sources.shape[1], len(cell)), dtype=dtype, device=device)
-    force[:, place] = of_sources.T
+    runs, _, signals = of_sources.shape
+    force = torch.zeros((runs, signals, len(cell)), dtype=dtype, device=device)
+    force[..., place] = of_sources.mT
     return Driven(len(settled.cell), len(cell), cell, force)
 
 
 def receiver_table(
-    receivers: Receivers, steps: int, dtype: torch.dtype, device: torch.device
+    receivers: Receivers, runs: int, steps: int, dtype: torch.dtype, device: torch.device
 ) -> ReceiverTable:
     """Return the receivers, for calls of `steps`."""
     index, weight = receivers.index.to(device).T.contiguous(), receivers.weight.to(device).T.contiguous()
-    recorded = torch.zeros((steps, index.shape[1]), dtype=dtype, device=device)
-    return ReceiverTable(index.shape[1], len(index), index, weight.to(dtype), recorded)
+    recorded = torch.zeros((runs, steps, index.shape[1]), dtype=dtype, device=device)
+    return ReceiverTable(index.shape[1], len(index), steps, index, weight.to(dtype), recorded)
 
 
-def no_terms(shape: Cells, c: Coefficients, device: torch.device) -> Terms:
+def no_terms(shape: Cells, runs: int, c: Coefficients, device: torch.device) -> Terms:
     """Return workspace for the layers' terms."""
     cells, (nx, ny, nz) = c.layer_cells, shape
     columns, crossed = ((cells * len(each.index) + 1,) for each in (c.columns, c.crossed))
     sizes = ((nx, 2 * cells, nz), (nx, ny, 2 * cells), (nx, 2 * cells, 2 * cells), columns, crossed)
-    return Terms(*(torch.zeros(size, dtype=c.layer_decay.dtype, device=device) for size in sizes))
+    return Terms(*(torch.zeros((runs, *size), dtype=c.layer_decay.dtype, device=device) for size in sizes))

@@ -1,4 +1,4 @@
-"""One time step on a GPU, in Triton: three launches, each of programs with different tasks.
+"""One time step of R runs on a GPU, in Triton: three launches, each of programs with different tasks.
 
 `prepare` only reads the pressures. It stretches the layers across y and z and the crossed columns, computes
 the heterogeneous cells, and reads the receivers. `sweep` computes the 27-point sum with all layers, and the
@@ -6,7 +6,8 @@ columns beside it. `settle` corrects the cells that this leaves wrong: heterogen
 cells and those of columns.
 
 The memory of layers and columns is read from one buffer and written to another. No program reads what another
-one of the same launch writes, so their order does not matter.
+one of the same launch writes, so their order does not matter. Programs with the same task for all runs are
+neighbours, as they read the same coefficients.
 """
 
 # The arguments are values of Triton's compiler, which has no types for them.
@@ -17,8 +18,29 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+from autdtorch.fdtd.kernels.contract import Layer
+
 # Places in the tensor of weights; scalars would be passed in single precision
 CENTER, FACE, EDGE, CORNER, KEEP = (tl.constexpr(place) for place in range(5))
+
+
+@triton.jit
+def _task(runs):
+    """Return the task of a program, and its run."""
+    program = tl.program_id(0)
+    return program // runs, tl.cast(program % runs, tl.int64)
+
+
+@triton.jit
+def _field(p, shape, run):
+    """Return the field of a run."""
+    return p + run * (tl.cast(shape.nx, tl.int64) * shape.ny * shape.nz)
+
+
+@triton.jit
+def _layer(layer, across, run, CELLS: tl.constexpr):
+    """Return the memory of a run at the low and the high layer, or at columns, with cells `across` it."""
+    return Layer(layer.psi + run * ((CELLS + 1) * across), layer.zeta + run * (CELLS * across))
 
 
 @triton.jit
@@ -150,7 +172,7 @@ def _stretch_columns(p, columns, old, new, profile, crossed, terms, program, WID
 
 
 @triton.jit
-def _gather_heterogeneous(p, before, shape, weights, heterogeneous, program, LOSSY: tl.constexpr,
+def _gather_heterogeneous(p, before, shape, weights, heterogeneous, program, run, LOSSY: tl.constexpr,
                           LANES: tl.constexpr):  # fmt: skip
     n = program * LANES + tl.arange(0, LANES)
     mask = n < heterogeneous.size
@@ -177,11 +199,12 @@ def _gather_heterogeneous(p, before, shape, weights, heterogeneous, program, LOS
         change -= ground * middle
     scale = tl.load(heterogeneous.scale + n, mask=mask, other=0)
     # The sweep gives `air` and the layers' term; `settle` adds `scale` times that.
-    tl.store(heterogeneous.settled + n, middle + keep * (middle - old) + change - scale * air, mask=mask)
+    settled = heterogeneous.settled + run * heterogeneous.size + n
+    tl.store(settled, middle + keep * (middle - old) + change - scale * air, mask=mask)
 
 
 @triton.jit
-def _read(p, receivers, row, program, LANES: tl.constexpr):
+def _read(p, receivers, row, program, run, LANES: tl.constexpr):
     r = program * LANES + tl.arange(0, LANES)
     mask = (r < receivers.size) & (row >= 0)
     total = tl.zeros([LANES], p.dtype.element_ty)
@@ -189,35 +212,50 @@ def _read(p, receivers, row, program, LANES: tl.constexpr):
         place = node * receivers.size + r
         cell = tl.load(receivers.cell + place, mask=mask, other=0)
         total += tl.load(receivers.weight + place, mask=mask, other=0) * tl.load(p + cell, mask=mask, other=0)
+    row += run * receivers.steps
     tl.store(receivers.recorded + tl.cast(row, tl.int64) * receivers.size + r, total, mask=mask)
 
 
 @triton.jit(do_not_specialize=["offset"])
 def prepare(p, before, shape, weights, profile, old, new, terms, heterogeneous, crossed, receivers, ends,
-            first, offset, LOSSY: tl.constexpr, CROSSED_WIDTH: tl.constexpr, CELLS: tl.constexpr,
+            runs, first, offset, LOSSY: tl.constexpr, CROSSED_WIDTH: tl.constexpr, CELLS: tl.constexpr,
             DEPTHS: tl.constexpr, LANES: tl.constexpr):  # fmt: skip
     """The part of a step that only reads pressures; receivers are read after the step before."""
-    program = tl.program_id(0)
+    program, run = _task(runs)
+    p, ends_of_rows, rows = _field(p, shape, run), 2 * shape.nx * shape.ny, 2 * shape.nx * shape.nz
     if program < ends.z:
-        _stretch_z(p, shape, old.z, new.z, profile, terms.z, program, CELLS, DEPTHS, LANES)
+        old_z, new_z = _layer(old.z, ends_of_rows, run, CELLS), _layer(new.z, ends_of_rows, run, CELLS)
+        term = terms.z + run * (ends_of_rows * CELLS)
+        _stretch_z(p, shape, old_z, new_z, profile, term, program, CELLS, DEPTHS, LANES)
     elif program < ends.y:
-        _stretch_y(p, shape, old.y, new.y, profile, terms.y, program - ends.z, CELLS, DEPTHS, LANES)
+        old_y, new_y = _layer(old.y, rows, run, CELLS), _layer(new.y, rows, run, CELLS)
+        term = terms.y + run * (rows * CELLS)
+        _stretch_y(p, shape, old_y, new_y, profile, term, program - ends.z, CELLS, DEPTHS, LANES)
     elif program < ends.yz:
-        _stretch_yz(p, shape, old.z, old.yz, new.yz, profile, terms.yz, program - ends.y, CELLS, DEPTHS,
+        lanes = 2 * shape.nx * (2 * CELLS)
+        old_yz, new_yz = _layer(old.yz, lanes, run, CELLS), _layer(new.yz, lanes, run, CELLS)
+        old_z, term = _layer(old.z, ends_of_rows, run, CELLS), terms.yz + run * (lanes * CELLS)
+        _stretch_yz(p, shape, old_z, old_yz, new_yz, profile, term, program - ends.y, CELLS, DEPTHS,
                     LANES)  # fmt: skip
     elif program < ends.heterogeneous:
-        _gather_heterogeneous(p, before, shape, weights, heterogeneous, program - ends.yz, LOSSY,
-                              DEPTHS * LANES)  # fmt: skip
+        _gather_heterogeneous(p, _field(before, shape, run), shape, weights, heterogeneous,
+                              program - ends.yz, run, LOSSY, DEPTHS * LANES)  # fmt: skip
     elif program < ends.crossed:
-        _stretch_columns(p, crossed, old.crossed, new.crossed, profile, terms.crossed, terms.crossed,
+        size = crossed.size
+        old_columns, new_columns = (
+            _layer(old.crossed, size, run, CELLS),
+            _layer(new.crossed, size, run, CELLS),
+        )
+        term = terms.crossed + run * (CELLS * size + 1)
+        _stretch_columns(p, crossed, old_columns, new_columns, profile, term, term,
                          program - ends.heterogeneous, CROSSED_WIDTH, False, CELLS, DEPTHS,
                          LANES)  # fmt: skip
     else:
-        _read(p, receivers, tl.load(first) + offset - 1, program - ends.crossed, DEPTHS * LANES)
+        _read(p, receivers, tl.load(first) + offset - 1, program - ends.crossed, run, DEPTHS * LANES)
 
 
 @triton.jit
-def _plane(p, i, shape, tile, weights, terms, CELLS: tl.constexpr):
+def _plane(p, i, shape, tile, weights, terms_y, terms_z, terms_yz, CELLS: tl.constexpr):
     """Return the sums over a plane across x for its cells and for the planes beside it."""
     ny, nz = shape.ny, shape.nz
     column, inside, near_y, near_z, in_y, in_z, place_y, place_z, place_yz = tile
@@ -230,15 +268,15 @@ def _plane(p, i, shape, tile, weights, terms, CELLS: tl.constexpr):
     edges = tl.load(below - 1, mask=inside) + tl.load(below + 1, mask=inside)
     edges += tl.load(above - 1, mask=inside) + tl.load(above + 1, mask=inside)
     if near_z:
-        at = terms.z + i * ny * (2 * CELLS) + place_z
+        at = terms_z + i * ny * (2 * CELLS) + place_z
         faces += tl.load(at, mask=in_z, other=0)
         edges += tl.load(at - 2 * CELLS, mask=in_z, other=0) + tl.load(at + 2 * CELLS, mask=in_z, other=0)
     if near_y:
-        at = terms.y + i * (2 * CELLS) * nz + place_y
+        at = terms_y + i * (2 * CELLS) * nz + place_y
         faces += tl.load(at, mask=in_y, other=0)
         edges += tl.load(at - 1, mask=in_y, other=0) + tl.load(at + 1, mask=in_y, other=0)
     if near_y & near_z:
-        at = terms.yz + i * (2 * CELLS) * (2 * CELLS) + place_yz
+        at = terms_yz + i * (2 * CELLS) * (2 * CELLS) + place_yz
         edges += tl.load(at, mask=in_y & in_z, other=0)
     return center * middle + face * faces + edge * edges, face * middle + edge * faces + corner * edges
 
@@ -261,8 +299,8 @@ def _tile(low_y, low_z, shape, CELLS: tl.constexpr, Y: tl.constexpr, Z: tl.const
 
 
 @triton.jit
-def _march(p, q, shape, weights, profile, old, new, terms, program, CELLS: tl.constexpr, X: tl.constexpr,
-           Y: tl.constexpr, Z: tl.constexpr):  # fmt: skip
+def _march(p, q, shape, weights, profile, old, new, terms_y, terms_z, terms_yz, program,
+           CELLS: tl.constexpr, X: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr):  # fmt: skip
     """Step a tile of y and z through X planes along x; each plane is summed once."""
     nx, ny, nz = shape.nx, shape.ny, shape.nz
     tiles_y, tiles_z = tl.cdiv(ny, Y), tl.cdiv(nz, Z)
@@ -274,12 +312,12 @@ def _march(p, q, shape, weights, profile, old, new, terms, program, CELLS: tl.co
     keep = tl.load(weights + KEEP)
     area = tl.cast(ny, tl.int64) * nz
     first = 1 + program // (tiles_y * tiles_z) * X
-    _, behind = _plane(p, first - 1, shape, tile, sums, terms, CELLS)
-    level, here = _plane(p, first, shape, tile, sums, terms, CELLS)
+    _, behind = _plane(p, first - 1, shape, tile, sums, terms_y, terms_z, terms_yz, CELLS)
+    level, here = _plane(p, first, shape, tile, sums, terms_y, terms_z, terms_yz, CELLS)
     for i in range(first, tl.minimum(first + X, nx - 1)):
         at = q + i * area + column
         before = tl.load(at, mask=inside)
-        level_ahead, ahead = _plane(p, i + 1, shape, tile, sums, terms, CELLS)
+        level_ahead, ahead = _plane(p, i + 1, shape, tile, sums, terms_y, terms_z, terms_yz, CELLS)
         value = level + (behind + ahead) - keep * before
         if i <= CELLS:
             half = (i - 1) * area + column
@@ -294,41 +332,63 @@ def _march(p, q, shape, weights, profile, old, new, terms, program, CELLS: tl.co
 
 
 @triton.jit
-def sweep(p, q, shape, weights, profile, old, new, terms, columns, tiles, COLUMNS_WIDTH: tl.constexpr,
-          CELLS: tl.constexpr, DEPTHS: tl.constexpr, LANES: tl.constexpr, X: tl.constexpr, Y: tl.constexpr,
-          Z: tl.constexpr):  # fmt: skip
+def sweep(p, q, shape, weights, profile, old, new, terms, columns, crossed, tiles, runs,
+          COLUMNS_WIDTH: tl.constexpr, CELLS: tl.constexpr, DEPTHS: tl.constexpr, LANES: tl.constexpr,
+          X: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr):  # fmt: skip
     """The 27-point sum with all layers, in place of the pressures before, and the columns."""
-    program = tl.program_id(0)
+    program, run = _task(runs)
+    p = _field(p, shape, run)
     if program < tiles:
-        _march(p, q, shape, weights, profile, old.x, new.x, terms, program, CELLS, X, Y, Z)
+        area = 2 * shape.ny * shape.nz
+        old_x, new_x = _layer(old.x, area, run, CELLS), _layer(new.x, area, run, CELLS)
+        at_y = terms.y + run * (2 * shape.nx * shape.nz * CELLS)
+        at_z = terms.z + run * (2 * shape.nx * shape.ny * CELLS)
+        at_yz = terms.yz + run * (shape.nx * (2 * CELLS) * (2 * CELLS))
+        _march(p, _field(q, shape, run), shape, weights, profile, old_x, new_x, at_y, at_z, at_yz, program,
+               CELLS, X, Y, Z)  # fmt: skip
     else:
-        _stretch_columns(p, columns, old.columns, new.columns, profile, terms.crossed, terms.columns,
-                         program - tiles, COLUMNS_WIDTH, True, CELLS, DEPTHS, LANES)  # fmt: skip
+        size = columns.size
+        old_columns, new_columns = (
+            _layer(old.columns, size, run, CELLS),
+            _layer(new.columns, size, run, CELLS),
+        )
+        beside, term = (
+            terms.crossed + run * (CELLS * crossed.size + 1),
+            terms.columns + run * (CELLS * size + 1),
+        )
+        _stretch_columns(p, columns, old_columns, new_columns, profile, beside, term, program - tiles,
+                         COLUMNS_WIDTH, True, CELLS, DEPTHS, LANES)  # fmt: skip
 
 
 @triton.jit(do_not_specialize=["offset"])
-def settle(q, heterogeneous, settled, driven, shares, signal, first, offset, SHARES: tl.constexpr,
-           SIGNALS: tl.constexpr, LANES: tl.constexpr):  # fmt: skip
+def settle(q, shape, heterogeneous, settled, driven, terms, columns, signal, runs, first, offset,
+           SHARES: tl.constexpr, SIGNALS: tl.constexpr, CELLS: tl.constexpr,
+           LANES: tl.constexpr):  # fmt: skip
     """Correct the cells that the sweep leaves wrong."""
-    n = tl.program_id(0) * LANES + tl.arange(0, LANES)
+    program, run = _task(runs)
+    n = program * LANES + tl.arange(0, LANES)
     mask, still = n < driven.size, n < driven.settled
-    at = q + tl.load(driven.cell + n, mask=mask, other=0)
+    at = _field(q, shape, run) + tl.load(driven.cell + n, mask=mask, other=0)
     value = tl.load(at, mask=mask, other=0)
     place = tl.load(settled.heterogeneous + n, mask=still, other=-1)
     varies = place >= 0
     scale = tl.load(heterogeneous.scale + place, mask=varies, other=1)
-    value = scale * value + tl.load(heterogeneous.settled + place, mask=varies, other=0)
+    swept = heterogeneous.settled + run * heterogeneous.size
+    value = scale * value + tl.load(swept + place, mask=varies, other=0)
+    shares = terms.columns + run * (CELLS * columns.size + 1)
     for share in tl.static_range(SHARES):
         source = tl.load(settled.share + share * driven.settled + n, mask=still, other=0)
         value += tl.load(shares + source, mask=still, other=0)
     row = SIGNALS * (tl.load(first) + offset)
+    force = driven.force + run * (SIGNALS * driven.size) + n
     for s in tl.static_range(SIGNALS):
-        value += tl.load(signal + row + s) * tl.load(driven.force + s * driven.size + n, mask=mask, other=0)
+        value += tl.load(signal + row + s) * tl.load(force + s * driven.size, mask=mask, other=0)
     hard = tl.load(settled.sound_hard + n, mask=still, other=0) > 0
     tl.store(at, tl.where(hard, 0, value), mask=mask)
 
 
 @triton.jit(do_not_specialize=["row"])
-def read_last(p, receivers, row, LANES: tl.constexpr):
+def read_last(p, shape, receivers, runs, row, LANES: tl.constexpr):
     """Read the receivers after the last step."""
-    _read(p, receivers, row, tl.program_id(0), LANES)
+    program, run = _task(runs)
+    _read(_field(p, shape, run), receivers, row, program, run, LANES)

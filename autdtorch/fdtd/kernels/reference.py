@@ -16,6 +16,8 @@ from autdtorch.fdtd.kernels.contract import (
 )
 from autdtorch.fdtd.stencil import flat_offsets
 
+_X, _Y, _Z = 1, 2, 3  # Axes of fields, after that of the runs
+
 
 def neighbours(field: Tensor, axis: int) -> Tensor:
     """Return the sum of the two neighbours along an axis, two cells shorter along it."""
@@ -34,6 +36,10 @@ class ReferenceKernel:
         """Return 1: this kernel is not meant to be fast."""
         return 1
 
+    def together(self, shape: tuple[int, int, int], receivers: int) -> int:
+        """Return 1, as it holds all states."""
+        return 1
+
     def advance(
         self, state: WaveState, c: Coefficients, sources: Sources, receivers: Receivers, signal: Tensor
     ) -> tuple[WaveState, Tensor]:
@@ -41,45 +47,47 @@ class ReferenceKernel:
         recorded = []
         for row in signal:
             state = self._step(state, c, sources.index, (sources.force * row).sum(-1))
-            recorded.append((state.now.reshape(-1)[receivers.index] * receivers.weight).sum(-1))
-        return state, torch.stack(recorded)
+            recorded.append((state.now.flatten(1)[:, receivers.index] * receivers.weight).sum(-1))
+        return state, torch.stack(recorded, dim=1)
 
     def _step(self, state: WaveState, c: Coefficients, driven: Tensor, force: Tensor) -> WaveState:
+        shape = state.now.shape
         new = torch.nn.functional.pad(_sweep(state.now, c) - c.keep * _core(state.before), (1,) * 6)
-        flat_now, flat_before = state.now.reshape(-1), state.before.reshape(-1)
-        now, before = flat_now[c.heterogeneous_index], flat_before[c.heterogeneous_index]
-        around = c.heterogeneous_index[:, None] + torch.from_numpy(flat_offsets(state.now.shape))
-        change = (c.heterogeneous_weight * (flat_now[around] - now[:, None])).sum(-1)
+        flat_now, flat_before = state.now.flatten(1), state.before.flatten(1)
+        now, before = flat_now[:, c.heterogeneous_index], flat_before[:, c.heterogeneous_index]
+        around = c.heterogeneous_index[:, None] + torch.from_numpy(flat_offsets(shape[1:]))
+        change = (c.heterogeneous_weight * (flat_now[:, around] - now[..., None])).sum(-1)
         value = now + c.keep * (now - before) + change
-        new = new.reshape(-1).index_copy(0, c.heterogeneous_index, value).reshape(state.now.shape)
+        new = new.flatten(1).index_copy(1, c.heterogeneous_index, value).reshape(shape)
         memory, term = _absorb(state.now, state.memory, c)
-        term = term.reshape(-1)
-        term = term.index_copy(0, c.layer_index, c.layer_scale * term[c.layer_index]).reshape(new.shape)
+        term = term.flatten(1)
+        term = term.index_copy(1, c.layer_index, c.layer_scale * term[:, c.layer_index]).reshape(shape)
         nothing = torch.zeros(c.crossed.index.T[1:].shape, dtype=flat_now.dtype, device="cpu")
         crossed, beside = _absorb_columns(flat_now, c.crossed, nothing, state.memory.crossed, c)
-        beside = torch.nn.functional.pad(beside.reshape(-1), (0, 1))[c.crossing.T[1:]]
+        beside = torch.nn.functional.pad(beside.flatten(1), (0, 1))[:, c.crossing.T[1:]]
         columns, shares = _absorb_columns(flat_now, c.columns, beside, state.memory.columns, c)
         inside = c.columns.index.T[1:-1].reshape(-1)
-        new = (new + term).reshape(-1).index_add(0, inside, shares.reshape(-1))
+        new = (new + term).flatten(1).index_add(1, inside, shares.flatten(1))
         if len(c.loss_index):
-            around = c.loss_index[:, None] + torch.from_numpy(flat_offsets(state.now.shape))
-            lost = (c.loss_weight * (flat_now - flat_before)[around]).sum(-1)
-            new = new.index_add(0, c.loss_index, lost - c.loss_ground * flat_now[c.loss_index])
-        new = new.index_add(0, driven, force).index_fill(0, c.sound_hard_index, 0)
+            around = c.loss_index[:, None] + torch.from_numpy(flat_offsets(shape[1:]))
+            lost = (c.loss_weight * (flat_now - flat_before)[:, around]).sum(-1)
+            new = new.index_add(1, c.loss_index, lost - c.loss_ground * flat_now[:, c.loss_index])
+        new = new.index_add(1, driven, force).index_fill(1, c.sound_hard_index, 0)
         memory = memory._replace(columns=columns, crossed=crossed)
-        return WaveState(new.reshape(state.now.shape), state.now, memory)
+        return WaveState(new.reshape(shape), state.now, memory)
 
 
 def _core(field: Tensor) -> Tensor:
-    return field[1:-1, 1:-1, 1:-1]
+    return field[:, 1:-1, 1:-1, 1:-1]
 
 
 def _sweep(p: Tensor, c: Coefficients) -> Tensor:
     """Return line 1 of the contract, without `before`, in all cells inside the ring."""
-    along = [neighbours(p, axis) for axis in range(3)]
-    faces = sum(middle(middle(along[a], b), d) for a, b, d in ((0, 1, 2), (1, 0, 2), (2, 0, 1)))
-    edges = sum(middle(neighbours(along[a], b), d) for a, b, d in ((0, 1, 2), (1, 2, 0), (2, 0, 1)))
-    corners = neighbours(neighbours(along[0], 1), 2)
+    along = {axis: neighbours(p, axis) for axis in (_X, _Y, _Z)}
+    others = (_X, _Y, _Z), (_Y, _X, _Z), (_Z, _X, _Y)
+    faces = sum(middle(middle(along[a], b), d) for a, b, d in others)
+    edges = sum(middle(neighbours(along[a], b), d) for a, b, d in ((_X, _Y, _Z), (_Y, _Z, _X), (_Z, _X, _Y)))
+    corners = neighbours(neighbours(along[_X], _Y), _Z)
     return c.center * _core(p) + c.face * faces + c.edge * edges + c.corner * corners
 
 
@@ -91,7 +99,7 @@ def _around(field: Tensor, axis: int) -> Tensor:
 def _between(field: Tensor, axis: int, before: int, after: int) -> Tensor:
     """Pad a field with `before` and `after` zeros along an axis."""
     width = [0] * 6
-    width[4 - 2 * axis], width[5 - 2 * axis] = before, after
+    width[2 * (_Z - axis)], width[2 * (_Z - axis) + 1] = before, after
     return torch.nn.functional.pad(field, width)
 
 
@@ -109,36 +117,38 @@ def _absorb(p: Tensor, memory: Memory, c: Coefficients) -> tuple[Memory, Tensor]
         rest = size[axis] - cells - 1
         return _between(low, axis, 1, rest) + _between(torch.flip(high, (axis,)), axis, rest, 1)
 
-    z, ends = _stretch(p, z, c, 2)
-    y, sides = _stretch(p, y, c, 1)
-    yz, edges = _stretch(torch.cat(ends, 2), yz, c, 1)
-    e_z, e_y = placed(ends, axis=2), placed(sides, axis=1)
-    e_yz = placed(torch.split(placed(edges, axis=1), cells, dim=2), axis=2)
-    across = smooth(p, 1, 2) + c.edge * (e_y + e_z) + c.corner * (_around(e_y, 2) + _around(e_z, 1) + e_yz)
+    z, ends = _stretch(p, z, c, _Z)
+    y, sides = _stretch(p, y, c, _Y)
+    yz, edges = _stretch(torch.cat(ends, _Z), yz, c, _Y)
+    e_z, e_y = placed(ends, _Z), placed(sides, _Y)
+    e_yz = placed(torch.split(placed(edges, _Y), cells, dim=_Z), _Z)
+    across = (
+        smooth(p, _Y, _Z) + c.edge * (e_y + e_z) + c.corner * (_around(e_y, _Z) + _around(e_z, _Y) + e_yz)
+    )
     # the outermost ring stays zero: nothing is smoothed into it
-    x, faces = _stretch(torch.nn.functional.pad(_core(across), (1,) * 6), x, c, 0)
-    term = placed(faces, axis=0) + smooth(e_y, 0, 2) + smooth(e_z, 0, 1)
-    term = term + c.edge * e_yz + c.corner * _around(e_yz, 0)
+    x, faces = _stretch(torch.nn.functional.pad(_core(across), (1,) * 6), x, c, _X)
+    term = placed(faces, _X) + smooth(e_y, _X, _Z) + smooth(e_z, _X, _Y)
+    term = term + c.edge * e_yz + c.corner * _around(e_yz, _X)
     return memory._replace(x=x, y=y, z=z, yz=yz), torch.nn.functional.pad(_core(term), (1,) * 6)
 
 
 def _absorb_columns(
     flat: Tensor, columns: Columns, beside: Tensor, memory: Layer, c: Coefficients
 ) -> tuple[Layer, Tensor]:
-    """Advance the memory of columns, with summands `beside` (L + 1, m); return it and the terms (L, m)."""
+    """Advance the memory of columns, with summands `beside` (..., L + 1, m); return it and the terms."""
     cells = columns.index.T[1:, :, None] + columns.offset
-    across = torch.nn.functional.pad((columns.weight * flat[cells]).sum(-1) + beside, (0, 0, 1, 0))
-    return _advanced(across, memory, c, 0)
+    across = torch.nn.functional.pad((columns.weight * flat[:, cells]).sum(-1) + beside, (0, 0, 1, 0))
+    return _advanced(across, memory, c, 1)
 
 
 def _stretch(field: Tensor, layer: Layer, c: Coefficients, axis: int) -> tuple[Layer, tuple[Tensor, Tensor]]:
     """Advance the memory of an axis; return it and E_a of the field in the low and the high layer."""
     slabs = (each.narrow(axis, 0, c.layer_cells + 2) for each in (field, torch.flip(field, (axis,))))
-    sides = [
-        _advanced(slab, Layer(psi, zeta), c, axis) for slab, psi, zeta in zip(slabs, *layer, strict=True)
-    ]
+    memories = zip(*(part.unbind(1) for part in layer), strict=True)
+    sides = [_advanced(slab, Layer(*each), c, axis) for slab, each in zip(slabs, memories, strict=True)]
     (low, low_term), (high, high_term) = sides
-    return Layer(*map(torch.stack, zip(low, high, strict=True))), (low_term, high_term)
+    both = (torch.stack(pair, dim=1) for pair in zip(low, high, strict=True))
+    return Layer(*both), (low_term, high_term)
 
 
 def _advanced(across: Tensor, layer: Layer, c: Coefficients, axis: int) -> tuple[Layer, Tensor]:
