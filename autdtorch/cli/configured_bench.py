@@ -80,9 +80,7 @@ class Bench:
             place = {key: self._section.get(key) for key in device.port_keys}
             texts = {key: str(value) for key, value in place.items() if value is not None}
             return hardware.Link(device, device.open_port(texts), self.transducers, settle)
-        from autdtorch.hardware.emulator.bench import BenchPort  # needs pyusb
-
-        port = BenchPort(bench, print) if self.is_dry else device.emulated_port(bench)
+        port = bench.port(print) if self.is_dry else device.emulated_port(bench)
         return hardware.Link(device, port, self.transducers, settle, bench.bus.sleep)
 
     def sensor(self) -> AbstractContextManager[AnySensor]:

@@ -18,7 +18,6 @@ from small_scenes import random_frames
 
 from autdtorch import hardware as hw
 from autdtorch.hardware import streaming
-from autdtorch.hardware.emulator.bench import BenchPort
 from autdtorch.scene.sequence import Sequence
 
 COUNT = 16  # transducers of the bench
@@ -247,7 +246,7 @@ def test_a_port_that_shows_frames_shows_each(trial):
     shown, sequence = [], Sequence(random_frames(40, COUNT), 9000.0, loop=False)
     for device in (hw.AUTD3, hw.OPENMPD):
         bench = trial.bench(device)
-        with hw.Link(device, BenchPort(bench, shown.append), range(COUNT), 0, bench.bus.sleep) as link:
+        with hw.Link(device, bench.port(shown.append), range(COUNT), 0, bench.bus.sleep) as link:
             rate = 8000.0 if device == hw.AUTD3 else 9000.0
             shown.clear()
             link.play_sequence(Sequence(sequence.drives, rate, loop=False))
@@ -382,7 +381,7 @@ MISTAKES = [
 def test_a_mistake_is_refused_in_one_line_and_nothing_plays(trial, device, make, arguments, message):
     kind = hw.OPENMPD if isinstance(device, str) else device
     bench = hw.EmulatedBench(kind, trial.simulated.transfer_matrix, range(COUNT))
-    port = kind.emulated_port(bench) if kind.adapters else BenchPort(bench)
+    port = kind.emulated_port(bench) if kind.adapters else bench.port()
     with hw.Link(kind, port, range(COUNT), 0, bench.bus.sleep) as link:
         if device == CLOSED:
             link.close()

@@ -1,5 +1,6 @@
 """The package: cost of the import, content of a wheel, docstrings with shapes and units."""
 
+import graphlib
 import inspect
 import json
 import re
@@ -11,6 +12,7 @@ import types
 import zipfile
 from pathlib import Path
 
+import grimp
 import pytest
 from build_hook import PythonCheck
 
@@ -52,6 +54,12 @@ def test_imports_are_quick_without_heavy_packages_and_bring_no_warning() -> None
     # It takes some 30 ms; importing torch, which it must not, takes seconds on a loaded machine.
     assert seconds < 2.0
     assert loaded == [[], [], ["matplotlib"]]  # after the import, after all names but plots, after plots
+
+
+def test_no_modules_import_one_another() -> None:
+    graph = grimp.build_graph("autdtorch", cache_dir=None)  # imports in functions and for types count
+    imports = {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+    graphlib.TopologicalSorter(imports).prepare()  # raises `CycleError`, which lists a circle
 
 
 def test_an_older_python_is_told_the_version_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:

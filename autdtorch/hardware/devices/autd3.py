@@ -9,21 +9,18 @@ import threading
 import time
 from collections.abc import Callable, Coroutine, Mapping
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
-from autdtorch.hardware.devices.device import Device, Firmware
+from autdtorch.hardware.devices.device import Device, EmulatedBoards, Firmware
 from autdtorch.hardware.transport.port import HeldSequence, LinkError, Port, closed_on_error
 from autdtorch.scene.arrays import AUTD3_TRANSDUCERS
 from autdtorch.scene.drive import PhaseLevels
 from autdtorch.utils.array_types import COMPLEX, REAL, Bytes
 from autdtorch.utils.hints import with_extra
 from autdtorch.utils.validation import invalid
-
-if TYPE_CHECKING:
-    from autdtorch.hardware.emulator.bench import EmulatedBench
 
 _ANSWER_MS = 100  # wait of the kit for an answer; its default of 10 ms is too short on a busy computer
 _TIMEOUT = 5.0  # of a command [s]; the kit asks boards that do not answer 8 times more before it gives up
@@ -54,7 +51,7 @@ class _Autd3(Device):
                 raise invalid(name, value, f"must be None, as {self.name} is on the network")
         return Autd3Port(self.boards, _network(network) if isinstance(network, str) else network)
 
-    def emulated_port(self, bench: EmulatedBench) -> Port:
+    def emulated_port(self, bench: EmulatedBoards) -> Port:
         return EmulatedAutd3Port(self.boards, bench)
 
     def require_rate(self, rate: float) -> None:
@@ -333,7 +330,7 @@ def autd3_sequence(sequence: HeldSequence, boards: int) -> list[Any]:
 class EmulatedAutd3Port(Autd3Port):
     """The port of AUTD3 boards that the kit emulates on this machine, silently; a bench plays for them."""
 
-    def __init__(self, boards: int, bench: EmulatedBench) -> None:
+    def __init__(self, boards: int, bench: EmulatedBoards) -> None:
         """Start the emulator of `boards` boards, and connect to it."""
         self._emulator = autd3_kit().UdpEmulator(boards)
         self._bench = bench

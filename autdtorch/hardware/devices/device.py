@@ -7,7 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 import torch
@@ -18,9 +18,6 @@ from autdtorch.hardware.transport.usb import find_device
 from autdtorch.scene.drive import PhaseLevels, drive_tensor, validate_drive
 from autdtorch.utils.array_types import COMPLEX, Bytes
 from autdtorch.utils.validation import ArrayLike, integer_at_least, invalid
-
-if TYPE_CHECKING:
-    from autdtorch.hardware.emulator.bench import EmulatedBench
 
 _BITS = 10  # of a byte on a serial line: start, 8, stop
 
@@ -38,6 +35,22 @@ class Firmware(Protocol):
 
     def drive(self) -> torch.Tensor:
         """Return the drive (N,), complex128, that the transducers emit now."""
+
+
+class EmulatedBoards(Protocol):
+    """Emulated boards of a device, as the device sees them; `EmulatedBench` describes them.
+
+    `bus` is a backend of pyusb, and `firmware` that of the first board.
+    """
+
+    bus: Any
+    firmware: Firmware
+
+    def receive(self, frame: bytes) -> None:
+        """Take a frame without USB."""
+
+    def port(self) -> Port:
+        """Return a port without USB."""
 
 
 @dataclass(frozen=True)
@@ -129,13 +142,9 @@ class Device(ABC):
                 ports.append(openers[chip.idVendor, chip.idProduct](chip))
         return ports[0] if len(ports) == 1 else SharedPort(ports)
 
-    def emulated_port(self, bench: EmulatedBench) -> Port:
+    def emulated_port(self, bench: EmulatedBoards) -> Port:
         """Return the port of the emulated device on a bench: its chip's, or one without USB."""
-        if self.adapters:
-            return self.open_port({}, bench.bus)
-        from autdtorch.hardware.emulator.bench import BenchPort  # needs pyusb
-
-        return BenchPort(bench)
+        return self.open_port({}, bench.bus) if self.adapters else bench.port()
 
     @property
     def transducers(self) -> int:

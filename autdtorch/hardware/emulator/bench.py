@@ -318,6 +318,10 @@ class EmulatedBench:
         """The device's USB chip on the bus; of the first of several boards."""
         return self.bus.chips[0]
 
+    def port(self, show: Callable[[str], object] | None = None) -> Port:
+        """Return a port without USB, which shows each frame as text if there is a function to."""
+        return BenchPort(self, show)
+
     def receive(self, frame: bytes) -> None:
         """Have the device take a frame without USB; several chips share it evenly."""
         each = len(frame) // len(self._firmwares)

@@ -37,6 +37,7 @@ from autdtorch.propagators.notices import SteadyStateWarning
 from autdtorch.propagators.plan import Plan, plan
 from autdtorch.propagators.store import BODIES, Store, key_of
 from autdtorch.propagators.tmatrix.bodies import enough_degrees, has_closed_form
+from autdtorch.propagators.tmatrix.body_matrix import BodyMatrix
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.medium import Medium
@@ -53,16 +54,6 @@ logger = logging.getLogger(__name__)
 
 _ENTRY_BYTES = 48.0  # of T and what makes it
 _DIGITS = 10  # Decimals of the places [m] of obstacles in their body, so that poses are the same body
-
-
-class BodyMatrix(NamedTuple):
-    """The attributes of a `TMatrix`."""
-
-    matrix: torch.Tensor
-    wavenumber: complex
-    radius: float
-    center: torch.Tensor
-    axes: torch.Tensor
 
 
 class SimulatedT(NamedTuple):

@@ -15,17 +15,15 @@ import functools
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import torch
 
+from autdtorch.propagators.tmatrix.body_matrix import BodyMatrix
 from autdtorch.propagators.tmatrix.translation import Translation, WaveFrame
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.images import Image
 from autdtorch.utils.process import cached_property, require_memory
-
-if TYPE_CHECKING:
-    from autdtorch.propagators.tmatrix.tmatrix import TMatrix
 
 logger = logging.getLogger(__name__)
 
@@ -68,7 +66,7 @@ Ways = list[list[list[Way]]]
 """Ways: those to body i from the images of body j, by i and j."""
 
 
-def ways_between(bodies: Sequence[TMatrix], images: Sequence[Image], more: int = 0) -> Ways:
+def ways_between(bodies: Sequence[BodyMatrix], images: Sequence[Image], more: int = 0) -> Ways:
     """Return the ways between bodies in one pose, or in B poses; regular waves have so many more degrees."""
     frames = [
         WaveFrame(each.center.reshape(-1, 3), each.axes.reshape(-1, 3, 3), each.degree) for each in bodies

@@ -5,27 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from autdtorch.analytic.discs import MeanWaves, powers_needed
 from autdtorch.analytic.momentum import gradient_by_place, gradient_by_turn
 from autdtorch.analytic.spherical_waves import outgoing_waves
+from autdtorch.propagators.tmatrix.body_matrix import BodyMatrix
 from autdtorch.scene.arrays import TransducerArray, apertures_of, complex_strengths_of, radii_of
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.images import Image, distinct
-from autdtorch.utils.validation import LENGTH_TOLERANCE
-
-if TYPE_CHECKING:
-    from autdtorch.propagators.tmatrix.tmatrix import TMatrix
 
 _ALIKE = 4
 """Discs of one radius and direction from which on their means are `MeanWaves`, and not those over nodes."""
 
 
 def incoming_waves(
-    body: TMatrix, array: TransducerArray, images: Sequence[Image], drive: torch.Tensor
+    body: BodyMatrix, array: TransducerArray, images: Sequence[Image], drive: torch.Tensor
 ) -> torch.Tensor:
     """Return the coefficients (..., N, R) [Pa] of regular waves around a body, under drives (..., R, M).
 
@@ -44,7 +41,7 @@ class _Driven(torch.autograd.Function):
         center: torch.Tensor,
         axes: torch.Tensor,
         drive: torch.Tensor,
-        body: TMatrix,
+        body: BodyMatrix,
         array: TransducerArray,
         images: Sequence[Image],
         degree: int,
@@ -91,13 +88,13 @@ class IncomingWaves:
 
     @classmethod
     def of(
-        cls, body: TMatrix, array: TransducerArray, images: Sequence[Image], degree: int | None = None
+        cls, body: BodyMatrix, array: TransducerArray, images: Sequence[Image], degree: int | None = None
     ) -> IncomingWaves:
         """Return the waves of an array around a body, by default up to its degree.
 
         An array inside its sphere raises.
         """
-        offsets_of(body, "array.positions", array.positions)
+        body.offsets("array.positions", array.positions)
         degree = body.degree if degree is None else degree
         parts = [
             (index, image.weight, _incoming_from(body, degree, array, index, image))
@@ -152,7 +149,7 @@ def _alike(array: TransducerArray) -> list[torch.Tensor]:
 
 
 def _incoming_from(
-    body: TMatrix, degree: int, array: TransducerArray, index: torch.Tensor, image: Image
+    body: BodyMatrix, degree: int, array: TransducerArray, index: torch.Tensor, image: Image
 ) -> MeanWaves | torch.Tensor:
     """Return the waves around a body of images of transducers alike, by unit strengths over 4 pi i k."""
     centers, radius = image.of(array.positions[index]), float(radii_of(array)[index[0]])
@@ -166,19 +163,9 @@ def _incoming_from(
     if not radius:
         return outgoing_waves(degree, body.wavenumber, offsets @ body.axes, conjugate=True)
     nodes = apertures_of(array, abs(body.wavenumber)).chosen(index)
-    offsets_of(body, "array.positions", image.of(nodes.positions.reshape(-1, 3)))
+    body.offsets("array.positions", image.of(nodes.positions.reshape(-1, 3)))
     means = []
     for node in nodes.positions.unbind(dim=1):
         each = (image.of(node) - body.center[..., None, :]) @ body.axes
         means.append(outgoing_waves(degree, body.wavenumber, each, conjugate=True))
     return torch.einsum("q...,q->...", torch.stack(means), nodes.weights.to(torch.complex128))
-
-
-def offsets_of(body: TMatrix, name: str, positions: torch.Tensor) -> torch.Tensor:
-    """Return positions (..., P, 3) in the coordinates of a body, after checking that they are outside."""
-    offsets = positions - body.center[..., None, :]
-    nearest = float(torch.linalg.vector_norm(offsets.detach(), dim=-1).amin())
-    if nearest < body.radius - LENGTH_TOLERANCE:
-        accepted = f"must be at least {body.radius:.4g} m from the centre of the body"
-        raise ValueError(f"{name}: {nearest:.4g} m at the nearest; {accepted}")
-    return offsets @ body.axes

@@ -105,7 +105,7 @@ class TMatrixPropagator(ScenePropagator):
             return self._bodies
         with torch.inference_mode(False):  # later calls may need gradients
             return TMatrixCluster(
-                [TMatrix(*body.matrix(self._store)) for body in placed_bodies(self.plan)],
+                [TMatrix(**vars(body.matrix(self._store))) for body in placed_bodies(self.plan)],
                 self.scene.reflectors,
             )
 

@@ -7,20 +7,16 @@ and outgoing waves W at the points. It is computed from the side with fewer colu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 
 from autdtorch.analytic.spherical_waves import degrees, mirrored, outgoing_waves
+from autdtorch.propagators.tmatrix.body_matrix import BodyMatrix
 from autdtorch.propagators.tmatrix.coupling import Ways, received, solved, ways_between
-from autdtorch.propagators.tmatrix.incoming import IncomingWaves, incoming_waves, offsets_of
+from autdtorch.propagators.tmatrix.incoming import IncomingWaves, incoming_waves
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.images import NO_MIRRORS, Image
-
-if TYPE_CHECKING:
-    from autdtorch.propagators.tmatrix.tmatrix import TMatrix
 
 _AT_ONCE = 200_000
 """Waves at points that are computed at once: 3 MB, which fit into a cache."""
@@ -33,7 +29,7 @@ def parts_of(points: torch.Tensor, waves: int) -> tuple[torch.Tensor, ...]:
 
 
 def scattered_field(
-    bodies: Sequence[TMatrix],
+    bodies: Sequence[BodyMatrix],
     array: TransducerArray,
     points: torch.Tensor,
     images: Sequence[Image],
@@ -61,7 +57,7 @@ def scattered_field(
     )
 
 
-def _weights(bodies: Sequence[TMatrix], waves: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:
+def _weights(bodies: Sequence[BodyMatrix], waves: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:
     """Return the weights (..., P, N) of incoming waves in what waves (..., P, N) bring to points.
 
     By reciprocity they are scattered by bodies with transposed maps, as waves of opposite orders.
@@ -98,7 +94,7 @@ def _in_poses(waves: torch.Tensor, poses: Sequence[int]) -> torch.Tensor:
     return waves.movedim(0, 1).reshape(*poses, len(waves), waves.shape[-1])
 
 
-def joined(bodies: Sequence[TMatrix], images: Sequence[Image]) -> torch.Tensor:
+def joined(bodies: Sequence[BodyMatrix], images: Sequence[Image]) -> torch.Tensor:
     """Return the map (N, N) from the regular waves on all bodies to the outgoing waves of all."""
     maps = [body.matrix for body in bodies]
     sizes = [len(matrix) for matrix in maps]
@@ -107,7 +103,7 @@ def joined(bodies: Sequence[TMatrix], images: Sequence[Image]) -> torch.Tensor:
 
 
 def waves_of_body(
-    bodies: Sequence[TMatrix],
+    bodies: Sequence[BodyMatrix],
     number: int,
     array: TransducerArray,
     images: Sequence[Image],
@@ -120,7 +116,7 @@ def waves_of_body(
     transducer alone. Both have one degree more than T, up to which regular waves exchange momentum with the
     outgoing ones. `together` maps the array's waves on all bodies to both, if it is known; see `joined_on`.
     """
-    raised = [_with_next_degree(body) if index == number else body for index, body in enumerate(bodies)]
+    raised = [body.with_next_degree() if index == number else body for index, body in enumerate(bodies)]
     if drive is None:
         incident = [IncomingWaves.of(body, array, images).matrix for body in raised]
     else:
@@ -142,7 +138,7 @@ def waves_of_body(
 
 
 def joined_on(
-    bodies: Sequence[TMatrix], number: int, every: torch.Tensor
+    bodies: Sequence[BodyMatrix], number: int, every: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the maps (n, N) from the array's waves on all bodies to the regular and outgoing waves of one.
 
@@ -159,18 +155,12 @@ def joined_on(
     return direct if echoes is None else direct + echoes[:, 0], outgoing
 
 
-def _with_next_degree(body: TMatrix) -> TMatrix:
-    """Return a body with a degree more, which it does not scatter."""
-    more = 2 * body.degree + 3
-    return replace(body, matrix=torch.nn.functional.pad(body.matrix, (0, more, 0, more)))
-
-
 def _with_zeros(rows: torch.Tensor, place: int, count: int) -> torch.Tensor:
     """Return rows (N + count, K) with so many of zeros at a place."""
     return torch.cat([rows[:place], rows.new_zeros(count, rows.shape[1]), rows[place:]])
 
 
-def waves_at(bodies: Sequence[TMatrix], points: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:
+def waves_at(bodies: Sequence[BodyMatrix], points: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:
     """Return the outgoing waves (..., P, N) of all bodies and their images at points (..., P, 3) [m].
 
     A mirrored wave at a point is the wave at the mirrored point.
@@ -178,7 +168,7 @@ def waves_at(bodies: Sequence[TMatrix], points: torch.Tensor, images: Sequence[I
     none = torch.zeros((), **COMPLEX)
     parts = []
     for body in bodies:
-        offsets = (offsets_of(body, "points", image.of(points)) for image in images)
+        offsets = (body.offsets("points", image.of(points)) for image in images)
         waves = [
             image.weight * outgoing_waves(body.degree, body.wavenumber, each)
             for image, each in zip(images, offsets, strict=True)
@@ -188,7 +178,10 @@ def waves_at(bodies: Sequence[TMatrix], points: torch.Tensor, images: Sequence[I
 
 
 def scattered_waves(
-    bodies: Sequence[TMatrix], array: TransducerArray, images: Sequence[Image], left_out: Sequence[int] = (0,)
+    bodies: Sequence[BodyMatrix],
+    array: TransducerArray,
+    images: Sequence[Image],
+    left_out: Sequence[int] = (0,),
 ) -> list[torch.Tensor]:
     """Return the coefficients (..., N, M) [Pa] of all bodies' outgoing waves under unit drives of an array.
 
@@ -201,7 +194,7 @@ def scattered_waves(
     return [torch.cat(_scattered(each, ways, incident), dim=-2) for each in maps]
 
 
-def _without_highest(body: TMatrix, fewer: int) -> torch.Tensor:
+def _without_highest(body: BodyMatrix, fewer: int) -> torch.Tensor:
     """Return T (N, N) with 0 in place of its `fewer` highest degrees."""
     low = degrees(body.degree) <= body.degree - fewer
     return torch.where(low[:, None] & low, body.matrix, 0) if fewer else body.matrix

@@ -22,6 +22,7 @@ from autdtorch.fdtd.kernels import available_kernel
 from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.propagators.store import store_in
 from autdtorch.propagators.tmatrix.body import Solver, placed
+from autdtorch.propagators.tmatrix.body_matrix import BodyMatrix
 from autdtorch.propagators.tmatrix.scattering import joined, joined_on, scattered_field
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import composed_rotation
@@ -58,7 +59,7 @@ _ARRAYS = ("matrix", "center", "axes", "radius", "wavenumber")
 
 
 @dataclass(frozen=True, eq=False)
-class TMatrix:
+class TMatrix(BodyMatrix):
     """A body that scatters sound, outside its circumscribed sphere, in any pose.
 
     `TMatrix.of` simulates obstacles that move as one body.
@@ -71,12 +72,6 @@ class TMatrix:
         center: of the sphere (3,) [m], or (..., 3) of many poses.
         axes: of the body in the scene, the columns of a matrix (3, 3), or (..., 3, 3).
     """
-
-    matrix: torch.Tensor
-    wavenumber: complex
-    radius: float
-    center: torch.Tensor
-    axes: torch.Tensor
 
     @classmethod
     def of(
@@ -117,12 +112,7 @@ class TMatrix:
         frequency = positive("frequency", frequency, "Hz")
         spacing, error = positive("spacing", spacing, "m"), number_between("error", error, 1e-8, 0.1)
         solver = Solver(spacing, error, available_kernel(kernel, device))
-        return cls(*placed(bodies, medium, frequency, solver).matrix(store_in(cache)))
-
-    @property
-    def degree(self) -> int:
-        """The largest degree of the waves."""
-        return math.isqrt(len(self.matrix)) - 1
+        return cls(**vars(placed(bodies, medium, frequency, solver).matrix(store_in(cache))))
 
     @property
     def reciprocity(self) -> float:
@@ -162,16 +152,7 @@ class TMatrix:
         beside = f" beside a rotation of {tuple(angles.shape)}" + (f" and poses {before}" if before else "")
         poses = _broadcast("offset", shift, beside, shift.shape[:-1], angles.shape[:-1], before)
         axes = composed_rotation(angles.cos(), angles.sin()) @ self.axes
-        return replace(self, center=self.center + shift, axes=axes)._in_poses(poses)
-
-    def _in_poses(self, poses: Sequence[int]) -> TMatrix:
-        """Return the body with poses of these leading dimensions."""
-        return replace(self, center=self.center.expand(*poses, 3), axes=self.axes.expand(*poses, 3, 3))
-
-    def _some(self, first: int, count: int) -> TMatrix:
-        """Return the body in some of its poses, counted over all leading dimensions."""
-        some = slice(first, first + count)
-        return replace(self, center=self.center.reshape(-1, 3)[some], axes=self.axes.reshape(-1, 3, 3)[some])
+        return replace(self, center=self.center + shift, axes=axes).in_poses(poses)
 
     def transfer_matrix(self, array: TransducerArray, points: ArrayLike) -> torch.Tensor:
         """Return transfer matrices (..., P, M) [Pa]; see `TMatrixCluster.transfer_matrix`.
@@ -217,11 +198,6 @@ def _broadcast(name: str, value: torch.Tensor, beside: str, *shapes: Sequence[in
     except ValueError:
         shape = f"{tuple(value.shape)}{beside}"
         raise ValueError(f"{name}: shape {shape}; leading dimensions must broadcast") from None
-
-
-def _varies(body: TMatrix) -> bool:
-    """Return whether gradients by a body are asked for."""
-    return any(part.requires_grad for part in (body.matrix, body.center, body.axes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,7 +279,7 @@ class TMatrixCluster:
             aside = (turn @ (body.center - pivot)[..., None])[..., 0] - (body.center - pivot)
             bodies.append(replace(alone, center=alone.center + aside))
         cluster = TMatrixCluster(bodies, self.reflectors)
-        is_still = not self.poses and not any(_varies(body) for body in self.bodies)
+        is_still = not self.poses and not any(body.varies for body in self.bodies)
         if self._before is not None or (is_still and not self.reflectors and len(bodies) > 1):
             object.__setattr__(cluster, "_before", self._before or self)
         return cluster
@@ -375,7 +351,7 @@ class TMatrixCluster:
 
         It has so many columns of waves.
         """
-        bodies = [body._in_poses(poses) for body in self.bodies]
+        bodies = [body.in_poses(poses) for body in self.bodies]
         waves = sum(len(body.matrix) for body in bodies)
         is_coupled = self.together is None and (len(bodies) > 1 or self.reflectors)
         count = max(1 + _AT_ONCE // (waves * columns), _FEWEST if is_coupled else 1)
@@ -383,6 +359,6 @@ class TMatrixCluster:
 
         def part(first: int) -> torch.Tensor:
             with torch.set_grad_enabled(gradients):  # which holds in one thread only
-                return work([body._some(first, count) for body in bodies], slice(first, first + count))
+                return work([body.some_poses(first, count) for body in bodies], slice(first, first + count))
 
         return torch.cat(spread(part, range(0, math.prod(poses), count)))

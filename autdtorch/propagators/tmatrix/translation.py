@@ -24,9 +24,6 @@ from autdtorch.analytic.momentum import gradient_by_place, gradient_by_turn
 from autdtorch.analytic.spherical_waves import harmonics, mirrored, turns
 from autdtorch.utils.array_types import REAL
 
-LANES = 8
-"""Poses in a vector of the kernel; see `VECTOR`."""
-
 
 class WaveFrame(NamedTuple):
     """The frame of waves in B poses, and their largest degree."""
@@ -178,6 +175,8 @@ class _Factors(NamedTuple):
 
 def _padded(values: torch.Tensor) -> torch.Tensor:
     """Return values (..., P) of whole vectors of poses, of values (..., B); the last pose is repeated."""
+    from autdtorch.propagators.tmatrix.translation_kernel import LANES  # loads numba
+
     more = -values.shape[-1] % LANES
     return torch.cat([values, values[..., -1:].expand(*values.shape[:-1], more)], dim=-1)
 

@@ -13,7 +13,9 @@ from numba import njit
 
 from autdtorch.fdtd.kernels.compiled import INNER, entry
 from autdtorch.fdtd.kernels.cpu_intrinsics import add_conjugate_products, add_products, set_to_multiples
-from autdtorch.propagators.tmatrix.translation import LANES
+
+LANES = 8
+"""Poses in a vector; see `VECTOR`."""
 
 _LANES, _PAIR = np.uint64(LANES), np.uint64(2 * LANES)
 _ZERO, _ONE, _TWO = np.uint64(0), np.uint64(1), np.uint64(2)
