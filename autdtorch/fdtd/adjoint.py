@@ -43,7 +43,7 @@ def recorded(
     """Step one run from silence, once per row of `signal` (steps, S), and return the record (steps, q).
 
     Differentiable, once, by `sources.force`, `heterogeneous_weight`, `loss_weight` and `loss_ground`;
-    derivatives by rows in the boundary layers are zero. Sources and receivers, as those of `assembly`, must
+    derivatives by rows in the absorbing layers are zero. Sources and receivers, as those of `assembly`, must
     be outside of the layers, where reciprocity does not hold.
     """
     names = "heterogeneous_weight", "loss_weight", "loss_ground"

@@ -24,7 +24,7 @@ _CELL_BYTES, _FIELD_NUMBERS = 3.0, 2.5
 
 _CELL_MEMORY, _ELEMENT_BYTES, _COLUMN_BYTES = 2_000.0, 14_000.0, 18_000.0
 """Memory [bytes] of a heterogeneous cell, of an element while its surface is assembled, and of an element
-that a surface cuts in a boundary layer."""
+that a surface cuts in an absorbing layer."""
 
 _ALIKE, _FORCES = 0.25, 3.0
 """Memory and time of assembling elements along the grid, nearly all of which are alike, and time of those
@@ -37,8 +37,9 @@ _RECORDED = 44
 """Memory [bytes] of a recorded number, and of what is made of it for the Fourier sums."""
 
 _CELL_STEPS, _COLUMN_STEPS, _LOSSY = 15.0, 150.0, 2.0
-"""Time of a step of a heterogeneous cell, and of one that a surface cuts in a boundary layer [steps of a cell
-of air, as in the following times]. Cells of bodies that absorb have two rows: the factor on the former."""
+"""Time of a step of a heterogeneous cell, and of one that a surface cuts in an absorbing layer [steps of a
+cell of air, as in the following times]. Cells of bodies that absorb have two rows: the factor on
+the former."""
 
 _PAIR_STEPS, _ASSEMBLY_STEPS, _MESH_STEPS = 11.0, 60_000.0, 60_000.0
 """Time of one term of a sum over radiating cells, of the assembly of a heterogeneous cell, and of what a mesh
@@ -57,7 +58,7 @@ class Heterogeneity(NamedTuple):
 
     cut: float  # elements that surfaces cut
     cells: float  # heterogeneous cells: beside surfaces, and inside another medium
-    columns: float  # elements that surfaces cut in the boundary layers
+    columns: float  # elements that surfaces cut in the absorbing layers
     meshed: float  # those at meshes
     assembled: float  # those beside surfaces, by the time of assembling them
 

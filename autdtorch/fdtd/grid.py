@@ -1,4 +1,4 @@
-"""The grid: cubic cells over a domain, with a boundary layer around it."""
+"""The grid: cubic cells over a domain, with an absorbing layer around it."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from autdtorch.utils.spatial import parts_of, places_on
 from autdtorch.utils.validation import invalid
 
 MAX_CELLS = 10**9  # Most cells of a grid: more would take over 30 GB in single precision
-# Cells of air between the obstacles and the boundary layer of a box. The first may be heterogeneous, the next
-# two are the Huygens surface, and the last two serve the interpolation of points next to it
+# Cells of air between the obstacles and the absorbing layer of a box. The first may be heterogeneous, the
+# next two are the Huygens surface, and the last two serve the interpolation of points next to it
 # (`scattered_field.py`).
 AROUND = 5
 # Places on the few separate surfaces in a box, as many on each however small, and the share of their pairs
@@ -35,13 +35,13 @@ _PLACES, _REACHED, _FEW = 256, 0.995, 8
 
 @dataclass(frozen=True)
 class Grid:
-    """Cubic cells; from cell (0, 0, 0) inwards a ring of zeros, the boundary layer and the interior."""
+    """Cubic cells; from cell (0, 0, 0) inwards a ring of zeros, the absorbing layer and the interior."""
 
     spacing: float  # edge of a cell [m]
-    interior: tuple[int, int, int]  # cells per axis inside the boundary layer
+    interior: tuple[int, int, int]  # cells per axis inside the absorbing layer
     origin: tuple[float, float, float]  # centre of cell (0, 0, 0) [m]
     kappa: float  # wavenumber in air times spacing [rad]
-    layer_cells: int  # thickness of the boundary layer
+    layer_cells: int  # thickness of the absorbing layer
     path: float  # way of sound before it has arrived everywhere [m]
 
     @property
@@ -104,7 +104,7 @@ class Grid:
         return np.asarray(((places >= np.array(self.first)) & (places < np.array(self.last))).all(axis=-1))
 
     def clip(self, cells: Array) -> Array:
-        """Return positions (..., 3) in cells, moved from the boundary layer to the nearest interior cell."""
+        """Return positions (..., 3) in cells, moved from the absorbing layer to the nearest interior cell."""
         return np.clip(cells, self.first, np.array(self.last) - 1)
 
 
@@ -114,8 +114,8 @@ class Extent:
 
     lower: Sequence[float]  # corner with the smallest coordinates (3,) [m]
     upper: Sequence[float]  # corner with the largest coordinates (3,) [m]
-    margin: int  # cells around that, before the boundary layer begins
-    layer: Thickness  # of the boundary layer
+    margin: int  # cells around that, before the absorbing layer begins
+    layer: Thickness  # of the absorbing layer
     path: float  # way of sound before it has arrived everywhere [m]
 
     def interior(self, spacing: float, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> tuple[int, int, int]:

@@ -35,7 +35,7 @@ USUAL_PERIODS = 1.7
 # The first axis of a grid of at least so many cells whose shortest axis is at most this part of the next: the
 # kernel is 1.3 to 1.8 times as fast where that is the shortest (60 x 60 x 25 to 432 x 432 x 29 cells)
 _LARGE, _FLAT = 20_000, 0.5
-# Time of a step of a cell in a boundary layer, of a run in a box beside its steps, and of a term of a sum
+# Time of a step of a cell in an absorbing layer, of a run in a box beside its steps, and of a term of a sum
 # over Green's function
 _LAYER, _BOX_RUN, _PAIR = 4.0, 2_000_000, 1.0
 # Time of a number of the matrices of waves that mirrors send back: once, and after each block of periods
@@ -70,19 +70,19 @@ class PlannedGrid:
 
     @cached_property
     def interior(self) -> tuple[int, int, int]:
-        """Cells per axis inside the boundary layer."""
+        """Cells per axis inside the absorbing layer."""
         return self.extent.interior(self.spacing)
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Cells per axis, boundary layers included."""
+        """Cells per axis, absorbing layers included."""
         rim = self.extent.layer.cells(self.kappa) + 1
         x, y, z = (length + 2 * rim for length in self.interior)
         return x, y, z
 
     @property
     def cells(self) -> int:
-        """Number of cells, boundary layers included."""
+        """Number of cells, absorbing layers included."""
         return math.prod(self.shape)
 
     @property
@@ -175,7 +175,7 @@ class Grouping:
 
     @property
     def cells(self) -> int:
-        """Cells of all grids, boundary layers included."""
+        """Cells of all grids, absorbing layers included."""
         return sum(grid.cells for grid in self.grids)
 
     @property
@@ -210,7 +210,7 @@ def choose_grids(
     tilted = any(is_tilted(grid.axes) for grid in boxes.grids)
     method, grouping = ("full", domain) if walls or not (outside or tilted or gain > 1) else ("box", boxes)
     logger.debug(
-        "method auto: %s; full would take %.2g times as long as box (walls through the boundary layer: %s,"
+        "method auto: %s; full would take %.2g times as long as box (walls through the absorbing layer: %s,"
         " obstacles that leave the domain: %s, tilted obstacles: %s)", method, gain, walls, outside, tilted,
     )  # fmt: skip
     return method, grouping

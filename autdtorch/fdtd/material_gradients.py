@@ -99,7 +99,7 @@ def cells_of_obstacles(
         lossy |= losses.any(axis=1)
         changed = np.flatnonzero(rows.any(axis=1) | (masses != 0) | losses.any(axis=1))
         if not grid.inside(index[changed]).all():
-            reason = "an obstacle that is differentiated reaches into the boundary layers"
+            reason = "an obstacle that is differentiated reaches into the absorbing layers"
             raise ValueError(f"density, sound_speed: {reason}; must end inside the domain")
         places, shift = torch.from_numpy(changed), value - value.detach()
         weight = weight.index_add(0, places, shift * torch.from_numpy(rows[changed]))

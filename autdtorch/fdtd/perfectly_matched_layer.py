@@ -1,4 +1,4 @@
-"""The perfectly matched layer around a grid, its boundary layer: thickness, and profile at one frequency.
+"""The perfectly matched layer around a grid, its absorbing layer: thickness, and profile at one frequency.
 
 Along its axis a layer replaces the second difference d2 by g d(g d), with
 g = 1 / (1 + sigma / (alpha - i w)). In time this takes two memory variables (CPML of second order: Komatitsch
@@ -46,7 +46,7 @@ _SHIFT = 0.1
 _DIFFERENCE = 1e-7  # Step of the logarithms of the damping, for numerical derivatives
 _BOUNDS = (-14.0, 6.0)  # Range of the logarithms of the damping over w: from none to opaque
 _ROUNDING = 1e-6  # Differences from scaled air below this, relative to a face's weight, are rounding
-# The boundary layers: their axis, and 1 for the one at its upper end
+# The absorbing layers: their axis, and 1 for the one at its upper end
 _LAYERS = tuple(itertools.product(range(3), (0, 1)))
 # Columns of one layer: cells in the ring (m,), step inwards, weights (m, w) and offsets (w,)
 _Part = tuple[Index, int, Array, Index]

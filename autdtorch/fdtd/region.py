@@ -36,7 +36,7 @@ MIN_CELLS_PER_WAVELENGTH = 3.0  # Fewest cells per wavelength; coarser grids are
 # Fewest cells per wavelength without a warning. On coarser grids points would need interpolation over more
 # than 10 cells a side, and the layer reflects more than -61 dB.
 FAIR_CELLS_PER_WAVELENGTH = 4.0
-# Most cells per wavelength. The fit of the boundary layer starts within its bounds up to about 700.
+# Most cells per wavelength. The fit of the absorbing layer starts within its bounds up to about 700.
 MAX_CELLS_PER_WAVELENGTH = 500
 RATIO = 1.5  # Ratio of the spacings of the two grids: the coarser costs a fifth of the finer
 
@@ -72,7 +72,7 @@ class Body:
 
     shape: Shape
     fluid: Fluid | None  # its material, None if it is rigid or has an impedance
-    continued: bool = False  # whether it continues through the boundary layers instead of ending before them
+    continued: bool = False  # whether it continues through the absorbing layers instead of ending before them
     uncertainty: float = 0.0  # distance [m] by which its surface may be off (rms)
     rigid_error: float = 0.0  # relative difference of the field in front of it, of a body taken as rigid
     # impedance of its surface, locally reacting, as a ratio to air (density times sound speed); None if rigid

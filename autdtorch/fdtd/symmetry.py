@@ -2,7 +2,7 @@
 
 A symmetry maps heterogeneous cells onto cells with equal stencil rows, and transducers onto transducers. It
 is one of the 48 signed permutations of the axes about the grid's centre. Stencil rows contain all effects of
-obstacles, their order, the domain and the boundary layers, so only rows are compared. For any symmetry S the
+obstacles, their order, the domain and the absorbing layers, so only rows are compared. For any symmetry S the
 transfer matrix satisfies G[p, m] = G[S p, S m].
 """
 

@@ -76,7 +76,7 @@ def differentiable_field(
     Raises:
         ValueError: an argument has another shape or is out of range, or maps are given in a scene with
             obstacles or reflectors. A reflector is neither rigid nor soft, or not along an axis. A
-            differentiated obstacle reaches into the boundary layers.
+            differentiated obstacle reaches into the absorbing layers.
     """
     require_kind("scene", scene, Scene)
     kernel, precision = available_kernel(kernel, device), precision_of(dtype)

@@ -40,7 +40,7 @@ class Estimate:
     Attributes:
         method: "free_space", "box", "full" or "tmatrix".
         spacing: edge of a cell [m]; None where nothing is simulated.
-        cells: cells of all grids, boundary layers included.
+        cells: cells of all grids, absorbing layers included.
         runs: number of simulations, with symmetries.
         memory: most memory in use at a time, without what is in use already [bytes].
         seconds: time on this machine, as busy as it is now [s].

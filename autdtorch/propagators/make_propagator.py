@@ -81,7 +81,7 @@ def make_propagator(
             box turns with tilted flat faces. "tmatrix": T-matrices of the obstacles, each
             simulated once for all poses, arrays and points, and known for spheres; see
             `TMatrix`. "auto": free space without obstacles; full where a wall continues through
-            the boundary layer; tmatrix where it takes fewer simulations (up to three spheres take none); box
+            the absorbing layer; tmatrix where it takes fewer simulations (up to three spheres take none); box
             where other obstacles leave the domain or are tilted; otherwise the cheaper of box and full. The
             propagator's `method` is the one chosen; the reason is logged at level DEBUG.
         spacing: edge of a cell [m], at most a third of the wavelength. The error falls with its square, or

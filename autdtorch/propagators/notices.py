@@ -96,12 +96,12 @@ def warn_of_scene(plan: Plan) -> None:
 
 
 def warn_of_ending_walls(scene: Scene) -> None:
-    """Log which walls end before the boundary layers because an earlier wall has another direction."""
+    """Log which walls end before the absorbing layers because an earlier wall has another direction."""
     walls = enumerate(walls_of(scene))
     if ending := [str(index) for index, (wall, continued) in walls if wall and not continued]:
         logger.warning(
             "obstacle %s crosses the domain in another direction than a wall before: it ends where the"
-            " boundary layer begins, and its end reflects", ", ".join(ending),
+            " absorbing layer begins, and its end reflects", ", ".join(ending),
         )  # fmt: skip
 
 

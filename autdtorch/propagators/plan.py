@@ -140,7 +140,7 @@ class Plan:
 
     @property
     def cells(self) -> int:
-        """Cells of all grids, boundary layers included."""
+        """Cells of all grids, absorbing layers included."""
         return self.grouping.cells
 
     @property
@@ -232,7 +232,7 @@ def plan(
 
 
 def region_of(scene: Scene) -> Region:
-    """Return the region of a scene; parallel walls across it continue through the boundary layers."""
+    """Return the region of a scene; parallel walls across it continue through the absorbing layers."""
     bodies = []
     for number, (obstacle, (_, continued)) in enumerate(zip(scene.obstacles, walls_of(scene), strict=True)):
         material = obstacle.fluid_at(scene.frequency)
@@ -293,7 +293,7 @@ def difference_from_rigid(body: Body, region: Region) -> float:
 
 
 def walls_of(scene: Scene) -> list[tuple[bool, bool]]:
-    """Return whether each obstacle is a wall, and whether it continues through the boundary layers.
+    """Return whether each obstacle is a wall, and whether it continues through the absorbing layers.
 
     A wall or slab is aligned with the axes, and crosses the domain on two axes at least. Those parallel to
     the first one continue. Other shapes were measured to be unstable in the layers, and so were edges where

@@ -1,6 +1,6 @@
 """Memory and time of gradients, beside a simulation without.
 
-The paper's two cubes at 1 mm, 100^3 cells and their boundary layers, in 1008 steps; gradients by the drive,
+The paper's two cubes at 1 mm, 100^3 cells and their absorbing layers, in 1008 steps; gradients by the drive,
 also by the materials of the cubes, and also by density and sound speed of every cell. Each case has a new
 process, which compiles the kernel first. Takes 5 minutes on 2 idle cores.
 """

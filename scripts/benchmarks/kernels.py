@@ -72,7 +72,7 @@ def bandwidth(numbers: int, seconds: float) -> float:
 
 
 def uniform(assembly: Assembly) -> Coefficients:
-    """Return the coefficients of air without boundary layers."""
+    """Return the coefficients of air without absorbing layers."""
     c, nothing = assembly.coefficients, torch.zeros(0, dtype=torch.int64)
     dtype = assembly.dtype
     none, silent = torch.zeros(0, dtype=dtype), torch.zeros(1, dtype=dtype)

@@ -42,7 +42,7 @@ def scene_grid(scene: at.Scene, spacing: float, offset: float, layer_cells: int,
         scene: with one focus, and obstacles with the sound speed of air.
         spacing: edge of a cell [m].
         offset: of the cell centres from the focus along each axis [cells].
-        layer_cells: of the boundary layer that the peer adds.
+        layer_cells: of the absorbing layer that the peer adds.
         smooth: whether grid and layer get sides without prime factors over 5, for FFTs.
     """
     focus = scene.control_points[0].numpy()

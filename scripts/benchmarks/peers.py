@@ -105,7 +105,7 @@ class Setting:
     order: int  # of the differences in space; 0 for spectral
     offset: float
     steps: tuple[int, int]  # time steps per period, in air and with obstacles
-    layer_cells: int  # of its boundary layer
+    layer_cells: int  # of its absorbing layer
     periods: int  # after which a run with obstacles ends
     cases: tuple[str, ...] = tuple(CASES)
 

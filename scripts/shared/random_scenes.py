@@ -31,7 +31,7 @@ STEPS, LONG_STEPS = 2_000, 100_000
 LONG_SHARE = 0.01
 """Share of the scenes with `LONG_STEPS`; these are the smallest, 6 cells across."""
 INSIDE_SHARE = 0.75
-"""Share of the scenes without obstacles in the boundary layer."""
+"""Share of the scenes without obstacles in the absorbing layer."""
 KINDS = {
     **{"box": 0.15, "rotated box": 0.1, "sphere": 0.1, "cylinder": 0.1, "plate": 0.15, "needle": 0.1},
     **{"shell": 0.05, "voxels": 0.05, "mesh": 0.05, "wall": 0.15},
@@ -59,7 +59,7 @@ class Trial:
     dtype: torch.dtype
     steps: int  # of each run, at least; the driven run takes `FEWEST_PERIODS` if these are more
     labels: tuple[str, ...]
-    inside: bool  # whether all obstacles are inside the domain; else some may reach into the boundary layer
+    inside: bool  # whether all obstacles are inside the domain; else some may reach into the absorbing layer
     refused: int  # scenes drawn before it that are refused
 
     def __str__(self) -> str:

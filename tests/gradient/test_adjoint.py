@@ -27,7 +27,7 @@ from autdtorch.scene.obstacles import Box, Sphere
 HEAVY = Sphere((4.7e-3, 4.2e-3, 4.6e-3), 1.7e-3, density=20.0, sound_speed=300.0)
 RIGID = Box((3.2e-3, 7e-3, 7e-3), (3e-3, 2.3e-3, 2.3e-3), rigid=True)
 WALL = Box((4e-3, 4e-3, 7.4e-3), (40e-3, 40e-3, 1e-3), density=5.0, sound_speed=340.0)
-"""Continues through the boundary layers of x and y."""
+"""Continues through the absorbing layers of x and y."""
 
 STEPS = 24
 

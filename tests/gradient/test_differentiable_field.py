@@ -167,7 +167,7 @@ def test_bad_input_is_refused(call, message):
 def test_obstacles_in_the_layers_are_not_differentiated():
     scene = small_scene((SPHERE, WALL), extent=12e-3)
     density, _ = materials(SPHERE, WALL)
-    with pytest.raises(ValueError, match="reaches into the boundary layers"):
+    with pytest.raises(ValueError, match="reaches into the absorbing layers"):
         at.differentiable_field(scene, DRIVE, density=density, **EXACT)
 
 

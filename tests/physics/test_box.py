@@ -243,7 +243,7 @@ def test_reciprocity_between_boxes():
     forward = propagator.transfer_matrix(torch.cat((points, points + 0.2e-3)))[:1]
     assert len(propagator.runs) == 1 + 2
     # Scheme and Green's function are symmetric. What drives a box and what it radiates are so up to the
-    # grid's error in air, over a box, and what its boundary layer reflects: 2.6e-4 here.
+    # grid's error in air, over a box, and what its absorbing layer reflects: 2.6e-4 here.
     assert relative_error(backward, forward) < 6e-4
 
 
@@ -274,7 +274,7 @@ def test_obstacles_share_a_box_where_that_is_cheaper():
     grouping = cheapest(scene, 1e-3)
     assert sorted(grid.group for grid in grouping.grids) == [(0, 2), (1,)]
     assert grouping.box_cost(1) < one_box(region_of(scene), 1e-3).box_cost(1)
-    # on coarse cells boundary layers fill each box: one is cheaper
+    # on coarse cells absorbing layers fill each box: one is cheaper
     assert len(cheapest(scene, 2.8e-3).grids) == 1
     # Steps alone would favour two boxes, 0.8 to 1; the sums between them take as long once more.
     assert [len(cheapest(cubes(36e-3, gap), 2e-3).grids) for gap in (180e-3, 360e-3)] == [1, 2]

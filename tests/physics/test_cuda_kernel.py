@@ -35,7 +35,7 @@ SIZE = 9e-3
 HEAVY = Box((3.4e-3, 4.5e-3, 4.5e-3), (1.8e-3, 4e-3, 3e-3), density=100.0, sound_speed=340.0)
 RIGID = Box((3.4e-3, 4.5e-3, 4.5e-3), (2.2e-3, 5e-3, 4e-3), rigid=True)
 WALL = Box((4.5e-3, 4.5e-3, 7.3e-3), (30e-3, 30e-3, 1.2e-3), density=5.0, sound_speed=300.0)
-"""Continues through the boundary layers of x and y."""
+"""Continues through the absorbing layers of x and y."""
 
 WHOLE = BlockSizes(x=32, y=32, z=32, lanes=1024)
 """One program a task: interpreted, a program takes the same time however large it is."""

@@ -29,7 +29,7 @@ FAST = Box(center=(14e-3, 20e-3, 14e-3), size=(6e-3, 5e-3, 5e-3), density=3.0, s
 
 
 PLATE = Box((12e-3, 12e-3, 21.7e-3), (30e-3, 40e-3, 1.7e-3), density=5.0, sound_speed=300.0)
-"""Runs through the boundary layers of x and y."""
+"""Runs through the absorbing layers of x and y."""
 
 
 @functools.cache  # no kernel changes them

@@ -318,7 +318,7 @@ def test_areas_of_surfaces_are_true(shape, area, tolerance, spacing):
     assert total == pytest.approx(area, rel=tolerance)
 
 
-def test_a_lossy_plate_continues_through_the_boundary_layers():
+def test_a_lossy_plate_continues_through_the_absorbing_layers():
     """The field behind it equals an infinite slab's."""
     plate = Box((14e-3, 12e-3, 12e-3), (3e-3, 90e-3, 90e-3), density=3.0, sound_speed=300.0, absorption=300.0)
     scene = small_scene((plate,))

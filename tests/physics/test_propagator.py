@@ -41,7 +41,7 @@ def random_drive(rows, transducers, seed=0):
 
 
 # required of the paper's scene: 0.5 % at 1 mm, 2 % at 2 mm; this small one has its points closer to the
-# boundary layers. At 2.8 mm, 3 cells per wavelength, the layers send back up to 1.6 % each (-36 dB).
+# absorbing layers. At 2.8 mm, 3 cells per wavelength, the layers send back up to 1.6 % each (-36 dB).
 @pytest.mark.parametrize(("spacing", "tolerance"), [(7e-4, 1e-3), (1e-3, 2e-3), (2e-3, 1e-2), (2.8e-3, 4e-2)])
 def test_free_space_is_exact_to_the_grid(spacing, tolerance):
     scene = small_scene()

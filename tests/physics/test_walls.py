@@ -1,4 +1,4 @@
-"""Walls: through the boundary layers, thinner than a cell, and hard ones, which are simulated as rigid."""
+"""Walls: through the absorbing layers, thinner than a cell, and hard ones, which are simulated as rigid."""
 
 import math
 

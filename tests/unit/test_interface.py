@@ -219,7 +219,7 @@ def test_a_face_through_vertices_is_corrected_from_either_side(side):
 
 @given(st.integers(0, 2), st.floats(-0.5, 0.5), CONTRASTS, st.booleans())
 def test_a_face_along_the_grid_has_a_positive_energy_in_every_direction(axis, offset, contrast, behind):
-    """Otherwise boundary layers that it enters give energy.
+    """Otherwise absorbing layers that it enters give energy.
 
     Two elements in a row represent the rest of each material; along the face there is a wave of the grid.
     """

@@ -1,11 +1,11 @@
-"""The discrete scheme: stencil and boundary layer, the place of the grid, and points between its cells."""
+"""The discrete scheme: stencil and absorbing layer, the place of the grid, and points between its cells."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
-from checks.boundary import measured_reflection
+from checks.absorbing_layer import measured_reflection
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import AIR

@@ -119,8 +119,8 @@ def layered_elements(
 
     Layers have widths (n, L) [cells] and materials (n, L), and these densities (m,). The energy has a part g
     (p1 - p0)^T W (p1 - p0) of the pressures p0 and p1 in the planes, where W averages along a plane in air.
-    Each plane adds its energy in air times a mobility. All parts are positive: waves would grow in a boundary
-    layer otherwise.
+    Each plane adds its energy in air times a mobility. All parts are positive: waves would otherwise
+    grow in an absorbing layer.
     """
     wavenumber = stencil.kappa * materials.slowness[layer]
     ports = two_port(width, density[layer], wavenumber, stencil.kappa)

@@ -52,7 +52,7 @@ class Union:
 
     shapes: tuple[Shape, ...]
     material: int
-    continued: bool  # whether they continue through the boundary layers, unchanged from the interior
+    continued: bool  # whether they continue through the absorbing layers, unchanged from the interior
     # whether blocks represent it: its faces are flat and parallel to the grid, or it is slender
     aligned: bool
     rigid: bool
@@ -145,7 +145,7 @@ def _impedance(body: Body, grid: Grid) -> complex | None:
 
 
 def _require_continuable(number: int, body: Body) -> None:
-    """Refuse bodies through the boundary layers that these do not absorb waves in.
+    """Refuse bodies through the absorbing layers that these do not absorb waves in.
 
     Layers stretch the coupling of cells, and not the damping of it by a complex density. Along a surface with
     an impedance waves grow in them.

@@ -1,7 +1,7 @@
 """Operations that Numba lacks: on several numbers at a time, and on counters of several threads.
 
 Numba vectorises neither the rows around heterogeneous cells, which are scattered and whose sums keep an
-order, nor the short ends of rows with the cells of boundary layers.
+order, nor the short ends of rows with the cells of absorbing layers.
 """
 
 from __future__ import annotations

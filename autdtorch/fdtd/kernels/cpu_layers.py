@@ -1,4 +1,4 @@
-"""The boundary layers of a chunk of planes on one core.
+"""The absorbing layers of a chunk of planes on one core.
 
 The layers stretch the sums of neighbours along an axis: T_y p becomes T_y p + E_y p, and T_y T_z p becomes
 (T_y + E_y)(T_z + E_z) p. A plane's memory across y is stored as L + 2 rows from the ring inwards, then as

@@ -7,9 +7,9 @@ pressure gives two planes, A and B, and the new pressure is
     new_i = B_i + A_(i-1) + A_(i+1) - keep before_i.
 
 The last A is added when plane i + 2 reads it. Large planes are cut in strips of rows, each of which is swept
-through all planes, so that the cache holds A and what plane i + 2 completes. The boundary layers across y and
-z stretch T_y and T_z: `cpu_layers.py` adds the resulting terms to A and B, and the terms of the layers across
-x to new_i.
+through all planes, so that the cache holds A and what plane i + 2 completes. The absorbing layers across y
+and z stretch T_y and T_z: `cpu_layers.py` adds the resulting terms to A and B, and the terms of the layers
+across x to new_i.
 
 Cells inside rigid bodies are skipped. A is anything there: it counts in cells of the planes beside that are
 inside or at the surface, whose pressure nobody reads or is set to zero.

@@ -1,4 +1,4 @@
-"""j-Wave: k-space pseudospectral, in JAX; the boundary layer is part of the grid."""
+"""j-Wave: k-space pseudospectral, in JAX; the absorbing layer is part of the grid."""
 
 from __future__ import annotations
 

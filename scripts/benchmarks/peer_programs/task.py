@@ -1,6 +1,6 @@
 """Tasks and answers of peers as files, for programs in other environments; needs NumPy only.
 
-A peer runs as `python <name>_peer.py task.npz answer.npz`. Grids exclude the boundary layers of the peer.
+A peer runs as `python <name>_peer.py task.npz answer.npz`. Grids exclude the absorbing layers of the peer.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Task(Stored):
     source_weights: Array  # share of the source in each cell (S,)
     receiver_cells: Cells  # recorded cells (R, 3)
     ends: Cells  # periods (E,), ascending, at which phasors are returned; the last ends the run
-    layer_cells: int  # thickness of the boundary layer
+    layer_cells: int  # thickness of the absorbing layer
     order: int  # of the differences in space; 0 for spectral
 
     @property

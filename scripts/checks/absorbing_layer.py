@@ -1,4 +1,4 @@
-"""Reflection of the boundary layer, measured against a larger domain.
+"""Reflection of the absorbing layer, measured against a larger domain.
 
 Prints a Markdown table. A source and receivers lie in a row, all at one distance from a layer. A second run
 has that layer so far away that its echo does not return in time; the difference of the two is the echo. It is
