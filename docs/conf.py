@@ -17,7 +17,7 @@ version = release = autdtorch.__version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 nitpicky = True
 nitpick_ignore_regex = [  # not described here
-    ("py:class", r"(?!autdtorch\.).*|autdtorch\.(utils\.images|methods\.calibration\.(fit|simulation))\..*")
+    ("py:class", r"(?!autdtorch\.).*|autdtorch\.(utils\.images|methods\.calibration\.fit)\..*")
 ]
 default_role = "py:obj"
 

@@ -18,7 +18,7 @@ import torch
 
 from autdtorch.io.scene_file import load_scene, save_scene
 from autdtorch.methods.calibration.calibration import Calibration, HeldBack
-from autdtorch.methods.calibration.fit import CalibrationFit, Changes, LinearChanges, Simulation
+from autdtorch.methods.calibration.fit import CalibrationFit, CalibrationStart, Changes, LinearChanges
 from autdtorch.methods.doubtful_readings import Magnitudes
 from autdtorch.methods.matrix_posterior import MatrixPosterior, MatrixPrior
 from autdtorch.methods.prior import Prior
@@ -117,7 +117,7 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
         scene = _scene_of(files) if files else None
         propagator = None if scene is None else make_propagator(scene, **header["propagator"])
-        simulation = Simulation(
+        simulation = CalibrationStart(
             propagator, _changes(propagator, header, tensors), tensors["widths"], tensors.get("points")
         )
         readings = Readings(**_group("readings", tensors))

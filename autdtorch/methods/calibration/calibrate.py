@@ -15,7 +15,7 @@ from autdtorch.methods.calibration.calibration import (
     gain_to,
     relative_error,
 )
-from autdtorch.methods.calibration.fit import CalibrationFit, LinearChanges, Simulation, fitted
+from autdtorch.methods.calibration.fit import CalibrationFit, CalibrationStart, LinearChanges, fitted
 from autdtorch.methods.doubtful_readings import saturation_doubts
 from autdtorch.methods.prior import Prior, prior_of
 from autdtorch.objectives.readings import Readings
@@ -72,7 +72,7 @@ def calibrate(
         raise invalid("readings", readings, "must have at least one reading above 0 Pa")
     if folds == 1 or folds > readings.count:
         raise invalid("folds", folds, f"must be 0, or 2 to {readings.count}, the number of readings")
-    simulation = Simulation.of(propagator_or_matrix, readings, prior)
+    simulation = CalibrationStart.of(propagator_or_matrix, readings, prior)
     start = simulation.changes.matrix(torch.zeros_like(simulation.widths)).to("cpu", torch.complex128)
     expected = (readings.drives @ start.T).abs()
     if not (expected > 0).any():
@@ -192,7 +192,7 @@ def _sensor_doubts(failed: torch.Tensor, expected: torch.Tensor, observed: torch
 
 
 def _fit_without_failed(
-    simulation: Simulation, readings: Readings, prior: Prior, expected: torch.Tensor
+    simulation: CalibrationStart, readings: Readings, prior: Prior, expected: torch.Tensor
 ) -> tuple[CalibrationFit, torch.Tensor]:
     """Return the fit, and the points (P,), bool, that neither simulation nor other readings explain."""
     observed = readings.pressure

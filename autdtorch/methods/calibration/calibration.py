@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import torch
 
-from autdtorch.methods.calibration.fit import CalibrationFit, Simulation, prior_around
+from autdtorch.methods.calibration.fit import CalibrationFit, CalibrationStart, prior_around
 from autdtorch.methods.doubtful_readings import Magnitudes
 from autdtorch.methods.prior import Prior
 from autdtorch.objectives.objective import validate_drives
@@ -96,7 +96,7 @@ class Calibration:
         doubts: sentences about sensors and readings that do not fit.
     """
 
-    simulation: Simulation
+    simulation: CalibrationStart
     simulated: torch.Tensor
     readings: Readings
     settings: Prior

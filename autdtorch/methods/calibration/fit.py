@@ -95,7 +95,7 @@ class CalibrationFit:
         }
 
 
-def fitted(simulation: Simulation, readings: Readings, prior: Prior) -> CalibrationFit:
+def fitted(simulation: CalibrationStart, readings: Readings, prior: Prior) -> CalibrationFit:
     """Fit a simulation to readings.
 
     The matrix is linearised by the amounts of changes, fitted, and linearised again at the fitted amounts
@@ -147,7 +147,7 @@ def _first(prior: MatrixPrior, readings: Readings, unit: float) -> CalibrationFi
 
 
 def _moved(
-    simulation: Simulation,
+    simulation: CalibrationStart,
     prior: Prior,
     before: CalibrationFit,
     fit: CalibrationFit,
@@ -230,8 +230,8 @@ class Tangent(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Simulation:
-    """The simulation that a calibration starts from.
+class CalibrationStart:
+    """The simulation that a calibration starts from, before its fit.
 
     Attributes:
         propagator: of the scene; None where a transfer matrix alone is known.
@@ -246,7 +246,7 @@ class Simulation:
     points: torch.Tensor | None
 
     @classmethod
-    def of(cls, model: Propagator | ArrayLike, readings: Readings, prior: Prior) -> Simulation:
+    def of(cls, model: Propagator | ArrayLike, readings: Readings, prior: Prior) -> CalibrationStart:
         """Check a propagator, or a transfer matrix (P, M) [Pa], against the readings and the prior."""
         if prior.transfer_matrix is not None:
             accepted = "must be None: calibrate takes the matrix as its first argument"
