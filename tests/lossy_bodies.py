@@ -39,9 +39,10 @@ class BoxRun:
         self.transform = box.near_to_far(Apertures.of_points(torch.from_numpy(sphere(0.03))))
         self.cells = np.unique(np.concatenate((self.transform.cells, extra(assembly))))
         place = torch.from_numpy(np.searchsorted(self.cells, self.transform.cells))
-        state = run_to_steady_state(
-            assembly, CpuKernel(), box.sources(force), self.cells, 1e-5, 200,
-            lambda phasors: [self.transform.field(phasors[place, None])], lambda periods: None,
+        (state,) = run_to_steady_state(
+            assembly, CpuKernel(), lambda runs: box.sources(force[:, None]), self.cells, [1e-5], 200,
+            lambda phasors, runs: [self.transform.field(phasors[place])], lambda periods: None,
+            torch.zeros((1, 1), dtype=torch.float64),
         )  # fmt: skip
         self.phasors = state.pressure
         self.amplitudes = self.transform.amplitudes(self.phasors[place, None])

@@ -84,8 +84,8 @@ class ScatteredField:
         return torch.from_numpy(force)
 
     def sources(self, force: Tensor) -> Sources:
-        """Return complex forces (h,) at the heterogeneous cells of one run as kernels take them."""
-        both = torch.view_as_real(force)[None].to(self.assembly.dtype)
+        """Return complex forces (h, R) at the heterogeneous cells of R runs as kernels take them."""
+        both = torch.view_as_real(force.mT).to(self.assembly.dtype)
         return Sources(torch.from_numpy(self.assembly.heterogeneous.index), both)
 
     def waves(

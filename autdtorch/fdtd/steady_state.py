@@ -1,4 +1,4 @@
-"""The steady state of a run, extrapolated from the phasors of its blocks.
+"""The steady states of runs, extrapolated from the phasors of their blocks.
 
 A block is the fewest periods, at least three, with a whole number of steps. Phasors of windows of that
 length, a quarter of a block apart, follow x_(n+1) = A x_n + b, as the scheme is linear. Reduced rank
@@ -11,23 +11,24 @@ from __future__ import annotations
 import itertools
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
 from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_basis, drive_signal, fourier_sum
-from autdtorch.utils.array_types import COMPLEX, Index
+from autdtorch.utils.array_types import Index
+from autdtorch.utils.process import even_parts, spread
 
-Phasors = NDArray[np.complex128]
-Echo = Callable[[Tensor], Sources]
-"""The sources of a run whose cells have phasors (k,): a linear map, and a constant."""
+Observe = Callable[[Tensor, Index], Sequence[Tensor]]
+"""Observe: maps phasors (k, r) of r runs, and the numbers (r,) of these, to quantities (n, r)."""
+Echo = Callable[[Tensor, Index], Sources]
+"""The sources of r runs, by their numbers (r,), whose cells have phasors (k, r): linear, and a constant."""
 MOST_JUDGED = 32
 """Receivers of a kind whose pressure decides when a run has converged."""
 
@@ -38,6 +39,8 @@ _PARTS = 4  # Windows per block
 _FEWEST_PHASORS, _MOST_PHASORS = 12, 64
 _MOST_NUMBERS = 20_000_000  # Most complex numbers of the stored phasors: 160 MB of single precision
 _MOST_FITTED = 2048  # Most cells whose phasors decide the means
+# Numbers of stored phasors that are summed at once: as many as the CPU's cache holds, and for a GPU more
+_SUMMED, _SUMMED_ON_GPU = 2**16, 2**24
 _ROUNDING = 1e-13  # Regularisation of the normal equations, relative to the mean square of the differences
 # Pressure relative to that in free space, -80 dB, below which errors are relative to this floor: behind a
 # wall or in an enclosure nothing arrives
@@ -51,7 +54,7 @@ _FALLING = 0.1
 
 @dataclass(frozen=True)
 class SteadyState:
-    """Phasors of cells with their estimated residual."""
+    """Phasors of cells in a run, with their estimated residual."""
 
     pressure: Tensor  # phasors (k,), complex
     periods: int  # periods stepped
@@ -62,45 +65,72 @@ class SteadyState:
 def run_to_steady_state(
     assembly: Assembly,
     kernel: Kernel,
-    sources: Sources,
+    drive: Callable[[Index], Sources],
     cells: Index,
-    tolerance: float,
+    tolerances: Sequence[float],
     max_periods: int,
-    observe: Callable[[Tensor], Sequence[Tensor]],
+    observe: Observe,
     stepped: Callable[[int], None],
-    floors: Sequence[float] = (0.0,),
+    floors: Tensor,
     echo: Echo | None = None,
-) -> SteadyState:
-    """Step until the relative residual is within `tolerance`, or `max_periods` have passed.
+) -> list[SteadyState]:
+    """Step R runs until the relative residual of each is within its tolerance, or `max_periods` have passed.
 
-    `observe` maps the phasors of `cells` (k,) to the quantities that must all converge, once sound has
-    arrived everywhere. The residual of each is relative to its norm, or to its entry of `floors` if that is
-    more. `stepped` is called with the number of periods after each block. With an `echo`, the sources follow
-    the phasors: see `windows_of_run`.
+    `drive` returns the sources of runs by their numbers; the kernel decides how many it steps together.
+    `observe` maps the phasors of `cells` to Q quantities that must all converge, once sound has arrived
+    everywhere. The residual of each is relative to its norm, or to its entry of `floors` (Q, R) if that is
+    more. `stepped` is called with the periods of all runs after each block. With an `echo`, the sources
+    follow the phasors: see `WindowedRuns`. Derivatives are not recorded.
     """
     earliest, (steps, block) = fewest_periods(assembly.grid.arrival), block_of(assembly.steps_per_period)
     if echo:
         earliest += block  # the first answer to an echo is a block late
     kept = phasors_kept(len(cells))
-    sequence = Extrapolation(kept, single=assembly.dtype == torch.float32)
-    values: deque[Sequence[Tensor]] = deque(maxlen=_JUDGED)
     first_judged = min(earliest, max_periods) - (_JUDGED - 1) * block
     ramp = math.ceil(RAMP_PERIODS * assembly.steps_per_period)
     unused = (math.ceil(first_judged / block) - 1) * steps - (kept - 1) * _shift(steps)
-    for count, windows in windows_of_run(assembly, kernel, sources, cells, echo, unused):
-        stepped(block)
-        for start, phasor in windows:
-            if start >= ramp:
-                sequence.append(phasor)
-        if count < first_judged:
-            continue
-        limit = torch.from_numpy(sequence.limit() if len(sequence) else windows[-1][1])
-        values.append(observe(limit))
-        residual = max(map(_residual, zip(*values, strict=True), floors))
-        converged = count >= earliest and residual <= tolerance
-        if converged or count >= max_periods:
-            break
-    return SteadyState(limit, count, residual, converged)
+    limit = np.array(tolerances)
+
+    @torch.no_grad()  # holds in one thread only
+    def together(bounds: tuple[int, int]) -> list[SteadyState]:
+        runs = np.arange(*bounds)
+        stepping = WindowedRuns(assembly, kernel, drive(runs), cells, runs, echo, unused)
+        sequences = Extrapolation(kept, single=assembly.dtype == torch.float32)
+        values: deque[list[Tensor]] = deque(maxlen=_JUDGED)
+        places = torch.arange(len(runs), device="cpu")  # among the runs that are stepped
+        states: dict[int, SteadyState] = {}
+        for count in itertools.count(block, block):
+            windows = stepping.advance()
+            stepped(block * len(runs))
+            for start, phasors in windows:
+                if start >= ramp:
+                    sequences.append(phasors)
+            if count < first_judged:
+                continue
+            limits = sequences.limits(places) if len(sequences) else windows[-1][1].mT[:, places]
+            values.append([value.cpu() for value in observe(limits, runs)])
+            residuals = map(_residuals, zip(*values, strict=True), floors[:, runs])
+            residual = torch.stack(list(residuals)).amax(dim=0).numpy()
+            converged = (residual <= limit[runs]) & (count >= earliest)
+            done = converged | (count >= max_periods)
+            for place in np.flatnonzero(done):
+                state = count, float(residual[place]), bool(converged[place])
+                states[runs[place]] = SteadyState(limits[:, place].contiguous().cpu(), *state)
+            if done.all():
+                break
+            rest = torch.from_numpy(np.flatnonzero(~done))
+            runs, places = runs[rest.numpy()], places[rest]
+            values = deque(([value[:, rest] for value in each] for each in values), _JUDGED)
+            if 2 * len(places) < len(stepping.runs):
+                stepping.choose(places)
+                sequences.choose(places)
+                places = torch.arange(len(runs), device="cpu")
+        return [states[run] for run in range(*bounds)]
+
+    count, threads = len(limit), kernel.at_once(assembly.grid.shape)
+    most = kernel.together(assembly.grid.shape, len(cells))
+    batches = even_parts(count, max(math.ceil(count / most), min(threads, count))) if count else []
+    return [state for states in spread(together, batches, threads) for state in states]
 
 
 def block_of(steps_per_period: Fraction) -> tuple[int, int]:
@@ -120,103 +150,149 @@ def phasors_kept(cells: int) -> int:
 
 
 class Extrapolation:
-    """Reduced rank extrapolation of a sequence, from its last `most` values."""
+    """Reduced rank extrapolation of R sequences, from the last `most` values of each."""
 
     def __init__(self, most: int, single: bool = False) -> None:
-        """Start an empty sequence, whose values are stored in double or in `single` precision."""
-        self._precision = np.complex64 if single else np.complex128
+        """Start empty sequences, whose values are stored in double or in `single` precision."""
+        self._precision = torch.complex64 if single else torch.complex128
         self._most, self._count = most, 0
-        self._values: NDArray[Any] = np.zeros((0, 0), self._precision)  # in turn (most, k)
-        self._last = np.zeros(0, np.complex128)
-        self._steps: deque[Phasors] = deque(maxlen=most - 1)
-        self._product = np.zeros((0, 0), np.complex128)
+        # The stored values (n, R, k), and of cells that decide the means the last value (R, m), its steps
+        # (R, n - 1, m) and their products (R, n - 1, n - 1); the oldest are overwritten
+        self._values = self._last = self._steps = self._products = torch.empty(0, device="cpu")
 
     def __len__(self) -> int:
         """Return the number of stored values."""
         return min(self._count, self._most)
 
-    def append(self, value: Phasors) -> None:
-        """Append the next value (k,)."""
-        before, self._last = self._last, value[:: -(-len(value) // _MOST_FITTED)].copy()
-        if self._count:
-            step = self._last - before
-            self._steps.append(step)
-            old = self._product[-len(self._steps) + 1 :, -len(self._steps) + 1 :]
-            self._product = np.empty((len(self._steps),) * 2, np.complex128)
-            self._product[:-1, :-1] = old if len(self._steps) > 1 else 0
-            self._product[:, -1] = [np.vdot(other, step) for other in self._steps]
-            self._product[-1] = self._product[:, -1].conj()
+    def append(self, values: Tensor) -> None:
+        """Append the next value (R, k) of each sequence."""
+        fitted, number = values[:, :: -(-values.shape[1] // _MOST_FITTED)].clone(), self._count
+        if number == 0:
+            runs, count = fitted.shape
+            self._values = values.new_empty((self._most, *values.shape), dtype=self._precision)
+            self._steps = values.new_empty((runs, self._most - 1, count))
+            self._products = values.new_empty((runs, self._most - 1, self._most - 1))
         else:
-            self._values = np.empty((self._most, len(value)), self._precision)
-        self._values[self._count % self._most] = value
-        self._count += 1
+            place, filled = (number - 1) % (self._most - 1), min(number, self._most - 1)
+            self._steps[:, place] = step = fitted - self._last
+            products = (self._steps[:, :filled] @ step.conj()[..., None])[..., 0]
+            self._products[:, place, :filled], self._products[:, :filled, place] = products, products.conj()
+        self._values[number % self._most] = values
+        self._last, self._count = fitted, number + 1
 
-    def limit(self) -> Phasors:
-        """Return the estimated limit (k,), or the last value while there are too few."""
-        count = len(self._steps)
-        size = float(np.trace(self._product).real) / max(count, 1)
-        if count < 2 or not (math.isfinite(size) and size > 0):
-            return np.asarray(self._values[(self._count - 1) % self._most], np.complex128)
-        mean = np.linalg.solve(self._product + _ROUNDING * size * np.eye(count), np.ones(count))
-        mean /= mean.sum()
-        total = np.zeros(self._values.shape[1], np.complex128)
-        for place, share in enumerate(mean, self._count - count):
-            total += share * self._values[place % self._most]
-        return total
+    def choose(self, places: Tensor) -> None:
+        """Go on with some of the sequences."""
+        self._values, self._last = self._values[:, places], self._last[places]
+        self._steps, self._products = self._steps[places], self._products[places]
+
+    def limits(self, places: Tensor) -> Tensor:
+        """Return the estimated limits (k, r) of some sequences, or last values while there are too few."""
+        values, weights = self._values[: len(self)], self._weights(places)
+        limits = weights.new_empty((values.shape[2], len(places)))
+        summed = _SUMMED if values.device.type == "cpu" else _SUMMED_ON_GPU
+        width = max(1, summed // weights.numel())
+        parts = zip(torch.split(values, width, dim=2), torch.split(limits, width), strict=True)
+        for part, target in parts:
+            target[:] = torch.einsum("nrk,nr->kr", part[:, places].to(weights.dtype), weights)
+        return limits
+
+    def _weights(self, places: Tensor) -> Tensor:
+        """Return the weights (n, r) of the stored values of some sequences in their limits."""
+        steps = min(self._count, self._most) - 1
+        products = self._products[places, :steps, :steps].cpu().numpy()
+        size = np.trace(products, axis1=1, axis2=2).real / max(steps, 1)
+        usable = np.flatnonzero((steps > 1) & np.isfinite(size) & (size > 0))
+        regular = products[usable] + _ROUNDING * size[usable, None, None] * np.eye(steps)
+        means = np.linalg.solve(regular, np.ones((len(usable), steps, 1)))[..., 0]
+        means /= means.sum(axis=1, keepdims=True)
+        weights = np.zeros((len(self), len(places)), np.complex128)
+        weights[(self._count - 1) % self._most] = 1
+        numbers = np.arange(self._count - steps, self._count)  # of values that have a step
+        weights[np.ix_(numbers % self._most, usable)] = means.T[(numbers - 1) % (self._most - 1)]
+        return torch.from_numpy(weights).to(self._values.device)
 
 
-def windows_of_run(
-    assembly: Assembly,
-    kernel: Kernel,
-    sources: Sources,
-    cells: Index,
-    echo: Echo | None = None,
-    unused: int = 0,
-) -> Iterator[tuple[int, list[tuple[int, Phasors]]]]:
-    """Step from silence; yield after each block the periods so far, and start and phasors of its windows.
+class WindowedRuns:
+    """R runs from silence, and the phasors of their windows, block by block.
 
-    Blocks within the first `unused` steps are not recorded, and have no windows.
+    With an `echo`, the sources fade over the next block into those that it returns for the phasors of a
+    block: what the cells radiate comes back while they are stepped, and blocks still follow
+    x_(n+1) = A x_n + b.
 
-    With an `echo`, `sources` fade over the next block into those that it returns for the phasors of a block:
-    what the cells radiate comes back while they are stepped, and blocks still follow x_(n+1) = A x_n + b.
+    Attributes:
+        runs: their numbers (R,).
     """
-    steps_per_period = assembly.steps_per_period
-    steps, periods = block_of(steps_per_period)
-    shift = steps if echo else _shift(steps)
-    recorded_from = 0 if echo else max(0, unused // steps * steps)
-    rising = _smooth((torch.arange(steps, device="cpu") + 0.5) / steps)[:, None].to(assembly.dtype)
-    before = sources
-    ones = torch.ones((len(cells), 1), dtype=assembly.dtype, device="cpu")
-    receivers = Receivers(torch.from_numpy(cells[:, None]), ones)
-    nothing = Receivers(receivers.index[:0], ones[:0])
-    state, basis = assembly.silence(sources), drive_basis(steps, periods)
-    total = silence = torch.zeros(len(cells), **COMPLEX)
-    sums: dict[int, Tensor] = {}  # Fourier sums from the first recorded step to where windows begin and end
-    for block in itertools.count():
-        first = block * steps
-        signal = drive_signal(steps_per_period, first, steps).to(assembly.dtype)
-        driven = sources
-        if echo:
-            signal = torch.cat([(1 - rising) * signal, rising * signal], dim=1)
-            driven = Sources(sources.index, torch.cat([before.force, sources.force], dim=2))
-        read = receivers if first >= recorded_from else nothing
-        state, recorded = kernel.advance(state, assembly.coefficients, driven, read, signal)
-        if read is nothing:
-            yield (block + 1) * periods, []
-            continue
-        sums = {time: value for time, value in sums.items() if time > first - steps}
+
+    def __init__(
+        self,
+        assembly: Assembly,
+        kernel: Kernel,
+        sources: Sources,
+        cells: Index,
+        runs: Index,
+        echo: Echo | None = None,
+        unused: int = 0,
+    ) -> None:
+        """Begin runs with their sources; blocks within the first `unused` steps are not recorded."""
+        self.runs = runs
+        self._assembly, self._kernel, self._echo = assembly, kernel, echo
+        self._sources = self._before = sources
+        self._steps, periods = block_of(assembly.steps_per_period)
+        self._shift = self._steps if echo else _shift(self._steps)
+        self._recorded_from = 0 if echo else max(0, unused // self._steps * self._steps)
+        ones = torch.ones((len(cells), 1), dtype=assembly.dtype, device="cpu")
+        self._receivers = Receivers(torch.from_numpy(cells[:, None]), ones)
+        self._nothing = Receivers(self._receivers.index[:0], ones[:0])
+        self._state, self._basis = assembly.silence(sources), drive_basis(self._steps, periods)
+        self._time = 0
+        # Fourier sums (R, k) from the first recorded step, until now and to where windows begin and end
+        self._total: Any = 0.0
+        self._sums: dict[int, Tensor] = {}
+
+    def advance(self) -> list[tuple[int, Tensor]]:
+        """Step a block; return start and phasors (R, k) of the windows that end in it, if it is recorded."""
+        first, steps, shift = self._time, self._steps, self._shift
+        self._time += steps
+        sources, signal = self._drive(first)
+        recording = first >= self._recorded_from
+        receivers = self._receivers if recording else self._nothing
+        self._state, recorded = self._kernel.advance(
+            self._state, self._assembly.coefficients, sources, receivers, signal
+        )
+        if not recording:
+            return []
+        self._sums = {time: value for time, value in self._sums.items() if time > first - steps}
         inside = (time for time in range(first + 1, first + steps) if _is_needed(time, steps, shift))
         for begin, end in itertools.pairwise((first, *inside, first + steps)):
             part = slice(begin - first, end - first)
-            total = total + fourier_sum(basis[:, part], recorded[0, part]).cpu()
-            sums[end] = total
-        del recorded  # before the next one, as it may be most of a run's memory
+            self._total = self._total + fourier_sum(self._basis[:, part], recorded[:, part])
+            self._sums[end] = self._total
         starts = range(-(-(first + 1) // shift) * shift - steps, first + 1, shift)
-        whole = (start for start in starts if start >= recorded_from or not recorded_from)
-        windows = [(start, (sums[start + steps] - sums.get(start, silence)).numpy()) for start in whole]
-        yield (block + 1) * periods, windows
-        if echo:
-            before, sources = sources, echo(torch.from_numpy(windows[-1][1]))
+        whole = (start for start in starts if start >= self._recorded_from or not self._recorded_from)
+        windows = [(start, self._sums[start + steps] - self._sums.get(start, 0.0)) for start in whole]
+        if self._echo:
+            phasors = windows[-1][1].mT.contiguous().cpu()
+            self._before, self._sources = self._sources, self._echo(phasors, self.runs)
+        return windows
+
+    def choose(self, places: Tensor) -> None:
+        """Go on with some of the runs."""
+        self.runs, self._state = self.runs[places.numpy()], self._state.chosen(places)
+        self._before, self._sources = self._before.chosen(places), self._sources.chosen(places)
+        self._total = self._total[places]
+        self._sums = {time: value[places] for time, value in self._sums.items()}
+
+    def _drive(self, first: int) -> tuple[Sources, Tensor]:
+        """Return the sources of a block and their signals."""
+        assembly, steps = self._assembly, self._steps
+        signal = drive_signal(assembly.steps_per_period, first, steps).to(assembly.dtype)
+        if not self._echo:
+            return self._sources, signal
+        share = ((torch.arange(steps, device="cpu") + 0.5) / steps)[:, None]
+        rising = (share * share * (3 - 2 * share)).to(assembly.dtype)
+        force = torch.cat([self._before.force, self._sources.force], dim=2)
+        both = torch.cat([(1 - rising) * signal, rising * signal], dim=1)
+        return Sources(self._sources.index, force), both
 
 
 def _shift(steps: int) -> int:
@@ -224,24 +300,19 @@ def _shift(steps: int) -> int:
     return max(1, steps // _PARTS)
 
 
-def _smooth(share: Tensor) -> Tensor:
-    return share * share * (3 - 2 * share)
-
-
 def _is_needed(time: int, steps: int, shift: int) -> bool:
     """Return whether a window ends or begins after `time` steps; ends are `shift` apart."""
     return time % shift == 0 or (time + steps) % shift == 0
 
 
-def _residual(values: Sequence[Tensor], floor: float) -> float:
-    """Return the residual of the last value, estimated from its changes over the last blocks."""
-    last, size = values[-1], max(float(values[-1].norm()), floor)
-    if len(values) < 3 or not size:
-        return math.inf
-    changes = [float((one - before).norm()) / size for before, one in itertools.pairwise(values)]
-    if not all(map(math.isfinite, changes)):
-        return math.inf
-    falls = [one / before for before, one in itertools.pairwise(changes) if before]
-    if len(falls) == 2 and max(falls) <= _FALLING:
-        return _CAUTION * max(falls) * changes[-1]
-    return _CAUTION * max(changes[-1], float((last - values[-3]).norm()) / size)
+def _residuals(values: Sequence[Tensor], floors: Tensor) -> Tensor:
+    """Return the residuals (r,) of the last value (n, r), estimated from its changes over the last blocks."""
+    last, size = values[-1], torch.maximum(values[-1].norm(dim=0), floors)
+    if len(values) < 3:
+        return torch.full_like(size, math.inf)
+    changes = torch.stack([(later - value).norm(dim=0) for value, later in itertools.pairwise(values)]) / size
+    residuals = _CAUTION * torch.maximum(changes[-1], (last - values[-3]).norm(dim=0) / size)
+    if len(values) == _JUDGED:
+        slowest = (changes[1:] / changes[:-1]).amax(dim=0)
+        residuals = torch.where(slowest <= _FALLING, _CAUTION * slowest * changes[-1], residuals)
+    return torch.where(changes.isfinite().all(dim=0), residuals, math.inf)

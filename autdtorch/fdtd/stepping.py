@@ -49,7 +49,7 @@ RAMP_PERIODS = 8
 _BACKGROUND = 1e-20
 _FEWEST_IDLE = 32  # Cells of a row from which it is quicker to skip them than to step them
 _LOOKING = 512  # Points whose kernels are looked at together
-_TOGETHER = 16_384  # Receivers whose records in double precision stay in the cache
+_TOGETHER = 16_384  # Receivers whose records in double precision stay in the CPU's cache
 _ONE_NODE = torch.ones(1, **REAL)  # Weight of a point with a single node
 
 
@@ -271,14 +271,15 @@ def drive_basis(steps: int, periods: int) -> Tensor:
 
 
 def fourier_sum(basis: Tensor, recorded: Tensor) -> Tensor:
-    """Return the sum (R,) of a record (steps, R) with the weights (2, steps) of a phasor."""
+    """Return sums (..., q) of records (..., steps, q) with the weights (2, steps) of a phasor."""
     # in single precision PyTorch may take products of a few bits (torch.set_float32_matmul_precision)
     basis = basis.to(recorded.device)
-    parts = [basis @ part.double() for part in torch.split(recorded, _TOGETHER, dim=1)]
-    cosine, sine = torch.cat(parts, dim=1)
+    width = _TOGETHER if recorded.device.type == "cpu" else max(1, recorded.shape[-1])
+    parts = [basis @ part.double() for part in torch.split(recorded, width, dim=-1)]
+    cosine, sine = torch.cat(parts, dim=-1).unbind(-2)
     return torch.complex(cosine, sine)
 
 
 def drive_dft(recorded: Tensor, periods: int) -> Tensor:
-    """Return phasors (R,) at the drive frequency of a record (steps, R) of `periods`."""
-    return fourier_sum(drive_basis(len(recorded), periods), recorded)
+    """Return phasors (..., q) at the drive frequency of records (..., steps, q) of `periods`."""
+    return fourier_sum(drive_basis(recorded.shape[-2], periods), recorded)

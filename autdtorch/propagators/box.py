@@ -8,7 +8,6 @@ fewer runs, which begin at them (reciprocity).
 from __future__ import annotations
 
 import contextlib
-import functools
 import itertools
 import logging
 import math
@@ -26,13 +25,13 @@ from autdtorch.fdtd.coupling import Coupling, coupling_of
 from autdtorch.fdtd.grouping import one_box
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
-from autdtorch.fdtd.steady_state import MOST_JUDGED, SteadyState, run_to_steady_state
+from autdtorch.fdtd.steady_state import MOST_JUDGED, Observe, SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_array, orbits_of_transducers
 from autdtorch.fdtd.turning import is_tilted
 from autdtorch.propagators.absorbed_power import Radiators, absorption
 from autdtorch.propagators.assembled_box import assembled_box
-from autdtorch.propagators.multiple_scattering import Observe, iterated
+from autdtorch.propagators.multiple_scattering import iterated
 from autdtorch.propagators.simulation import (
     AbsorbingCells,
     PressureMap,
@@ -326,9 +325,10 @@ class BoxSimulation(Simulation):
             incident = self._incident(sources, strength, some)
         audible = (~self.silent(some.positions)).to(incident.dtype)[:, None]
         floors = [[self._silence(some.positions[group], *drive) for group in groups] for drive in drives]
+        least = torch.tensor(floors, **REAL).mT.clamp(min=torch.finfo(torch.float64).tiny)
 
-        def observed(phasors: torch.Tensor, runs: slice) -> list[torch.Tensor]:
-            parts = zip(readings, torch.split(phasors, sizes), strict=True)
+        def observed(phasors: torch.Tensor, runs: Index) -> list[torch.Tensor]:
+            parts = zip(readings, torch.split(phasors.cpu(), sizes), strict=True)
             pressure = audible * (incident[:, runs] + sum(reading.field(part) for reading, part in parts))
             return [pressure[group] for group in groups]
 
@@ -336,30 +336,18 @@ class BoxSimulation(Simulation):
             _Scatterer(self, transform, stepped, self.coupling(box, box, box.echoes) if box.echoes else None)
             for box, transform in zip(self.boxes, transforms, strict=True)
         ]
+        begin, count, tolerance = time.perf_counter(), len(drives), self.plan.tolerance
+        driving = [body.driving(drives) for body in bodies]
         if len(bodies) == 1 and not bodies[0].comes_back_later:
-
-            @torch.no_grad()  # holds in one thread only
-            def alone(run: int) -> tuple[SteadyState, float]:
-                begin, force = time.perf_counter(), self.boxes[0].driving(*drives[run])
-
-                def observe(phasors: torch.Tensor) -> list[torch.Tensor]:
-                    return [value[:, 0] for value in observed(phasors[:, None], slice(run, run + 1))]
-
-                steady = bodies[0].answer(force, self.plan.tolerance, observe, floors[run])
-                return steady, time.perf_counter() - begin
-
-            states = spread(alone, range(len(drives)), self._kernel.at_once(self.assemblies[0].grid.shape))
+            states = bodies[0].answers(driving[0], [tolerance] * count, observed, least)
         else:
-            driving = [torch.stack([box.driving(*drive) for drive in drives], dim=1) for box in self.boxes]
-            least = torch.tensor(floors, **REAL).mT.clamp(min=torch.finfo(torch.float64).tiny)
-            observe_all = functools.partial(observed, runs=slice(None))
-            states, settled = iterated(bodies, driving, observe_all, least, self.plan.tolerance)
+            states, settled = iterated(bodies, driving, observed, least, tolerance)
             if not settled and len(bodies) > 1:
                 logger.debug("the iteration between %d boxes does not converge: one box instead", len(bodies))
                 return self._in_one_box._solved(sources, strength, judged, stepped)
-        steady, seconds = zip(*states, strict=True)
-        phasors = torch.stack([each.pressure for each in steady], dim=1)
-        runs = list(map(Run.of, steady, seconds))
+        seconds = (time.perf_counter() - begin) / count
+        phasors = torch.stack([state.pressure for state in states], dim=1)
+        runs = [Run.of(state, seconds) for state in states]
         return Solved(transforms, torch.split(phasors, sizes), runs), runs
 
     def _kernels_compiled(self) -> AbstractContextManager[None]:
@@ -394,36 +382,47 @@ class _Scatterer:
         """True if mirrors send back an incident field of a further run."""
         return self.echo is not None and bool(self.echo.rest)
 
-    def answer(
-        self, force: torch.Tensor, tolerance: float, observe: Observe, floors: Sequence[float] = (0.0,)
-    ) -> SteadyState:
-        """Simulate the answer to forces (h,) until all that is observed has converged."""
+    def driving(self, drives: Sequence[tuple[Apertures, torch.Tensor]]) -> torch.Tensor:
+        """Return the forces (h, R) of the incident fields of R drives, sources and their strengths."""
+        return torch.stack(spread(lambda drive: self.transform.box.driving(*drive), drives), dim=1)
+
+    def answers(
+        self,
+        incoming: torch.Tensor,
+        tolerances: Sequence[float],
+        observe: Observe | None = None,
+        floors: torch.Tensor | None = None,
+    ) -> list[SteadyState]:
+        """Simulate the answers to forces (h, R) until all that is observed has converged.
+
+        By default, these are the amplitudes of the Huygens surface.
+        """
         box, cells, plan = self.transform.box, self.transform.cells, self.simulation.plan
-        sources = box.sources(force)
-        if not sources.force.any():  # obstacles of air, or drives that cancel
-            return SteadyState(torch.zeros(len(cells), **COMPLEX), 0, 0.0, True)
-        echo = None if self.comes_back_later else self.echo
+        # without those of obstacles of air, and of drives that cancel
+        loud = box.sources(incoming).force.any(dim=(1, 2)).nonzero()[:, 0].numpy()
 
-        def echoed(phasors: torch.Tensor) -> Sources:
-            assert echo
-            return box.sources(force + box.forces(echo.field(self.outgoing(phasors[:, None]))[:, 0]))
+        def drive(runs: Index) -> Sources:
+            return box.sources(incoming[:, loud[runs]])
 
-        settings = tolerance, plan.max_periods, observe, self.stepped, floors, echoed if echo else None
-        return run_to_steady_state(box.assembly, self.simulation._kernel, sources, cells, *settings)
+        def echoed(phasors: torch.Tensor, runs: Index) -> Sources:
+            assert self.echo
+            back = spread(box.forces, self.echo.field(self.outgoing(phasors)).mT)
+            return box.sources(incoming[:, loud[runs]] + torch.stack(back, dim=1))
 
-    def answers(self, incoming: torch.Tensor, tolerances: Sequence[float]) -> list[SteadyState]:
-        """Simulate the answers to forces (h, R) until their amplitudes have converged."""
+        def observed(phasors: torch.Tensor, runs: Index) -> Sequence[torch.Tensor]:
+            return observe(phasors, loud[runs]) if observe else [self.outgoing(phasors.cpu())]
 
-        def observe(phasors: torch.Tensor) -> list[torch.Tensor]:
-            return [self.outgoing(phasors)]
-
-        at_once = self.simulation._kernel.at_once(self.transform.box.assembly.grid.shape)
-
-        @torch.no_grad()  # holds in one thread only
-        def run(pair: tuple[torch.Tensor, float]) -> SteadyState:
-            return self.answer(*pair, observe)
-
-        return spread(run, list(zip(incoming.mT, tolerances, strict=True)), at_once)
+        states = run_to_steady_state(
+            box.assembly, self.simulation._kernel, drive, cells, [tolerances[run] for run in loud],
+            plan.max_periods, observed, self.stepped,
+            torch.zeros((1, len(loud)), **REAL) if floors is None else floors[:, loud],
+            echoed if self.echo and not self.comes_back_later else None,
+        )  # fmt: skip
+        silent = SteadyState(torch.zeros(len(cells), **COMPLEX), 0, 0.0, True)
+        answers = [silent] * len(tolerances)
+        for run, state in zip(loud, states, strict=True):
+            answers[run] = state
+        return answers
 
     def outgoing(self, phasors: torch.Tensor) -> torch.Tensor:
         """Return the amplitudes of the Huygens surface."""

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.steady_state import MOST_JUDGED, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble
 from autdtorch.propagators.absorbed_power import Radiators, absorption
@@ -16,6 +17,7 @@ from autdtorch.propagators.simulation import AbsorbingCells, Run, Simulation, St
 from autdtorch.scene.checks import require_inside
 from autdtorch.scene.reflectors import require_in_front
 from autdtorch.utils.apertures import Apertures
+from autdtorch.utils.array_types import REAL, Index
 from autdtorch.utils.images import Mirror
 from autdtorch.utils.process import cached_property, one_library_thread
 
@@ -61,19 +63,33 @@ class DomainSimulation(Simulation):
         (assembly,), plan = self.assemblies, self.plan
         points = assembly.interpolation(receivers.positions, receivers.weights)
         cells = np.unique(points.index)
-        reading = points.matrix(cells)
         every = math.ceil(len(receivers.centers) / MOST_JUDGED)
+        reading, drives = points.matrix(cells), list(zip(sources, strength, strict=True))
         judged = reading[::every]
-        rows, runs = [], []
-        for source, amplitude in zip(sources, strength, strict=True):
-            begin = time.perf_counter()
-            everything, strengths = self.imaged(source, amplitude)
-            forces = assembly.sources(everything.positions, strengths, everything.weights)
-            steady = run_to_steady_state(
-                assembly, self._kernel, forces, cells, plan.tolerance, plan.max_periods,
-                lambda phasor: [torch.from_numpy(judged @ phasor.numpy())], stepped,
-                [self._silence(receivers.positions[::every], source, amplitude)],
-            )  # fmt: skip
-            runs.append(Run.of(steady, time.perf_counter() - begin))
-            rows.append(torch.from_numpy(reading @ steady.pressure.numpy()))
-        return torch.stack(rows), runs
+
+        def drive(runs: Index) -> Sources:
+            imaged = (self.imaged(*drives[run]) for run in runs)
+            return _joined([assembly.sources(each.positions, force, each.weights) for each, force in imaged])
+
+        def observe(phasors: torch.Tensor, runs: Index) -> list[torch.Tensor]:
+            return [torch.from_numpy(judged @ phasors.cpu().numpy())]
+
+        floors = [self._silence(receivers.positions[::every], *each) for each in drives]
+        begin = time.perf_counter()
+        states = run_to_steady_state(
+            assembly, self._kernel, drive, cells, [plan.tolerance] * len(drives), plan.max_periods, observe,
+            stepped, torch.tensor([floors], **REAL),
+        )  # fmt: skip
+        seconds = (time.perf_counter() - begin) / len(drives)
+        phasors = torch.stack([state.pressure for state in states], dim=1)
+        pressure = torch.from_numpy(reading @ phasors.numpy())
+        return pressure.mT, [Run.of(state, seconds) for state in states]
+
+
+def _joined(parts: Sequence[Sources]) -> Sources:
+    """Return the sources of several runs from those of each."""
+    index = torch.unique(torch.cat([part.index for part in parts]))
+    force = parts[0].force.new_zeros((len(parts), len(index), 2))
+    for run, part in zip(force, parts, strict=True):
+        run[torch.searchsorted(index, part.index)] = part.force[0]
+    return Sources(index, force)

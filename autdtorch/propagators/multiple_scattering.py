@@ -10,15 +10,14 @@ passes contribute little, and are simulated to looser tolerances.
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Protocol, Self
 
 import numpy as np
 import torch
 
 from autdtorch.fdtd.grouping import MOST_PASSES
-from autdtorch.fdtd.steady_state import SteadyState
+from autdtorch.fdtd.steady_state import Observe, SteadyState
 from autdtorch.utils.array_types import REAL
 
 logger = logging.getLogger(__name__)
@@ -39,9 +38,6 @@ _MOST_FITTED = 4096
 
 _NOISE = 1e-4
 """Singular values, relative to the largest, that are noise of runs: those of orders without news."""
-
-Observe = Callable[[torch.Tensor], Sequence[torch.Tensor]]
-"""Observe: maps phasors (k,) or (k, R) to the quantities that must all converge."""
 
 
 class Scatterer(Protocol):
@@ -69,15 +65,16 @@ def iterated(
     observe: Observe,
     floors: torch.Tensor,
     tolerance: float,
-) -> tuple[list[tuple[SteadyState, float]], bool]:
+) -> tuple[list[SteadyState], bool]:
     """Iterate until all that is observed of R runs has converged, or `MOST_PASSES` have passed.
 
     `incident` are the waves (n, R) on each body. Half of the relative tolerance is for the runs, half for the
     iteration. `observe` maps the phasors (K, R) of all bodies to quantities (k, R), Q of them; changes are
-    relative to their norms, or to `floors` (Q, R) if those are more. The result is the phasors and the
-    seconds of each run, and whether the iteration has converged.
+    relative to their norms, or to `floors` (Q, R) if those are more. The result is the phasors of each run,
+    and whether the iteration has converged.
     """
-    begin, runs, incoming = time.perf_counter(), incident[0].shape[1], list(incident)
+    runs, incoming = incident[0].shape[1], list(incident)
+    numbers = np.arange(runs)
     largest = torch.stack([waves.norm(dim=0) for waves in incident]).amax(dim=0).clamp_min(_TINY)
     periods, reached, unsettled = np.zeros(runs, np.int64), np.ones(runs, bool), torch.zeros(runs, **REAL)
     orders: list[torch.Tensor] = []
@@ -95,13 +92,13 @@ def iterated(
         unsettled += residuals.amax(dim=0)
         orders.append(torch.cat(parts))
         if number == 1:
-            silent = observe(torch.zeros_like(orders[0]))
+            silent = observe(torch.zeros_like(orders[0]), numbers)
         else:
             phasors, left = extrapolated(orders)
-            values = observe(phasors)
+            observed = zip(observe(left, numbers), silent, observe(phasors, numbers), floors, strict=True)
             missing = [
                 (part - nothing).norm(dim=0) / torch.maximum(value.norm(dim=0), floor)
-                for part, nothing, value, floor in zip(observe(left), silent, values, floors, strict=True)
+                for part, nothing, value, floor in observed
             ]
             # what K adds to the first order is a measure of what it adds to the residual
             echo = (phasors - orders[0]).norm(dim=0) / orders[0].norm(dim=0).clamp_min(_TINY)
@@ -113,10 +110,10 @@ def iterated(
         parts_of = ([body.incoming(other, waves) for other, waves in sent] for body in bodies)
         incoming = [torch.stack([part for part in each if part is not None]).sum(dim=0) for each in parts_of]
     logger.debug("%d boxes, %d passes of multiple scattering", len(bodies), number)
-    seconds, residual = (time.perf_counter() - begin) / runs, (unsettled + remaining).tolist()
+    residual = (unsettled + remaining).tolist()
     reached &= (remaining <= tolerance / 2).numpy()
     states = map(SteadyState, phasors.mT, periods.tolist(), residual, reached.tolist())
-    return [(state, seconds) for state in states], settled
+    return list(states), settled
 
 
 def extrapolated(orders: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:

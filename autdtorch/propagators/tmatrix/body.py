@@ -27,10 +27,11 @@ from autdtorch.analytic.spherical_waves import (
     regular_waves,
     sphere_coefficients,
 )
-from autdtorch.fdtd.grouping import Grouping, one_box
+from autdtorch.fdtd.grouping import USUAL_PERIODS, Grouping, one_box
 from autdtorch.fdtd.kernels import make_kernel
+from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.scattered_field import ScatteredField
-from autdtorch.fdtd.steady_state import MOST_JUDGED, SteadyState, run_to_steady_state
+from autdtorch.fdtd.steady_state import MOST_JUDGED, fewest_periods, run_to_steady_state
 from autdtorch.fdtd.symmetry import symmetries
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.notices import SteadyStateWarning
@@ -45,8 +46,8 @@ from autdtorch.scene.obstacles import Obstacle, Sphere
 from autdtorch.scene.obstacles.moving import at_rest, circumscribed, is_movable, shifted
 from autdtorch.scene.scene import OverlapWarning, ScaleWarning, Scene
 from autdtorch.utils.apertures import Apertures
-from autdtorch.utils.array_types import COMPLEX, REAL
-from autdtorch.utils.process import cached_property, one_library_thread, require_memory, spread
+from autdtorch.utils.array_types import COMPLEX, REAL, Index
+from autdtorch.utils.process import cached_property, one_library_thread, require_memory
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.units import warn_user
 
@@ -243,22 +244,20 @@ class BodyWaves:
         outgoing = mixing.mH @ self._multipoles()
         judged = sphere_points((0.0, 0.0, 0.0), self.radius, MOST_JUDGED)
         observed = outgoing_waves(self.degree, box.wavenumber, judged) @ mixing @ outgoing
-        with show_progress(len(self.runs), "simulating the waves of a body") as progress:
 
-            @torch.no_grad()
-            def run(waves: list[int]) -> SteadyState:
-                forces = box.sources(box.forces((incoming[:, waves] / size[waves]).sum(dim=1)))
-                settings = (
-                    plan.tolerance,
-                    plan.max_periods,
-                    lambda phasors: [observed @ phasors],
-                    lambda _: None,
-                )
-                steady = run_to_steady_state(box.assembly, kernel, forces, box.surface[1], *settings)
-                progress.advance(1)
-                return steady
+        def drive(runs: Index) -> Sources:
+            waves = (self.runs[run] for run in runs)
+            fields = ((incoming[:, some] / size[some]).sum(dim=1) for some in waves)
+            return box.sources(torch.stack([box.forces(field) for field in fields], dim=1))
 
-            states = spread(run, self.runs, kernel.at_once(box.assembly.grid.shape))
+        count = len(self.runs)
+        periods = math.ceil(count * USUAL_PERIODS * fewest_periods(box.assembly.grid.arrival))
+        with show_progress(periods, "simulating the waves of a body") as progress:
+            states = run_to_steady_state(
+                box.assembly, kernel, drive, box.surface[1], [plan.tolerance] * count, plan.max_periods,
+                lambda phasors, runs: [observed @ phasors.cpu()], progress.advance,
+                torch.zeros((1, count), **REAL),
+            )  # fmt: skip
         answers = outgoing @ torch.stack([steady.pressure for steady in states], dim=1)
         matrix, kinds = torch.zeros_like(mixing), self._kinds
         for waves, answer in zip(self.runs, answers.mT, strict=True):

@@ -1,0 +1,111 @@
+"""Steady states of runs that are stepped together: each is that of the run alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_scenes import CUBE, assembled_parts, relative_error, small_scene
+
+from autdtorch import Box, Reflector, make_propagator
+from autdtorch.fdtd.kernels.contract import Sources
+from autdtorch.fdtd.kernels.cpu import CpuKernel
+from autdtorch.fdtd.steady_state import Extrapolation, run_to_steady_state
+from autdtorch.propagators.store import BODIES
+
+MODES = 3
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**31), st.integers(MODES + 2, 12), st.integers(MODES + 2, 30))
+def test_limits_of_sequences_of_few_modes_are_exact(seed, most, count):
+    """x_(n+1) = A x_n + b with three modes, whose differences the mean removes."""
+    random = torch.Generator().manual_seed(seed)
+
+    def complex_numbers(*shape):
+        return torch.randn(shape, generator=random, dtype=torch.complex128)
+
+    limit, modes, turns = complex_numbers(4, 50), complex_numbers(4, MODES, 50), complex_numbers(4, MODES)
+    factors = 0.9 * turns / turns.abs().clamp(min=1)
+    together, rest = Extrapolation(most), torch.tensor([0, 2])
+    for number in range(count):
+        together.append(limit + torch.einsum("rmk,rm->rk", modes, factors**number))
+    limits = together.limits(torch.arange(4))
+    # the regularisation of squares, 1e-13, leaves its root; a mode that has almost decayed leaves less
+    assert relative_error(limits.mT, limit) < 1e-4
+    together.choose(rest)
+    assert relative_error(together.limits(torch.arange(2)), limits[:, rest]) < 1e-9
+
+
+class Kernel(CpuKernel):
+    """Steps a number of runs together, and notes how many runs each call steps."""
+
+    def __init__(self, runs):
+        super().__init__()
+        self.runs, self.stepped = runs, []
+
+    def together(self, shape, receivers):
+        return self.runs
+
+    def at_once(self, shape):
+        return 1
+
+    def advance(self, state, *arguments):
+        self.stepped.append(len(state.now))
+        return super().advance(state, *arguments)
+
+
+@pytest.mark.parametrize("most_periods", [200, 10])
+def test_runs_together_end_each_at_its_time(most_periods):
+    assembly, sources, receivers = assembled_parts(small_scene((CUBE,)), 2e-3, torch.float64)
+    cells, tolerances = np.unique(receivers.index), [1e-2, 1e-6, 1e-2, 1e-4, 1e-9]
+    random = torch.Generator().manual_seed(1)
+    forces = sources.force * torch.randn((5, len(sources.index), 1), generator=random, dtype=torch.float64)
+
+    def states(kernel):
+        return run_to_steady_state(
+            assembly, kernel, lambda runs: Sources(sources.index, forces[runs]), cells, tolerances,
+            most_periods, lambda phasors, runs: [phasors], lambda periods: None, torch.zeros((1, 5)),
+        )  # fmt: skip
+
+    together, alone = Kernel(5), Kernel(1)
+    for state, single in zip(states(together), states(alone), strict=True):
+        assert (state.periods, state.converged) == (single.periods, single.converged)
+        # rounding, which the extrapolation of small differences magnifies
+        assert relative_error(state.pressure, single.pressure) < 1e-10
+        assert state.residual == pytest.approx(single.residual, rel=1e-2)
+    assert set(alone.stepped) == {1}
+    assert sum(together.stepped) <= 2 * sum(alone.stepped)  # at most half of those stepped have converged
+    if most_periods == 200:
+        assert together.stepped[-1] < 5
+
+
+PLATE = Box((12e-3, 12e-3, 12e-3), (4e-3, 9e-3, 3e-3), rigid=True, rotation=(0.3, 0.2, 0.1))
+FAR = Box((30e-3, 60e-3, 150e-3), (4e-3, 7e-3, 3e-3), rigid=True)
+FLOOR = Reflector((0.0, 0.0, -10e-3), (0.0, 0.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("method", "scene", "grids"),
+    [
+        ("full", small_scene((PLATE,)), 1),
+        ("box", small_scene((PLATE,)), 1),
+        ("box", replace(small_scene((PLATE,)), reflectors=(FLOOR,)), 1),
+        ("box", replace(small_scene((PLATE,)), obstacles=(PLATE, FAR), domain=((0.0,) * 3, (0.16,) * 3)), 2),
+        ("tmatrix", small_scene((PLATE,)), 1),
+    ],
+    ids=["full", "box", "echo", "boxes", "tmatrix"],
+)
+def test_matrices_of_runs_together_are_those_of_runs_alone(method, scene, grids, monkeypatch):
+    """In single precision; with a reflector, what it sends back drives the runs."""
+    matrices = []
+    for runs in (1, 2, 64):
+        monkeypatch.setattr(CpuKernel, "together", lambda self, shape, receivers, runs=runs: runs)
+        BODIES.forget()
+        propagator = make_propagator(scene, method, 2e-3, tolerance=1e-3, cache=False)
+        assert len(propagator.plan.grouping.grids) == grids
+        matrices.append(propagator.transfer_matrix())
+    # rounding of single precision, which the extrapolation of small differences magnifies
+    assert all(relative_error(matrix, matrices[0]) < 1e-5 for matrix in matrices)
