@@ -44,7 +44,7 @@ from autdtorch.objectives.perturbations import simulated_matrix
 from autdtorch.objectives.readings import Readings
 from autdtorch.propagators import make_propagator
 from autdtorch.study.report.hardware_report import write_hardware_report
-from autdtorch.study.run_study import check_goal, name_of, solve
+from autdtorch.study.study_method import check_goal, name_of, solve
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.progress import Progress, show_progress

@@ -20,7 +20,7 @@ from autdtorch.methods.catalogue import METHODS
 from autdtorch.objectives.readings import Readings
 from autdtorch.propagators import make_propagator
 from autdtorch.scene.scene import Scene
-from autdtorch.study.run_study import StudyMethod
+from autdtorch.study.study_method import StudyMethod
 from autdtorch.utils.files import path_of
 from autdtorch.utils.validation import invalid, require_known, within
 

@@ -26,7 +26,8 @@ from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.moving import angles_of
 from autdtorch.scene.scene import Scene
 from autdtorch.study.results import StudyResult, summary_rows, with_prefixes
-from autdtorch.study.run_study import StudyMethod, name_of, run_study
+from autdtorch.study.run_study import run_study
+from autdtorch.study.study_method import StudyMethod, name_of
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.text import counted
 from autdtorch.utils.units import angles

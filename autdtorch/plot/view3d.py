@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageColor
 
-from autdtorch.plot import meshes3d
+from autdtorch.plot import meshes3d, plotter3d
 from autdtorch.plot.colours import FLOOR, WAVE_MAP
 from autdtorch.plot.data import MM, in_decibels, largest, pressure_text, pressure_unit, zero_level
-from autdtorch.plot.meshes3d import STILL_AXES
+from autdtorch.plot.plotter3d import STILL_AXES
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.files import in_folder, path_of
 from autdtorch.utils.hints import with_extra
@@ -160,7 +160,7 @@ def view3d(
     if in_domain is not None:
         meshes3d.add_isosurface(plotter, scene, in_decibels(in_domain, zero), height)
         caption.append(f"surface: {height:g} dB")
-    meshes3d.add_caption(plotter, *caption)
+    plotter3d.add_caption(plotter, *caption)
     if path is not None:
         _write(plotter, path, scene, caption)
     return plotter
@@ -203,8 +203,8 @@ def animate3d(
     digit = 10.0 ** math.floor(math.log10(peak)) if peak else 1.0
     limit = digit * max(1, math.ceil(peak / digit))  # of one digit, for round numbers on the colour bar
     actor = meshes3d.add_sheet(plotter, sheet, WAVE_MAP, (-limit, limit))
-    meshes3d.add_bar(plotter, actor, f"p(t) [{unit}]", position=meshes3d.FIELD_BAR, labels=5, fmt="%.3g")
-    meshes3d.add_caption(plotter, f"one period: {1e6 / scene.frequency:.3g} µs")
+    plotter3d.add_bar(plotter, actor, f"p(t) [{unit}]", position=plotter3d.FIELD_BAR, labels=5, fmt="%.3g")
+    plotter3d.add_caption(plotter, f"one period: {1e6 / scene.frequency:.3g} µs")
     emitted = discs["phase"].copy()
     pictures = []
     for turn in np.arange(frames) / frames:
@@ -250,7 +250,7 @@ def _write(plotter: pyvista.Plotter, path: Path, scene: Scene, caption: Sequence
     if path.suffix.lower() == ".gltf":
         _write_gltf(plotter, path)
     else:
-        meshes3d.add_axes(plotter, scene.domain)
+        plotter3d.add_axes(plotter, scene.domain)
         _write_html(plotter, path, caption)
         plotter.remove_bounds_axes()
     for actor in still:

@@ -9,6 +9,16 @@ from typing import Any, NamedTuple
 
 import torch
 
+from autdtorch.scene.boards import (
+    AUTD3_SOURCE_STRENGTH,
+    AUTD3_TRANSDUCERS,
+    OPENMPD_SOURCE_STRENGTH,
+    SONICSURFACE_SOURCE_STRENGTH,
+    TRANSDUCER_RADIUS,
+    autd3_places,
+    grid_places,
+    square_places,
+)
 from autdtorch.scene.drive import warn_of_degrees
 from autdtorch.scene.geometry import Coordinates, in_plane, plane_basis
 from autdtorch.scene.transducer_values import disc_radius, for_each, unit_normals
@@ -30,23 +40,6 @@ from autdtorch.utils.validation import (
 
 PAPER_SOURCE_STRENGTH = 1 / (4 * math.pi)
 """Source strength in the paper's Eq. 2: on-axis pressure at full drive times distance [Pa m]."""
-
-# Source strengths [Pa m] in programs for the devices. They differ by nearly a factor of 2 for similar
-# transducers, and not all say whether they are peak or RMS values: measure yours.
-AUTD3_SOURCE_STRENGTH = 4.386  # AUTD3 SDK
-OPENMPD_SOURCE_STRENGTH = 3.4  # AcousTools
-SONICSURFACE_SOURCE_STRENGTH = 2.53  # Ultraino
-
-TRANSDUCER_RADIUS = 4.5e-3
-"""Radius of the radiating disc of a 10 mm transducer for 40 kHz [m] (AcousTools, Ultraino)."""
-
-AUTD3_TRANSDUCERS = 249
-AUTD3_UNIT = 192e-3, 151.4e-3
-"""Width and height of an AUTD3 unit with its rim [m]."""
-
-_AUTD3_PLACES, _AUTD3_PITCH = (18, 14), 10.16e-3
-_AUTD3_MISSING = {(1, 1), (2, 1), (16, 1)}  # grid places (x, y) of screws and connectors
-_SQUARE_PLACES, _SQUARE_PITCH = 16, 10.5e-3
 
 _TRANSDUCER_BYTES = 500.0  # memory for each transducer [bytes], with the search for its neighbours
 
@@ -153,7 +146,7 @@ class TransducerArray:
         count_u, count_v = positive_integers("shape", shape, 2)
         require_memory("shape", shape, _TRANSDUCER_BYTES * count_u * count_v)
         pitch = positive("pitch", pitch, "m")
-        places = torch.cartesian_prod(pitch * _centred(count_u), pitch * _centred(count_v)).reshape(-1, 2)
+        places = grid_places(count_u, count_v, pitch)
         more = {"shape": [count_u, count_v], "pitch": pitch}
         return flat_array("grid", places, center, normal, angle, source_strength, radius, **more)
 
@@ -184,7 +177,7 @@ class TransducerArray:
         """
         count_x, count_y = positive_integers("units", units, 2)
         require_memory("units", units, _TRANSDUCER_BYTES * AUTD3_TRANSDUCERS * count_x * count_y)
-        places = _autd3_places(count_x, count_y)
+        places = autd3_places(count_x, count_y)
         units = count_x, count_y
         return flat_array("autd3", places, center, normal, angle, source_strength, radius, units=list(units))
 
@@ -204,8 +197,7 @@ class TransducerArray:
         The order follows the table of emitters in the device's Python program. Frames are encoded in the
         order of channels, which the firmware needs.
         """
-        across = _SQUARE_PITCH * _centred(_SQUARE_PLACES)
-        places = torch.cartesian_prod(-across, across).flip(1)
+        places = square_places().transpose(0, 1).reshape(-1, 2)
         return flat_array("sonicsurface", places, center, normal, angle, source_strength, radius)
 
     @classmethod
@@ -223,8 +215,7 @@ class TransducerArray:
         Arguments and errors as for `TransducerArray.autd3`; the default source strength is AcousTools'.
         Positions are nominal; `OpenMPDBoard.load` reads the positions and calibration of one board.
         """
-        across = _SQUARE_PITCH * _centred(_SQUARE_PLACES)
-        places = torch.cartesian_prod(across, -across)
+        places = square_places().reshape(-1, 2)
         return flat_array("openmpd", places, center, normal, angle, source_strength, radius)
 
     def __add__(self, other: TransducerArray) -> TransducerArray:
@@ -256,11 +247,8 @@ class TransducerArray:
         """
         factor = torch.as_tensor(for_each("gain", gain, len(self), positive, ""), **REAL)
         delay = torch.as_tensor(for_each("phase", phase, len(self), finite_number, "rad"), **REAL)
-        array = replace(
-            self,
-            source_strength=strengths_of(self) * factor,
-            phase=phase_offsets_of(self) + delay,
-        )
+        strength = strengths_of(self) * factor
+        array = replace(self, source_strength=strength, phase=phase_offsets_of(self) + delay)
         object.__setattr__(array, "_recipes", _forms_of(self))
         return array
 
@@ -409,25 +397,3 @@ def apertures_of(array: TransducerArray, wavenumber: float = 0.0) -> Apertures:
     normals, facing = torch.unique(array.normals, dim=0, return_inverse=True)  # most arrays have one
     axes = torch.stack([torch.stack([*plane_basis(normal), normal]) for normal in normals])[facing]
     return Apertures(array.positions, axes, radii, wavenumber * float(radii.max()))
-
-
-def _autd3_places(count_x: int, count_y: int) -> torch.Tensor:
-    """Return positions (M, 2) [m] along x and y of AUTD3 units, as in autd3-core 0.12.
-
-    A unit is row by row with x fastest; of several units, y is fastest.
-    """
-    along_x, along_y = (_AUTD3_PITCH * _centred(count) for count in _AUTD3_PLACES)
-    unit = [
-        (x, y)
-        for j, y in enumerate(along_y.tolist())
-        for i, x in enumerate(along_x.tolist())
-        if (i, j) not in _AUTD3_MISSING
-    ]
-    width, height = AUTD3_UNIT
-    shifts = torch.cartesian_prod(width * _centred(count_x), height * _centred(count_y))
-    return (shifts[:, None] + torch.tensor(unit, **REAL)).reshape(-1, 2)
-
-
-def _centred(count: int) -> torch.Tensor:
-    """Return `count` positions one apart, around 0."""
-    return torch.arange(count, **REAL) - (count - 1) / 2

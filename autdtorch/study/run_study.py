@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-import functools
-import inspect
 import logging
 import math
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 
-from autdtorch.io.goal_section import goal_section, require_score
+from autdtorch.io.goal_section import goal_section
 from autdtorch.methods.base import Method
-from autdtorch.methods.run import run
-from autdtorch.methods.seeds import TRIAL_BYTES, Trials
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.forces import ForceGoal, ForceObjective, Push
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.objectives.metrics import focus_metrics
-from autdtorch.objectives.objective import Objective
 from autdtorch.objectives.over_scenes import OverScenes
-from autdtorch.objectives.quiet import QuietPoints, SeenPoints
-from autdtorch.objectives.readings import Readings
 from autdtorch.objectives.scenarios import observed_goal
 from autdtorch.propagators import Propagator, SimulatedPropagator, TMatrixPropagator, make_propagator
 from autdtorch.propagators.plan import plan
@@ -43,27 +35,27 @@ from autdtorch.study.results import (
     median_trial,
     provenance_now,
 )
+from autdtorch.study.study_method import (
+    StudyMethod,
+    check_goal,
+    code_of,
+    counts_of,
+    goals_of,
+    solve,
+)
 from autdtorch.utils.files import require_name
-from autdtorch.utils.process import require_memory
 from autdtorch.utils.progress import Progress, show_progress
 from autdtorch.utils.spatial import nearest
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
-    integer_at_least,
     invalid,
     positive,
-    require_kind,
-    require_known,
     within,
 )
 
 logger = logging.getLogger(__name__)
 
-StudyMethod: TypeAlias = Method | Callable[..., Solution]
-"""A `Method`, or a function of an objective with its settings bound. A function that has parameters `trials`
-and `seed` gets the numbers of the trials to run, as many as it must return, and the study's seed. One
-that has a parameter `goal` gets the goal."""
 
 BLOCK = Method.block
 """Trials that are run and saved together: a process that ends loses one block at most."""
@@ -122,7 +114,7 @@ def run_study(
             raise ValueError(f"{field}: empty; must have at least one")
         for name in named:
             require_name(field, name)
-    counts = _counts(methods, trials, seed)
+    counts = counts_of(methods, trials, seed)
     plane_spacing = positive("plane_spacing", plane_spacing, "m")
     check_goal(goal, scenes, methods)
     copies = scenes_of(scenarios, goal)
@@ -135,7 +127,7 @@ def run_study(
                     method.require_fit(problem, min(counts[name], method.block))
     planes = {name: _plane_points(scene, plane_spacing) for name, scene in scenes.items()}
     # The digest of our source does not cover methods, obstacles and goals of users.
-    code = [*map(_code_of, methods.values()), *map(type, _goals_of(goal))]
+    code = [*map(code_of, methods.values()), *map(type, goals_of(goal))]
     code += [type(obstacle) for scene in scenes.values() for obstacle in scene.obstacles]
     ours = all(one.__module__.partition(".")[0] == "autdtorch" for one in code)
     provenance = provenance_now(config, seed)
@@ -189,89 +181,6 @@ def _for_poses(scenes: Mapping[str, Scene], solver: Mapping[str, Any]) -> dict[s
         return dict(solver)
     logger.debug("T-matrices: %d runs for all poses", runs)
     return {**solver, "method": "tmatrix"}
-
-
-def _counts(methods: Mapping[str, StudyMethod], trials: int | Mapping[str, int], seed: int) -> dict[str, int]:
-    """Check the seed, and return the number of trials of each method."""
-    integer_at_least("seed", seed, 0)
-    random = [name for name, method in methods.items() if _is_random(method)]
-    if not isinstance(trials, Mapping):
-        trials = dict.fromkeys(random, integer_at_least("trials", trials, 1))
-    require_known("trials", trials, random, "random method")
-    if absent := [name for name in random if name not in trials]:
-        raise invalid("trials", dict(trials), f"must also give the number for {', '.join(absent)}")
-    counts = {name: integer_at_least(f"trials.{name}", trials.get(name, 1), 1) for name in methods}
-    for name, count in counts.items():
-        require_memory(f"trials.{name}", count, TRIAL_BYTES * count)
-    return counts
-
-
-def check_goal(
-    goal: Goal | ForceGoal, scenes: Mapping[str, Scene], methods: Mapping[str, StudyMethod]
-) -> None:
-    """Check the goal against all scenes, and that every method can maximise it."""
-    if not isinstance(goal, ForceGoal):
-        require_kind("goal", goal, Goal)
-    require_score(goal.name, goal.unit)
-    for scene in scenes.values():
-        with within("goal"):
-            goal.check(scene) if isinstance(goal, ForceGoal) else goal.check(len(scene.control_points))
-    for name, method in methods.items():
-        if goal == WEAKEST_FOCUS or isinstance(method, Method):
-            continue
-        if goal_keyword(method) is None:
-            accepted = f"must have a parameter `goal`, for the goal {goal.name}"
-            raise invalid(f"method {name}", name_of(method), accepted)
-
-
-def goal_keyword(method: Callable[..., Solution]) -> str | None:
-    """Return the name of the parameter for the goal of a function, if it has one."""
-    taken = inspect.signature(method).parameters
-    if "goal" in taken or "score" not in taken:
-        return "goal" if "goal" in taken else None
-    warnings.warn(f"{name_of(method)}: the parameter `score` is now `goal`", DeprecationWarning, stacklevel=2)
-    return "score"
-
-
-def _goals_of(goal: Goal | ForceGoal) -> list[Goal | ForceGoal]:
-    """Return a goal, and the goals that it is made of."""
-    return [goal, *_goals_of(goal.goal)] if isinstance(goal, QuietPoints | SeenPoints) else [goal]
-
-
-def _is_random(method: StudyMethod) -> bool:
-    return method.random if isinstance(method, Method) else "trials" in inspect.signature(method).parameters
-
-
-def name_of(method: StudyMethod) -> str:
-    """Return the name of a method, or of the function that it is."""
-    return method.name if isinstance(method, Method) else str(_code_of(method).__name__)
-
-
-def _code_of(method: StudyMethod) -> Any:
-    """Return the class of a method, or the function behind it."""
-    if isinstance(method, Method):
-        return type(method)
-    return method.func if isinstance(method, functools.partial) else method
-
-
-def solve(
-    method: StudyMethod,
-    objective: Objective,
-    trials: Trials,
-    seed: int,
-    goal: Goal,
-    start: torch.Tensor | None = None,
-    readings: Readings | None = None,
-) -> Solution:
-    """Run trials of a method on an objective, from drives (T, M) and readings where it begins at any."""
-    if isinstance(method, Method):
-        return run(method, objective, trials, seed, goal=goal, start=start, readings=readings)
-    taken = inspect.signature(method).parameters
-    if readings is not None:
-        accepted = "must be None: only a Method goes on from them, no function"
-        raise invalid("readings", readings, accepted)
-    arguments = {"trials": trials, "seed": seed, goal_keyword(method) or "goal": goal}
-    return method(objective, **{key: value for key, value in arguments.items() if key in taken})
 
 
 def _run_scene(

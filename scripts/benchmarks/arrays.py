@@ -18,7 +18,7 @@ from shared.scenes import relative_error
 from shared.timing import in_new_process, peak_memory, shortest, timed
 
 import autdtorch as at
-from autdtorch.scene.arrays import TRANSDUCER_RADIUS
+from autdtorch.scene.boards import TRANSDUCER_RADIUS
 
 DOCUMENT = "performance.md"
 

@@ -27,7 +27,7 @@ import autdtorch as at
 from autdtorch.hardware import AUTD3
 from autdtorch.hardware.devices.autd3 import autd3_sequence
 from autdtorch.propagators.free_space import free_space_matrix
-from autdtorch.scene.arrays import TRANSDUCER_RADIUS
+from autdtorch.scene.boards import TRANSDUCER_RADIUS
 from autdtorch.scene.sequence import Sequence
 
 DOCUMENT = "benchmarks.md"

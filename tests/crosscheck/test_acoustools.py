@@ -23,7 +23,7 @@ from shared.scenes import relative_error
 
 import autdtorch as at
 from autdtorch.propagators.free_space import free_space_matrix
-from autdtorch.scene.arrays import TRANSDUCER_RADIUS
+from autdtorch.scene.boards import TRANSDUCER_RADIUS
 
 
 def test_both_come_to_the_series_of_a_rigid_sphere() -> None:

@@ -8,7 +8,8 @@ import torch
 from scipy.special import j1
 
 import autdtorch as at
-from autdtorch.scene.arrays import AUTD3_UNIT, OPENMPD_SOURCE_STRENGTH, apertures_of
+from autdtorch.scene.arrays import apertures_of
+from autdtorch.scene.boards import AUTD3_UNIT, OPENMPD_SOURCE_STRENGTH
 from autdtorch.utils.spatial import distances
 
 PITCH = 10.16e-3

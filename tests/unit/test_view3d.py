@@ -15,7 +15,7 @@ import torch
 from small_scenes import scene_of_all_kinds, small_scene
 
 import autdtorch as at
-from autdtorch.plot.meshes3d import STILL_AXES
+from autdtorch.plot.plotter3d import STILL_AXES
 from autdtorch.plot.view3d import animate3d, rendering_problem, view3d
 
 SPACING = 5e-3  # m, cells of the plane in the pictures

@@ -16,7 +16,7 @@ import torch
 
 from autdtorch.hardware.devices.device import Device, EmulatedBoards, Firmware
 from autdtorch.hardware.transport.port import HeldSequence, LinkError, Port, closed_on_error
-from autdtorch.scene.arrays import AUTD3_TRANSDUCERS
+from autdtorch.scene.boards import AUTD3_TRANSDUCERS
 from autdtorch.scene.drive import PhaseLevels
 from autdtorch.utils.array_types import COMPLEX, REAL, Bytes
 from autdtorch.utils.hints import with_extra

@@ -20,7 +20,8 @@ import torch
 
 from autdtorch.hardware.devices.device import Device, Firmware
 from autdtorch.hardware.transport.serial_chips import FT232H
-from autdtorch.scene.arrays import OPENMPD_SOURCE_STRENGTH, TRANSDUCER_RADIUS, TransducerArray
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.boards import OPENMPD_SOURCE_STRENGTH, TRANSDUCER_RADIUS
 from autdtorch.scene.drive import PhaseLevels, validate_drive
 from autdtorch.scene.geometry import in_plane
 from autdtorch.utils.array_types import COMPLEX

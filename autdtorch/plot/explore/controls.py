@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from autdtorch.plot.explore.display import ANGLES, FOCUS, MM, POSITION, first_state, four_digits, in_mm
+from autdtorch.plot.explore.grip import DIGITS
 from autdtorch.plot.explore.page import CAMERA
-from autdtorch.plot.explore.session import DIGITS, Session
+from autdtorch.plot.explore.session import Session
 
 _LOWEST = -60.0  # level of the isosurface in the volume [dB]
 _BEFORE_CAMERA = 10.0  # priority of the mouse; the camera's is lower

@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from autdtorch.plot import colours, meshes3d
+from autdtorch.plot import colours, meshes3d, plotter3d
 from autdtorch.plot.data import MM, in_decibels
+from autdtorch.plot.explore.grip import Grip
 from autdtorch.plot.explore.situation import Situation
 from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles.moving import circumscribed
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.validation import Vector
 
 _INK = {False: ("black", "white"), True: ("#e6e6e6", "#14171c")}  # lines and background, by dark
 _SAMPLES = 600  # along a ray through the scene, to find the body under the mouse
@@ -30,24 +30,6 @@ _RING = 1.1, 1.4  # radii of the ring around the chosen transducer, relative to 
 _SURFACE_NAME, _FORCE_NAME = "isosurface", "force"
 _ARROW = 2.5  # wavelengths: length of the arrow of the force
 _FORCE_COLOUR = "#D81B60"  # not in the colour map of the pressure, on light and dark
-
-
-class Grip(NamedTuple):
-    """A hold of the mouse on an object in the picture.
-
-    Attributes:
-        kind: "body", "focus" or "transducer".
-        number: index of the object.
-        place: the point of the object under the mouse (3,) [m].
-        origin: centre of the object when it was gripped (3,) [m].
-        angles: angles of a body when it was gripped (3,) [rad].
-    """
-
-    kind: str
-    number: int
-    place: Array
-    origin: Array
-    angles: Vector = (0.0, 0.0, 0.0)
 
 
 class Scale(NamedTuple):
@@ -73,7 +55,7 @@ class Picture:
 
     def __init__(self, situation: Situation) -> None:
         """Draw a situation, as yet without a field."""
-        self.plotter = meshes3d.empty_plotter(situation.scene.domain, off_screen=True)
+        self.plotter = plotter3d.empty_plotter(situation.scene.domain, off_screen=True)
         self._dark = False
         self._domain: Any = None  # that the camera looks at
         self.draw(situation)
@@ -106,7 +88,7 @@ class Picture:
         self.place(situation, 0, 0)
         if scene.domain != self._domain:
             self._domain = scene.domain
-            meshes3d.look_at(self.plotter, scene.domain)
+            plotter3d.look_at(self.plotter, scene.domain)
             self._fitted = self.plotter.camera.parallel_scale
             self._first = self.plotter.camera_position
             self._fit()
@@ -138,7 +120,7 @@ class Picture:
         self._dark = dark
         ink, paper = _INK[dark]
         self.plotter.set_background(paper)
-        meshes3d.add_axes(self.plotter, self._situation.scene.domain, ink, _LETTERS)
+        plotter3d.add_axes(self.plotter, self._situation.scene.domain, ink, _LETTERS)
         self.plotter.actors[meshes3d.ARROWS].prop.color = ink
 
     def place(self, situation: Situation, focus: int, transducer: int) -> None:

@@ -16,8 +16,8 @@ import torch
 
 from autdtorch.plot.data import largest
 from autdtorch.plot.explore.calculation import Calculator, Finished, Report, Request, Result
-from autdtorch.plot.explore.display import MM, Display, offered, refusal
-from autdtorch.plot.explore.picture import Grip
+from autdtorch.plot.explore.display import Display, offered, refusal
+from autdtorch.plot.explore.grip import Grip
 from autdtorch.plot.explore.situation import (
     History,
     Situation,
@@ -27,13 +27,8 @@ from autdtorch.plot.explore.situation import (
     save_situation,
 )
 from autdtorch.plot.explore.trial_pictures import TrialPictures
-from autdtorch.scene.geometry import rotation_matrix
-from autdtorch.scene.obstacles.moving import angles_of
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
-
-DIGITS = 7
-"""Decimals of lengths [m] from the page, whose steps are 0.1 mm."""
 
 _PATIENCE = 0.25  # s; a picture before the field would slow its calculation down
 _LOOK = 0.5  # s between looks for a new picture of a trial
@@ -138,23 +133,12 @@ class Session:
 
     def drag(self, grip: Grip, place: Array) -> None:
         """Move a body or a focus so that its grip is at a place (3,) [m]."""
-        offset = np.round((place - grip.place) / MM, 1) * MM
-        if grip.kind == "body":
-            body = self.now.bodies[grip.number]
-            x, y, z = (grip.origin + offset).round(DIGITS).tolist()
-            self.attempt(lambda: self.now.with_body(grip.number, (x, y, z), body.angles))
-        else:
-            points = self.now.scene.control_points.clone()
-            points[grip.number] = points.new_tensor((grip.origin + offset).round(DIGITS))
-            self.attempt(lambda: self.now.with_points(points))
+        self.attempt(lambda: grip.dragged(self.now, place))
 
     def turn(self, grip: Grip, angle: float) -> None:
         """Turn a body about the vertical by an angle [rad] from its angles when it was gripped."""
         if grip.kind == "body":
-            body = self.now.bodies[grip.number]
-            turn = rotation_matrix((0.0, 0.0, angle)) @ rotation_matrix(grip.angles)
-            a, b, c = angles_of(turn).tolist()
-            self.attempt(lambda: self.now.with_body(grip.number, body.center, (a, b, c)))
+            self.attempt(lambda: grip.turned(self.now, angle))
 
     def choose(self, grip: Grip) -> None:
         """Choose the gripped object in the lists of the page."""
@@ -201,17 +185,11 @@ class Session:
 
     def undo(self) -> None:
         """Go a step back."""
-        self.grip = None
-        self._end_search()
-        self._history.undo()
-        self._show()
+        self._go(self._history.undo)
 
     def redo(self) -> None:
         """Repeat a step."""
-        self.grip = None
-        self._end_search()
-        self._history.redo()
-        self._show()
+        self._go(self._history.redo)
 
     def add_focus(self) -> None:
         """Add a focus beside the chosen one."""
@@ -301,6 +279,13 @@ class Session:
         if self._running:
             self._cancelled = f"{self.methods[str(self._search)].label} cancelled, "
         self._search, self._running, self._view_waits = None, False, False
+
+    def _go(self, along_history: Callable[[], None]) -> None:
+        """Show another step, which ends a search."""
+        self.grip = None
+        self._end_search()
+        along_history()
+        self._show()
 
     def _show(self) -> None:
         self.place()

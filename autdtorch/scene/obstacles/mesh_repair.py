@@ -15,7 +15,6 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order
 
-from autdtorch.scene.obstacles.mesh_file import Polygons, triangulated
 from autdtorch.scene.obstacles.mesh_solid import (
     Triangles,
     joined,
@@ -24,6 +23,7 @@ from autdtorch.scene.obstacles.mesh_solid import (
     solid_of,
     winding_number,
 )
+from autdtorch.scene.obstacles.polygons import Polygons, triangulated
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.spatial import areas_of, connected_parts, paired_sides, sides_of
 

@@ -1,0 +1,115 @@
+"""The methods of a study: each a `Method` or a function, with its trials and its goal."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any, TypeAlias
+
+import torch
+
+from autdtorch.io.goal_section import require_score
+from autdtorch.methods.base import Method
+from autdtorch.methods.run import run
+from autdtorch.methods.seeds import TRIAL_BYTES, Trials
+from autdtorch.methods.solution import Solution
+from autdtorch.objectives.forces import ForceGoal
+from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
+from autdtorch.objectives.objective import Objective
+from autdtorch.objectives.quiet import QuietPoints, SeenPoints
+from autdtorch.objectives.readings import Readings
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.process import require_memory
+from autdtorch.utils.validation import integer_at_least, invalid, require_kind, require_known, within
+
+StudyMethod: TypeAlias = Method | Callable[..., Solution]
+"""A `Method`, or a function of an objective with its settings bound. A function that has parameters `trials`
+and `seed` gets the numbers of the trials to run, as many as it must return, and the study's seed. One
+that has a parameter `goal` gets the goal."""
+
+
+def counts_of(
+    methods: Mapping[str, StudyMethod], trials: int | Mapping[str, int], seed: int
+) -> dict[str, int]:
+    """Check the seed, and return the number of trials of each method."""
+    integer_at_least("seed", seed, 0)
+    random = [name for name, method in methods.items() if _is_random(method)]
+    if not isinstance(trials, Mapping):
+        trials = dict.fromkeys(random, integer_at_least("trials", trials, 1))
+    require_known("trials", trials, random, "random method")
+    if absent := [name for name in random if name not in trials]:
+        raise invalid("trials", dict(trials), f"must also give the number for {', '.join(absent)}")
+    counts = {name: integer_at_least(f"trials.{name}", trials.get(name, 1), 1) for name in methods}
+    for name, count in counts.items():
+        require_memory(f"trials.{name}", count, TRIAL_BYTES * count)
+    return counts
+
+
+def check_goal(
+    goal: Goal | ForceGoal, scenes: Mapping[str, Scene], methods: Mapping[str, StudyMethod]
+) -> None:
+    """Check the goal against all scenes, and that every method can maximise it."""
+    if not isinstance(goal, ForceGoal):
+        require_kind("goal", goal, Goal)
+    require_score(goal.name, goal.unit)
+    for scene in scenes.values():
+        with within("goal"):
+            goal.check(scene) if isinstance(goal, ForceGoal) else goal.check(len(scene.control_points))
+    for name, method in methods.items():
+        if goal == WEAKEST_FOCUS or isinstance(method, Method):
+            continue
+        if goal_keyword(method) is None:
+            accepted = f"must have a parameter `goal`, for the goal {goal.name}"
+            raise invalid(f"method {name}", name_of(method), accepted)
+
+
+def goal_keyword(method: Callable[..., Solution]) -> str | None:
+    """Return the name of the parameter for the goal of a function, if it has one."""
+    taken = inspect.signature(method).parameters
+    if "goal" in taken or "score" not in taken:
+        return "goal" if "goal" in taken else None
+    warnings.warn(f"{name_of(method)}: the parameter `score` is now `goal`", DeprecationWarning, stacklevel=2)
+    return "score"
+
+
+def goals_of(goal: Goal | ForceGoal) -> list[Goal | ForceGoal]:
+    """Return a goal, and the goals that it is made of."""
+    return [goal, *goals_of(goal.goal)] if isinstance(goal, QuietPoints | SeenPoints) else [goal]
+
+
+def _is_random(method: StudyMethod) -> bool:
+    return method.random if isinstance(method, Method) else "trials" in inspect.signature(method).parameters
+
+
+def name_of(method: StudyMethod) -> str:
+    """Return the name of a method, or of the function that it is."""
+    return method.name if isinstance(method, Method) else str(code_of(method).__name__)
+
+
+def code_of(method: StudyMethod) -> Any:
+    """Return the class of a method, or the function behind it."""
+    if isinstance(method, Method):
+        return type(method)
+    return method.func if isinstance(method, functools.partial) else method
+
+
+def solve(
+    method: StudyMethod,
+    objective: Objective,
+    trials: Trials,
+    seed: int,
+    goal: Goal,
+    start: torch.Tensor | None = None,
+    readings: Readings | None = None,
+) -> Solution:
+    """Run trials of a method on an objective, from drives (T, M) and readings where it begins at any."""
+    if isinstance(method, Method):
+        return run(method, objective, trials, seed, goal=goal, start=start, readings=readings)
+    taken = inspect.signature(method).parameters
+    if readings is not None:
+        accepted = "must be None: only a Method goes on from them, no function"
+        raise invalid("readings", readings, accepted)
+    arguments = {"trials": trials, "seed": seed, goal_keyword(method) or "goal": goal}
+    return method(objective, **{key: value for key, value in arguments.items() if key in taken})
