@@ -73,7 +73,7 @@ class Wiring:
     def of_device(self, drive: torch.Tensor) -> torch.Tensor:
         """Return the drive (..., N) of all the device's transducers for a checked `drive` (..., M)."""
         everyone = torch.zeros((*drive.shape[:-1], self.device.transducers), **COMPLEX)
-        everyone[..., self.transducers] = drive
+        everyone[..., self.transducers] = drive.cpu()
         return everyone
 
 
@@ -98,7 +98,7 @@ class AmplitudeScale:
 
     def asked(self, drive: torch.Tensor) -> torch.Tensor:
         """Return the drive to ask of the device, in the device's scale, for a trial's `drive` (M,)."""
-        return self.frames_asked(validate_single_drive(drive, len(self._most)))
+        return self.frames_asked(validate_single_drive(drive, len(self._most)).cpu())
 
     def frames_asked(self, drives: torch.Tensor) -> torch.Tensor:
         """Return the drives to ask of the device, in its scale, for a trial's checked `drives` (..., M)."""
@@ -107,7 +107,7 @@ class AmplitudeScale:
 
     def quantised(self, drive: torch.Tensor) -> torch.Tensor:
         """Return the device's nearest drives to drives (..., M), both in the trial's scale."""
-        drive = validate_drive(drive, len(self._most))
+        drive = validate_drive(drive, len(self._most)).cpu()
         # One by one, as the link plays them: no rounding may depend on the rows beside.
         rows = [self._wiring.quantised(self.asked(row)) for row in drive.reshape(-1, drive.shape[-1])]
         return torch.stack(rows).reshape(drive.shape) / self.largest

@@ -15,6 +15,7 @@ import torch
 
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.array_types import device_of
 from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import (
@@ -78,9 +79,9 @@ def observe_drives(
 
     `ValueError` for no drive, another M than `transducers`, not finite complex numbers, or |q| > 1.
     """
-    drive = validate_drives(drive, transducers)
+    device, drive = device_of(drive), validate_drives(drive, transducers)
     pressure = observe(drive.reshape(-1, transducers))
-    return pressure.reshape(*drive.shape[:-1], -1)
+    return pressure.reshape(*drive.shape[:-1], -1).to(device)
 
 
 def validate_drives(drive: torch.Tensor, transducers: int, name: str = "drive") -> torch.Tensor:
@@ -198,7 +199,7 @@ class SimulatedObjective:
             drive: (..., M) complex, |q| <= 1; each drive is an evaluation.
 
         Returns:
-            Pressure magnitudes (..., P) [Pa], float64, on the CPU, without gradient. In mode "transfer" a row
+            Pressure magnitudes (..., P) [Pa], float64, without gradient. In mode "transfer" a row
             is rounded alike, whatever the other rows and the number of threads.
 
         Raises:

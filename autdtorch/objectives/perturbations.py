@@ -17,7 +17,7 @@ import torch
 from autdtorch.objectives.objective import Objective, observe_drives, require_objective, validate_drives
 from autdtorch.objectives.readings import deviation_by_square
 from autdtorch.scene.drive import PhaseLevels, drive_from_phases, validate_drive
-from autdtorch.utils.array_types import REAL
+from autdtorch.utils.array_types import REAL, device_of
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import (
     boolean,
@@ -116,7 +116,7 @@ class FailedTransducers(Perturbation):
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
         """Return `drive` (..., M) without the failed transducers."""
-        return super().emitted(drive) * self._working
+        return super().emitted(drive) * self._working.to(drive.device)
 
 
 class Drift(Perturbation):
@@ -148,7 +148,7 @@ class Drift(Perturbation):
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
         """Return `drive` (..., M) with the drift after the evaluations so far."""
-        return super().emitted(drive) * self._factors(self._walk)[0]
+        return super().emitted(drive) * self._factors(self._walk)[0].to(drive.device)
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
         size = (len(drive), len(self._steps))
@@ -247,11 +247,11 @@ def true_pressure(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
     are left out: noise and its drift. Only the innermost objective counts the evaluations.
     """
     require_objective(objective)
-    drive = validate_drives(drive, len(objective.scene.array))
+    device, drive = device_of(drive), validate_drives(drive, len(objective.scene.array))
     while isinstance(objective, Perturbation):
         drive = objective.emitted(drive)
         objective = objective.inner
-    return observe_drives(objective, drive, drive.shape[-1])
+    return observe_drives(objective, drive, drive.shape[-1]).to(device)
 
 
 def quantised(objective: Objective, drive: torch.Tensor) -> torch.Tensor:

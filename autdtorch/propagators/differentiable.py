@@ -20,7 +20,7 @@ from autdtorch.scene.checks import require_inside
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.reflectors import require_in_front
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.array_types import COMPLEX
+from autdtorch.utils.array_types import COMPLEX, device_of
 from autdtorch.utils.validation import (
     ArrayLike,
     integer_at_least,
@@ -63,15 +63,14 @@ def differentiable_field(
         spacing: edge of a cell [m], at most a third of the wavelength.
         periods: periods of the drive that are stepped, in blocks of a few; the phasors are those of the last
             block. By default sound crosses the domain twice; resonances need more.
-        device: as in `make_propagator`, as is `kernel`. The result is on the CPU; gradients pass to tensors
-            on any device.
+        device: as in `make_propagator`, as is `kernel`; gradients pass to tensors on any.
         kernel: the kernel.
         dtype: precision of the fields, float32 or float64.
         time_step: upper limit [s], as in `make_propagator`. The default, the largest stable one, may change
             with the medium from call to call, and the field slightly with it.
 
     Returns:
-        complex128 (..., P) [Pa].
+        complex128 (..., P) [Pa], on the device of the drive.
 
     Raises:
         ValueError: an argument has another shape or is out of range, or maps are given in a scene with
@@ -120,7 +119,7 @@ def differentiable_field(
         sources = cells.driven(assembly.sources(nodes.positions, strength, nodes.weights), assembly)
         record = recorded(stepper, assembly, sources, receivers, signal)
         fields.append(drive_dft(record[-steps:], block)[None])  # the last block
-    return torch.cat(fields).reshape(*drive.shape[:-1], len(targets))
+    return torch.cat(fields).reshape(*drive.shape[:-1], len(targets)).to(device_of(drive))
 
 
 def cell_centers(scene: Scene, spacing: float = 1e-3) -> torch.Tensor:

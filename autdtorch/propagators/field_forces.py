@@ -23,7 +23,7 @@ from autdtorch.propagators.tmatrix.force import radiation_force
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.array_types import REAL
+from autdtorch.utils.array_types import REAL, device_of
 from autdtorch.utils.validation import ArrayLike, points_grid, real_tensor, require_kind
 
 _APART = 0.15, 0.3  # wavelengths between a body's circumscribed sphere and the two around it
@@ -121,7 +121,7 @@ def radiation_stress(
     """
     require_kind("propagator", propagator, Propagator)
     scene, (places, grid) = propagator.scene, points_grid("points", points)
-    drive = validate_drive(drive, len(scene.array)).cpu()
+    device, drive = device_of(drive), validate_drive(drive, len(scene.array)).cpu()
     normals = _unit_normals(normals, grid)
     medium, parts = scene.medium, []
     for nodes in torch.split(nodes_around(scene, places.detach().cpu()), _AT_ONCE):
@@ -132,7 +132,7 @@ def radiation_stress(
     kinetic = medium.density / 4 * velocity.abs().square().sum(dim=-1)
     through = (velocity.conj() * normals).sum(dim=-1, keepdim=True)
     stress = (kinetic - potential)[..., None] * normals - medium.density / 2 * (velocity * through).real
-    return stress.reshape(*drive.shape[:-1], *grid, 3)
+    return stress.reshape(*drive.shape[:-1], *grid, 3).to(device)
 
 
 def _unit_normals(normals: ArrayLike, grid: torch.Size) -> torch.Tensor:

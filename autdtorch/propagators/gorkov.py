@@ -20,6 +20,7 @@ from autdtorch.propagators.propagator import Propagator
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.particle import BEAD, Particle
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.array_types import device_of
 from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import ArrayLike, Vector, invalid, points_grid, require_kind, unit_vector
 
@@ -100,15 +101,16 @@ def gorkov(
     require_kind("particle", particle, Particle)
     warn_of_large(particle, scene)
     places, grid = points_grid("points", points)
-    drive = validate_drive(drive, len(scene.array))
-    field = field_derivatives(propagator, drive, nodes_around(scene, places))
+    device, drive = device_of(drive), validate_drive(drive, len(scene.array)).cpu()
+    field = field_derivatives(propagator, drive, nodes_around(scene, places.cpu()))
     potential, force, stiffness = _of(field, particle, scene)
     if up is not None:
         upwards = force.new_tensor(unit_vector("up", up))
         potential = potential + particle.weight * (places.to(force) @ upwards)
         force = force - particle.weight * upwards
     shape = (*drive.shape[:-1], *grid)
-    return Gorkov(potential.reshape(shape), force.reshape(*shape, 3), stiffness.reshape(*shape, 3, 3))
+    parts = potential.reshape(shape), force.reshape(*shape, 3), stiffness.reshape(*shape, 3, 3)
+    return Gorkov(*(part.to(device) for part in parts))
 
 
 def factors(particle: Particle, scene: Scene) -> tuple[float, float]:

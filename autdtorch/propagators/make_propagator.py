@@ -91,8 +91,8 @@ def make_propagator(
             or the estimated error where the spacing is chosen; a warning tells where voxels are too coarse
             for it. Hard obstacles are simulated as rigid where the difference is smaller.
         device: where simulations run: "cpu", "cuda" (an NVIDIA GPU, the current one) or a `torch.device`; by
-            default a GPU if there is one. Results are on the CPU, and equal to rounding wherever they come
-            from.
+            default a GPU if there is one. Results are equal to rounding wherever they come from, and on the
+            device of the drive or the points, the CPU by default.
         kernel: "cpu" (numba), "cuda" (Triton, on an NVIDIA GPU), "reference" (torch, slow, readable), or
             "auto" for the fastest available on the device.
         dtype: precision of the fields, float32 or float64.

@@ -13,7 +13,7 @@ from autdtorch.scene.drive import validate_drive, validate_single_drive
 from autdtorch.scene.obstacles.base import inside_any
 from autdtorch.scene.reflectors import are_in_front
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.array_types import COMPLEX, REAL
+from autdtorch.utils.array_types import COMPLEX, REAL, device_of
 from autdtorch.utils.spatial import nearest
 from autdtorch.utils.validation import ArrayLike, boolean, invalid, points_grid, positive, require_kind
 
@@ -90,7 +90,7 @@ class ScenePropagator(ABC):
                 infinite one if obstacles are ignored. `point_errors` returns the error of each point.
 
         Returns:
-            complex128 (P, M) [Pa], and the error if asked for.
+            complex128 (P, M) [Pa] on the device of `points`, and the error if asked for.
 
         Raises:
             ValueError: `points` are not finite, have another shape, are behind a reflector, outside the
@@ -98,6 +98,7 @@ class ScenePropagator(ABC):
         """
         with_error = boolean("return_error", return_error)
         matrix, error = self._matrix(points, with_error)
+        matrix = matrix.to(device_of(points))
         return (matrix, error) if with_error else matrix
 
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
@@ -107,45 +108,45 @@ class ScenePropagator(ABC):
         more drives in later calls, multiply by `transfer_matrix`.
 
         Args:
-            drive: (..., M) complex, |q| <= 1, on any device.
+            drive: (..., M) complex, |q| <= 1.
             points: (P, 3) or a grid such as (Nu, Nv, 3) [m], which may cross obstacles and reflectors; behind
                 these it is 0.
 
         Returns:
-            complex128 (..., P) or (..., Nu, Nv) [Pa], on the CPU; differentiable by the drive.
+            complex128 (..., P) or (..., Nu, Nv) [Pa] on the device of the drive, and differentiable by it.
 
         Raises:
             ValueError: drive or points of another shape or out of range, as in `transfer_matrix`.
         """
-        drive = validate_drive(drive, len(self.scene.array)).cpu()
+        device, drive = device_of(drive), validate_drive(drive, len(self.scene.array)).cpu()
         places, grid = points_grid("points", points)
-        is_picture = len(grid) > 1
+        places, is_picture = places.cpu(), len(grid) > 1
         front = are_in_front(self.scene.reflectors, places.detach())
         if is_picture and not front.all():
             field = torch.zeros((*drive.shape[:-1], len(places)), **COMPLEX)
             if front.any():
-                field[..., front.cpu()] = self._field(drive, places[front], is_picture)
+                field[..., front] = self._field(drive, places[front], is_picture)
         else:
             field = self._field(drive, places, is_picture)
-        return field.reshape(*drive.shape[:-1], *grid)
+        return field.reshape(*drive.shape[:-1], *grid).to(device)
 
     def absorbed_power(self, drive: torch.Tensor) -> AbsorbedPower:
         """Return the power that each obstacle and each reflector absorbs; FDTD takes a run for each drive.
 
         Args:
-            drive: (..., M) complex, |q| <= 1, on any device.
+            drive: (..., M) complex, |q| <= 1.
 
         Returns:
-            The power [W], float64, of the obstacles (..., K) and the reflectors (..., J). Power lost in the
-            medium is not counted, and none in obstacles that free space ignores.
+            The power [W], float64, of the obstacles (..., K) and the reflectors (..., J), on the device of
+            the drive. Power lost in the medium is not counted, and none in obstacles that free space ignores.
 
         Raises:
             ValueError: a drive of another shape or out of range, or a reflector that absorbs and has a
                 complex reflection or faces another.
         """
-        drive = validate_drive(drive, len(self.scene.array)).cpu().detach()
+        device, drive = device_of(drive), validate_drive(drive, len(self.scene.array)).cpu().detach()
         power = self._absorbed(drive.reshape(-1, drive.shape[-1]))
-        return AbsorbedPower(*(part.reshape(*drive.shape[:-1], part.shape[1]) for part in power))
+        return AbsorbedPower(*(part.reshape(*drive.shape[:-1], part.shape[1]).to(device) for part in power))
 
 
 def volume_field(propagator: Propagator, drive: ArrayLike, spacing: float | None = None) -> torch.Tensor:
@@ -175,7 +176,7 @@ def volume_field(propagator: Propagator, drive: ArrayLike, spacing: float | None
     axes = zip(lower, upper, steps, counts, strict=True)
     points = torch.cartesian_prod(*(low + (high - low) * step / count for low, high, step, count in axes))
     valid = are_shown(scene, points)
-    field = torch.full((len(points),), complex(math.nan, math.nan), **COMPLEX)
+    field = torch.full((len(points),), complex(math.nan, math.nan), **COMPLEX).to(drive.device)
     field[valid] = propagator.field(drive, points[None, valid])[0]  # a grid, which may touch obstacles
     return field.reshape(counts)
 

@@ -20,7 +20,7 @@ from autdtorch.propagators.propagator import ScenePropagator
 from autdtorch.propagators.simulation import PressureMap, Run, Simulation
 from autdtorch.propagators.store import Store
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.array_types import COMPLEX, REAL
+from autdtorch.utils.array_types import COMPLEX, REAL, device_of
 from autdtorch.utils.process import cached_property, one_library_thread, require_memory
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import ArrayLike, invalid
@@ -127,7 +127,7 @@ class SimulatedPropagator(ScenePropagator):
         results, free = self._results(places, with_error=True), self._free(places)
         matrix, residual = results[0].matrix, results[0].residual
         settling = torch.where(matrix.any(dim=1), residual * matrix.norm() / sizes(matrix, free), 0.0)
-        return self._errors(results, free) + settling
+        return (self._errors(results, free) + settling).to(device_of(points))
 
     @one_library_thread()
     def known_errors(self) -> tuple[float, float, float]:

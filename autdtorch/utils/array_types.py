@@ -1,4 +1,4 @@
-"""Types of NumPy arrays, and keywords of tensors on the CPU."""
+"""Types of NumPy arrays, keywords of tensors on the CPU, and the device of an argument."""
 
 from __future__ import annotations
 
@@ -20,3 +20,8 @@ REAL: Final[dict[str, Any]] = {"dtype": torch.float64, "device": "cpu"}
 
 COMPLEX: Final[dict[str, Any]] = {"dtype": torch.complex128, "device": "cpu"}
 """COMPLEX: complex128 on the CPU."""
+
+
+def device_of(value: object) -> torch.device:
+    """Return the device of an argument that may be a tensor; of other numbers, the CPU."""
+    return value.device if isinstance(value, torch.Tensor) else torch.device("cpu")

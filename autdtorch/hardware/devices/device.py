@@ -165,7 +165,7 @@ class Device(ABC):
         """
         tensor = drive if isinstance(drive, torch.Tensor) else drive_tensor(drive)
         checked = validate_drive(tensor, tensor.shape[-1] if tensor.ndim else 0)
-        return self.phase_levels.nearest(checked.detach())
+        return self.phase_levels.nearest(checked.detach().cpu())
 
     def drive(self, *levels: ArrayLike) -> torch.Tensor:
         """Return the drive (..., M), complex128, that the device emits for integer levels, by column.

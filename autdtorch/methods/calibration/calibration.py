@@ -15,7 +15,7 @@ from autdtorch.objectives.objective import validate_drives
 from autdtorch.objectives.readings import Readings
 from autdtorch.propagators.scene_changes import SceneChanges
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.array_types import COMPLEX
+from autdtorch.utils.array_types import COMPLEX, device_of
 from autdtorch.utils.process import cached_property, one_library_thread
 from autdtorch.utils.text import counted, html_facts
 from autdtorch.utils.validation import ArrayLike, complex_tensor, points_tensor
@@ -227,7 +227,8 @@ class Calibration:
             played, Magnitudes(magnitudes, torch.zeros_like(magnitudes, dtype=torch.bool))
         )
         deviation = self.fit.line.covariance.deviations_of(others, same_points=points is None)
-        return Prediction(magnitudes, deviation, (deviation.square() + posterior.variance).sqrt())
+        parts = magnitudes, deviation, (deviation.square() + posterior.variance).sqrt()
+        return Prediction(*(part.to(device_of(drives)) for part in parts))
 
     @property
     def _factors(self) -> tuple[torch.Tensor, ...]:

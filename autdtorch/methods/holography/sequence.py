@@ -27,7 +27,7 @@ from autdtorch.methods.holography.algorithms import GOLDEN, TINY, UNREACHED
 from autdtorch.methods.holography.holography import checked_targets
 from autdtorch.scene.geometry import path_foci
 from autdtorch.scene.sequence import Sequence
-from autdtorch.utils.array_types import Array, ComplexArray
+from autdtorch.utils.array_types import Array, ComplexArray, device_of
 from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import (
     ArrayLike,
@@ -74,7 +74,7 @@ def drive_sequence(
         iterations: most iterations of the path, >= 1.
 
     Returns:
-        Drives (T, M), complex128, |q| <= 1.
+        Drives (T, M), complex128, |q| <= 1, on the device of G.
 
     Raises:
         ValueError: not finite numbers, shapes that do not fit, targets <= 0, a focus that no transducer
@@ -100,7 +100,7 @@ def drive_sequence(
     if even:
         level = np.abs(drives[:, None] @ rows.swapaxes(1, 2)).min(axis=(1, 2))
         drives = drives * (level.min() / np.maximum(level, TINY))[:, None]
-    return torch.from_numpy(drives)
+    return torch.from_numpy(drives).to(device_of(G))
 
 
 def sequence_along(

@@ -28,6 +28,7 @@ from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.reflectors import require_in_front
+from autdtorch.utils.array_types import device_of
 from autdtorch.utils.images import Image
 from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import ArrayLike, integer_at_least, invalid, require_kind
@@ -145,7 +146,8 @@ class _Driven:
     @one_library_thread()
     def sums(self, momentum: _Momentum, drive: ArrayLike) -> torch.Tensor:
         """Return what a body takes up of a momentum (..., 3) under drives (..., M)."""
-        drive, together = validate_drive(drive, len(self.array)).cpu(), self.cluster.together_on(self.number)
+        device, together = device_of(drive), self.cluster.together_on(self.number)
+        drive = validate_drive(drive, len(self.array)).cpu()
 
         def of_drives(bodies: Sequence[TMatrix], drives: torch.Tensor) -> torch.Tensor:  # (..., R, M)
             regular, outgoing = waves_of_body(bodies, self.number, self.array, self.images, drives, together)
@@ -164,7 +166,7 @@ class _Driven:
             poses, len(self.array), lambda bodies, part: of_drives(bodies, drives[part])
         )
         forces = forces.reshape(*(every[dimension] for dimension in order), 3)
-        return forces.permute(*np.argsort(order), -1)
+        return forces.permute(*np.argsort(order), -1).to(device)
 
     @one_library_thread()
     def matrices(self, momentum: _Momentum) -> torch.Tensor:

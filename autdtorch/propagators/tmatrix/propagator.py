@@ -25,7 +25,7 @@ from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
 from autdtorch.scene.checks import require_clear
 from autdtorch.scene.reflectors import require_in_front
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.array_types import COMPLEX, REAL
+from autdtorch.utils.array_types import COMPLEX, REAL, device_of
 from autdtorch.utils.images import Image
 from autdtorch.utils.process import cached_property, one_library_thread
 from autdtorch.utils.validation import ArrayLike, differentiable_points, points_tensor
@@ -118,7 +118,7 @@ class TMatrixPropagator(ScenePropagator):
         """Return which points (P, 3) [m] are outside all bodies' spheres; none if a transducer is not."""
         nodes = self.scene.array.nodes.positions.reshape(-1, 3)
         outside = are_outside(points_tensor("points", points).cpu(), self._spheres)
-        return outside & are_outside(nodes, self._spheres).all()
+        return (outside & are_outside(nodes, self._spheres).all()).to(device_of(points))
 
     @cached_property
     def _spheres(self) -> list[ObstacleGroup]:
@@ -148,7 +148,7 @@ class TMatrixPropagator(ScenePropagator):
         errors[served] = self._wave_errors(places[served], matrix[served])
         if not served.all():
             errors[~served] = self._box.point_errors(places[~served])
-        return errors
+        return errors.to(device_of(points))
 
     def _wave_errors(self, points: torch.Tensor, matrix: torch.Tensor) -> torch.Tensor:
         """Return the estimated errors (P,) of rows of G (P, M) that the waves serve."""

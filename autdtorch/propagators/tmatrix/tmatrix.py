@@ -29,7 +29,7 @@ from autdtorch.scene.geometry import composed_rotation
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.reflectors import Reflector, require_arrangement, require_in_front
-from autdtorch.utils.array_types import COMPLEX, REAL
+from autdtorch.utils.array_types import COMPLEX, REAL, device_of
 from autdtorch.utils.files import path_of, read_arrays, write_arrays
 from autdtorch.utils.hints import renamed_keywords
 from autdtorch.utils.images import NO_MIRRORS, Image, images_of
@@ -145,7 +145,8 @@ class TMatrix(BodyMatrix):
 
         Gradients of all pass. Transfer matrices of many poses have their leading dimensions.
         """
-        shift, angles = real_tensor("offset", offset, "m"), turn_tensor(rotation, rotation_degrees)
+        shift = real_tensor("offset", offset, "m").cpu()
+        angles = turn_tensor(rotation, rotation_degrees).cpu()
         if shift.ndim == 0 or shift.shape[-1] != 3 or not shift.numel():
             raise ValueError(f"offset: shape {tuple(shift.shape)}; must be (3,), or (..., 3) for many poses")
         before = np.broadcast_shapes(self.center.shape[:-1], self.axes.shape[:-2])
@@ -301,7 +302,7 @@ class TMatrixCluster:
         """Return transfer matrices (..., P, M), complex128 [Pa], of an array at points (..., P, 3) [m].
 
         Leading dimensions of the points and of the bodies' poses are broadcast. Gradients of points, places
-        and turns pass.
+        and turns pass. The result is on the device of the points.
 
         Raises:
             ValueError: a point or transducer within a circumscribed sphere.
@@ -316,14 +317,14 @@ class TMatrixCluster:
         direct = free_space_matrix(targets, array, self.bodies[0].wavenumber, images).reshape(*grid, -1)
         if not self.poses:
             scattered = scattered_field(self.bodies, array, targets, images, self.together)
-            return direct + scattered.reshape(direct.shape)
+            return (direct + scattered.reshape(direct.shape)).to(device_of(points))
         sets = targets.reshape(*grid, 3).expand(*every, -1, -1).reshape(-1, grid[-1], 3)
 
         def of_poses(bodies: Sequence[TMatrix], part: slice) -> torch.Tensor:
             return scattered_field(bodies, array, sets[part], images, self.together)
 
         scattered = self.by_poses(every, len(array), of_poses)
-        return direct + scattered.reshape(*every, *direct.shape[-2:])
+        return (direct + scattered.reshape(*every, *direct.shape[-2:])).to(device_of(points))
 
     @property
     def together(self) -> torch.Tensor | None:

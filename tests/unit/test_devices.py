@@ -1,0 +1,136 @@
+"""Tensors on a GPU, or in the guise of a GPU's, are accepted everywhere; results are on it, and equal."""
+
+import inspect
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from emulated_gpu import gpu
+from public_calls import AIR_ALONE, BALL, DRIVE, MATRIX, SCENE, Call, limited_link, propagator, public_calls
+
+import autdtorch as at
+from autdtorch.utils.validation import real_tensor
+
+TENSORS = {"drive", "drives", "G", "points", "positions", "pressure", "X"}
+"""Parameters that are tensors, wherever a tensor is accepted."""
+
+RESULTS_ON_CPU = {"PoseBall.certificate", "equilibrium", "haptic_metrics", "modulated"}
+"""Calls whose results are kept, as scenes are, on the CPU."""
+
+ROOMS = tuple(f"autdtorch.{room}." for room in ("analytic", "methods", "objectives", "propagators", "scene"))
+
+CALLS = {
+    name: call
+    for name, call in public_calls().items()
+    if TENSORS & call.parameters.keys()
+    and call.function.__module__.startswith(ROOMS)
+    and not inspect.isclass(call.function)
+    and not name.endswith((".tell", "of_rows", ".air"))
+}
+
+pytestmark = pytest.mark.filterwarnings("ignore::autdtorch.SteadyStateWarning")  # of coarse, short runs
+
+POINTS = torch.tensor([[22e-3, 7e-3, 14e-3], [20e-3, 16e-3, 12e-3]], dtype=torch.float64)
+
+
+def tensors_of(result):
+    """The tensors that a result is or has."""
+    if isinstance(result, torch.Tensor):
+        return [result]
+    parts = vars(result).values() if hasattr(result, "__dict__") else result
+    return [part for part in parts if isinstance(part, torch.Tensor)] if np.iterable(parts) else []
+
+
+def is_array(value):
+    return isinstance(value, torch.Tensor) or (
+        isinstance(value, list) and np.asarray(value).dtype.kind == "f"
+    )
+
+
+def require_equal(results, expected):
+    assert len(results) == len(expected)
+    for result, value in zip(results, expected, strict=True):
+        assert result.dtype == value.dtype
+        # rounding in double precision, and of fields that a GPU steps in single precision
+        size = 0.0 if value.dtype == torch.bool else float(value.nan_to_num().abs().sum())
+        torch.testing.assert_close(result.cpu(), value, rtol=1e-4, atol=1e-6 * size, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", sorted(CALLS))
+def test_a_result_is_on_the_device_of_the_tensors(name, tmp_path):
+    call: Call = CALLS[name]
+    others = {"array": None, "medium": None} if name.startswith("radiation_") else {}  # of a propagator
+    if name == "drive_sequence":
+        others["G"] = MATRIX.expand(2, -1, -1)
+    arguments = call.arguments(tmp_path, **others)
+    expected = tensors_of(call.bound(tmp_path)(**arguments))
+    with gpu() as to_gpu:
+        moved = {
+            key: to_gpu(real_tensor(key, value) if isinstance(value, list) else value)
+            if key in TENSORS and is_array(value)
+            else value
+            for key, value in arguments.items()
+        }
+        results = tensors_of(call.bound(tmp_path)(**moved))
+        if name not in RESULTS_ON_CPU:
+            assert all(result.is_cuda for result in results)
+        require_equal(results, expected)
+
+
+@pytest.mark.parametrize("method", ["free_space", "tmatrix", "box"])
+def test_a_field_is_on_the_device_of_the_drive(method):
+    scene = {"free_space": AIR_ALONE, "tmatrix": BALL, "box": SCENE}[method]
+    settings = {"spacing": 2e-3, "tolerance": 0.5, "max_periods": 6} if method == "box" else {}
+    made = propagator(scene, method, **settings)
+    expected = made.field(DRIVE, POINTS)
+    with gpu() as to_gpu:
+        for drive, points in itertools.product((DRIVE, to_gpu(DRIVE)), (POINTS, to_gpu(POINTS))):
+            field = made.field(drive, points)
+            assert field.device == drive.device
+            require_equal([field], [expected])
+            assert made.transfer_matrix(points).device == points.device
+
+
+def test_gradients_pass_to_tensors_on_the_device():
+    made = propagator(BALL, "tmatrix")
+
+    def slopes(drive, points):
+        drive, points = drive.clone().requires_grad_(), points.clone().requires_grad_()
+        total = made.field(0.9 * drive, points).abs().sum() + made.transfer_matrix(points).abs().sum()
+        return torch.autograd.grad(total, (drive, points))
+
+    expected = slopes(DRIVE, POINTS)
+    with gpu() as to_gpu:
+        results = slopes(to_gpu(DRIVE), to_gpu(POINTS))
+        assert all(result.is_cuda for result in results)
+        require_equal(results, expected)
+
+
+@pytest.mark.parametrize(
+    "method", [at.GABS(), at.LSSG(), at.GradientAscent(), at.Holography(), at.PhaseStepping()]
+)
+def test_methods_take_a_matrix_a_start_and_readings_on_the_device(method):
+    def solution(matrix, start):
+        objective = at.SimulatedObjective.of_matrix(AIR_ALONE, matrix)
+        state = method.start(at.Problem.of(objective, start=start))
+        return at.run(method, objective, start=start), method.tell(state, objective(method.ask(state)))
+
+    expected, _ = solution(MATRIX, DRIVE)
+    with gpu() as to_gpu:
+        result, state = solution(to_gpu(MATRIX), to_gpu(DRIVE))
+        readings = at.Readings(to_gpu(DRIVE)[None], to_gpu(MATRIX.abs()[None, :, 0]))
+        method.tell(state, to_gpu(readings.pressure), drives=to_gpu(readings.drives))
+    require_equal([result.drive, result.pressure], [expected.drive, expected.pressure])
+
+
+def test_poses_and_the_bench_take_tensors_of_the_device():
+    bodies = propagator(BALL, "tmatrix").bodies
+    offsets = torch.tensor([[1e-4, 0.0, 0.0], [0.0, 1e-4, 0.0]], dtype=torch.float64)
+    expected = bodies.moved(offsets).transfer_matrix(BALL.array, POINTS)
+    with gpu() as to_gpu:
+        matrices = bodies.moved(to_gpu(offsets)).transfer_matrix(BALL.array, to_gpu(POINTS))
+        assert matrices.is_cuda
+        require_equal([matrices], [expected])
+        limited_link().play(to_gpu(DRIVE))
+        assert torch.equal(limited_link().quantised(to_gpu(DRIVE)), limited_link().quantised(DRIVE))
