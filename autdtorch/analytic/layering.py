@@ -15,12 +15,7 @@ from scipy.special import hankel1, hankel2, jv
 from autdtorch.utils.array_types import Array, ComplexArray
 from autdtorch.utils.fluids import fluid_ratios
 from autdtorch.utils.units import real_wavenumber
-from autdtorch.utils.validation import (
-    ArrayLike,
-    invalid,
-    positive,
-    real_tensor,
-)
+from autdtorch.utils.validation import ArrayLike, invalid, positive, real_tensor
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
 # A panel of 32 Gauss nodes has errors below 1e-13 up to these limits.

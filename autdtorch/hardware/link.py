@@ -372,10 +372,7 @@ def open_link(
 
 
 def open_autd3(
-    boards: int = 1,
-    transducers: _Transducers | None = None,
-    network: Any = None,
-    settle: float = SETTLE,
+    boards: int = 1, transducers: _Transducers | None = None, network: Any = None, settle: float = SETTLE
 ) -> Link:
     """Find boards of AUTD3 on the network and switch their outputs off.
 

@@ -150,10 +150,7 @@ def read_rows(path: str | os.PathLike[str], gaps: bool = False) -> Rows:
 
 
 def table_of(
-    rows: Rows,
-    columns: Mapping[str, str],
-    named: Callable[[Array], list[str]],
-    guess: Guess,
+    rows: Rows, columns: Mapping[str, str], named: Callable[[Array], list[str]], guess: Guess
 ) -> dict[str, Array]:
     """Return the columns (R,) of a table in SI units, by name.
 

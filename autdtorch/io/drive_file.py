@@ -17,12 +17,7 @@ from autdtorch.io.array_file import NORMAL_COLUMNS, OFFSET, PLACE_COLUMNS, SIZE_
 from autdtorch.io.csv_table import Guessed, Rows, read_rows, table_of, write_table
 from autdtorch.io.ultraino_file import SUFFIX, read_ultraino
 from autdtorch.scene.arrays import TransducerArray, phase_offsets_of, radii_of, strengths_of
-from autdtorch.scene.drive import (
-    amplitudes_of,
-    drive_from_phases,
-    phases_of,
-    validate_drive,
-)
+from autdtorch.scene.drive import amplitudes_of, drive_from_phases, phases_of, validate_drive
 from autdtorch.scene.sequence import Sequence
 from autdtorch.utils.array_types import AnyArray, Array
 from autdtorch.utils.files import path_of, read_arrays, write_arrays

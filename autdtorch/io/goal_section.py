@@ -8,13 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from autdtorch.objectives.forces import ForceGoal, GoalOfForce, Levitate, Push, Trap
-from autdtorch.objectives.goals import (
-    WEAKEST_FOCUS,
-    Goal,
-    MeanPressure,
-    TargetPressures,
-    WeakestFocus,
-)
+from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal, MeanPressure, TargetPressures, WeakestFocus
 from autdtorch.objectives.over_scenes import OverScenes
 from autdtorch.objectives.quiet import Contrast, QuietPoints, SeenPoints
 from autdtorch.scene.particle import Particle

@@ -71,10 +71,7 @@ class Attainable:
 
 
 def attainable(
-    objective: Objective,
-    least: float = 0.0,
-    goal: GoalFunction = WEAKEST_FOCUS,
-    seed: int = 0,
+    objective: Objective, least: float = 0.0, goal: GoalFunction = WEAKEST_FOCUS, seed: int = 0
 ) -> Attainable:
     """Return whether a drive scores above `least`, by gradient ascent and the bound of the goal.
 

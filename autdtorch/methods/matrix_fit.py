@@ -184,11 +184,7 @@ def retrieve(drives: torch.Tensor, read: Magnitudes, generator: torch.Generator)
 
 
 def _searched(
-    drives: torch.Tensor,
-    inverse: torch.Tensor,
-    read: Magnitudes,
-    short: bool,
-    generator: torch.Generator,
+    drives: torch.Tensor, inverse: torch.Tensor, read: Magnitudes, short: bool, generator: torch.Generator
 ) -> torch.Tensor:
     """Return candidates (M, K) for a row that explains magnitudes (N, 1), after a long search if `short`."""
     start = _spectral(drives, read)[:, None]

@@ -19,13 +19,7 @@ from autdtorch.scene.sequence import Sequence
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.process import require_memory
 from autdtorch.utils.text import counted
-from autdtorch.utils.validation import (
-    ArrayLike,
-    number_between,
-    points_tensor,
-    require_kind,
-    within,
-)
+from autdtorch.utils.validation import ArrayLike, number_between, points_tensor, require_kind, within
 
 if TYPE_CHECKING:
     from autdtorch.propagators import Propagator

@@ -17,14 +17,7 @@ from autdtorch.scene.drive import validate_single_drive
 from autdtorch.scene.obstacles import Sphere
 from autdtorch.scene.particle import Particle
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.validation import (
-    ArrayLike,
-    Vector,
-    finite_vector,
-    invalid,
-    require_kind,
-    unit_vector,
-)
+from autdtorch.utils.validation import ArrayLike, Vector, finite_vector, invalid, require_kind, unit_vector
 
 _ERROR = 1e-6  # of the sphere's T-matrix
 _FARTHEST = 0.5  # wavelengths from the point, where the next traps are

@@ -65,12 +65,7 @@ class SceneChanges:
         units: of their amounts.
     """
 
-    def __init__(
-        self,
-        propagator: Propagator,
-        names: Sequence[str],
-        points: ArrayLike | None = None,
-    ) -> None:
+    def __init__(self, propagator: Propagator, names: Sequence[str], points: ArrayLike | None = None) -> None:
         """Check the changes; nothing is simulated here.
 
         Args:

@@ -10,13 +10,7 @@ import torch
 
 from autdtorch.utils.spatial import distances
 from autdtorch.utils.units import real_wavenumber, warn_user
-from autdtorch.utils.validation import (
-    ArrayLike,
-    complex_tensor,
-    finite_vector,
-    points_tensor,
-    real_tensor,
-)
+from autdtorch.utils.validation import ArrayLike, complex_tensor, finite_vector, points_tensor, real_tensor
 
 AMPLITUDE_TOLERANCE = 1e-6
 """Excess of |q| over 1 that is accepted: the rounding error of a drive computed in float32."""

@@ -35,24 +35,12 @@ from autdtorch.study.results import (
     median_trial,
     provenance_now,
 )
-from autdtorch.study.study_method import (
-    StudyMethod,
-    check_goal,
-    code_of,
-    counts_of,
-    goals_of,
-    solve,
-)
+from autdtorch.study.study_method import StudyMethod, check_goal, code_of, counts_of, goals_of, solve
 from autdtorch.utils.files import require_name
 from autdtorch.utils.progress import Progress, show_progress
 from autdtorch.utils.spatial import nearest
 from autdtorch.utils.text import counted
-from autdtorch.utils.validation import (
-    LENGTH_TOLERANCE,
-    invalid,
-    positive,
-    within,
-)
+from autdtorch.utils.validation import LENGTH_TOLERANCE, invalid, positive, within
 
 logger = logging.getLogger(__name__)
 

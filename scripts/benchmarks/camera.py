@@ -214,10 +214,7 @@ def one_registration(seed: int, rises: np.ndarray, marks: torch.Tensor) -> np.nd
 
 
 def draw(
-    ax: Axes,
-    label: str,
-    cases: list[tuple[float, Case]],
-    gathered: Callable[[Case], dict[str, np.ndarray]],
+    ax: Axes, label: str, cases: list[tuple[float, Case]], gathered: Callable[[Case], dict[str, np.ndarray]]
 ) -> None:
     """Draw median, quartiles and stated errors of each pressure over an axis."""
     x = [value for value, _ in cases]

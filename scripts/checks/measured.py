@@ -12,16 +12,7 @@ from pathlib import Path
 
 import torch
 from shared.document import Page, percent, printed, table
-from shared.hologram_readings import (
-    AUTHORS_RADIUS,
-    KINDS,
-    LEVELS,
-    TARGETS,
-    TRIES,
-    Holograms,
-    matrix,
-    scene,
-)
+from shared.hologram_readings import AUTHORS_RADIUS, KINDS, LEVELS, TARGETS, TRIES, Holograms, matrix, scene
 from shared.hologram_readings import MARKS as HOLOGRAM_MARKS
 from shared.scans import MARK as SCAN_MARK
 from shared.scans import RADIUS, Scan, load_scans

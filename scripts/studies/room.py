@@ -27,10 +27,7 @@ TABLE = at.Reflector((-106e-3, 0, 0), (1, 0, 0))
 ROOMS: Mapping[str, Sequence[at.Reflector]] = {
     "flush in a panel": [at.Reflector.behind(ARRAY)],
     "on a table": [TABLE],
-    "between walls": [
-        at.Reflector((-150e-3, 0, 0), (1, 0, 0)),
-        at.Reflector((150e-3, 0, 0), (-1, 0, 0)),
-    ],
+    "between walls": [at.Reflector((-150e-3, 0, 0), (1, 0, 0)), at.Reflector((150e-3, 0, 0), (-1, 0, 0))],
 }
 TILTED = {"center": (0, 0, 80e-3), "rotation_degrees": (0, 20, 0), "rigid": True}
 FELT = at.Box((-101e-3, 0, 100e-3), (10e-3, 200e-3, 200e-3), **at.porous(200e3))

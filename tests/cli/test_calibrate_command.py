@@ -37,7 +37,7 @@ def test_a_scene_is_calibrated(bench, run, tmp_path, capsys):
     assert run(*COMMAND, "calibrate.prior.rest=0.01") == 0
     folder, printed = tmp_path / "outputs/bench_calibrated", capsys.readouterr().out
     assert sorted(path.name for path in folder.iterdir()) == [
-        *("calibration.npz", "calibration.png", "scene", "summary.txt"),
+        *("calibration.npz", "calibration.png", "scene", "summary.txt")
     ]
     assert printed.startswith((folder / "summary.txt").read_text())
     calibration = at.load_calibration(folder / "calibration.npz")

@@ -12,15 +12,7 @@ import yaml
 
 from autdtorch.cli.configured_bench import Bench
 from autdtorch.cli.main import CONFIGS
-from autdtorch.hardware import (
-    DEVICES,
-    SENSORS,
-    Device,
-    LinkError,
-    MovedMicrophone,
-    Oscilloscope,
-    ScopeSensor,
-)
+from autdtorch.hardware import DEVICES, SENSORS, Device, LinkError, MovedMicrophone, Oscilloscope, ScopeSensor
 from autdtorch.hardware.sensors.sensor import SensorConfig
 from autdtorch.io.drive_file import load_drive
 from autdtorch.io.scene_file import load_scene

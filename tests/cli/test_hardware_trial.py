@@ -177,10 +177,7 @@ OPENMPD = ("hardware=openmpd", "hardware.limits.amplitude=1", "hardware.transduc
             (*EMULATED, "hardware/sensor=camera", "hardware.sensor.scale=0.1"),
             "hardware.sensor.scale: 0.1; must be 0.01, as",
         ),
-        (
-            (*EMULATED, "hardware/sensor=camera", "hardware.sensor.screen.heating=-1"),
-            "Screen.heating: -1",
-        ),
+        ((*EMULATED, "hardware/sensor=camera", "hardware.sensor.screen.heating=-1"), "Screen.heating: -1"),
         (
             (*EMULATED, "hardware/sensor=camera"),
             "scene.observation_plane: None; must be the plane of the screen",
@@ -195,10 +192,7 @@ OPENMPD = ("hardware=openmpd", "hardware.limits.amplitude=1", "hardware.transduc
             (*GABS, "hardware.transducers='0-99999999999'"),
             "must be numbers from 0 to 255, each once, and ranges",
         ),
-        (
-            (*GABS, "hardware.boards=2"),
-            "hardware.boards: 2; must be null: it is for autd3, openmpd and",
-        ),
+        ((*GABS, "hardware.boards=2"), "hardware.boards: 2; must be null: it is for autd3, openmpd and"),
         ((*GABS, "hardware.network=eth0"), "hardware.network: 'eth0'; must be null: it is for autd3"),
         ((*GABS, "hardware.sensor.snr=nan"), "hardware.sensor.snr: nan; must be"),
         ((*GABS, "hardware.device=openmpd", "hardware.boards=[a.pat]"), "hardware.boards: 'a.pat'; no such"),

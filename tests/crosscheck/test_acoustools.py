@@ -10,12 +10,7 @@ import torch
 pytest.importorskip("acoustools", reason="needs AcousTools: install autdtorch[crosscheck]")
 pytest.importorskip("vedo", reason="AcousTools needs it: install autdtorch[crosscheck]")
 
-from acoustools.Solvers import (
-    gspat_solver,
-    iterative_backpropagation,
-    naive_solver_batched,
-    wgs_solver_batch,
-)
+from acoustools.Solvers import gspat_solver, iterative_backpropagation, naive_solver_batched, wgs_solver_batch
 from acoustools.Utilities import forward_model_batched
 from checks.acoustools import boundary_elements, cube_mesh, rigid_cubes, sphere_mesh
 from shared.cases import simulate, sphere_case

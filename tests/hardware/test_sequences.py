@@ -100,8 +100,7 @@ def test_frames_are_sent_in_order_when_they_are_due_and_without_drift(clock, rat
 
 @settings(max_examples=30)
 @given(
-    rate=st.floats(500, 40_000),
-    delays=st.dictionaries(st.integers(0, 100), st.floats(0, 20e-3), max_size=5),
+    rate=st.floats(500, 40_000), delays=st.dictionaries(st.integers(0, 100), st.floats(0, 20e-3), max_size=5)
 )
 def test_late_frames_are_sent_all_the_same_and_counted(rate, delays):
     with pytest.MonkeyPatch.context() as patch:

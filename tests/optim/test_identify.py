@@ -218,13 +218,7 @@ def test_noisy_readings_are_not_doubted(make_objective, random_matrix, caplog, l
     assert not re.search("outliers|sensor|leaves", caplog.text)
 
 
-COARSE = [
-    (1, 16, 0.5, None),
-    (2, 6, 1.0, None),
-    (4, 16, 0.5, None),
-    (3, 8, 0.5, 16),
-    (1, 16, 0.5, 24),
-]
+COARSE = [(1, 16, 0.5, None), (2, 6, 1.0, None), (4, 16, 0.5, None), (3, 8, 0.5, 16), (1, 16, 0.5, 24)]
 
 
 @pytest.mark.parametrize(("points", "transducers", "step", "evaluations"), COARSE)

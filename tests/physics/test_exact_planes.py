@@ -4,15 +4,7 @@ import numpy as np
 import pytest
 import torch
 from exact_fields import SLOPE_TOLERANCE, STEP, K
-from exact_planes import (
-    Ball,
-    Plane,
-    corner,
-    monopoles,
-    pistons_in_panel,
-    sphere_before_plane,
-    waveguide,
-)
+from exact_planes import Ball, Plane, corner, monopoles, pistons_in_panel, sphere_before_plane, waveguide
 
 from autdtorch import analytic
 from autdtorch.propagators.free_space import free_space_matrix

@@ -9,16 +9,7 @@ import torch
 from bloch_chain import reflection
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lossy_bodies import (
-    AIR,
-    FREQUENCY,
-    WAVENUMBER,
-    BoxRun,
-    incident,
-    region_of_bodies,
-    sphere,
-    sphere_series,
-)
+from lossy_bodies import AIR, FREQUENCY, WAVENUMBER, BoxRun, incident, region_of_bodies, sphere, sphere_series
 from scipy.sparse import coo_array
 from small_scenes import relative_error, small_scene
 

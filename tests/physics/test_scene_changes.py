@@ -237,9 +237,7 @@ def test_obstacles_of_air_stay_air():
 def test_a_change_that_makes_no_sense_is_refused(names, message):
     voxels = VoxelMask(np.ones((2, 2, 2), bool), 1e-3, origin=(12e-3, 4e-3, 4e-3), rigid=True)
     scene = replace(
-        small_scene((BALL, voxels)),
-        medium=Medium(998.0, 1482.0),
-        reflectors=(Reflector.behind(DISCS.array),),
+        small_scene((BALL, voxels)), medium=Medium(998.0, 1482.0), reflectors=(Reflector.behind(DISCS.array),)
     )
     with pytest.raises(ValueError, match=message):
         SceneChanges(make_propagator(scene, "box", cache=False), names)

@@ -203,10 +203,7 @@ BROKEN = [
     ("phase [rad],amplitude,p [Pa peak]\n0,-1,1", "column 'amplitude': '-1'; .* from 0 to 1"),
     ("phase 0 [rad],phase 1 [rad],amplitude 0,p [Pa peak]\n0,1,1,1", "1 of amplitude and 2 of phase"),
     ("phase [rad],intensity,p [Pa peak]\n0,1,1", "amplitudes in levels beside phases in rad"),
-    (
-        "autd3 phase 0,intensity,p [Pa peak]\n0,256,1",
-        "'256'; .* from 0 to 255",
-    ),
+    ("autd3 phase 0,intensity,p [Pa peak]\n0,256,1", "'256'; .* from 0 to 255"),
     (TABLE.replace("phase 1", "phase 0"), r"columns of phase, 'phase 0 \[deg\]' twice"),
     (TABLE.replace("phase 1", "phase 7"), "must have the numbers from 0 or 1, each once"),
     (

@@ -217,10 +217,7 @@ def _homography(coordinates: Array, pixels: Array) -> Array:
     ones, zeros = np.ones((len(source), 1)), np.zeros((len(source), 3))
     known = np.hstack([source, ones])
     equations = np.vstack(
-        [
-            np.hstack([known, zeros, -image[:, :1] * known]),
-            np.hstack([zeros, known, -image[:, 1:] * known]),
-        ]
+        [np.hstack([known, zeros, -image[:, :1] * known]), np.hstack([zeros, known, -image[:, 1:] * known])]
     )
     _, values, rows = np.linalg.svd(equations)
     if values[7] < _LEAST_SPREAD * values[0]:

@@ -11,12 +11,7 @@ from typing import NamedTuple
 
 import torch
 
-from autdtorch.hardware.sensors.scpi_scope import (
-    COARSEST,
-    FINEST,
-    Oscilloscope,
-    Waveform,
-)
+from autdtorch.hardware.sensors.scpi_scope import COARSEST, FINEST, Oscilloscope, Waveform
 from autdtorch.hardware.sensors.sensor import SensorError
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import (

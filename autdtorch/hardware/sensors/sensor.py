@@ -18,13 +18,7 @@ from autdtorch.objectives.objective import validate_magnitudes
 from autdtorch.objectives.perturbations import SNRS, random_rms
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.process import send
-from autdtorch.utils.validation import (
-    finite_number,
-    integer_at_least,
-    invalid,
-    number_between,
-    require_kind,
-)
+from autdtorch.utils.validation import finite_number, integer_at_least, invalid, number_between, require_kind
 
 if TYPE_CHECKING:
     from autdtorch.hardware.emulator.bench import EmulatedBench

@@ -269,14 +269,8 @@ class Calibration:
         gains, phases = _spreads(self)
         facts += [
             ("scale", f"{self.scale.value:.4g} +- {self.scale.deviation:.2g}"),
-            (
-                "gains",
-                f"spread {_percent(gains)}, each +- {_percent(float(self.gain_deviation.mean()))}",
-            ),
-            (
-                "phases",
-                f"spread {phases:.3f} rad, each +- {float(self.phase_deviation.mean()):.3f} rad",
-            ),
+            ("gains", f"spread {_percent(gains)}, each +- {_percent(float(self.gain_deviation.mean()))}"),
+            ("phases", f"spread {phases:.3f} rad, each +- {float(self.phase_deviation.mean()):.3f} rad"),
             ("noise", f"{self.noise:.3g} Pa"),
             ("determined", f"{self.determined:.0f} of {2 * len(self.gain)} directions of gains and phases"),
         ]

@@ -147,11 +147,7 @@ def _first(prior: MatrixPrior, readings: Readings, unit: float) -> CalibrationFi
 
 
 def _moved(
-    simulation: CalibrationStart,
-    prior: Prior,
-    before: CalibrationFit,
-    fit: CalibrationFit,
-    tangent: Tangent,
+    simulation: CalibrationStart, prior: Prior, before: CalibrationFit, fit: CalibrationFit, tangent: Tangent
 ) -> tuple[CalibrationFit, Tangent]:
     """Return a fit with its amounts, or nearer to those of the tangent, where it fits better than before."""
     start = tangent.amounts

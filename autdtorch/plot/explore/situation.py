@@ -162,9 +162,7 @@ class Situation:
         center[axis] = self.height
         size = [high - low for low, high in zip(lower, upper, strict=True)]
         return Plane(
-            (center[0], center[1], center[2]),
-            _AXES[self.plane],
-            (size[(axis + 1) % 3], size[(axis + 2) % 3]),
+            (center[0], center[1], center[2]), _AXES[self.plane], (size[(axis + 1) % 3], size[(axis + 2) % 3])
         )
 
     def with_body(self, index: int, center: Vector, angles: Vector) -> Situation:

@@ -343,10 +343,7 @@ class TMatrixCluster:
         return images_of([each.mirror for each in self.reflectors], self.bodies[0].wavenumber, size)
 
     def by_poses(
-        self,
-        poses: Sequence[int],
-        columns: int,
-        work: Callable[[Sequence[TMatrix], slice], torch.Tensor],
+        self, poses: Sequence[int], columns: int, work: Callable[[Sequence[TMatrix], slice], torch.Tensor]
     ) -> torch.Tensor:
         """Return what `work` does for the bodies in each of the poses (...), flat, a few poses at a time.
 
