@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from shared.document import Page, printed, table
 from shared.scenes import relative_error
+from shared.timing import timed
 
 import autdtorch as at
 from autdtorch.propagators import Propagator
@@ -178,9 +179,7 @@ def rates() -> str:
 
     def rate(count: int, move: Callable[[torch.Tensor, torch.Tensor], at.TMatrixCluster]) -> float:
         pushed(count, move)
-        begin = time.process_time()
-        pushed(count, move)
-        return count / (time.process_time() - begin)
+        return count / timed(lambda: pushed(count, move), time.process_time)[1]
 
     as_one = rate(POSES, pair.moved)
     alone = rate(POSES // 4, lambda *pose: at.TMatrixCluster([cube.moved(*pose), pair.bodies[1]]))

@@ -5,14 +5,13 @@ foci. Each time is the shortest of three, with the kernels compiled. Takes three
 """
 
 import dataclasses
-import time
 from collections.abc import Iterator
 
 import numpy as np
 import pyvista
 from shared.document import percent, printed
 from shared.scenes import relative_error, uncached
-from shared.timing import shortest
+from shared.timing import shortest, timed
 
 import autdtorch as at
 
@@ -60,9 +59,7 @@ def of_pose(obstacle: at.Obstacle, array: at.TransducerArray) -> str:
     nearby = at.NearbyPoses(uncached(scene, "box", 1.0, 2e-3))
     nearby.transfer_matrix()
     pose = {"offset": (0.6e-3, -0.5e-3, 0.6e-3), "rotation_degrees": (1.2, -1.0, 1.2)}
-    begin = time.perf_counter()
-    matrix, told = nearby.transfer_matrix(**pose, return_error=True)
-    spent = time.perf_counter() - begin
+    (matrix, told), spent = timed(lambda: nearby.transfer_matrix(**pose, return_error=True))
     error = relative_error(matrix, uncached(scene.moved(**pose), "box", 1.0, 2e-3).transfer_matrix())
     return f"{spent:.2f} s, {percent(error)} from a new simulation, {percent(told)} told"
 
