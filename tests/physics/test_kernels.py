@@ -4,6 +4,7 @@ import functools
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -12,9 +13,9 @@ from small_scenes import CUBE, NO_RECEIVERS, NO_SOURCES, all_tensors, assembled_
 
 from autdtorch.analytic.discs import waves_of
 from autdtorch.analytic.green import green
-from autdtorch.fdtd.kernels.contract import uniform_state
-from autdtorch.fdtd.kernels.cpu import CpuKernel, _alike, _cuts
-from autdtorch.fdtd.kernels.cpu_intrinsics import ALIKE
+from autdtorch.fdtd.kernels.blocks import BLOCK, blocks_of
+from autdtorch.fdtd.kernels.contract import Sources, uniform_state
+from autdtorch.fdtd.kernels.cpu import CpuKernel, _cuts
 from autdtorch.fdtd.kernels.cpu_sweep import strips_of
 from autdtorch.fdtd.kernels.cpu_waves import superposition, wave_matrix
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
@@ -79,6 +80,22 @@ def test_runs_side_by_side_are_those_alone(kernel):
         assert torch.equal(value, torch.cat(parts))
 
 
+def test_forces_on_all_heterogeneous_cells_are_those_on_each():
+    """The kernel adds them block by block, unless another cell is driven too."""
+    assembly, _, receivers = scene_parts(torch.float64, 40.0, True)
+    signal, c = drive_signal(assembly.steps_per_period, 0, 41), assembly.coefficients
+    index = c.heterogeneous_index
+    force = torch.rand((1, len(index), 2), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    beside = torch.cat([index[:1] - 1, index]), torch.nn.functional.pad(force, (0, 0, 1, 0))
+    assert not torch.isin(beside[0][0], index)
+    stepped = []
+    for sources in (Sources(index, force), Sources(*beside)):
+        state = assembly.silence(sources)
+        stepped.append(all_tensors(*CpuKernel().advance(state, c, sources, receivers, signal)))
+    for value, expected in zip(*stepped, strict=True):  # the order of sums differs, as above
+        assert (value - expected).abs().max() <= 1e-12 * expected.abs().max()
+
+
 @pytest.mark.parametrize(("chunks", "lossy"), [(2, False), (4, False), (4, True)])
 def test_chunks_of_planes_are_the_whole(chunks, lossy, monkeypatch):
     """Chunks change the order of sums; the number of threads changes nothing."""
@@ -133,26 +150,21 @@ def test_no_cell_reads_those_inside_rigid_bodies(monkeypatch):
     assert all(map(torch.equal, stepped(c, math.nan), whole))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_rows_of_equal_weights_change_no_bit(dtype, monkeypatch):
-    """A kernel computes them many at a time, outside of the layers."""
-    face = Box((12e-3, 21.7e-3, 12e-3), (30e-3, 1.7e-3, 40e-3), density=5.0, sound_speed=300.0)
-    parts = assembled_parts(small_scene((face,)), 1e-3, dtype)
-    assembly, sources, receivers = parts
-    c, signal = assembly.coefficients, drive_signal(assembly.steps_per_period, 0, 41).to(dtype)
-    used = []
-
-    def stepped(alike):
-        monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._alike", alike)
-        state, recorded = CpuKernel().advance(assembly.silence(sources), c, sources, receivers, signal)
-        return all_tensors(state, recorded)
-
-    together = stepped(lambda *cells: used.append(_alike(*cells)) or used[-1])
-    layers = torch.isin(c.heterogeneous_index, c.layer_index).numpy()
-    assert used[0].max() >= ALIKE
-    assert layers.any()
-    assert not used[0][layers].any()
-    assert all(map(torch.equal, together, stepped(lambda *cells: 0 * _alike(*cells))))
+@given(st.lists(st.booleans(), max_size=60), st.integers(1, 3), st.integers(0, 100))
+def test_each_cell_is_in_one_block_with_its_weights(cells, kinds, seed):
+    """Other cells of a block have no weights, and no block reaches beyond the last cell."""
+    generator = np.random.default_rng(seed)
+    index = 10 + np.flatnonzero(cells)
+    rows = generator.random((kinds, 27))[generator.integers(0, kinds, len(index))]
+    blocks = blocks_of(index, rows)
+    expected = np.zeros((len(blocks.first) * BLOCK, 27))
+    expected[blocks.slot] = rows
+    assert (blocks.weight[blocks.kind].transpose(0, 2, 1).reshape(-1, 27) == expected).all()
+    reached = (blocks.first[:, None] + np.arange(BLOCK)).reshape(-1)
+    assert (reached[blocks.slot] == index).all()
+    assert (reached <= index.max(initial=0)).all()
+    lane, (first, last) = np.arange(BLOCK), blocks.lanes.T[:, :, None]
+    assert (np.flatnonzero((lane >= first) & (lane < last)) == blocks.slot).all()
 
 
 def test_one_worker_steps_where_processors_are_busy(monkeypatch):

@@ -21,9 +21,8 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from autdtorch.utils.array_types import AnyArray, Index
+from autdtorch.fdtd.kernels.blocks import Blocks, blocks_of
 from autdtorch.utils.process import cached_property
-from autdtorch.utils.spatial import distinct_rows
 
 
 class Layer(NamedTuple):
@@ -100,14 +99,16 @@ class Coefficients:
         return len(self.layer_decay) // 2
 
     @cached_property
-    def distinct_rows(self) -> tuple[Index, AnyArray]:
-        """The number (n,) of each heterogeneous cell's row in a table, and the table (k, 27).
+    def heterogeneous(self) -> Blocks:
+        """The heterogeneous cells in blocks."""
+        return blocks_of(self.heterogeneous_index.numpy(), self.heterogeneous_weight.numpy())
 
-        At flat faces few rows are distinct.
-        """
-        rows = self.heterogeneous_weight.numpy()
-        first, kind = distinct_rows(rows)
-        return kind, rows[first]
+    @cached_property
+    def lossy(self) -> Blocks:
+        """The lossy cells in blocks."""
+        return blocks_of(
+            self.loss_index.numpy(), self.loss_weight.to(self.heterogeneous_weight.dtype).numpy()
+        )
 
 
 @dataclass

@@ -23,6 +23,7 @@ import torch
 from numba import njit
 from numpy.typing import NDArray
 
+from autdtorch.fdtd.kernels.blocks import BLOCK, Blocks
 from autdtorch.fdtd.kernels.compiled import INNER, entry, meanwhile
 from autdtorch.fdtd.kernels.contract import (
     Coefficients,
@@ -33,17 +34,15 @@ from autdtorch.fdtd.kernels.contract import (
     uniform_state,
 )
 from autdtorch.fdtd.kernels.cpu_intrinsics import (
-    ALIKE,
     add_to_counter,
     give_way,
+    losses_around,
     read_counter,
-    row_offsets,
-    sum_of_rows,
 )
 from autdtorch.fdtd.kernels.cpu_layers import FlatMemory, plane_profiles, rows_profile, stretch
 from autdtorch.fdtd.kernels.cpu_sweep import planes_at_once, strips_of, sweep_planes, workspace
 from autdtorch.fdtd.kernels.cpu_waves import superposition
-from autdtorch.fdtd.stencil import OFFSETS
+from autdtorch.fdtd.stencil import OFFSETS, flat_offsets
 from autdtorch.utils.array_types import COMPLEX, REAL, AnyArray, Index
 from autdtorch.utils.process import spread, thread_count
 
@@ -74,11 +73,11 @@ def _wait_for(counters, tasks):  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _record(p, receivers, first, last, out):  # type: ignore[no-untyped-def]
     index, weight = receivers  # a row for each cell of a receiver
-    out[first:last] = 0
     for m in range(len(index)):
         cell, share = index[m], weight[m]
         for r in range(first, last):
-            out[r] += share[r] * p[cell[r]]
+            value = share[r] * p[cell[r]]
+            out[r] = out[r] + value if m else value
 
 
 @njit(**INNER)
@@ -99,13 +98,16 @@ def _sweep_chunk(c, p, q, medium, layers, cells, room):  # type: ignore[no-untyp
 
 
 @njit(**INNER)
-def _damp_chunk(c, p, q, losses, offset):  # type: ignore[no-untyped-def]
+def _damp_chunk(c, p, q, keep, losses, offset):  # type: ignore[no-untyped-def]
     """Compute the losses in the cells of chunk c, before the sweep overwrites the pressures `q` before."""
-    index, weight, total, ground, starts, change = losses
-    for n in range(starts[c], starts[c + 1]):
-        cell = index[n]
-        rows = sum_of_rows(p, cell, offset, weight, n * 27) - sum_of_rows(q, cell, offset, weight, n * 27)
-        change[n] = rows + total[n] * (p[cell] - q[cell]) - ground[n] * p[cell]
+    cell, _, place_of, weight, total, ground, starts, change = losses
+    size = np.uint64(BLOCK)
+    for b in range(np.uint64(starts[c]), np.uint64(starts[c + 1])):
+        at, place = cell[b], b * size
+        losses_around(p, q, at, keep, offset, weight, place_of[b], change, place)
+        for k in range(size):
+            here, n = p[at + k], place + k
+            change[n] += total[n] * (here - q[at + k]) - ground[n] * here
 
 
 @njit(**INNER)
@@ -121,14 +123,23 @@ def _finish_chunk(c, q, medium, cells, losses, outermost, sources, row, sound_ha
             for j in range(1, ny - 1):
                 for k in range(j * nz + 1, j * nz + nz - 1):
                     q[at * plane + k] += outermost[other, (1 - end) * plane + k]
-    index, _, _, _, scale, _, _, new, swept = cells
-    for n in range(starts[cuts[c]], starts[cuts[c + 1]]):
-        absorbed = scale[n] * (q[index[n]] - swept[n]) if scale[n] != 0 else scale[n]
-        q[index[n]] = new[n] + absorbed
-    lossy, _, _, _, loss_starts, change = losses
-    for n in range(loss_starts[c], loss_starts[c + 1]):
-        q[lossy[n]] += change[n]
-    driven, force = sources
+    cell, lanes, _, _, _, in_layer, scale, _, new, swept = cells
+    driven, force, push = sources
+    first, last, size = np.uint64(starts[cuts[c]]), np.uint64(starts[cuts[c + 1]]), np.uint64(BLOCK)
+    for s in range(len(push)):
+        for n in range(first * size, last * size):
+            new[n] += push[s, n] * row[s]
+    for b in range(first, last):
+        at, place = cell[b], b * size
+        if in_layer[b]:
+            for k in range(lanes[b, 0], lanes[b, 1]):
+                new[place + k] += scale[place + k] * (q[at + k] - swept[place + k])
+        for k in range(lanes[b, 0], lanes[b, 1]):
+            q[at + k] = new[place + k]
+    lossy, loss_lanes, _, _, _, _, loss_starts, change = losses
+    for b in range(loss_starts[c], loss_starts[c + 1]):
+        for k in range(loss_lanes[b, 0], loss_lanes[b, 1]):
+            q[lossy[b] + k] += change[np.uint64(b) * size + k]
     for n in range(driven_starts[c], driven_starts[c + 1]):
         pressure = q[driven[n]]
         for s in range(len(row)):
@@ -199,7 +210,7 @@ def _advance(  # type: ignore[no-untyped-def]
                 first, last = np.uint64(c * read // chunks), np.uint64((c + 1) * read // chunks)
                 _record(now, receivers, first, last, recorded[step - 1])
             if swept and step < steps:
-                _damp_chunk(c, now, new, losses, cells[3])
+                _damp_chunk(c, now, new, medium[11], losses, cells[4])
         if kind == swept and step < steps:
             _sweep_chunk(c, now, new, medium, layers, cells, room)
         elif kind == swept + 1:
@@ -253,37 +264,50 @@ def _zeros(c: Coefficients, count: int) -> AnyArray:
 
 
 def _heterogeneous_cells(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, ...]:
-    """Return indices, kinds, weights by kind, offsets, layer scale, weights of air, runs, and workspace."""
-    index, (kind, weight) = c.heterogeneous_index.numpy(), c.distinct_rows
-    air = np.array((c.center, c.face, c.edge, c.corner), weight.dtype)[np.abs(OFFSETS).sum(axis=1)]
-    scale = np.zeros_like(weight, shape=len(index))
+    """Return blocks, their weights, offsets, which are in layers, layer scale, air's weights, workspace."""
+    blocks = c.heterogeneous
+    air = np.array((c.center, c.face, c.edge, c.corner), blocks.weight.dtype)[np.abs(OFFSETS).sum(axis=1)]
+    index = c.heterogeneous_index.numpy()
+    scale = np.zeros_like(blocks.weight, shape=len(index))
     scale[np.searchsorted(index, c.layer_index.numpy())] = c.layer_scale.numpy()
-    new, swept = np.empty_like(scale), np.empty_like(scale)
-    row, alike = (part.astype(np.int32) for part in (kind, _alike(index, kind, scale)))  # half the traffic
-    return index, row, weight.reshape(-1), row_offsets(shape), scale, air, alike, new, swept
+    scale = blocks.laid(scale)
+    in_layer = (scale.reshape(-1, BLOCK) != 0).any(axis=1)
+    work = np.empty_like(scale), np.empty_like(scale)
+    offset = np.array(flat_offsets(shape)[::3])
+    return *_flat(blocks), offset, in_layer, scale, air.repeat(BLOCK), *work
 
 
-def _alike(index: Index, kind: Index, scale: AnyArray) -> NDArray[np.int64]:
-    """Return for each cell (n,) how many follow it in a row, itself included, with equal weights.
+def _losses(c: Coefficients, plane: int, cuts: NDArray[np.int64]) -> tuple[AnyArray, ...]:
+    """Return the lossy cells: blocks, their weights, sums of these, ground, first of a chunk, workspace."""
+    blocks = c.lossy
+    total = blocks.weight.sum(axis=1)[blocks.kind].reshape(-1)
+    ground = blocks.laid(c.loss_ground.numpy().astype(total.dtype, copy=False))
+    starts = _first_blocks(blocks, plane * cuts)
+    return *_flat(blocks), total, ground, starts, np.empty_like(total)
 
-    It is zero in the layers, and in rows of fewer than `ALIKE` such cells.
+
+def _forces(c: Coefficients, sources: Sources) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """Return the driven cells (n,) and their forces by signal (S, n), and forces (S, slots) of all blocks.
+
+    Forces on all heterogeneous cells are those of the blocks.
     """
-    number = np.arange(len(index))
-    kind = np.where(scale == 0, kind, -1 - number)
-    starts = np.flatnonzero((np.diff(index, prepend=-1) != 1) | (np.diff(kind, prepend=-1) != 0))
-    length = np.diff(starts, append=len(index))
-    ends = np.repeat(starts + np.where(length < ALIKE, 0, length), length)
-    return np.asarray((ends - number).clip(min=0), np.int64)
+    # numba compiles again for arrays with gaps, and crashed when it loaded that from disk
+    force = sources.force[0].mT.contiguous().numpy()
+    if not torch.equal(sources.index, c.heterogeneous_index):
+        return _unsigned(sources.index), force, np.zeros_like(force, shape=(0, 0))
+    of_blocks = c.heterogeneous.laid(force)
+    return _unsigned(sources.index[:0]), np.zeros_like(force, shape=(len(force), 0)), of_blocks
 
 
-def _losses(c: Coefficients, plane: int, cuts: NDArray[np.int64], dtype: type) -> tuple[AnyArray, ...]:
-    """Return the lossy cells: indices, rows, their sums, ground, the first in each chunk, workspace."""
-    index: AnyArray = c.loss_index.contiguous().numpy()
-    weight: AnyArray = c.loss_weight.contiguous().numpy().astype(dtype, copy=False)
-    ground: AnyArray = c.loss_ground.contiguous().numpy().astype(dtype, copy=False)
-    total = weight.sum(axis=1)
-    starts = np.searchsorted(index, plane * cuts)
-    return index, weight.reshape(-1), total, ground, starts, np.empty_like(total)
+def _flat(blocks: Blocks) -> tuple[AnyArray, ...]:
+    """Return the first cells, lanes, first weights and weights of blocks."""
+    first = blocks.first.view(np.uint64)
+    return first, blocks.lanes, blocks.kind * np.uint64(27 * BLOCK), blocks.weight.reshape(-1)
+
+
+def _first_blocks(blocks: Blocks, cells: Index) -> Index:
+    """Return the number of the first block behind each of the flat indices `cells`, ascending."""
+    return np.searchsorted(blocks.first + blocks.lanes[:, 0], cells)
 
 
 def _share_of_processors(work: Callable[[], object], workers: int) -> float:
@@ -326,25 +350,32 @@ class CpuKernel:
     ) -> tuple[WaveState, torch.Tensor]:
         """See `Kernel.advance`."""
         runs = [slice(run, run + 1) for run in range(len(state.now))]
-        records = [
-            self._stepped(state.chosen(run), c, Sources(sources.index, sources.force[run]), receivers, signal)
-            for run in runs
-        ]
+        # in large pages, unlike PyTorch's
+        recorded = np.empty((len(runs), len(signal), len(receivers.index)), state.now.numpy().dtype)
+        for run, record in zip(runs, recorded, strict=True):
+            driven = Sources(sources.index, sources.force[run])
+            self._step(state.chosen(run), c, driven, receivers, signal, record)
         now, before = (state.now, state.before) if len(signal) % 2 == 0 else (state.before, state.now)
-        return WaveState(now, before, state.memory), torch.from_numpy(np.stack(records))
+        return WaveState(now, before, state.memory), torch.from_numpy(recorded)
 
-    def _stepped(
-        self, state: WaveState, c: Coefficients, sources: Sources, receivers: Receivers, signal: torch.Tensor
-    ) -> AnyArray:
-        """Step a single run; return its record (steps, q)."""
+    def _step(
+        self,
+        state: WaveState,
+        c: Coefficients,
+        sources: Sources,
+        receivers: Receivers,
+        signal: torch.Tensor,
+        recorded: AnyArray,
+    ) -> None:
+        """Step a single run, and set its record (steps, q)."""
         shape, cuts = state.now.shape[1:], _cuts(state.now.shape[1:])
         plane = shape[1] * shape[2]
         dtype = c.heterogeneous_weight.numpy().dtype.type
-        recorded = np.empty((len(signal), len(receivers.index)), dtype)  # in large pages, unlike PyTorch's
+        forces = _forces(c, sources)
         medium = (
             cuts,
-            np.searchsorted(c.heterogeneous_index.numpy(), plane * np.arange(shape[0] + 1)),
-            np.searchsorted(sources.index.numpy(), plane * cuts),
+            _first_blocks(c.heterogeneous, plane * np.arange(shape[0] + 1)),
+            np.searchsorted(forces[0], plane * cuts),
             np.searchsorted(c.sound_hard_index.numpy(), plane * cuts),
             *(np.uint64(cells) for cells in shape),
             *(dtype(weight) for weight in (c.center, c.face, c.edge, c.corner, c.keep)),
@@ -361,13 +392,12 @@ class CpuKernel:
             medium,
             tuple(part.reshape(-1) for part in memory.arrays),
             _heterogeneous_cells(c, shape),
-            _losses(c, plane, cuts, dtype),
+            _losses(c, plane, cuts),
             workspace(cuts, shape, c.layer_cells, dtype),
             _columns(c),
             tuple((psi.reshape(-1).numpy(), zeta.reshape(-1).numpy()) for psi, zeta in state.memory[4:]),
             _unsigned(c.sound_hard_index),
-            # numba compiles again for arrays with gaps, and crashed when it loaded that from disk
-            (_unsigned(sources.index), sources.force[0].mT.contiguous().numpy()),
+            forces,
             (_unsigned(receivers.index.mT), receivers.weight.mT.contiguous().numpy()),
             signal.contiguous().numpy(),
             recorded,
@@ -375,7 +405,6 @@ class CpuKernel:
         )
         self._work(lambda: _advance(*arguments), len(cuts) - 1)
         memory.give_back()
-        return recorded
 
     def compiled_ahead(self, c: Coefficients) -> AbstractContextManager[None]:
         """Compile `advance` in another process while the sums of waves are compiled here."""

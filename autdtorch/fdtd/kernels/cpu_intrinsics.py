@@ -11,31 +11,17 @@ import os
 from typing import Any
 
 import llvmlite.binding
-import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from autdtorch.fdtd.stencil import flat_offsets
-from autdtorch.utils.array_types import Index
+from autdtorch.fdtd.kernels.blocks import BLOCK
 
-_WIDTH = 4  # Cells of a row that are read: three neighbours, and a lane of padding with weight zero
+_WIDTH = 4  # Cells of a row that are added at once
 _MIDDLE = 13  # The cell itself among its neighbours, from which it does not differ
-# Neighbour read first in each row, and the lane of padding: no read leaves the grid or the weights
-_FIRST, _PADDING = (*range(0, 24, 3), 23), (*8 * (3,), 0)
 VECTOR = 64
 """Bytes of a vector of `add_products`."""
-
-ALIKE = 16
-"""Neighbouring cells with equal weights that are computed at once."""
-
-
-def row_offsets(shape: tuple[int, ...]) -> Index:
-    """Return the flat offsets (9,) from a cell to the first cells read of the nine rows around it."""
-    first = np.array(flat_offsets(shape)[::3])
-    first[8] -= 1
-    return first
 
 
 def _item(context: Any, builder: Any, signature: Any, arguments: Any, array: int, index: Any) -> Any:
@@ -45,74 +31,55 @@ def _item(context: Any, builder: Any, signature: Any, arguments: Any, array: int
     return cgutils.get_item_pointer(context, builder, kind, items, [index], wraparound=False)  # type: ignore[no-untyped-call]
 
 
-def _sum_of_rows(typing_context: Any, p: Any, cell: Any, offset: Any, weight: Any, at: Any) -> Any:
-    """Return the sum of weight[at + j] * (p[neighbour j] - p[cell]) over the 27 neighbours j."""
+def _around(losses: bool) -> Any:
+    """Return the operation out = sum over j of weight_j (u_j - u), for a block and the 27 neighbours j.
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        number, long = context.get_data_type(p.dtype), ir.IntType(64)
-        row, size = ir.VectorType(number, _WIDTH), context.get_abi_sizeof(number)
-        _, at_cell, _, _, first_weight = arguments
+    The `BLOCK` cells begin at `cell`, their weights (27, `BLOCK`) at `at`, the results at `place`. With
+    `losses`, u is the change p - q. Otherwise u is p, and p + keep (p - q) is added.
+    """
 
-        def pointer(array: int, index: Any) -> Any:
-            return _item(context, builder, signature, arguments, array, index)
+    def sums(
+        typing_context: Any, p: Any, q: Any, cell: Any, keep: Any, offset: Any, weight: Any, at: Any,
+        out: Any, place: Any,
+    ) -> Any:  # fmt: skip
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            number, long = context.get_data_type(p.dtype), ir.IntType(64)
+            cells, size = ir.VectorType(number, BLOCK), context.get_abi_sizeof(number)
+            _, _, first_cell, keeping, _, _, first_weight, _, first_out = arguments
 
-        def load(array: int, index: Any) -> Any:
-            return builder.load(builder.bitcast(pointer(array, index), row.as_pointer()), align=size)
+            def item(array: int, index: Any) -> Any:
+                return _item(context, builder, signature, arguments, array, index)
 
-        def lane(j: int) -> Any:
-            return ir.Constant(ir.IntType(32), j)
+            def load(array: int, index: Any) -> Any:
+                return builder.load(builder.bitcast(item(array, index), cells.as_pointer()), align=size)
 
-        pressure, here = builder.load(pointer(0, at_cell)), ir.Constant(row, None)
-        for j in range(_WIDTH):
-            here = builder.insert_element(here, pressure, lane(j))
-        total = ir.Constant(row, None)
-        for r, (first, padding) in enumerate(zip(_FIRST, _PADDING, strict=True)):
-            step = builder.load(pointer(2, ir.Constant(long, r)))
-            rise = builder.fsub(load(0, builder.add(at_cell, step)), here)
-            weights = load(3, builder.add(first_weight, ir.Constant(long, first)))
-            weights = builder.insert_element(weights, ir.Constant(number, 0.0), lane(padding))
-            total = builder.fadd(total, builder.fmul(weights, rise))
-        parts = [builder.extract_element(total, lane(j)) for j in range(_WIDTH)]
-        return builder.fadd(builder.fadd(parts[0], parts[2]), builder.fadd(parts[1], parts[3]))
+            def value(index: Any) -> Any:
+                return builder.fsub(load(0, index), load(1, index)) if losses else load(0, index)
 
-    return p.dtype(p, types.int64, offset, weight, types.int64), generate
+            here, parts = value(first_cell), 3 * [ir.Constant(cells, None)]
+            for row in range(9):
+                start = builder.add(first_cell, builder.load(item(4, ir.Constant(long, row))))
+                for j in range(3):
+                    if (neighbour := 3 * row + j) == _MIDDLE:
+                        continue
+                    rise = builder.fsub(value(builder.add(start, ir.Constant(long, j))), here)
+                    weights = load(5, builder.add(first_weight, ir.Constant(long, neighbour * BLOCK)))
+                    parts[j] = builder.fadd(parts[j], builder.fmul(weights, rise))
+            total = builder.fadd(builder.fadd(parts[0], parts[2]), parts[1])
+            if not losses:
+                change = builder.fsub(here, load(1, first_cell))
+                zeros = ir.Constant(ir.VectorType(ir.IntType(32), BLOCK), None)
+                share = builder.insert_element(ir.Constant(cells, ir.Undefined), keeping, ir.IntType(32)(0))
+                kept = builder.fmul(builder.shuffle_vector(share, share, zeros), change)
+                total = builder.fadd(builder.fadd(here, kept), total)
+            results = builder.bitcast(item(7, first_out), cells.as_pointer())
+            builder.store(total, results, align=size)
+            return context.get_dummy_value()
 
+        long = types.uint64
+        return types.void(p, q, long, keep, offset, weight, long, out, long), generate
 
-def _sums_of_rows(
-    typing_context: Any, p: Any, cell: Any, offset: Any, weight: Any, at: Any, out: Any, place: Any
-) -> Any:
-    """Write the sums of `_sum_of_rows` for `ALIKE` cells from `cell` on with equal weights, bit for bit."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        number, long = context.get_data_type(p.dtype), ir.IntType(64)
-        cells, size = ir.VectorType(number, ALIKE), context.get_abi_sizeof(number)
-        zeros = ir.Constant(ir.VectorType(ir.IntType(32), ALIKE), None)
-        _, first_cell, _, _, first_weight, _, first_out = arguments
-
-        def pointer(array: int, index: Any) -> Any:
-            return _item(context, builder, signature, arguments, array, index)
-
-        def load(index: Any) -> Any:
-            return builder.load(builder.bitcast(pointer(0, index), cells.as_pointer()), align=size)
-
-        def repeated(value: Any) -> Any:
-            first = builder.insert_element(ir.Constant(cells, ir.Undefined), value, ir.IntType(32)(0))
-            return builder.shuffle_vector(first, first, zeros)
-
-        here, parts = load(first_cell), 4 * [ir.Constant(cells, None)]
-        for r, (first, padding) in enumerate(zip(_FIRST, _PADDING, strict=True)):
-            start = builder.add(first_cell, builder.load(pointer(2, ir.Constant(long, r))))
-            for j in range(_WIDTH):
-                if j == padding or first + j == _MIDDLE:
-                    continue
-                rise = builder.fsub(load(builder.add(start, ir.Constant(long, j))), here)
-                share = builder.load(pointer(3, builder.add(first_weight, ir.Constant(long, first + j))))
-                parts[j] = builder.fadd(parts[j], builder.fmul(repeated(share), rise))
-        total = builder.fadd(builder.fadd(parts[0], parts[2]), builder.fadd(parts[1], parts[3]))
-        builder.store(total, builder.bitcast(pointer(5, first_out), cells.as_pointer()), align=size)
-        return context.get_dummy_value()
-
-    return types.void(p, types.int64, offset, weight, types.int64, out, types.int64), generate
+    return sums
 
 
 def _add_four(typing_context: Any, u: Any, at: Any, v: Any, start: Any) -> Any:
@@ -240,8 +207,8 @@ def _read_atomically(typing_context: Any, counters: Any, place: Any) -> Any:
 add_products: Any = intrinsic(_products_added(False))
 add_conjugate_products: Any = intrinsic(_products_added(True))
 set_to_multiples: Any = intrinsic(_set_to_multiples)
-sum_of_rows: Any = intrinsic(_sum_of_rows)
-sums_of_rows: Any = intrinsic(_sums_of_rows)
+step_around: Any = intrinsic(_around(losses=False))
+losses_around: Any = intrinsic(_around(losses=True))
 add_four: Any = intrinsic(_add_four)
 add_to_counter: Any = intrinsic(_add_atomically)
 read_counter: Any = intrinsic(_read_atomically)

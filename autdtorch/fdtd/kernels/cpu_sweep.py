@@ -28,8 +28,9 @@ import torch
 from numba import njit
 from numpy.typing import NDArray
 
+from autdtorch.fdtd.kernels.blocks import BLOCK
 from autdtorch.fdtd.kernels.compiled import INNER
-from autdtorch.fdtd.kernels.cpu_intrinsics import ALIKE, sum_of_rows, sums_of_rows
+from autdtorch.fdtd.kernels.cpu_intrinsics import step_around
 from autdtorch.fdtd.kernels.cpu_layers import absorb_x, add_terms, stretch_planes
 from autdtorch.utils.array_types import Index
 
@@ -55,25 +56,13 @@ def _sweep(p, at, n, row, q, old, back, across, here, behind, weights):  # type:
 
 @njit(**INNER)
 def _heterogeneous(p, q, cells, first, last, keep):  # type: ignore[no-untyped-def]
-    """Compute new pressures of heterogeneous cells; in layers also the result of the sweep in them."""
-    index, kind, weight, offset, scale, air, alike, new, swept = cells
-    n = first
-    while n < last:
-        if alike[n] > 0:
-            m = n + min(alike[n] - ALIKE, 0)  # the last cells of a run are computed with some before them
-            cell = index[m]
-            sums_of_rows(p, cell, offset, weight, kind[n] * len(air), new, m)
-            for k in range(ALIKE):
-                here, before = p[cell + k], q[cell + k]
-                new[m + k] = here + keep * (here - before) + new[m + k]
-            n = m + ALIKE
-            continue
-        cell = index[n]
-        here, before = p[cell], q[cell]
-        new[n] = here + keep * (here - before) + sum_of_rows(p, cell, offset, weight, kind[n] * len(air))
-        if scale[n] != 0:
-            swept[n] = here + keep * (here - before) + sum_of_rows(p, cell, offset, air, 0)
-        n += 1
+    """Compute new pressures of blocks of cells; in layers also the result of the sweep in them."""
+    cell, _, place_of, weight, offset, in_layer, _, air, new, swept = cells
+    for b in range(_U(first), _U(last)):
+        at, place = cell[b], b * _U(BLOCK)
+        step_around(p, q, at, keep, offset, weight, place_of[b], new, place)
+        if in_layer[b]:
+            step_around(p, q, at, keep, offset, air, _U(0), swept, place)
 
 
 @njit(**INNER)
