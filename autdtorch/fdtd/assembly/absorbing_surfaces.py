@@ -40,6 +40,7 @@ from numpy.typing import NDArray
 from autdtorch.fdtd.assembly.aligned import Blocks
 from autdtorch.fdtd.assembly.element import (
     FAR,
+    PAIR_OF,
     PAIRS,
     SUBCELLS,
     VERTICES,
@@ -64,8 +65,6 @@ _LEAST_GRADIENT = 0.3  # Least gradient of a signed distance with which a place 
 # Largest |b Y|, so that time steps stay long, and largest part of it that adds mass, relative to kappa: the
 # second vertex gives this mass, and keeps most of its own
 _LARGEST, _LARGEST_MASS = 0.5, 0.3
-_PAIR = np.zeros((8, 8), np.int64)  # Number of each pair of vertices in `PAIRS`
-_PAIR[PAIRS[:, 0], PAIRS[:, 1]] = _PAIR[PAIRS[:, 1], PAIRS[:, 0]] = np.arange(len(PAIRS))
 _NEXT = (4, 2, 1)  # Difference of the numbers of two vertices along each axis
 
 
@@ -245,8 +244,7 @@ def with_impedance_faces(
     `index` (n,) are their flat indices on a grid of `shape` elements, ascending. The mask `uncut` (n,) has
     those without a face, beside the others.
     """
-    if materials.losses is None or not materials.reacting.any() or len(index) == 0:
-        return elements
+    assert materials.losses
     # T off its diagonal, and sums of its rows where it adds mass and stiffness
     coupling, mass = np.zeros((len(index), 28), complex), np.zeros((2, len(index), 8), complex)
     strides = flat_strides(shape)
@@ -263,7 +261,7 @@ def with_impedance_faces(
         kind = np.where(flow.imag > 0, 1, 0)
         np.add.at(mass, (kind, row, vertex), flow * first * (first + second))
         np.add.at(mass, (kind, beyond, vertex), flow * second * (first + second))
-        np.add.at(coupling, (beyond, _PAIR[vertex, vertex ^ _NEXT[axis]]), flow * first * second)
+        np.add.at(coupling, (beyond, PAIR_OF[vertex, vertex ^ _NEXT[axis]]), flow * first * second)
     factor = stencil.slope.real / 2
     links, (heavy, stiff) = factor * coupling, factor * mass
     return elements._replace(

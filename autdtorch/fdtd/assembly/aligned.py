@@ -6,6 +6,7 @@ planes along each axis are of one kind, and each kind is assembled once.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -18,9 +19,10 @@ from autdtorch.fdtd.assembly.element import VERTICES, InterfaceElements, Materia
 from autdtorch.fdtd.assembly.layers import layered_elements
 from autdtorch.fdtd.assembly.prisms import Prisms, prisms, stacked
 from autdtorch.fdtd.assembly.sections import MaterialKey, Section
-from autdtorch.fdtd.stencil import Stencil
-from autdtorch.utils.array_types import Array, Index
+from autdtorch.fdtd.stencil import Stencil, places_of
+from autdtorch.utils.array_types import AnyArray, Array, Index
 from autdtorch.utils.process import cached_property
+from autdtorch.utils.spatial import distinct_cells, places_among
 
 _ROUNDING = 1e-6  # Distance [cells] up to which planes are one
 # Distance [cells] to which planes move from vertices: an edge then lies in an element
@@ -119,20 +121,24 @@ class Blocks:
         """Mask (3, k, l, m) of the kinds of elements that vary along each axis."""
         return np.stack([varies(self.material, self.planes, axis) for axis in range(3)])
 
-    @property
-    def kinds(self) -> tuple[Index, Index, Index]:
-        """Kinds of the elements along each axis, as indices of arrays of kinds (k, l, m)."""
-        x, y, z = np.ix_(*(each.kind for each in self.planes))
-        return x, y, z
+    def over_elements(self, of_kinds: AnyArray) -> AnyArray:
+        """Return the values (nx, ny, nz) of all elements, from values (k, l, m) of their kinds."""
+        for axis in (2, 1, 0):  # the last copies whole planes
+            of_kinds = of_kinds.take(self.planes[axis].kind, axis=axis)
+        return of_kinds
 
-    def kinds_of(self, first: Index) -> Index:
-        """Return the kinds (n, 3) of elements by their first cells (n, 3)."""
-        return np.stack([each.kind[cells] for each, cells in zip(self.planes, first.T, strict=True)], axis=-1)
+    def kinds_among(self, index: Index) -> tuple[Index, Index]:
+        """Return the distinct kinds (k, 3) of elements at flat indices (n,), and the kind of each (n,)."""
+        shape = self.varied.shape[1:]
+        flat = self.over_elements(np.arange(math.prod(shape)).reshape(shape)).ravel()[index]
+        distinct = distinct_cells(flat, math.prod(shape))
+        place = places_among(distinct, math.prod(shape))[flat]
+        return places_of(distinct, shape), place.astype(np.int64)
 
     @property
     def at_centers(self) -> Index:
-        """Material at the centre of each element (nx, ny, nz)."""
-        return np.asarray(self.material[np.ix_(*(each.centers for each in self.planes))])
+        """Material at the centres of the elements of each kind (k, l, m)."""
+        return np.asarray(self.material[np.ix_(*(each.centers[each.begin] for each in self.planes))])
 
     def at_vertices(self, cells: Index) -> Index:
         """Return the material (...) at cells (..., 3)."""
@@ -160,10 +166,9 @@ _STIFFER = 0.2
 
 
 def aligned_elements(
-    first: Index, blocks: Blocks, materials: Materials, stencil: Stencil
+    kinds: Index, blocks: Blocks, materials: Materials, stencil: Stencil
 ) -> InterfaceElements:
-    """Return elements, by their first cells (n, 3), that vary among blocks."""
-    kinds, place = np.unique(blocks.kinds_of(first), axis=0, return_inverse=True)
+    """Return elements of each of the kinds (k, 3)."""
     varied = np.stack([each[tuple(kinds.T)] for each in blocks.varied], axis=1)
     coupling, mass = np.zeros((len(kinds), 28)), np.zeros((len(kinds), 8))
     for axis in range(3):
@@ -175,10 +180,10 @@ def aligned_elements(
             coupling[mask], mass[mask] = make(axis, kinds[mask], blocks, materials, stencil)
     corners = varied.all(axis=1)
     coupling[corners], mass[corners] = _cornered(kinds[corners], blocks, materials, stencil)
+    first = np.stack([each.begin[kind] for each, kind in zip(blocks.planes, kinds.T, strict=True)], axis=-1)
     vertex = blocks.at_vertices(first[:, None] + VERTICES)
-    place = place.ravel()
-    nothing = np.zeros(len(first), bool), np.zeros((len(first), 0))
-    return InterfaceElements(coupling[place], mass[place], vertex, *nothing)
+    nothing = np.zeros(len(kinds), bool), np.zeros((len(kinds), 0))
+    return InterfaceElements(coupling, mass, vertex, *nothing)
 
 
 def _layered(

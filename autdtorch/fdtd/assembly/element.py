@@ -22,6 +22,8 @@ FAR = 1e3  # Signed distance of a body that is too far from an element to matter
 # Offsets of the eight vertices of an element [cells]
 VERTICES = np.array(list(itertools.product((0, 1), repeat=3)))
 PAIRS = np.array(list(itertools.combinations(range(8), 2)))  # The 28 pairs of vertices that are coupled
+PAIR_OF = np.zeros((8, 8), np.int64)  # Number of each pair of vertices in `PAIRS`; 0 of a vertex and itself
+PAIR_OF[PAIRS[:, 0], PAIRS[:, 1]] = PAIR_OF[PAIRS[:, 1], PAIRS[:, 0]] = np.arange(len(PAIRS))
 # Number of edges along each axis between the vertices of a pair (28, 3)
 EDGES_BETWEEN = np.abs(VERTICES[PAIRS[:, 0]] - VERTICES[PAIRS[:, 1]])
 # Points of an element at which signed distances are measured (125, 3), from its first vertex [cells]

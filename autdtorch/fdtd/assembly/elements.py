@@ -21,7 +21,7 @@ from autdtorch.fdtd.assembly.aligned import Blocks, aligned_elements
 from autdtorch.fdtd.assembly.edges import edges_of, reductions
 from autdtorch.fdtd.assembly.element import FAR, LATTICE, SUBCELLS, InterfaceElements, Materials
 from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
-from autdtorch.fdtd.assembly.losses import GROUND, with_losses
+from autdtorch.fdtd.assembly.losses import with_losses
 from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, quadratic, roughness
 from autdtorch.fdtd.assembly.unions import Union, unions_of
 from autdtorch.fdtd.grid import Grid
@@ -53,7 +53,8 @@ class Elements:
     # material of each element (nx - 1, ny - 1, nz - 1), of an interface element at its centre
     material: NDArray[np.int16]
     index: Index  # flat indices of the interface elements (n,), ascending
-    interface: InterfaceElements  # their coupling coefficients and masses
+    kind: Index  # the kind of each (n,): at flat faces many elements are equal
+    interface: InterfaceElements  # coupling coefficients and masses of the kinds
 
 
 def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
@@ -62,37 +63,36 @@ def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
     blocks = _blocks(bodies, grid)
     bodies = [body.measured(grid.spacing) for body in bodies]
     material, cut, beside = _measured(bodies, grid)
-    material = np.where(beside, material, blocks.at_centers).astype(np.int16)
-    cut = np.where(beside, cut, np.any([varied[blocks.kinds] for varied in blocks.varied], axis=0))
-    whole = np.where(cut, -1, material)
+    material = np.where(beside, material, blocks.over_elements(blocks.at_centers.astype(np.int16)))
+    cut = np.where(beside, cut, blocks.over_elements(np.any(blocks.varied, axis=0)))
     along = cut & ~beside
     if materials.reacting.any():
         # pressures in front of their faces are those of two cells
         along |= binary_dilation(along) & ~beside & ~materials.rigid[material]
     index = np.flatnonzero(along), np.flatnonzero(cut & beside)
-    parts = (
-        _aligned(index[0], ~cut.ravel()[index[0]], blocks, grid, materials, stencil),
-        _interface(bodies, index[1], whole, grid, materials, stencil),
-    )
-    order = np.argsort(np.concatenate(index))
-    return Elements(
-        materials, material, np.concatenate(index)[order], InterfaceElements.joined(parts).chosen(order)
-    )
+    parts = [_aligned(index[0], ~cut, blocks, materials, stencil)]
+    parts += _interface(bodies, index[1], np.where(cut, -1, material), grid, materials, stencil)
+    count = np.cumsum([0] + [len(elements.mass) for elements, _ in parts])
+    kind = np.concatenate([first + kinds for first, (_, kinds) in zip(count, parts, strict=False)])
+    order = np.argsort(every := np.concatenate(index), kind="stable")  # of two runs
+    interface = InterfaceElements.joined([elements for elements, _ in parts])
+    return Elements(materials, material, every[order], kind[order], interface)
 
 
 def _aligned(
-    index: Index,
-    uncut: NDArray[np.bool_],
-    blocks: Blocks,
-    grid: Grid,
-    materials: Materials,
-    stencil: Stencil,
-) -> InterfaceElements:
-    """Return the elements at flat indices (n,): those that vary among blocks, and `uncut` ones (n,)."""
-    shape = tuple(cells - 1 for cells in grid.shape)
-    first = places_of(index, shape)
-    elements = with_losses(lambda kinds: aligned_elements(first, blocks, kinds, stencil), materials, stencil)
-    return with_impedance_faces(elements, index, shape, uncut, blocks, materials, stencil)
+    index: Index, uncut: NDArray[np.bool_], blocks: Blocks, materials: Materials, stencil: Stencil
+) -> tuple[InterfaceElements, Index]:
+    """Return the kinds of the elements at flat indices (n,), and the kind of each (n,).
+
+    These vary among blocks, or are `uncut` (nx - 1, ny - 1, nz - 1) in front of a surface with an impedance.
+    """
+    kinds, kind = blocks.kinds_among(index)
+    elements = with_losses(lambda these: aligned_elements(kinds, blocks, these, stencil), materials, stencil)
+    if not materials.reacting.any():
+        return elements, kind
+    here, shape = uncut.ravel()[index], uncut.shape
+    every = with_impedance_faces(elements.chosen(kind), index, shape, here, blocks, materials, stencil)
+    return every, np.arange(len(index))
 
 
 def _blocks(bodies: Sequence[Union], grid: Grid) -> Blocks:
@@ -212,10 +212,13 @@ def _interface(
     grid: Grid,
     materials: Materials,
     stencil: Stencil,
-) -> InterfaceElements:
-    """Return the interface elements, at flat indices (n,); `whole` as in `_thick`."""
-    none = np.zeros((0, 28)), np.zeros((0, 8)), np.zeros((0, 8), np.int64), np.zeros(0, bool)
-    no_loss = np.zeros((0, 0 if materials.losses is None else GROUND.stop))
+) -> list[tuple[InterfaceElements, Index]]:
+    """Return the kinds of the elements at flat indices (n,), and the kind of each, in parts of these.
+
+    `whole` is as in `_thick`.
+    """
+    if not len(index):
+        return []
     numbers = np.array([body.material for body in bodies], np.int64)
     shapes = [shape for body in bodies for shape in body.shapes]
     edges = [
@@ -227,7 +230,7 @@ def _interface(
     ]
     shape = tuple(cells - 1 for cells in grid.shape)
 
-    def chunk(begin: int) -> InterfaceElements:
+    def chunk(begin: int) -> tuple[InterfaceElements, Index]:
         first = places_of(index[begin : begin + _CHUNK], shape)
         centers = np.array(grid.origin) + grid.spacing * (first + 0.5)
         less = reductions(edges, centers, grid.spacing)
@@ -239,11 +242,10 @@ def _interface(
         elements = with_losses(lambda these: interface_elements(near, these, stencil), materials, stencil)
         elements = with_impedance(elements, near.distance, numbers, materials, stencil)
         progress.advance(len(first))
-        return elements.chosen(kind)
+        return elements, kind
 
     with show_progress(len(index), "measuring surfaces") as progress:
-        parts = [InterfaceElements(*none, no_loss), *spread(chunk, range(0, len(index), _CHUNK))]
-    return InterfaceElements.joined(parts)
+        return spread(chunk, range(0, len(index), _CHUNK))
 
 
 # Returns the signed distances (...) [cells] of places (..., 3) [cells]

@@ -9,25 +9,33 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from autdtorch.fdtd.assembly.element import (
+    PAIR_OF,
     PAIRS,
     VERTICES,
     InterfaceElements,
+    Materials,
     stiffness_matrix,
     uniform_coupling,
 )
 from autdtorch.fdtd.assembly.elements import Elements
 from autdtorch.fdtd.assembly.losses import COUPLING, GROUND, MASS, condensed_loss
-from autdtorch.fdtd.assembly.neighbours import GridShape, enclosed_cells, in_parts, neighbours
-from autdtorch.fdtd.stencil import Stencil, places_of
+from autdtorch.fdtd.assembly.neighbours import (
+    GridShape,
+    enclosed_cells,
+    inner_cells,
+    neighbours,
+    with_neighbours,
+)
+from autdtorch.fdtd.stencil import Stencil, flat_offsets, flat_strides, places_of
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.spatial import distinct_cells, distinct_rows
+from autdtorch.utils.process import even_parts, spread
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +52,7 @@ _ROW_ROUNDING = 1e-9  # Stencil rows within this of air's are those of air
 # wavelength on 1.15 takes 7 % of the time step, errs less than 1.5 and leaves enough mass around. So much
 # transferred mass holds waves at a surface on coarser grids: a hand at 4 cells took 250 periods, 33 with 2.1.
 _FINE_MARGIN, _COARSE_MARGIN, _FINE_CELLS = 1.15, 2.1, 5.0
-_TOGETHER = 20_000  # Elements whose eigenvalues are computed together
+_TOGETHER = 4_096  # Cells or elements that are looked at together, which stay in the cache
 _MASS_TRANSFERS = 6  # Largest number of mass transfers to light cells; one is nearly always enough
 
 
@@ -98,50 +106,49 @@ def heterogeneous_cells(
     """
     x, y, z = elements.material.shape
     shape = (x + 1, y + 1, z + 1)
-    touched = distinct_cells(_vertices(elements, shape), math.prod(shape))
-    touched = touched[_inner(touched, shape)]
-    coupling, mass, need, hard, interface = _without_rigid(elements, touched, shape, stencil)
-    walls = elements.materials.rigid.any()
-    usual = stencil.total / _densest(elements)
+    vertices, around = _vertices(elements, shape), np.zeros(shape, bool)
+    around.ravel()[vertices] = True
+    touched = inner_cells(around)
+    cut, hard, rows = _without_rigid(elements, vertices, touched, shape, stencil)
     enclosed = np.zeros(0, np.int64)
-    if walls:
-        enclosed = enclosed_cells(coupling, touched, hard, shape, usual, sources)
-    hard[enclosed] = True
+    if elements.materials.rigid.any():
+        usual = stencil.total / _densest(elements)
+        enclosed = enclosed_cells(rows.coupling, rows.total, touched, hard, shape, usual, sources)
     if len(enclosed):
-        coupling *= _both_open(hard, touched, shape)
-    mass = _transferred_mass(coupling, mass, need, touched, shape)
-    coupling /= mass[:, None]
-    weight, air = coupling, stencil.weights
-    changed = [(np.abs(part - air) > _ROW_ROUNDING).any(axis=1) for part in in_parts(weight)]
-    changed = np.concatenate(changed) | (mass != 1)
-    loss = _touched_losses(elements, interface, touched, hard, shape, stencil)
-    changed |= loss.any(axis=1)
+        hard[enclosed] = True
+        rows = cut.rows(touched, hard)
+    mass = _transferred_mass(rows.coupling, rows.mass, rows.least, touched, shape)
+    loss = cut.losses(touched, hard)
+    weight, changed = rows.coupling, (mass != 1) | loss.any(axis=1)
+
+    def divide(ends: tuple[int, int]) -> None:
+        part = slice(*ends)
+        weight[part] /= mass[part, None]
+        changed[part] |= (np.abs(weight[part] - stencil.weights) > _ROW_ROUNDING).any(axis=1)
+
+    spread(divide, _in_parts(len(touched)))
     changed &= ~hard[touched]
-    surface = touched[changed], weight[changed], mass[changed], loss[changed]
+    index, weight, mass, loss = touched[changed], weight[changed], mass[changed], loss[changed]
     uniform = _uniform_cells(elements, touched, hard, shape, stencil)
-    index, weight, mass, loss = (np.concatenate(part) for part in zip(surface, uniform, strict=True))
-    order = np.argsort(index)
-    around = np.zeros(math.prod(shape), bool)
-    for part in in_parts(touched):
-        around[neighbours(part, shape)] = True
-    shell = np.flatnonzero(around & hard)
-    shell = shell[_inner(shell, shape)]
-    rows = index[order], weight[order], mass[order]
+    if len(uniform[0]):
+        both = zip((index, weight, mass, loss), uniform, strict=True)
+        index, weight, mass, loss = map(np.concatenate, both)
+        order = np.argsort(index, kind="stable")  # of two runs
+        index, weight, mass, loss = index[order], weight[order], mass[order], loss[order]
+    around[:] = False
+    around.ravel()[touched] = True
+    shell = inner_cells(with_neighbours(around) & hard.reshape(shape))
     losses = elements.materials.losses
     tangent = 0.0 if losses is None else losses.tangent
-    return HeterogeneousCells(*rows, np.flatnonzero(hard), shell, enclosed, lossy_cells(loss[order]), tangent)
+    return HeterogeneousCells(
+        index, weight, mass, np.flatnonzero(hard), shell, enclosed, lossy_cells(loss), tangent
+    )
 
 
 def lossy_cells(loss: Array) -> LossyCells | None:
     """Return the lossy of n cells, from the losses of all (n, 29): coupling, mass and ground."""
     place = np.flatnonzero(loss.any(axis=1))
     return LossyCells(place, loss[place, :27], *loss[place, 27:].T) if len(place) else None
-
-
-def _inner(index: Index, shape: GridShape) -> NDArray[np.bool_]:
-    """Return the mask (n,) of cells inside the outermost ring, which is always zero."""
-    places = places_of(index, shape)
-    return np.asarray(((places > 0) & (places < np.array(shape) - 1)).all(axis=1))
 
 
 def _vertices(elements: Elements, shape: GridShape) -> Index:
@@ -156,64 +163,110 @@ def _cell_material(elements: Elements) -> NDArray[np.int16]:
     return np.pad(elements.material, ((1, 0),) * 3, mode="edge").ravel()
 
 
+class _Rows(NamedTuple):
+    """Sums over the elements around n cells."""
+
+    coupling: Array  # (n, 27), none with rigid cells
+    mass: Array  # (n,)
+    least: Array  # least mass (n,)
+    total: Array  # sum of the magnitudes of the coupling (n,)
+
+
+class _ElementSums(NamedTuple):
+    """Elements by kind, to be summed around cells."""
+
+    number: NDArray[np.int32]  # kind of the element whose first vertex is a cell, of all cells (nx, ny, nz)
+    kinds: InterfaceElements
+    least: Array  # masses of the kinds that limit eigenvalues (k, 8)
+
+    def rows(self, cells: Index, hard: NDArray[np.bool_]) -> _Rows:
+        """Return the rows of cells (n,), without the rigid ones of a mask."""
+        return self._sums(cells, hard, self.kinds.coupling, self.kinds.mass, self.least)
+
+    def losses(self, cells: Index, hard: NDArray[np.bool_]) -> Array:
+        """Return the losses of cells (n, 29), as of `lossy_cells`; none (n, 0) if nothing absorbs."""
+        if not self.kinds.loss.shape[1]:
+            return np.zeros((len(cells), 0))
+        parts = (self.kinds.loss[:, part] for part in (COUPLING, MASS, GROUND))
+        return np.column_stack(self._sums(cells, hard, *parts)[:3])
+
+    def _sums(
+        self, cells: Index, hard: NDArray[np.bool_], coupling: Array, mass: Array, least: Array
+    ) -> _Rows:
+        """Return sums of coupling (k, 28) and of two values at the vertices (k, 8)."""
+        from autdtorch.fdtd.assembly.cell_kernels import add_elements  # loads numba
+
+        shape = self.number.shape
+        places = VERTICES - VERTICES[:, None] + 1
+        numbers = (
+            VERTICES @ flat_strides(shape),
+            flat_offsets(shape),
+            PAIR_OF,
+            np.ravel_multi_index(tuple(np.moveaxis(places, -1, 0)), (3, 3, 3)),
+        )
+        # numba compiles again for arrays with gaps
+        tables = tuple(map(np.ascontiguousarray, (coupling, mass, least)))
+        kind, rows, sums = self.number.ravel(), np.empty((len(cells), 27)), np.empty((3, len(cells)))
+        spread(
+            lambda ends: add_elements(*ends, cells, kind, tables, numbers, hard, rows, sums),
+            _in_parts(len(cells)),
+        )
+        return _Rows(rows, *sums)
+
+
 def _without_rigid(
-    elements: Elements, touched: Index, shape: GridShape, stencil: Stencil
-) -> tuple[Array, Array, Array, NDArray[np.bool_], InterfaceElements]:
-    """Return coupling, mass and least mass of the touched cells, rigid cells (k,), and the elements left."""
-    vertices, interface = _vertices(elements, shape), elements.interface
-    hard = elements.materials.rigid[_cell_material(elements)]
-    hard[vertices] = elements.materials.rigid[interface.material]
+    elements: Elements, vertices: Index, touched: Index, shape: GridShape, stencil: Stencil
+) -> tuple[_ElementSums, NDArray[np.bool_], _Rows]:
+    """Return the elements without rigid vertices, the mask of rigid cells (k,), and the touched rows."""
+    materials = elements.materials
+    every = InterfaceElements.joined([_uniform_elements(materials, stencil), elements.interface])
+    kind = len(materials.density) + elements.kind
+    hard = materials.rigid[_cell_material(elements)]
+    hard[vertices] = materials.rigid[every.material][kind]
     inside, count = hard[touched], -1
     densest = _densest(elements)
     sliver = np.zeros(len(hard), bool)
-    sliver[vertices[interface.finite]] = True
-    least = np.where(sliver[touched], max(_SLIVER_COUPLING / densest, _LEAST_COUPLING), _RIGID_COUPLING)
-    least *= stencil.total
+    sliver[vertices[every.finite[kind]]] = True
+    enough = np.where(sliver[touched], max(_SLIVER_COUPLING / densest, _LEAST_COUPLING), _RIGID_COUPLING)
+    enough *= stencil.total
     hard[touched] = False
     margin = _FINE_MARGIN if stencil.kappa <= 2 * math.pi / _FINE_CELLS else _COARSE_MARGIN
-    largest = margin * stencil.largest_symbol * float(elements.materials.speed.max())
-    parts = _stiffness(elements, interface, stencil)
-    coupling, mass, need = _assembled(elements, parts, touched, shape, largest)
+    largest = margin * stencil.largest_symbol * float(materials.speed.max())
+    number, least = np.zeros(shape, np.int32), _least_mass(every.coupling, largest)
+    number[:-1, :-1, :-1] = elements.material
+    number.ravel()[vertices[:, 0]] = kind
+    sums = _ElementSums(number, every, least)
     while True:
-        coupling *= _both_open(hard, touched, shape)
-        hard[touched] |= inside & (np.abs(coupling).sum(axis=1) <= least)
+        rows = sums.rows(touched, hard)
+        hard[touched] |= inside & (rows.total <= enough)
         if hard.sum() == count or not inside.any():
-            return coupling, mass, need, hard, interface
+            return sums, hard, rows
         count, out = hard.sum(), hard[vertices]
-        interface = condensed(elements.interface, out)
-        changed = np.isin(touched, vertices[out.any(axis=1)])
-        parts = _stiffness(elements, interface, stencil)
-        some = _assembled(elements, parts, touched[changed], shape, largest)
-        coupling[changed], mass[changed], need[changed] = some
+        some = np.flatnonzero(out.any(axis=1))
+        both = kind[some] << 8 | np.packbits(out[some], axis=1)[:, 0]
+        _, first, other = np.unique(both, return_index=True, return_inverse=True)
+        less = condensed(every.chosen(kind[some[first]]), out[some[first]])
+        number.ravel()[vertices[some, 0]] = len(least) + other
+        needed = np.concatenate((least, _least_mass(less.coupling, largest)))
+        sums = _ElementSums(number, InterfaceElements.joined([every, less]), needed)
 
 
-def _touched_losses(
-    elements: Elements,
-    interface: InterfaceElements,
-    touched: Index,
-    hard: NDArray[np.bool_],
-    shape: GridShape,
-    stencil: Stencil,
-) -> Array:
-    """Return the losses of the touched cells (n, 29), as of `lossy_cells`; none (n, 0) if nothing absorbs."""
-    losses = elements.materials.losses
-    if losses is None:
-        return np.zeros((len(touched), 0))
-    pairs = losses.coupling[:, None] * uniform_coupling(stencil)
-    vertices = np.repeat(losses.mass[:, None] / 8, 8, axis=1)
-    loss = np.concatenate((np.column_stack((pairs, vertices, np.zeros_like(vertices))), interface.loss))
-    (coupling, mass), (_, ground) = (
-        _assembled(elements, (loss[:, COUPLING], loss[:, part]), touched, shape, math.inf)[:2]
-        for part in (MASS, GROUND)
-    )
-    return np.column_stack((coupling * _both_open(hard, touched, shape), mass, ground))
+def _uniform_elements(materials: Materials, stencil: Stencil) -> InterfaceElements:
+    """Return an element of each material."""
+    losses, count = materials.losses, len(materials.density)
+    loss = np.zeros((count, 0))
+    if losses is not None:
+        vertices = np.repeat(losses.mass[:, None] / 8, 8, axis=1)
+        coupling = losses.coupling[:, None] * uniform_coupling(stencil)
+        loss = np.concatenate((coupling, vertices, np.zeros_like(vertices)), axis=1)
+    number = np.repeat(np.arange(count)[:, None], 8, axis=1)
+    coupling = uniform_coupling(stencil) / materials.density[:, None]
+    return InterfaceElements(coupling, materials.mass[number] / 8, number, np.zeros(count, bool), loss)
 
 
-def _stiffness(elements: Elements, interface: InterfaceElements, stencil: Stencil) -> list[Array]:
-    """Return coupling (k, 28) and mass (k, 8) of elements of one material, then of those at surfaces."""
-    kinds = elements.materials
-    uniform = uniform_coupling(stencil) / kinds.density[:, None], np.repeat(kinds.mass[:, None] / 8, 8, 1)
-    return [np.concatenate(part) for part in zip(uniform, interface[:2], strict=True)]
+def _in_parts(count: int) -> list[tuple[int, int]]:
+    """Return the bounds of parts of rows."""
+    return even_parts(count, 1 + count // _TOGETHER)
 
 
 def _densest(elements: Elements) -> float:
@@ -221,65 +274,22 @@ def _densest(elements: Elements) -> float:
     return float(elements.materials.density[~elements.materials.rigid].max())
 
 
-def _both_open(hard: NDArray[np.bool_], touched: Index, shape: GridShape) -> NDArray[np.bool_]:
-    """Return the mask (n, 27) of neighbours of touched cells where neither is in `hard` (k,)."""
-    return np.concatenate([~(hard[part, None] | hard[neighbours(part, shape)]) for part in in_parts(touched)])
-
-
 def condensed(interface: InterfaceElements, out: NDArray[np.bool_]) -> InterfaceElements:
     """Eliminate vertices `out` (n, 8) from the stiffness of elements by static condensation.
 
     Their pressure takes the value of least energy. To remove their coupling could make the energy negative.
     """
-    some = np.flatnonzero(out.any(axis=1))
-    # at flat faces nearly all elements are equal
-    parts = interface.coupling[some], interface.loss[some], out[some].astype(float)
-    first, kind = distinct_rows(np.concatenate(parts, axis=1))
-    gone = out[some[first]]
-    matrix = stiffness_matrix(interface.coupling[some[first]])
-    both = gone[:, :, None] & gone[:, None, :]
+    matrix = stiffness_matrix(interface.coupling)
+    both = out[:, :, None] & out[:, None, :]
     inverse = np.linalg.pinv(np.where(both, matrix, 0), rcond=_NULL_EIGENVALUE, hermitian=True)
-    across = np.where(gone[:, None, :], matrix, 0)
+    across = np.where(out[:, None, :], matrix, 0)
     matrix = matrix - across @ inverse @ across.transpose(0, 2, 1)
-    matrix[gone[:, :, None] | gone[:, None, :]] = 0
-    coupling = interface.coupling.copy()
-    coupling[some] = -matrix[:, PAIRS[:, 0], PAIRS[:, 1]][kind]
-    loss = interface.loss.copy()
+    matrix[out[:, :, None] | out[:, None, :]] = 0
+    loss = interface.loss
     if loss.shape[1]:
-        inner = condensed_loss(loss[some[first]], -inverse @ across.transpose(0, 2, 1), gone)
-        loss[some] = inner[kind]
+        loss = condensed_loss(loss, -inverse @ across.transpose(0, 2, 1), out)
+    coupling = -matrix[:, PAIRS[:, 0], PAIRS[:, 1]]
     return interface._replace(coupling=coupling, mass=np.where(out, 0, interface.mass), loss=loss)
-
-
-def _assembled(
-    elements: Elements, parts: Sequence[Array], touched: Index, shape: GridShape, largest: float
-) -> tuple[Array, Array, Array]:
-    """Return coupling (n, 27), mass (n,) and least mass (n,) of the touched cells.
-
-    They are sums over `parts` as of `_stiffness`, and over masses that limit eigenvalues to `largest`.
-    """
-    places = places_of(touched, shape)
-    cells = tuple(cells - 1 for cells in shape)
-    # elements by kind: of one material, then those that surfaces intersect
-    count = len(elements.materials.density)
-    kind = elements.material.astype(np.int32).ravel()
-    kind[elements.index] = count + np.arange(len(elements.index))
-    # at flat faces many elements are equal, and many cells are among equal ones
-    first, equal = distinct_rows(np.concatenate(parts, axis=1))
-    of_pairs, masses = (part[first] for part in parts)
-    least = _least_mass(of_pairs, largest)
-    kind = equal.astype(np.int32)[kind]
-    around = [kind[np.ravel_multi_index(tuple((places - vertex).T), cells)] for vertex in VERTICES]
-    some, number_of = distinct_rows(np.stack(around, axis=1))
-    coupling, mass, need = np.zeros((len(some), 27)), np.zeros(len(some)), np.zeros(len(some))
-    cube, pairs = coupling.reshape(-1, 3, 3, 3), np.zeros((len(masses), 8, 8))
-    pairs[:, PAIRS[:, 0], PAIRS[:, 1]] = pairs[:, PAIRS[:, 1], PAIRS[:, 0]] = of_pairs
-    for number, (vertex, kinds) in enumerate(zip(VERTICES, around, strict=True)):
-        x, y, z = (slice(1 - end, 3 - end) for end in vertex)
-        cube[:, x, y, z] += pairs[kinds[some], number].reshape(-1, 2, 2, 2)
-        mass += masses[kinds[some], number]
-        need += least[kinds[some], number]
-    return coupling[number_of], mass[number_of], need[number_of]
 
 
 def _least_mass(coupling: Array, largest: float) -> Array:
@@ -289,12 +299,15 @@ def _least_mass(coupling: Array, largest: float) -> Array:
     that moves alone, so that an element of air needs its mass.
     """
     masses = np.zeros((len(coupling), 8))
-    for part in np.array_split(np.arange(len(coupling)), 1 + len(coupling) // _TOGETHER):
-        matrix = stiffness_matrix(coupling[part])
+
+    def limit(ends: tuple[int, int]) -> None:
+        matrix = stiffness_matrix(coupling[(part := slice(*ends))])
         alone = np.diagonal(matrix, axis1=1, axis2=2).clip(min=0)
         scale = np.divide(1, np.sqrt(alone), out=np.zeros_like(alone), where=alone > 0)
         scaled = scale[:, :, None] * matrix * scale[:, None, :]
         masses[part] = alone * np.linalg.eigvalsh(scaled)[:, -1:] / largest
+
+    spread(limit, _in_parts(len(coupling)))
     return masses
 
 
@@ -329,14 +342,14 @@ def _uniform_cells(
     elements: Elements, touched: Index, hard: NDArray[np.bool_], shape: GridShape, stencil: Stencil
 ) -> tuple[Index, Array, Array, Array]:
     """Return index, weight, mass and losses of cells inside obstacles that absorb or have another speed."""
-    materials, material = elements.materials, _cell_material(elements)
+    materials = elements.materials
     factor, losses = materials.speed, materials.losses
     loss = np.zeros((len(factor), 0))
     if losses is not None:
         nothing = np.zeros_like(losses.mass)
         loss = np.column_stack((losses.coupling[:, None] * stencil.weights, losses.mass, nothing))
-    inside = ((factor != 1) | loss.any(axis=1))[material] & ~hard
+    unlike, material = (factor != 1) | loss.any(axis=1), _cell_material(elements)
+    inside = unlike[material] & ~hard
     inside[touched] = False
-    index = np.flatnonzero(inside)
-    number = material[index := index[_inner(index, shape)]]
+    number = material[index := inner_cells(inside.reshape(shape))]
     return index, factor[number, None] * stencil.weights, materials.mass[number], loss[number]

@@ -1,0 +1,83 @@
+"""Loops over cells and their neighbours, compiled; the order of all sums is fixed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from autdtorch.fdtd.kernels.compiled import entry
+
+
+@entry(Path(__file__).parent)
+def add_elements(first, last, cells, kind, tables, numbers, hard, coupling, sums):  # type: ignore[no-untyped-def]
+    """Write rows `first` to `last` of the coupling (n, 27) of cells (n,), and sums over their elements.
+
+    Args:
+        first: number of the first row.
+        last: one past the last row.
+        cells: flat indices (n,).
+        kind: of the element whose first vertex is a cell, of all cells.
+        tables: coupling (k, 28) of the kinds, and two values of each vertex (k, 8).
+        numbers: offsets of the vertices (8,) and of the neighbours (27,) of a cell, the number of each pair
+            of vertices in the table (8, 8), and that of the neighbour at the second vertex of a pair (8, 8).
+        hard: mask of the cells that are coupled to none.
+        coupling: the rows.
+        sums: the two values, and the sum of the magnitudes of a row (3, n).
+    """
+    (links, one, two), (vertices, neighbours, pair, place) = tables, numbers
+    for row in range(first, last):
+        cell, here = cells[row], coupling[row]
+        here[:] = 0.0
+        sums[:, row] = 0.0
+        for vertex in range(8):
+            element = kind[cell - vertices[vertex]]
+            for other in range(8):
+                if other != vertex:
+                    here[place[vertex, other]] += links[element, pair[vertex, other]]
+            sums[0, row] += one[element, vertex]
+            sums[1, row] += two[element, vertex]
+        for number in range(27):
+            if hard[cell] or hard[cell + neighbours[number]]:
+                here[number] = 0.0
+            sums[2, row] += abs(here[number])
+
+
+@entry(Path(__file__).parent)
+def join_cells(cells, coupling, least, place, free, number, neighbours, region):  # type: ignore[no-untyped-def]
+    """Join the regions of cells between which sound passes: write the least that each is joined to.
+
+    Args:
+        cells: flat indices (n,).
+        coupling: of the cells with their neighbours (n, 27).
+        least: coupling up to which nothing passes into a cell (n,).
+        place: of each cell of the grid among these, arbitrary for others.
+        free: mask of the cells that are not rigid.
+        number: the region of each cell of the grid, before.
+        neighbours: offsets (27,).
+        region: the number of each region, to be overwritten.
+    """
+    for row in range(len(cells)):
+        cell = cells[row]
+        if not free[cell]:
+            continue
+        here = number[cell]
+        while region[here] != here:
+            region[here] = region[region[here]]
+            here = region[here]
+        for offset in range(27):
+            near = cell + neighbours[offset]
+            if not free[near]:
+                continue
+            there = number[near]
+            while region[there] != there:
+                region[there] = region[region[there]]
+                there = region[there]
+            if there == here:
+                continue
+            blocked, other = least[row], place[near]
+            if cells[other] == near:
+                blocked = min(blocked, least[other])
+            if abs(coupling[row, offset]) > blocked:
+                low, high = min(here, there), max(here, there)
+                region[high] = here = low
+    for each in range(len(region)):
+        region[each] = region[region[each]]
