@@ -68,7 +68,7 @@ class Column(NamedTuple):
     unit: str | None
 
 
-class Rows(NamedTuple):
+class CsvRows(NamedTuple):
     """The cells of a CSV file.
 
     Attributes:
@@ -127,7 +127,7 @@ class Rows(NamedTuple):
         return [number for number in row if number is not None]
 
 
-def read_rows(path: str | os.PathLike[str], gaps: bool = False) -> Rows:
+def read_rows(path: str | os.PathLike[str], gaps: bool = False) -> CsvRows:
     """Return the cells of a CSV file, separated by commas, semicolons, tabs or blanks; at least one line.
 
     An empty cell at the end of a line is left out, unless there may be `gaps` and other lines are longer.
@@ -146,11 +146,13 @@ def read_rows(path: str | os.PathLike[str], gaps: bool = False) -> Rows:
     separator = _separator(lines[0][1])
     cells = [(number, _cells(f"{path}, line {number}", line, separator)) for number, line in lines]
     width = max(len(_shortened(row)) for _, row in cells) if gaps else 1
-    return Rows(str(path), [(number, _shortened(row, width)) for number, row in cells], comments, separator)
+    return CsvRows(
+        str(path), [(number, _shortened(row, width)) for number, row in cells], comments, separator
+    )
 
 
 def table_of(
-    rows: Rows, columns: Mapping[str, str], named: Callable[[Array], list[str]], guess: Guess
+    rows: CsvRows, columns: Mapping[str, str], named: Callable[[Array], list[str]], guess: Guess
 ) -> dict[str, Array]:
     """Return the columns (R,) of a table in SI units, by name.
 
@@ -181,7 +183,7 @@ def table_of(
     return table | {name: table[name] * _FACTORS[columns[name]][unit] for name, unit in header if unit}
 
 
-def _unit(rows: Rows, kind: str, table: Mapping[str, Array], guess: Guess) -> str | None:
+def _unit(rows: CsvRows, kind: str, table: Mapping[str, Array], guess: Guess) -> str | None:
     """Return the unit of columns whose names have none, from the comments or a guess that agrees."""
     with within(rows.path), warned_within(rows.path):
         if (stated := _unit_stated(rows.comments, kind)) is not None:
@@ -237,7 +239,7 @@ def _shortened(cells: list[str], width: int = 1) -> list[str]:
     return cells[:-1] if len(cells) > width and not cells[-1] else cells
 
 
-def without_index(rows: Rows) -> Rows:
+def without_index(rows: CsvRows) -> CsvRows:
     """Return rows without a first column that has no name and counts from 0, as pandas writes it."""
     (line, header), *others = rows.lines
     if header[0] or [cells[0] for _, cells in others] != [str(number) for number in range(len(others))]:
@@ -245,7 +247,7 @@ def without_index(rows: Rows) -> Rows:
     return rows._replace(lines=[(line, header[1:]), *((number, cells[1:]) for number, cells in others)])
 
 
-def _header(rows: Rows, columns: Mapping[str, str]) -> list[Column]:
+def _header(rows: CsvRows, columns: Mapping[str, str]) -> list[Column]:
     """Return the columns that the first line names."""
     line, cells = rows.lines[0]
     where = f"{rows.path}, line {line}"
@@ -261,7 +263,7 @@ def _header(rows: Rows, columns: Mapping[str, str]) -> list[Column]:
     return header
 
 
-def _from_comments(rows: Rows, columns: Mapping[str, str]) -> list[Column] | None:
+def _from_comments(rows: CsvRows, columns: Mapping[str, str]) -> list[Column] | None:
     """Return the columns that the last such comment names, None if none does."""
     for comment in reversed(rows.comments):
         for separator in {rows.separator: None, ",": None}:

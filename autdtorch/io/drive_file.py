@@ -14,7 +14,7 @@ import torch
 
 from autdtorch.hardware.devices import DEVICES
 from autdtorch.io.array_file import NORMAL_COLUMNS, OFFSET, PLACE_COLUMNS, SIZE_COLUMNS
-from autdtorch.io.csv_table import Guessed, Rows, read_rows, table_of, write_table
+from autdtorch.io.csv_table import CsvRows, Guessed, read_rows, table_of, write_table
 from autdtorch.io.ultraino_file import SUFFIX, read_ultraino
 from autdtorch.scene.arrays import TransducerArray, phase_offsets_of, radii_of, strengths_of
 from autdtorch.scene.drive import amplitudes_of, drive_from_phases, phases_of, validate_drive
@@ -218,7 +218,7 @@ def _from_csv(path: Path) -> torch.Tensor:
     return _in_frames(path, drive, table)
 
 
-def _openmpd_frames(rows: Rows) -> Array | None:
+def _openmpd_frames(rows: CsvRows) -> Array | None:
     """Return the phases (T, M) of rows after a first line with T and M; None for a table of another kind."""
     (_, first), *others = rows.lines
     counts = [int(cell) for cell in first if cell.isdecimal()]

@@ -45,7 +45,7 @@ _COUNTS = "columns={'phase': 16, 'pressure': 4}"
 
 
 @dataclass(frozen=True)
-class Column:
+class ReadingColumn:
     """A column: index and title, its quantity of `QUANTITIES`, its number, and its stated unit."""
 
     index: int
@@ -55,7 +55,7 @@ class Column:
     unit: Unit = UNSTATED
 
 
-Columns: TypeAlias = dict[str, list[Column]]
+Columns: TypeAlias = dict[str, list[ReadingColumn]]
 """Columns of each quantity, in order."""
 
 Named: TypeAlias = Mapping[str, int | str | Sequence[str]]
@@ -106,7 +106,7 @@ def columns_of(place: str, header: list[str] | None, width: int, named: Named | 
     return by_quantity
 
 
-def _of_header(place: str, header: list[str] | None, width: int) -> Iterator[Column]:
+def _of_header(place: str, header: list[str] | None, width: int) -> Iterator[ReadingColumn]:
     """Yield the columns of a table whose titles say what they hold, those of a quantity by their numbers."""
     if header is None:
         raise ValueError(
@@ -134,7 +134,7 @@ def _of_header(place: str, header: list[str] | None, width: int) -> Iterator[Col
         yield from sorted(members, key=lambda column: column.number or 0)
 
 
-def _counted(place: str, header: list[str] | None, width: int, kinds: list[str]) -> Iterator[Column]:
+def _counted(place: str, header: list[str] | None, width: int, kinds: list[str]) -> Iterator[ReadingColumn]:
     """Yield the columns of a table whose quantities the call counts, in their order."""
     if len(kinds) != width:
         raise ValueError(f"columns: {len(kinds)} in all; must be {width}, as {place} has")
@@ -143,10 +143,10 @@ def _counted(place: str, header: list[str] | None, width: int, kinds: list[str])
             continue
         with within(place):
             column = _column(index, header[index], what) if header else None
-        yield column or Column(index, str(index + 1), what)
+        yield column or ReadingColumn(index, str(index + 1), what)
 
 
-def _titled(place: str, header: list[str] | None, named: Named) -> Iterator[Column]:
+def _titled(place: str, header: list[str] | None, named: Named) -> Iterator[ReadingColumn]:
     """Yield the columns of a table whose titles the call names, each once.
 
     Columns of a pattern follow each other by their numbers, if these differ: ch2 comes before ch10.
@@ -171,11 +171,11 @@ def _titled(place: str, header: list[str] | None, named: Named) -> Iterator[Colu
                 yield from _by_number([_titled_column(index, titles[index], what) for index in matching])
 
 
-def _titled_column(index: int, title: str, what: str) -> Column:
-    return _column(index, title, what) or Column(index, title, what)
+def _titled_column(index: int, title: str, what: str) -> ReadingColumn:
+    return _column(index, title, what) or ReadingColumn(index, title, what)
 
 
-def _by_number(columns: list[Column]) -> list[Column]:
+def _by_number(columns: list[ReadingColumn]) -> list[ReadingColumn]:
     """Return columns in the order of their numbers, or as they are where some have none or one number."""
     numbers = [column.number for column in columns if column.number is not None]
     if len({*numbers}) < len(columns):
@@ -183,7 +183,7 @@ def _by_number(columns: list[Column]) -> list[Column]:
     return sorted(columns, key=lambda column: column.number or 0)
 
 
-def _column(index: int, title: str, what: str | None = None) -> Column | None:
+def _column(index: int, title: str, what: str | None = None) -> ReadingColumn | None:
     """Return the column that a title names, None if it names none; the call may know what it holds.
 
     Titles are such as `phase 3 [deg]`, `autd3 phase 3`, `arg q 3 [rad]`, `amplitude_3`, `p3_rms (kPa)`,
@@ -201,7 +201,7 @@ def _column(index: int, title: str, what: str | None = None) -> Column | None:
     if quantity is None or (what is None and len(numbers) > 1):
         return None
     unit = _unit(f"column {title!r}", quantity, names, " ".join([*units, stated]).strip(), device)
-    return Column(index, title, quantity, numbers[0] if numbers else None, unit)
+    return ReadingColumn(index, title, quantity, numbers[0] if numbers else None, unit)
 
 
 def _quantity(names: set[str]) -> str | None:

@@ -14,7 +14,7 @@ import torch
 
 from autdtorch.hardware.devices import DEVICES
 from autdtorch.io.csv_table import read_rows, without_index
-from autdtorch.io.readings_columns import SKIP, Column, Columns, Named, columns_of, counted_quantities
+from autdtorch.io.readings_columns import SKIP, Columns, Named, ReadingColumn, columns_of, counted_quantities
 from autdtorch.io.readings_units import Unit, drives_of, in_metres, merged, peak_amplitudes, radians, range_of
 from autdtorch.objectives.readings import Readings
 from autdtorch.scene.drive import AMPLITUDE_TOLERANCE
@@ -54,7 +54,7 @@ class Table:
     number: Callable[[Any], float | None]
     points: torch.Tensor | None = None
 
-    def read(self, columns: Sequence[Column], unit: Unit) -> Array:
+    def read(self, columns: Sequence[ReadingColumn], unit: Unit) -> Array:
         """Return the numbers (R, C) of columns in a unit; those of pressures may have gaps, as NaN."""
         gaps = columns[0].what.startswith("pressure")
         least, most, whole = range_of(columns[0].what, unit)
@@ -169,7 +169,7 @@ def readings_of(
     return Readings.of_rows(rows, places, pressure[:, 0], None if phase is None else phase[:, 0])
 
 
-def _pressure(table: Table, columns: list[Column], said: Unit | None) -> torch.Tensor:
+def _pressure(table: Table, columns: list[ReadingColumn], said: Unit | None) -> torch.Tensor:
     """Return peak amplitudes (R, P) [Pa], NaN at gaps."""
     unit = _unit(table, "pressure", columns, said)
     values = table.read(columns, unit)
@@ -177,7 +177,7 @@ def _pressure(table: Table, columns: list[Column], said: Unit | None) -> torch.T
         return torch.from_numpy(peak_amplitudes(values, unit, columns[0].unit.unit is not None))
 
 
-def _pressure_phase(table: Table, columns: list[Column], said: Unit | None) -> torch.Tensor | None:
+def _pressure_phase(table: Table, columns: list[ReadingColumn], said: Unit | None) -> torch.Tensor | None:
     """Return phases (R, P) [rad] of the pressures, NaN at gaps; None if there are none."""
     if not columns:
         if said is not None:
@@ -213,14 +213,14 @@ def _drives(table: Table, columns: Columns, said: Unit | None, drives: torch.Ten
         return drives_of(values, shares, unit, of_amplitudes)
 
 
-def _metres(table: Table, column: Column) -> Array:
+def _metres(table: Table, column: ReadingColumn) -> Array:
     """Return coordinates (R, 1) [m]."""
     values = table.read([column], column.unit)
     with within(table.place):
         return in_metres(values, column.unit)
 
 
-def _unit(table: Table, keyword: str, columns: list[Column], said: Unit | None) -> Unit:
+def _unit(table: Table, keyword: str, columns: list[ReadingColumn], said: Unit | None) -> Unit:
     """Return the unit of columns, which must agree."""
     stated = {column.unit: column for column in columns}
     if len(stated) > 1:

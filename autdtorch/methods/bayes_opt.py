@@ -36,7 +36,7 @@ from autdtorch.utils.validation import integer_at_least, invalid, number_between
 
 if TYPE_CHECKING:
     from autdtorch.methods.bayes.acquisition import Acquisition
-    from autdtorch.methods.bayes.gaussian_process import Fit, Rows
+    from autdtorch.methods.bayes.gaussian_process import Hyperparameters, MatrixRows
 
 NOISE = 1e-4
 """Noise variance that the process of the score assumes, relative to its signal variance. A fitted one would
@@ -294,9 +294,9 @@ class BayesOpt(Method):
         points: torch.Tensor,
         generators: Sequence[torch.Generator],
         left: int,
-    ) -> tuple[Fit, Rows | None]:
+    ) -> tuple[Hyperparameters, MatrixRows | None]:
         """Return hyperparameters and rows; `search` gets the tensors that the next fit begins with."""
-        from autdtorch.methods.bayes.gaussian_process import Fit, fitted
+        from autdtorch.methods.bayes.gaussian_process import Hyperparameters, fitted
 
         count = search["values"].shape[1]
         if self.model == "foci" and (self.prior is not None or count >= 3 * problem.transducers - 1):
@@ -305,7 +305,7 @@ class BayesOpt(Method):
         if "fitted" not in search or count >= _REFIT_GROWTH * int(search["fitted"]):
             search |= fitted(self.kernel, points, search["values"], self.noise)._asdict()
             search["fitted"] = torch.tensor(count, dtype=torch.int64, device="cpu")
-        return Fit(search["length_scale"], search["noise"]), None
+        return Hyperparameters(search["length_scale"], search["noise"]), None
 
     def _with_rows(
         self,
@@ -313,9 +313,9 @@ class BayesOpt(Method):
         search: dict[str, torch.Tensor],
         generators: Sequence[torch.Generator],
         left: int,
-    ) -> tuple[Fit, Rows]:
+    ) -> tuple[Hyperparameters, MatrixRows]:
         """Return the noise, and rows of the matrix that is fitted to all readings, or of a sample of it."""
-        from autdtorch.methods.bayes.gaussian_process import Fit, Rows, mean_intensity
+        from autdtorch.methods.bayes.gaussian_process import Hyperparameters, MatrixRows, mean_intensity
 
         observed = search["values"]
         drives = problem.quantise(self._drives(search["points"]))
@@ -336,13 +336,18 @@ class BayesOpt(Method):
         # The search explores by samples; the answer, and the last drive, follow the mean.
         rows = mean if left <= 1 else sampled
         share = (2 * search["variance"] / power).clamp_max(0.5)
-        fit = Fit(torch.ones_like(share), share / (1 - share))
+        fit = Hyperparameters(torch.ones_like(share), share / (1 - share))
         seen = scores_of(problem.goal, (drives @ rows.mT).abs()).argmax(dim=1)
         best = climbed(problem.goal, rows, drives[torch.arange(len(seen), device="cpu"), seen], _SAMPLE_STEPS)
-        return fit, Rows(rows[..., self._others(problem.transducers)], spread, self._points(best))
+        return fit, MatrixRows(rows[..., self._others(problem.transducers)], spread, self._points(best))
 
     def _acquisition(
-        self, goal: GoalFunction, values: torch.Tensor, points: torch.Tensor, fit: Fit, rows: Rows | None
+        self,
+        goal: GoalFunction,
+        values: torch.Tensor,
+        points: torch.Tensor,
+        fit: Hyperparameters,
+        rows: MatrixRows | None,
     ) -> Acquisition:
         from autdtorch.methods.bayes.acquisition import FocusAcquisition, ScoreAcquisition
         from autdtorch.methods.bayes.gaussian_process import Processes

@@ -16,7 +16,7 @@ from autdtorch.methods.base import Method, State, Step, setting, whole
 from autdtorch.methods.doubtful_readings import Magnitudes, reading_doubts, sensor_doubts
 from autdtorch.methods.further_readings import independent_readings
 from autdtorch.methods.gradient import climb, climbed, random_drives
-from autdtorch.methods.matrix_fit import Fit, posteriors, tensors_of
+from autdtorch.methods.matrix_fit import MatrixFit, posteriors, tensors_of
 from autdtorch.methods.prior import (
     Prior,
     best_simulated_drives,
@@ -240,7 +240,9 @@ def _name(number: int) -> str:
     return f"evaluation {number}" if number >= 0 else f"earlier reading {-1 - number}"
 
 
-def _highest(goal: GoalFunction, fit: Fit, drives: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+def _highest(
+    goal: GoalFunction, fit: MatrixFit, drives: torch.Tensor, generator: torch.Generator
+) -> torch.Tensor:
     """Return the best drive (M,) of a fitted matrix, which was fitted to drives (N, M)."""
     seen = drives[scores_of(goal, (drives @ fit.posterior.matrix.T).abs()).argmax()]
     starts = random_drives(_STARTS, len(seen), generator)
@@ -249,7 +251,7 @@ def _highest(goal: GoalFunction, fit: Fit, drives: torch.Tensor, generator: torc
 
 def _sampled(
     goal: GoalFunction,
-    fit: Fit,
+    fit: MatrixFit,
     drives: torch.Tensor,
     generator: torch.Generator,
     best: torch.Tensor,
@@ -260,7 +262,7 @@ def _sampled(
     return climbed(goal, samples, best.expand(count, -1), _SAMPLE_STEPS)
 
 
-def _magnitudes(fits: Sequence[Fit], drives: torch.Tensor) -> torch.Tensor:
+def _magnitudes(fits: Sequence[MatrixFit], drives: torch.Tensor) -> torch.Tensor:
     """Return the magnitudes (T, N, P) [Pa] that fitted matrices give for drives (T, N, M)."""
     pairs = zip(fits, drives, strict=True)
     return torch.stack([(played @ fit.posterior.matrix.T).abs() for fit, played in pairs])

@@ -28,7 +28,7 @@ _LEAST_SQUARES_STEPS = 100
 _FAINT = 0.02  # least intensity in the weights of readings, relative to the mean
 
 
-class Fit(NamedTuple):
+class MatrixFit(NamedTuple):
     """The posterior of a trial, and the readings as they were taken.
 
     Attributes:
@@ -50,7 +50,7 @@ def posteriors(
     generators: Sequence[torch.Generator],
     variance: torch.Tensor | None = None,
     deviation: torch.Tensor | None = None,
-) -> list[Fit]:
+) -> list[MatrixFit]:
     """Return the posteriors of T trials by all their readings but outliers.
 
     Args:
@@ -71,11 +71,11 @@ def posteriors(
         scaled = None if prior is None else prior.in_units_of(played, seen)
         noise = None if variance is None else variance[trial]
         errors = None if deviation is None else deviation[trial].clone()
-        fits.append(Trial(scaled, before, played, seen, generator, noise, deviation=errors).fit())
+        fits.append(TrialReadings(scaled, before, played, seen, generator, noise, deviation=errors).fit())
     return fits
 
 
-def tensors_of(fits: Sequence[Fit]) -> dict[str, torch.Tensor]:
+def tensors_of(fits: Sequence[MatrixFit]) -> dict[str, torch.Tensor]:
     """Return tensors from which `posteriors` goes on."""
     tensors = {name: torch.stack([getattr(fit.posterior, name) for fit in fits]) for name in _OF_POSTERIOR}
     return {
@@ -87,7 +87,7 @@ def tensors_of(fits: Sequence[Fit]) -> dict[str, torch.Tensor]:
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class TrialReadings:
     """The data of a trial's fit; see `posteriors`.
 
     The generator is for the first search without a prior. The phases of the pressures (N, P) [rad] are
@@ -104,12 +104,12 @@ class Trial:
     deviation: torch.Tensor | None = None
 
     @classmethod
-    def of(cls, prior: MatrixPrior, before: Mapping[str, torch.Tensor], readings: Readings) -> Trial:
+    def of(cls, prior: MatrixPrior, before: Mapping[str, torch.Tensor], readings: Readings) -> TrialReadings:
         """Return the trial of readings, with all that they state."""
         parts = readings.drives, readings.pressure
         return cls(prior, before, *parts, phase=readings.phase, deviation=readings.deviation)
 
-    def fit(self) -> Fit:
+    def fit(self) -> MatrixFit:
         """Return the fit without outliers, where readings at the end of a sensor's range are limits.
 
         A sensor that reads in coarse steps has equal highest readings near the best drive, too. These fit
@@ -128,7 +128,7 @@ class Trial:
                 return fit
         return self._screened(ends, plain.posterior.matrix)
 
-    def _screened(self, ends: torch.Tensor, matrix: torch.Tensor | None) -> Fit:
+    def _screened(self, ends: torch.Tensor, matrix: torch.Tensor | None) -> MatrixFit:
         """Return the fit that shows no further outlier; the first begins at a matrix (P, M), if any."""
         outliers = gaps = self.observed.isnan()
         if self.before:
@@ -146,7 +146,7 @@ class Trial:
             if torch.equal(shown, outliers):
                 break
             outliers = shown
-        return Fit(fit, read, ends)
+        return MatrixFit(fit, read, ends)
 
     def _start(self, read: Magnitudes, matrix: torch.Tensor | None) -> MatrixPosterior:
         """Return the posterior at which a fit begins: the one before, or the prior's.

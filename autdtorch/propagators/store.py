@@ -30,7 +30,7 @@ MOST_BYTES = 1_000_000_000
 """Limit of a store's memory [bytes]: the Huygens amplitudes of 256 transducers take 300 MB."""
 
 
-class Result(Protocol):
+class StoredResult(Protocol):
     """A result of a known size."""
 
     @property
@@ -39,7 +39,7 @@ class Result(Protocol):
         ...
 
 
-ResultT = TypeVar("ResultT", bound=Result)
+ResultT = TypeVar("ResultT", bound=StoredResult)
 
 
 class Store:

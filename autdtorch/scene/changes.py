@@ -32,19 +32,21 @@ Amounts: TypeAlias = Mapping[str, float]
 _AXES = "xyz"
 
 
-class Kind(NamedTuple):
+class ChangeKind(NamedTuple):
     """A kind of change: the unit of its amounts, and its meaning."""
 
     unit: str
     meaning: str
 
 
-def _shifts(part: str) -> dict[str, Kind]:
-    return {axis: Kind("m", f"shift of {part} along {axis}") for axis in _AXES}
+def _shifts(part: str) -> dict[str, ChangeKind]:
+    return {axis: ChangeKind("m", f"shift of {part} along {axis}") for axis in _AXES}
 
 
-def _moves(part: str, pivot: str) -> dict[str, Kind]:
-    turns = {f"turn_{axis}": Kind("rad", f"turn of {part} about {axis} through {pivot}") for axis in _AXES}
+def _moves(part: str, pivot: str) -> dict[str, ChangeKind]:
+    turns = {
+        f"turn_{axis}": ChangeKind("rad", f"turn of {part} about {axis} through {pivot}") for axis in _AXES
+    }
     return _shifts(part) | turns
 
 
@@ -54,13 +56,13 @@ _PARTS = {
     "array": _moves("the array, and of a panel that it stands in,", "the mean of its positions"),
     "points": _shifts("all points of observation"),
     "points[i]": _shifts("one point of observation"),
-    "reflectors[i]": {"distance": Kind("m", "shift of a plane along its normal")},
+    "reflectors[i]": {"distance": ChangeKind("m", "shift of a plane along its normal")},
 }
 
 KINDS = {f"{part}.{kind}": each for part, kinds in _PARTS.items() for kind, each in kinds.items()}
 """KINDS: the accepted names, with i for an index, with unit and meaning."""
-KINDS["temperature"] = Kind("K", "rise of the temperature of the air, whose absorption stays")
-KINDS["radius"] = Kind("m", "growth of the transducers' discs")
+KINDS["temperature"] = ChangeKind("K", "rise of the temperature of the air, whose absorption stays")
+KINDS["radius"] = ChangeKind("m", "growth of the transducers' discs")
 
 
 def unit_of(name: str) -> str:

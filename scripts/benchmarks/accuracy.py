@@ -14,7 +14,7 @@ from itertools import groupby
 import numpy as np
 from matplotlib.figure import Figure
 from shared import cases
-from shared.cases import Case, Simulation, cube_case, error_of, simulate, sphere_case
+from shared.cases import Case, SimulatedCase, cube_case, error_of, simulate, sphere_case
 from shared.document import Page, command_line, percent, table
 from shared.scenes import relative_error, uncached
 
@@ -103,7 +103,7 @@ def measure(spacings: Sequence[float], shifts: int) -> list[Row]:
     return [*rows, worst_point()]
 
 
-def compare(case: Case, treatment: str, spacing: float, simulation: Simulation) -> Row:
+def compare(case: Case, treatment: str, spacing: float, simulation: SimulatedCase) -> Row:
     """Return the errors of a transfer matrix."""
     total, scattered = error_of(case, simulation.matrix)
     seconds = f"{simulation.seconds:.1f} s"

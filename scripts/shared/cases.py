@@ -48,7 +48,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Simulation:
+class SimulatedCase:
     """A transfer matrix (P, M) [Pa], its run time [s], and whether every run reached the steady state."""
 
     matrix: torch.Tensor
@@ -56,7 +56,7 @@ class Simulation:
     settled: bool = True
 
 
-def simulate(case: Case, spacing: float, tolerance: float = TOLERANCE) -> Simulation:
+def simulate(case: Case, spacing: float, tolerance: float = TOLERANCE) -> SimulatedCase:
     """Simulate the transfer matrix at `spacing` [mm], scene assembly included in the time."""
 
     def work() -> tuple[torch.Tensor, bool]:
@@ -66,7 +66,7 @@ def simulate(case: Case, spacing: float, tolerance: float = TOLERANCE) -> Simula
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", at.SteadyStateWarning)  # `settled` reports it
         (matrix, settled), seconds = timed(work)
-    return Simulation(matrix, seconds, settled)
+    return SimulatedCase(matrix, seconds, settled)
 
 
 def close_scene(name: str, obstacles: Sequence[at.Obstacle] | None = None) -> at.Scene:

@@ -7,10 +7,10 @@ from botorch.acquisition.analytic import ExpectedImprovement, LogExpectedImprove
 import autdtorch as at
 from autdtorch.methods.bayes.acquisition import ScoreAcquisition
 from autdtorch.methods.bayes.gaussian_process import (
-    Fit,
+    Hyperparameters,
+    MatrixRows,
     PhasorKernel,
     Processes,
-    Rows,
     fitted,
     on_circle,
     phasors,
@@ -38,7 +38,7 @@ def uniform(*shape, seed=0):
 
 
 def fit_of(trials, outputs, length_scale, noise):
-    return Fit(
+    return Hyperparameters(
         *(torch.full((trials, outputs), value, dtype=torch.float64) for value in (length_scale, noise))
     )
 
@@ -163,7 +163,7 @@ class TestProcesses:
             values, feature = values[..., :1], on_circle(there)
         if kernel == "rows":
             g = random_matrix(4, 4, 0).reshape(2, 2, 4)
-            rows = Rows(g, torch.full((2, 2), 0.3, dtype=torch.float64), points[:, 0])
+            rows = MatrixRows(g, torch.full((2, 2), 0.3, dtype=torch.float64), points[:, 0])
             pressure = torch.complex(feature[..., :4], feature[..., 4:]) @ g.mT
             kernel, mean = "phasor", pressure.abs().square() + 0.3 * 4
         processes = Processes(kernel, points, values, fit_of(2, values.shape[2], 0.5, 1e-3), rows)

@@ -16,8 +16,8 @@ from autdtorch.plot.explore import calculation
 from autdtorch.plot.explore import situation as situation_module
 from autdtorch.plot.explore.calculation import Calculator, Finished, Request, Result
 from autdtorch.plot.explore.display import _force_text, offered
-from autdtorch.plot.explore.picture import followed
-from autdtorch.plot.explore.situation import SCENE_PLANE, Body, History, Situation, in_phase
+from autdtorch.plot.explore.rendering import followed
+from autdtorch.plot.explore.situation import SCENE_PLANE, History, MovedObstacle, Situation, in_phase
 
 PLACE = st.tuples(*[st.floats(-0.1, 0.1)] * 3)
 ANGLES = st.tuples(*[st.floats(-math.pi, math.pi)] * 3)
@@ -38,7 +38,7 @@ def oblique_scene():
 
 @given(st.sampled_from([BRICK, PEG, WEDGE]), PLACE, ANGLES)
 def test_the_pose_of_a_picture_is_that_of_the_obstacle(obstacle, center, angles):
-    body = Body(obstacle, center, angles)
+    body = MovedObstacle(obstacle, center, angles)
     turn, pivot, offset = body.pose
     moved = (obstacle.surface()[0] - pivot) @ turn.mT + pivot + offset
     # A cylinder's polygon may begin elsewhere on its rim; its axis has ten decimals
@@ -52,10 +52,10 @@ def test_the_pose_of_a_picture_is_that_of_the_obstacle(obstacle, center, angles)
 def test_bodies_stand_for_their_obstacles():
     ball = at.Sphere((0, 0, 0), 1e-3, rigid=True)
     for obstacle in (BRICK, PEG, WEDGE, ball):
-        assert Body.of(obstacle).obstacle is obstacle
-    turned = Body(BRICK, BRICK.center, (0.0, 0.0, 0.7)).obstacle
+        assert MovedObstacle.of(obstacle).obstacle is obstacle
+    turned = MovedObstacle(BRICK, BRICK.center, (0.0, 0.0, 0.7)).obstacle
     assert turned.rotation == pytest.approx((0, 0, 0.7), abs=1e-9)
-    body = Body(ball, (1e-3, 0, 0), (1.0, 0, 0))
+    body = MovedObstacle(ball, (1e-3, 0, 0), (1.0, 0, 0))
     assert body.obstacle.center == (1e-3, 0, 0)
     assert not body.turns
 
@@ -64,9 +64,9 @@ def test_the_weight_of_a_body_is_that_of_its_volume_where_its_density_is_known()
     fluid = {"density": 100.0, "sound_speed": 340.0}
     box = at.Box((0, 0, 0), (3e-3, 4e-3, 5e-3), (0.3, -0.2, 0.5), **fluid)
     ball = at.Sphere((0, 0, 0), 2e-3, **fluid)
-    assert Body.of(box).weight == pytest.approx(100 * 60e-9 * 9.81)
-    assert Body.of(ball).weight == pytest.approx(100 * 4 / 3 * math.pi * 8e-9 * 9.81)
-    assert Body.of(BRICK).weight is None  # rigid
+    assert MovedObstacle.of(box).weight == pytest.approx(100 * 60e-9 * 9.81)
+    assert MovedObstacle.of(ball).weight == pytest.approx(100 * 4 / 3 * math.pi * 8e-9 * 9.81)
+    assert MovedObstacle.of(BRICK).weight is None  # rigid
     assert _force_text(np.array([3e-3, 0, -4e-3]), 5.89e-5) == (
         "Force of the sound 5.00 mN: (3.00, 0.00, -4.00) mN. Weight 58.9 µN."
     )

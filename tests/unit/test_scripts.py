@@ -108,7 +108,7 @@ def test_the_order_of_a_power_law_is_its_power(spacings: tuple[float, ...]) -> N
 def test_errors_are_measured_of_the_scattered_field_too() -> None:
     case = sphere_case("sphere", (0.2e-3, -0.3e-3, 0.1e-3))
     free = free_space_matrix(case.points, case.scene.array, case.scene.wavenumber)
-    row = compare(case, "nothing scattered", 1.0, cases.Simulation(free, 0.0, True))
+    row = compare(case, "nothing scattered", 1.0, cases.SimulatedCase(free, 0.0, True))
     # two sums of the same series; 1e-9 of the smaller scattered field is far above rounding
     assert row.scattered == pytest.approx(1, abs=1e-9)
     row = worst_point(1.5)

@@ -38,7 +38,7 @@ _TARGET = 0.5  # share that it then fills
 _COARSER = 4.0  # a waveform that clips fills at least a quarter of a scale so much coarser
 
 
-class Fit(NamedTuple):
+class SineFit(NamedTuple):
     """A sine fitted to a signal: p (...,) of Re(p e^{-i w t}), t = 0 at the first sample; rms of the rest."""
 
     phasor: torch.Tensor
@@ -74,12 +74,12 @@ class LockIn:
         self._fit = torch.linalg.solve(weighted @ self._basis.T, weighted)
         self.noise_gain = float(self._fit[1:].square().sum())
 
-    def __call__(self, signal: torch.Tensor) -> Fit:
+    def __call__(self, signal: torch.Tensor) -> SineFit:
         """Return the fits to signals (..., S)."""
         coefficients = signal.to(torch.float64) @ self._fit.T
         rest = signal - coefficients @ self._basis
         residual = (rest.square().sum(dim=-1) / (rest.shape[-1] - len(self._basis))).sqrt()
-        return Fit(torch.complex(coefficients[..., 1], coefficients[..., 2]), residual)
+        return SineFit(torch.complex(coefficients[..., 1], coefficients[..., 2]), residual)
 
 
 @dataclass(frozen=True)

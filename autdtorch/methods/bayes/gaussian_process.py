@@ -152,7 +152,7 @@ _NOISES = 10.0 ** torch.linspace(-6, 0, 25, **REAL)
 """Candidates for the variance of a reading's noise, in mean intensities."""
 
 
-class Fit(NamedTuple):
+class Hyperparameters(NamedTuple):
     """The fitted hyperparameters of the processes of T trials, with K outputs each.
 
     Attributes:
@@ -164,12 +164,12 @@ class Fit(NamedTuple):
     length_scale: torch.Tensor
     noise: torch.Tensor
 
-    def of(self, outputs: list[int]) -> Fit:
+    def of(self, outputs: list[int]) -> Hyperparameters:
         """Return the hyperparameters of some outputs."""
-        return Fit(*(part[:, outputs] for part in self))
+        return Hyperparameters(*(part[:, outputs] for part in self))
 
 
-class Rows(NamedTuple):
+class MatrixRows(NamedTuple):
     """The rows of the transfer matrix as they are known before the observations.
 
     Attributes:
@@ -182,9 +182,9 @@ class Rows(NamedTuple):
     variance: torch.Tensor
     best: torch.Tensor
 
-    def of(self, outputs: list[int]) -> Rows:
+    def of(self, outputs: list[int]) -> MatrixRows:
         """Return the rows of some outputs."""
-        return Rows(self.mean[:, outputs], self.variance[:, outputs], self.best)
+        return MatrixRows(self.mean[:, outputs], self.variance[:, outputs], self.best)
 
 
 class Posterior(NamedTuple):
@@ -212,8 +212,8 @@ class Processes:
         kernel: KernelName,
         points: torch.Tensor,
         values: torch.Tensor,
-        fit: Fit,
-        rows: Rows | None = None,
+        fit: Hyperparameters,
+        rows: MatrixRows | None = None,
     ) -> None:
         """Condition the processes on observations.
 
@@ -291,27 +291,27 @@ def standardised(
 
 def fitted(
     kernel: KernelName, points: torch.Tensor, values: torch.Tensor, noise: float | Literal["inferred"]
-) -> Fit:
+) -> Hyperparameters:
     """Return the hyperparameters of the largest marginal likelihood.
 
     Args:
         kernel: space in which phases are measured.
         points: phases in turns (T, N, D).
         values: scores or pressures (T, N, K).
-        noise: as in `Fit`; "inferred" to fit it, too.
+        noise: as in `Hyperparameters`; "inferred" to fit it, too.
     """
     shape = values.shape[0], values.shape[2]
     fixed = torch.full(shape, 0.0 if isinstance(noise, str) else noise, **REAL)
     if kernel == "phasor":
         ones = torch.ones_like(fixed)
-        return Fit(ones, _likeliest_noise(points, values) if isinstance(noise, str) else fixed)
+        return Hyperparameters(ones, _likeliest_noise(points, values) if isinstance(noise, str) else fixed)
     standard = standardised(kernel, values, fixed)[0]
     fits = [
         [_fit_alone(kernel, turns, column[:, None], noise) for column in columns.T]
         for turns, columns in zip(points, standard, strict=True)
     ]
     length_scale, variance = torch.tensor(fits, **REAL).unbind(dim=-1)
-    return Fit(length_scale, variance)
+    return Hyperparameters(length_scale, variance)
 
 
 def _fit_alone(
@@ -354,7 +354,7 @@ def _intensity_variance(noise: torch.Tensor, expected: torch.Tensor | float = 1.
     return noise * (2 * expected + noise) + _JITTER
 
 
-def _kernel(kernel: KernelName, fit: Fit, rows: Rows | None, unit: torch.Tensor) -> Any:
+def _kernel(kernel: KernelName, fit: Hyperparameters, rows: MatrixRows | None, unit: torch.Tensor) -> Any:
     """Return the covariance of the modelled values; `unit` of intensities (T, K)."""
     if kernel != "phasor":
         matern = MaternKernel(2.5, batch_shape=fit.length_scale.shape[:1])
@@ -365,7 +365,7 @@ def _kernel(kernel: KernelName, fit: Fit, rows: Rows | None, unit: torch.Tensor)
     return PhasorKernel("drives", rows.mean / unit[..., None].sqrt(), rows.variance / unit)
 
 
-def _reach(kernel: KernelName, fit: Fit) -> torch.Tensor:
+def _reach(kernel: KernelName, fit: Hyperparameters) -> torch.Tensor:
     if kernel == "phasor":
         return torch.full(fit.noise.shape[:1], _PHASOR_REACH, **REAL)
     shortest = fit.length_scale.amin(dim=-1)

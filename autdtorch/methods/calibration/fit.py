@@ -14,7 +14,7 @@ import torch
 
 from autdtorch.methods.doubtful_readings import Magnitudes
 from autdtorch.methods.linearised_readings import LinearisedReadings
-from autdtorch.methods.matrix_fit import Trial
+from autdtorch.methods.matrix_fit import TrialReadings
 from autdtorch.methods.matrix_posterior import MatrixPosterior, MatrixPrior
 from autdtorch.methods.prior import Prior, gaussian_prior
 from autdtorch.objectives.readings import Readings
@@ -108,7 +108,7 @@ def fitted(simulation: CalibrationStart, readings: Readings, prior: Prior) -> Ca
     enough = _ENOUGH_ON_GRIDS if simulation.changes.simulates else _ENOUGH
     for left in reversed(range(_ROUNDS)):
         before, around = fit, prior_around(tangent, simulation.widths, prior).times(unit)
-        trial = Trial.of(around, fit.before, readings).fit()
+        trial = TrialReadings.of(around, fit.before, readings).fit()
         fit = replace(fit, posterior=trial.posterior, read=trial.read)
         step = fit.amounts - tangent.amounts
         if not len(step) or (step.abs() < enough * fit.deviations[-len(step) :]).all():

@@ -104,7 +104,7 @@ class Result:
 
 
 @dataclass(frozen=True)
-class Progress:
+class MethodProgress:
     """The progress of a method: evaluations so far and at most, and the best weakest focus [Pa]."""
 
     request: Request
@@ -122,7 +122,7 @@ class Finished:
     error: Exception | None = None
 
 
-Report = Result | Progress | Finished
+Report = Result | MethodProgress | Finished
 
 
 class Calculator:
@@ -184,7 +184,7 @@ class Calculator:
         with self._changed:
             return not self._changed.wait_for(self._is_old, _REST)
 
-    def _results(self, request: Request) -> Iterator[Result | Progress]:
+    def _results(self, request: Request) -> Iterator[Result | MethodProgress]:
         """Yield ever more complete results of a request."""
         begun = time.monotonic()
         situation, fine = request.situation, request.fine
@@ -250,11 +250,11 @@ class Calculator:
             yield state
 
 
-def _progress(request: Request, state: State) -> Progress:
+def _progress(request: Request, state: State) -> MethodProgress:
     assert request.method is not None
     most = request.method.most_evaluations(state.problem)
     score = float(state.best.score[0])
-    return Progress(request, request.method.label, state.evaluations, most, score)
+    return MethodProgress(request, request.method.label, state.evaluations, most, score)
 
 
 def _followed(propagator: Propagator, drive: torch.Tensor) -> torch.Tensor:

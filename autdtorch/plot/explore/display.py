@@ -14,7 +14,7 @@ from autdtorch.methods.catalogue import METHODS, VARIANTS, label_of
 from autdtorch.plot import colours
 from autdtorch.plot.data import in_decibels
 from autdtorch.plot.explore.calculation import Result
-from autdtorch.plot.explore.picture import Picture, Scale
+from autdtorch.plot.explore.rendering import Rendering, Scale
 from autdtorch.plot.explore.situation import SCENE_PLANE, History, Situation, devices_of, free_folder
 from autdtorch.plot.meshes3d import map_colours
 from autdtorch.scene.drive import amplitudes_of, phases_of
@@ -47,7 +47,7 @@ class Display:
     def __init__(self, state: Any, situation: Situation) -> None:
         """Draw a situation; `state` is trame's."""
         self._state = state
-        self.picture = Picture(situation)
+        self.picture = Rendering(situation)
         self.update: Callable[[], None] = lambda: None
         self.surface = _FIRST_SURFACE
         self.silent: dict[int, float] = {}

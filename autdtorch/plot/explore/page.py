@@ -11,8 +11,8 @@ from typing import NamedTuple
 from autdtorch.plot.explore.situation import SCENE_PLANE
 
 
-class Look(NamedTuple):
-    """A button that moves the camera: its label, its title, and the arguments of `Picture.move_camera`."""
+class CameraButton(NamedTuple):
+    """A button that moves the camera: its label, its title, and the arguments of `Rendering.move_camera`."""
 
     label: str
     title: str
@@ -20,13 +20,13 @@ class Look(NamedTuple):
 
 
 CAMERA = {
-    "look_left": Look("←", "look from further left", (15.0, 0.0, 1.0)),
-    "look_right": Look("→", "look from further right", (-15.0, 0.0, 1.0)),
-    "look_up": Look("↑", "look from further up", (0.0, 15.0, 1.0)),
-    "look_down": Look("↓", "look from further down", (0.0, -15.0, 1.0)),
-    "zoom_in": Look("+", "zoom in", (0.0, 0.0, 1.25)),
-    "zoom_out": Look("-", "zoom out", (0.0, 0.0, 0.8)),
-    "look_first": Look("First view", "first view", (0.0, 0.0, 0.0)),
+    "look_left": CameraButton("←", "look from further left", (15.0, 0.0, 1.0)),
+    "look_right": CameraButton("→", "look from further right", (-15.0, 0.0, 1.0)),
+    "look_up": CameraButton("↑", "look from further up", (0.0, 15.0, 1.0)),
+    "look_down": CameraButton("↓", "look from further down", (0.0, -15.0, 1.0)),
+    "zoom_in": CameraButton("+", "zoom in", (0.0, 0.0, 1.25)),
+    "zoom_out": CameraButton("-", "zoom out", (0.0, 0.0, 0.8)),
+    "look_first": CameraButton("First view", "first view", (0.0, 0.0, 0.0)),
 }
 """Buttons of the camera, by action."""
 
@@ -78,7 +78,7 @@ def _button(name: str, label: str, disabled: str = "false") -> str:
 <button type="button" id="{name}" @click="trigger('{name}')" :disabled="{disabled}">{label}</button>"""
 
 
-def _camera_button(name: str, look: Look) -> str:
+def _camera_button(name: str, look: CameraButton) -> str:
     return f"""
 <button type="button" id="{name}" title="{look.title}" aria-label="{look.title}"
   @click="trigger('{name}')">{look.label}</button>"""

@@ -33,7 +33,7 @@ _MOST_BYTES = 100_000_000  # of the vertices of meshes in the history; all else 
 
 
 @dataclass(frozen=True)
-class Body:
+class MovedObstacle:
     """An obstacle that is moved and turned about its centre.
 
     Attributes:
@@ -48,7 +48,7 @@ class Body:
     angles: Vector
 
     @classmethod
-    def of(cls, obstacle: Obstacle) -> Body:
+    def of(cls, obstacle: Obstacle) -> MovedObstacle:
         """Return the body of an obstacle in its original pose."""
         return cls(obstacle, _middle(obstacle), getattr(obstacle, "rotation", (0.0, 0.0, 0.0)))
 
@@ -83,13 +83,13 @@ class Body:
     def pose(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rotation (3, 3) about a pivot (3,) [m], then offset (3,) [m], from the original pose."""
         pivot = torch.tensor(_middle(self.original), **REAL)
-        turn = rotation_matrix(self.angles) @ rotation_matrix(Body.of(self.original).angles).mT
+        turn = rotation_matrix(self.angles) @ rotation_matrix(MovedObstacle.of(self.original).angles).mT
         return turn, pivot, pivot.new_tensor(self.center) - pivot
 
     @cached_property
     def obstacle(self) -> Obstacle:
         """The obstacle in its present pose."""
-        if self == Body.of(self.original):
+        if self == MovedObstacle.of(self.original):
             return self.original
         turn, pivot, offset = self.pose
         return shifted(turned(self.original, turn, pivot) if self.turns else self.original, offset)
@@ -109,7 +109,7 @@ class Situation:
         reference: pressure of the brightest colour [Pa]; None to fit it to the next field.
     """
 
-    bodies: tuple[Body, ...]
+    bodies: tuple[MovedObstacle, ...]
     scene: Scene
     drive: torch.Tensor
     plane: str
@@ -120,7 +120,7 @@ class Situation:
     @classmethod
     def of(cls, scene: Scene, drive: torch.Tensor) -> Situation:
         """Return the first situation of a scene."""
-        bodies = tuple(map(Body.of, scene.obstacles))
+        bodies = tuple(map(MovedObstacle.of, scene.obstacles))
         if (plane := scene.observation_plane) is not None:
             return cls(bodies, scene, drive, SCENE_PLANE, 0.0, plane)
         middle = scene.control_points.mean(dim=0)

@@ -50,7 +50,7 @@ class Scale(NamedTuple):
         return (colours.FLOOR, 0.0) if self.decibels else (0.0, self.reference)
 
 
-class Picture:
+class Rendering:
     """The picture. All its methods are called in one thread, as OpenGL requires."""
 
     def __init__(self, situation: Situation) -> None:
