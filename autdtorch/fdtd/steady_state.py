@@ -18,11 +18,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
 from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_basis, drive_signal, fourier_sum
-from autdtorch.utils.array_types import Index
+from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.process import even_parts, spread
 
 Observe = Callable[[Tensor, Index], Sequence[Tensor]]
@@ -96,7 +97,7 @@ def run_to_steady_state(
         runs = np.arange(*bounds)
         stepping = WindowedRuns(assembly, kernel, drive(runs), cells, runs, echo, unused)
         sequences = Extrapolation(kept, single=assembly.dtype == torch.float32)
-        values: deque[list[Tensor]] = deque(maxlen=_JUDGED)
+        judging = _Judging(observe, floors[:, runs])
         places = torch.arange(len(runs), device="cpu")  # among the runs that are stepped
         states: dict[int, SteadyState] = {}
         for count in itertools.count(block, block):
@@ -108,9 +109,7 @@ def run_to_steady_state(
             if count < first_judged:
                 continue
             limits = sequences.limits(places) if len(sequences) else windows[-1][1].mT[:, places]
-            values.append([value.cpu() for value in observe(limits, runs)])
-            residuals = map(_residuals, zip(*values, strict=True), floors[:, runs])
-            residual = torch.stack(list(residuals)).amax(dim=0).numpy()
+            residual = judging.residuals(limits, runs)
             converged = (residual <= limit[runs]) & (count >= earliest)
             done = converged | (count >= max_periods)
             for place in np.flatnonzero(done):
@@ -118,9 +117,8 @@ def run_to_steady_state(
                 states[runs[place]] = SteadyState(limits[:, place].contiguous().cpu(), *state)
             if done.all():
                 break
-            rest = torch.from_numpy(np.flatnonzero(~done))
-            runs, places = runs[rest.numpy()], places[rest]
-            values = deque(([value[:, rest] for value in each] for each in values), _JUDGED)
+            judging.choose(~done)
+            runs, places = runs[~done], places[~done]
             if 2 * len(places) < len(stepping.runs):
                 stepping.choose(places)
                 sequences.choose(places)
@@ -188,16 +186,16 @@ class Extrapolation:
     def limits(self, places: Tensor) -> Tensor:
         """Return the estimated limits (k, r) of some sequences, or last values while there are too few."""
         values, weights = self._values[: len(self)], self._weights(places)
-        limits = weights.new_empty((values.shape[2], len(places)))
-        summed = _SUMMED if values.device.type == "cpu" else _SUMMED_ON_GPU
-        width = max(1, summed // weights.numel())
-        parts = zip(torch.split(values, width, dim=2), torch.split(limits, width), strict=True)
-        for part, target in parts:
-            target[:] = torch.einsum("nrk,nr->kr", part[:, places].to(weights.dtype), weights)
-        return limits
+        limits = weights.new_empty((len(places), values.shape[2]))
+        width = max(1, (_SUMMED if values.device.type == "cpu" else _SUMMED_ON_GPU) // len(values))
+        for place, weight, limit in zip(places.tolist(), weights, limits, strict=True):
+            parts = torch.split(values[:, place], width, dim=1), torch.split(limit, width)
+            for part, target in zip(*parts, strict=True):
+                target[:] = weight @ part.to(weight.dtype)
+        return limits.mT
 
     def _weights(self, places: Tensor) -> Tensor:
-        """Return the weights (n, r) of the stored values of some sequences in their limits."""
+        """Return the weights (r, n) of the stored values of some sequences in their limits."""
         steps = min(self._count, self._most) - 1
         products = self._products[places, :steps, :steps].cpu().numpy()
         size = np.trace(products, axis1=1, axis2=2).real / max(steps, 1)
@@ -205,10 +203,10 @@ class Extrapolation:
         regular = products[usable] + _ROUNDING * size[usable, None, None] * np.eye(steps)
         means = np.linalg.solve(regular, np.ones((len(usable), steps, 1)))[..., 0]
         means /= means.sum(axis=1, keepdims=True)
-        weights = np.zeros((len(self), len(places)), np.complex128)
-        weights[(self._count - 1) % self._most] = 1
+        weights = np.zeros((len(places), len(self)), np.complex128)
+        weights[:, (self._count - 1) % self._most] = 1
         numbers = np.arange(self._count - steps, self._count)  # of values that have a step
-        weights[np.ix_(numbers % self._most, usable)] = means.T[(numbers - 1) % (self._most - 1)]
+        weights[np.ix_(usable, numbers % self._most)] = means[:, (numbers - 1) % (self._most - 1)]
         return torch.from_numpy(weights).to(self._values.device)
 
 
@@ -303,6 +301,27 @@ def _shift(steps: int) -> int:
 def _is_needed(time: int, steps: int, shift: int) -> bool:
     """Return whether a window ends or begins after `time` steps; ends are `shift` apart."""
     return time % shift == 0 or (time + steps) % shift == 0
+
+
+class _Judging:
+    """The last values of what is observed of R runs."""
+
+    def __init__(self, observe: Observe, floors: Tensor) -> None:
+        """Observe nothing yet; residuals are relative to norms of values, or to `floors` (Q, R) if more."""
+        self._observe, self._floors = observe, floors
+        self._values: deque[list[Tensor]] = deque(maxlen=_JUDGED)
+
+    def residuals(self, limits: Tensor, runs: Index) -> Array:
+        """Observe phasors (k, R) of runs, by their numbers (R,); return the estimated residuals (R,)."""
+        self._values.append([value.cpu() for value in self._observe(limits, runs)])
+        each = map(_residuals, zip(*self._values, strict=True), self._floors)
+        return torch.stack(list(each)).amax(dim=0).numpy()
+
+    def choose(self, mask: NDArray[np.bool_]) -> None:
+        """Go on with some of the runs."""
+        self._floors = self._floors[:, mask]
+        for values in self._values:
+            values[:] = [value[:, mask] for value in values]
 
 
 def _residuals(values: Sequence[Tensor], floors: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ import itertools
 import logging
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -53,6 +53,7 @@ from autdtorch.utils.process import cached_property, one_library_thread, spread
 
 logger = logging.getLogger(__name__)
 
+_TOGETHER = 8  # Runs whose phasors one thread maps at once
 _ENTRY_BYTES = torch.complex128.itemsize
 
 
@@ -109,13 +110,13 @@ class Solved(NamedTuple):
     def pressure(self) -> torch.Tensor:
         """The scattered field (P, R) [Pa] at the receivers."""
         parts = zip(self.transforms, self.phasors, strict=True)
-        return torch.stack([transform.field(part) for transform, part in parts]).sum(dim=0)
+        return torch.stack([_spread_runs(transform.field, part) for transform, part in parts]).sum(dim=0)
 
     @property
     def amplitudes(self) -> list[torch.Tensor]:
         """The amplitudes (n, R) [Pa m] of each box's Huygens surface."""
         pairs = zip(self.transforms, self.phasors, strict=True)
-        return [transform.amplitudes(part) for transform, part in pairs]
+        return [_spread_runs(transform.amplitudes, part) for transform, part in pairs]
 
 
 class BoxSimulation(Simulation):
@@ -329,7 +330,8 @@ class BoxSimulation(Simulation):
 
         def observed(phasors: torch.Tensor, runs: Index) -> list[torch.Tensor]:
             parts = zip(readings, torch.split(phasors.cpu(), sizes), strict=True)
-            pressure = audible * (incident[:, runs] + sum(reading.field(part) for reading, part in parts))
+            scattered = [_spread_runs(reading.field, part) for reading, part in parts]
+            pressure = audible * (incident[:, runs] + torch.stack(scattered).sum(dim=0))
             return [pressure[group] for group in groups]
 
         bodies = [
@@ -346,7 +348,7 @@ class BoxSimulation(Simulation):
                 logger.debug("the iteration between %d boxes does not converge: one box instead", len(bodies))
                 return self._in_one_box._solved(sources, strength, judged, stepped)
         seconds = (time.perf_counter() - begin) / count
-        phasors = torch.stack([state.pressure for state in states], dim=1)
+        phasors = torch.stack([state.pressure for state in states]).mT
         runs = [Run.of(state, seconds) for state in states]
         return Solved(transforms, torch.split(phasors, sizes), runs), runs
 
@@ -442,6 +444,11 @@ class _Scatterer:
             if coupling.rest:
                 field = field + box.radiated(outgoing, here.driven, coupling.rest)
         return torch.stack([here.forces(each) for each in field.mT], dim=1)
+
+
+def _spread_runs(linear: Callable[[torch.Tensor], torch.Tensor], phasors: torch.Tensor) -> torch.Tensor:
+    """Return a linear map of phasors (k, R), computed for some runs at a time on all threads."""
+    return torch.cat(spread(linear, torch.split(phasors, _TOGETHER, dim=1)), dim=1)
 
 
 def _images(box: ScatteredField, symmetry: Symmetry) -> Index:
