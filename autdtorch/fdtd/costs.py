@@ -102,7 +102,7 @@ class Costs:
         lasting = _CELL_BYTES * grouping.cells + _CELL_MEMORY * filled.cells + _COLUMN_BYTES * filled.columns
         assembled = min(_ELEMENTS * filled.cut / len(grouping.grids), _MOST_ELEMENTS * thread_count())
         assembled *= _ALIKE if grouping.aligned else 1
-        running = 12 * judged * cells + min(self.runs, self._at_once) * run
+        running = 12 * judged * cells + min(self.runs, self._at_once * self._together) * run
         lasting += 2 * self.itemsize * sum(grid.echo_numbers for grid in grouping.grids)
         return lasting + max(_ELEMENT_BYTES * assembled, running)
 
@@ -159,6 +159,13 @@ class Costs:
 
     @property
     def _at_once(self) -> int:
-        """Runs side by side; coupled boxes run one after the other."""
+        """Threads that step runs; coupled boxes run one after the other."""
         grids = self.grouping.grids
         return make_kernel(self.kernel).at_once(grids[0].shape) if len(grids) == 1 else 1
+
+    @property
+    def _together(self) -> int:
+        """Runs that a thread steps together; those on a GPU are in a memory of its own."""
+        if self.kernel == "cuda":
+            return 1
+        return make_kernel(self.kernel).together(self.grouping.grids[0].shape, self._cells_read)

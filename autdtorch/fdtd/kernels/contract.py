@@ -151,7 +151,7 @@ class Sources:
     # force by each signal (R, n, S) [Pa]; of a drive, real and imaginary part of the phasors
     force: Tensor
 
-    def chosen(self, runs: Tensor) -> Sources:
+    def chosen(self, runs: slice | Tensor) -> Sources:
         """Return the sources of some runs."""
         return Sources(self.index, self.force[runs])
 
