@@ -26,6 +26,7 @@ from autdtorch.fdtd.discrete_green import field_of_kernels
 from autdtorch.fdtd.face_nodes import FaceNodes
 from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Sources
+from autdtorch.fdtd.kernels.waves import superposition
 from autdtorch.fdtd.shapes import Shape, turned_shape
 from autdtorch.fdtd.stencil import flat_offsets, places_of
 from autdtorch.fdtd.stepping import Assembly
@@ -53,6 +54,7 @@ class ScatteredField:
     axes: Array  # axes of the grid, one a row (3, 3)
     images: tuple[Image, ...] = NO_MIRRORS  # of what it radiates; the first is the space itself
     mirrors: tuple[int, ...] = ()  # numbers of those whose images are on its grid
+    device: str = "cpu"  # that sums waves
 
     @property
     def echoes(self) -> tuple[Image, ...]:
@@ -96,11 +98,11 @@ class ScatteredField:
         images: Sequence[Image] = NO_MIRRORS,
     ) -> Tensor:
         """Return fields (P, R) at points (P, 3) [m] of images of sources (N, 3), amplitudes (N, R) [Pa m]."""
-        from autdtorch.fdtd.kernels.cpu_waves import superposition  # loads numba
 
         def of(image: Image) -> Tensor:
             seen = sources if image is SPACE_ITSELF else image_of(sources, image)
-            field = superposition(points, seen, amplitude, self.wavenumber, self.assembly.dtype)
+            settings = self.wavenumber, self.assembly.dtype, self.device
+            field = superposition(points, seen, amplitude, *settings)
             return field if image is SPACE_ITSELF else image.weight * field
 
         total = of(images[0])

@@ -137,7 +137,8 @@ class BoxSimulation(Simulation):
                 logger.debug("the grid around obstacles %s is turned along their faces", list(grid.group))
             assembly = assembled_box(grid.part, grid.axes, plan.spacing, plan.dtype, plan.time_step)
             images = plan.region.other_images(grid.mirrors, plan.scene.images)
-            boxes.append(ScatteredField(assembly, wavenumber, grid.axes, images, grid.mirrors))
+            settings = grid.axes, images, grid.mirrors, plan.device
+            boxes.append(ScatteredField(assembly, wavenumber, *settings))
         return boxes
 
     def _mirrors(self, numbers: Iterable[int]) -> list[Mirror]:

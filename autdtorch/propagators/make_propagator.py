@@ -90,9 +90,10 @@ def make_propagator(
         tolerance: relative error, in (0, 1): the distance to the steady state at which a simulation ends,
             or the estimated error where the spacing is chosen; a warning tells where voxels are too coarse
             for it. Hard obstacles are simulated as rigid where the difference is smaller.
-        device: where simulations run: "cpu", "cuda" (an NVIDIA GPU, the current one) or a `torch.device`; by
-            default a GPU if there is one. Results are equal to rounding wherever they come from, and on the
-            device of the drive or the points, the CPU by default.
+        device: where simulations run, and fields of many points are summed: "cpu", "cuda" (an NVIDIA GPU,
+            the current one) or a `torch.device`; by default a GPU if there is one. Results are equal to
+            rounding wherever they come from, and on the device of the drive or the points, by default the
+            CPU.
         kernel: "cpu" (numba), "cuda" (Triton, on an NVIDIA GPU), "reference" (torch, slow, readable), or
             "auto" for the fastest available on the device.
         dtype: precision of the fields, float32 or float64.
@@ -133,7 +134,7 @@ def make_propagator(
         settled = planned if spacing else planned.at(on_grids().spacing, tolerance, time_step)
         propagator = TMatrixPropagator(settled, store, on_grids)
     elif planned.method == "free_space":
-        return FreeSpacePropagator(scene)
+        return FreeSpacePropagator(scene, planned.device)
     else:
         propagator = on_grids()
     if time_step is not None:

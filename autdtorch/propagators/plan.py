@@ -127,6 +127,11 @@ class Plan:
         return key_of(settings, rigid, affecting)
 
     @property
+    def device(self) -> str:
+        """The device of the kernel, "cpu" or "cuda"."""
+        return "cuda" if self.kernel == "cuda" else "cpu"
+
+    @property
     def law(self) -> Law:
         """The growth of its errors with the spacing."""
         return Law(self.region.shortest_wavelength, self.grouping.aligned)

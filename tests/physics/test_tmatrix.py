@@ -14,7 +14,7 @@ from scipy.special import sph_harm_y
 from small_scenes import assert_slopes, relative_error
 
 import autdtorch as at
-from autdtorch.analytic.discs import MeanWaves, powers_needed
+from autdtorch.analytic.mean_waves import MeanWaves, powers_needed
 from autdtorch.analytic.sphere import fluid_sphere, impedance_sphere, rigid_sphere
 from autdtorch.analytic.spherical_waves import (
     degrees,

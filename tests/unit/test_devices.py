@@ -2,6 +2,7 @@
 
 import inspect
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,10 @@ from emulated_gpu import gpu
 from public_calls import AIR_ALONE, BALL, DRIVE, MATRIX, SCENE, Call, limited_link, propagator, public_calls
 
 import autdtorch as at
+from autdtorch.fdtd.kernels import waves
+from autdtorch.propagators import free_space
+from autdtorch.propagators.simulated import SimulatedPropagator
+from autdtorch.utils.apertures import Discs, centers_of
 from autdtorch.utils.validation import real_tensor
 
 TENSORS = {"drive", "drives", "G", "points", "positions", "pressure", "X"}
@@ -134,3 +139,51 @@ def test_poses_and_the_bench_take_tensors_of_the_device():
         require_equal([matrices], [expected])
         limited_link().play(to_gpu(DRIVE))
         assert torch.equal(limited_link().quantised(to_gpu(DRIVE)), limited_link().quantised(DRIVE))
+
+
+@pytest.mark.parametrize("wavenumber", [733.0, complex(733.0, 5.0)])
+@pytest.mark.parametrize("kinds", ["points", "discs as sources", "discs as points"])
+def test_sums_of_waves_are_those_of_the_cpu(kinds, wavenumber, monkeypatch):
+    generator = torch.Generator().manual_seed(0)
+    targets = 0.1 * torch.rand((90, 3), generator=generator, dtype=torch.float64)
+    centers, normals = targets[30:70].roll(1, dims=1), torch.nn.functional.normalize(targets[:40] - 0.03)
+    discs = Discs(centers, normals, torch.tensor([4.5e-3, 2e-3], dtype=torch.float64).repeat(20))
+    pair = {
+        "points": (targets, centers),
+        "discs as sources": (targets, discs),
+        "discs as points": (discs, targets),
+    }[kinds]
+    amplitude = torch.randn((len(centers_of(pair[1])), 3), generator=generator, dtype=torch.complex128)
+    expected = waves.superposition(*pair, amplitude, wavenumber)
+    single = waves.superposition(*pair, amplitude, wavenumber, torch.float32)
+    monkeypatch.setattr(waves, "WORTH_A_GPU", 1)
+    monkeypatch.setattr(waves, "AT_ONCE", 1000)
+    with gpu():
+        field = waves.superposition(*pair, amplitude, wavenumber, device="cuda")
+    # series end at most 1e-8 apart, see test_kernels.py; in single precision, waves are within 3e-7
+    assert (field - expected).norm() < 1e-7 * expected.norm()
+    assert (field - single).norm() < 1e-5 * expected.norm()
+
+
+@pytest.mark.parametrize("method", ["free_space", "box"])
+@pytest.mark.parametrize("radius", [0.0, 4e-3])
+def test_pictures_summed_on_the_gpu_are_those_of_the_cpu(method, radius, monkeypatch):
+    scene = replace(
+        SCENE, array=replace(SCENE.array, radius=radius), reflectors=[at.Reflector((40e-3, 0, 0), (-1, 0, 0))]
+    )
+    made = at.make_propagator(scene, method, 2e-3, 0.5, max_periods=6, device="cpu")
+    plane = torch.cartesian_prod(*(torch.linspace(-20e-3, 50e-3, n, dtype=torch.float64) for n in (7, 3, 5)))[
+        None
+    ]
+    expected = made.field(torch.stack([DRIVE, 0.5j * DRIVE]), plane)
+    for module in (waves, free_space):
+        monkeypatch.setattr(module, "WORTH_A_GPU", 1)
+    if method == "free_space":
+        summed = free_space.FreeSpacePropagator(scene, "cuda")
+    else:
+        summed = SimulatedPropagator(replace(made.plan, kernel="reference"))
+        for box in summed.simulation.boxes:
+            object.__setattr__(box, "device", "cuda")
+    with gpu():
+        field = summed.field(torch.stack([DRIVE, 0.5j * DRIVE]), plane)
+    assert (field - expected).norm() < 1e-5 * expected.norm()

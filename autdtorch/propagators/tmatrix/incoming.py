@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from autdtorch.analytic.discs import MeanWaves, powers_needed
+from autdtorch.analytic.mean_waves import MeanWaves, powers_needed
 from autdtorch.analytic.momentum import gradient_by_place, gradient_by_turn
 from autdtorch.analytic.spherical_waves import outgoing_waves
 from autdtorch.propagators.tmatrix.body_matrix import BodyMatrix
