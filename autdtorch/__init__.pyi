@@ -54,7 +54,7 @@ from .objectives.quiet import Contrast, QuietPoints, SeenPoints
 from .objectives.readings import Readings
 from .objectives.scenarios import Scenarios
 from .plot.calibration_figure import plot_calibration
-from .plot.costs import plot_pareto, plot_scaling
+from .plot.cost_figures import plot_pareto, plot_scaling
 from .plot.explore import explore
 from .plot.haptics_figure import plot_haptics
 from .plot.plane_figures import plot_force

@@ -18,7 +18,7 @@ from shared.cases import Case, SimulatedCase, cube_case, error_of, simulate, sph
 from shared.document import Page, command_line, percent, table
 from shared.scenes import relative_error, uncached
 
-from autdtorch.plot.costs import plot_pareto
+from autdtorch.plot.cost_figures import plot_pareto
 from autdtorch.plot.style import TICK_SIZE, readable
 
 DOCUMENT = "benchmarks.md"

@@ -25,7 +25,7 @@ from shared.cases import Case, cube_case, free_space_case, simulate, sphere_case
 from shared.document import Page, command_line, percent, table
 from shared.scenes import relative_error
 
-from autdtorch.plot.costs import plot_pareto
+from autdtorch.plot.cost_figures import plot_pareto
 from autdtorch.plot.style import TICK_SIZE
 
 DOCUMENT = "performance.md"

@@ -19,7 +19,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from small_scenes import AIR, scene_of_all_kinds, small_scene
 
 import autdtorch as at
-from autdtorch.plot.costs import plot_pareto, plot_scaling
+from autdtorch.plot.cost_figures import plot_pareto, plot_scaling
 from autdtorch.plot.data import clipped, parts_of_reflectors
 from autdtorch.plot.pressure_maps import plot_plane, plot_planes
 from autdtorch.plot.scene_figure import plot_scene

@@ -29,7 +29,7 @@ from studies.conditions import CONDITIONS, Method, outcome
 
 import autdtorch as at
 from autdtorch.objectives.objective import SimulatedObjective
-from autdtorch.plot.costs import fit_power
+from autdtorch.plot.cost_figures import fit_power
 from autdtorch.propagators import FreeSpacePropagator
 from autdtorch.propagators.free_space import free_space_matrix
 
