@@ -119,7 +119,7 @@ def indices_of(field: str, value: object, count: int) -> list[int]:
         if not ranges or not all(ranges) or sum(map(len, ranges)) > count:
             accepted = f"must be numbers from 0 to {count - 1}, each once, and ranges that go up, as 3,7-9"
             raise invalid(field, value, accepted)
-        value = [one for some in ranges for one in some]
+        value = [index for some in ranges for index in some]
     return indices(field, value, count)
 
 

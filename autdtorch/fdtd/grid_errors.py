@@ -87,7 +87,7 @@ def errors_by_grids(
     """Return the errors (P,) from other grids alone; see `grid_errors`."""
     size, compared = sizes(matrix, free), others[-_COMPARED:]
     spacings = [spacing, *(each for _, each in compared)]
-    changes = [(one - matrix).norm(dim=1) / size for one, _ in compared]
+    changes = [(coarse - matrix).norm(dim=1) / size for coarse, _ in compared]
     growth = torch.tensor([law.growth(each) for each in spacings], **REAL).expand(len(size), -1)
     if law.aligned and len(compared) > 1:
         change = (compared[0][0] - compared[1][0]).norm(dim=1) / size

@@ -206,7 +206,9 @@ def choose_grids(
     boxes = cheapest_boxes(region, spacing, tolerance, runs)
     gain = runs * domain.grids[0].work / boxes.box_cost(runs)
     first, last = region.domain
-    outside = any((np.less(one.lower, first) | np.greater(one.upper, last)).any() for one in region.shapes)
+    outside = any(
+        (np.less(shape.lower, first) | np.greater(shape.upper, last)).any() for shape in region.shapes
+    )
     tilted = any(is_tilted(grid.axes) for grid in boxes.grids)
     method, grouping = ("full", domain) if walls or not (outside or tilted or gain > 1) else ("box", boxes)
     logger.debug(

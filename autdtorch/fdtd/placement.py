@@ -69,8 +69,8 @@ def fitting_spacing(regions: Sequence[Region], spacing: float, coarsest: float =
     count = min(_TRIED * (1 + math.ceil(2 * _ROOM * longest / spacing)), _MOST_TRIED)
     tried = np.linspace((1 + _ROOM) * spacing, (1 - _ROOM) * spacing, count).clip(max=coarsest)
     missed = [
-        sum(_placements(place / one, first, area, 0.0)[1].min() for place, first, area in faces)
-        for one in tried
+        sum(_placements(place / choice, first, area, 0.0)[1].min() for place, first, area in faces)
+        for choice in tried
     ]
     return float(tried[int(np.argmin(missed))])
 

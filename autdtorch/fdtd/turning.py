@@ -132,7 +132,7 @@ def slender_faces(corners: Array) -> list[Array] | None:
         return None
     steps = radius * _SCALE * np.concatenate((-_STEPS, _STEPS))
     ends = np.array([lower[axis], upper[axis]])
-    return [ends if one == axis else middle[one] + steps for one in range(3)]
+    return [ends if along == axis else middle[along] + steps for along in range(3)]
 
 
 def staircase_excess(corners: Array) -> float:

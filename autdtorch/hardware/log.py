@@ -257,7 +257,7 @@ def lock_log(path: str | Path) -> Iterator[None]:
 def _difference(stored: Mapping[str, Any], origin: Mapping[str, Any]) -> str:
     """Describe the difference of two origins in JSON, where 1, 1.0 and true differ, and the order counts."""
     for name in (*origin, *stored):
-        texts = [json.dumps(one[name]) if name in one else None for one in (stored, origin)]
+        texts = [json.dumps(log[name]) if name in log else None for log in (stored, origin)]
         if texts[0] != texts[1]:
             return f"{name} is {stored.get(name, 'absent')}, not {origin.get(name, 'absent')}"
     return f"settings come in another order: {', '.join(stored)}"

@@ -143,10 +143,16 @@ class HardwareObjective:
             return None
 
         def deviation(pressure: torch.Tensor) -> torch.Tensor:
-            logged = {tuple(one.pressure.tolist()): one.deviation for one in self.log.evaluations}
+            logged = {
+                tuple(evaluation.pressure.tolist()): evaluation.deviation
+                for evaluation in self.log.evaluations
+            }
             rows = pressure.reshape(-1, pressure.shape[-1])
             known = [logged.get(tuple(row.tolist())) for row in rows]
-            parts = [sensed(row) if one is None else one for one, row in zip(known, rows, strict=True)]
+            parts = [
+                sensed(row) if deviation is None else deviation
+                for deviation, row in zip(known, rows, strict=True)
+            ]
             return torch.stack(parts).reshape(pressure.shape)
 
         return deviation

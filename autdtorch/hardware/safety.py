@@ -91,14 +91,14 @@ def ended_by_signals() -> Iterator[None]:
         raise Signalled(number)
 
     def restore() -> None:
-        for one, handler in before.items():
-            signal.signal(one, handler)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
-    handled = [one for one in _SIGNALS if signal.getsignal(one) is not signal.SIG_IGN]
-    before = {one: signal.getsignal(one) for one in handled}
+    handled = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.getsignal(number) for number in handled}
     try:
-        for one in handled:
-            signal.signal(one, end)
+        for number in handled:
+            signal.signal(number, end)
         yield
     finally:
         try:

@@ -338,4 +338,6 @@ def _played(path: Path, name: str, stored: Mapping[str, AnyArray]) -> torch.Tens
     with within(path):
         levels = [real_tensor(column, stored[column]) for column in wanted]
         # The device refuses fractions, which stay floats.
-        return device.drive(*(one.long() if torch.equal(one, one.round()) else one for one in levels))
+        return device.drive(
+            *(level.long() if torch.equal(level, level.round()) else level for level in levels)
+        )

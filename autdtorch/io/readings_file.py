@@ -220,7 +220,7 @@ def _from_log(path: Path, points: torch.Tensor | None) -> Readings:
         raise ValueError(f"{path}: no evaluation; must have at least one")
     drives = torch.stack([evaluation.drive for evaluation in evaluations])
     pressure = torch.stack([evaluation.pressure for evaluation in evaluations])
-    known = [one.deviation for one in evaluations if one.deviation is not None]
+    known = [evaluation.deviation for evaluation in evaluations if evaluation.deviation is not None]
     deviation = torch.stack(known) if len(known) == len(evaluations) else None
     if known and deviation is None:
         count = len(evaluations)
@@ -235,7 +235,7 @@ def _from_pictures(folder: Path, points: torch.Tensor | None) -> Readings:
         raise ValueError(f"{folder}: no picture of an evaluation; must have at least one")
     pictures = [load_picture(path) for path in paths]
     places = pictures[0].plane.points(_APART).reshape(-1, 3) if points is None else points
-    pressure, deviation = map(torch.stack, zip(*(one.at(places) for one in pictures), strict=True))
+    pressure, deviation = map(torch.stack, zip(*(picture.at(places) for picture in pictures), strict=True))
     origin, _ = read_log(folder.parent / _LOG)
     drives = torch.stack([load_drive(path) for path in paths])
     return Readings(_played(origin, drives), pressure, places, deviation=deviation)
@@ -243,7 +243,7 @@ def _from_pictures(folder: Path, points: torch.Tensor | None) -> Readings:
 
 def _played(origin: Mapping[str, Any], drives: torch.Tensor) -> torch.Tensor:
     """Return drives (N, M) at the levels of a trial's device; boards with their own corrections play any."""
-    device = next((one for one in DEVICES.values() if one.name == origin.get("device")), None)
+    device = next((device for device in DEVICES.values() if device.name == origin.get("device")), None)
     if device is None or "boards" in origin:
         return drives
     transducers = origin["transducers"]

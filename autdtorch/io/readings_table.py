@@ -115,7 +115,7 @@ def csv_table(path: Path, named: Named | None) -> Table:
         raise ValueError(f"{path}: no row under the header; must have at least one")
     file.require_regular(lines, len(first), "in the first row" if header is None else "in the header")
     points = [
-        [float(one) for one in match.groups()[1:]]
+        [float(number) for number in match.groups()[1:]]
         for text in file.comments
         if (match := _POINT.fullmatch(text))
     ]

@@ -291,8 +291,8 @@ def scene_sections(scene: Scene, name: str) -> dict[str, Any]:
         "medium": {field.name: getattr(medium, field.name) for field in fields(medium) if field.init},
         "array": boards[0] if len(boards) == 1 else boards,
         "obstacles": [
-            _obstacle(one, f"{name}_{number}", f"Scene.obstacles[{number}]")
-            for number, one in enumerate(scene.obstacles)
+            _obstacle(obstacle, f"{name}_{number}", f"Scene.obstacles[{number}]")
+            for number, obstacle in enumerate(scene.obstacles)
         ],
         "control_points": {"type": "points", "positions": scene.control_points.tolist()},
         "domain": dict(zip(("lower", "upper"), map(list, scene.domain), strict=True)),
@@ -303,7 +303,7 @@ def scene_sections(scene: Scene, name: str) -> dict[str, Any]:
             field.name: list(getattr(plane, field.name)) for field in fields(Plane)
         }
     if scene.reflectors:
-        sections["reflectors"] = [_reflector(one) for one in scene.reflectors]
+        sections["reflectors"] = [_reflector(reflector) for reflector in scene.reflectors]
     return sections
 
 

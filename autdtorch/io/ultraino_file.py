@@ -77,8 +77,8 @@ def read_ultraino(path: str | os.PathLike[str]) -> UltrainoFile:
         raise ValueError(f"{path}: {error}; must be a simulation saved by Ultraino, XML in gzip") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    lists = [one.fields.get("transducers") for one in reader.simulations]
-    transducers = [one for each in lists if isinstance(each, _Record) for one in each.entries]
+    lists = [simulation.fields.get("transducers") for simulation in reader.simulations]
+    transducers = [entry for each in lists if isinstance(each, _Record) for entry in each.entries]
     if not transducers:
         raise ValueError(f"{path}: no transducers; must be a simulation saved by Ultraino with some")
     with within(path):

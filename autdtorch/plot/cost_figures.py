@@ -132,7 +132,7 @@ def _name_front(ax: Axes, points: Array, names: Mapping[int, str], higher_is_bet
         width, height = _size(name)
         # Costs rise along the front: a name covers one before it if it is too wide, and that is too high.
         apart = [abs(place[index] - other) > (width, room) for other, room in written]
-        if all(one.any() for one in apart):
+        if all(gaps.any() for gaps in apart):
             ax.annotate(name, tuple(points[index]), fontsize=TICK_SIZE, **where)
             written.append((place[index], height))
 

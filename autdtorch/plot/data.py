@@ -158,8 +158,8 @@ def clipped(corners: Array, lower: Vector, upper: Vector, reflectors: Iterable[R
     for inwards, corner in ((1.0, lower), (-1.0, upper)):
         for axis in range(3):
             corners = _cut(corners, inwards * (corners[:, axis] - corner[axis]))
-    for one in reflectors:
-        corners = _cut(corners, (corners - np.array(one.point)) @ np.array(one.normal))
+    for reflector in reflectors:
+        corners = _cut(corners, (corners - np.array(reflector.point)) @ np.array(reflector.normal))
     return corners
 
 
@@ -180,10 +180,10 @@ def parts_of_reflectors(reflectors: Sequence[Reflector], domain: tuple[Vector, V
     """Return the corners (K, 3) [m] of each reflector's part in a domain and in front of the others."""
     lower, upper = (np.array(corner) for corner in domain)
     parts = []
-    for one in reflectors:
-        normal, middle = np.array(one.normal), (lower + upper) / 2
-        middle = middle - (middle - np.array(one.point)) @ normal * normal
-        u, v = (float(np.linalg.norm(upper - lower)) * axis.numpy() for axis in plane_basis(one.normal))
+    for reflector in reflectors:
+        normal, middle = np.array(reflector.normal), (lower + upper) / 2
+        middle = middle - (middle - np.array(reflector.point)) @ normal * normal
+        u, v = (float(np.linalg.norm(upper - lower)) * axis.numpy() for axis in plane_basis(reflector.normal))
         corners = middle + np.array([u + v, v - u, -u - v, u - v])
-        parts.append(clipped(corners, *domain, [other for other in reflectors if other is not one]))
+        parts.append(clipped(corners, *domain, [other for other in reflectors if other is not reflector]))
     return parts

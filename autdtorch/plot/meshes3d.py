@@ -154,7 +154,7 @@ def add_obstacle(
         for outwards, corner in zip((-1.0, 1.0), domain or (), strict=False)
         for normal in outwards * np.eye(3)
     ]
-    sides += [(-np.array(one.normal), np.array(one.point)) for one in reflectors]
+    sides += [(-np.array(reflector.normal), np.array(reflector.point)) for reflector in reflectors]
     for normal, corner in sides:
         if (((surface.points - MM * corner) @ normal) > 0).any():
             surface = surface.clip(normal=normal, origin=MM * corner)
@@ -190,10 +190,10 @@ def cut_at_reflectors(actors: Iterable[pyvista.Actor], reflectors: Iterable[Refl
     """Hide the parts of actors behind reflectors, wherever they are moved."""
     from vtkmodules.vtkCommonDataModel import vtkPlane
 
-    for one in reflectors:
+    for reflector in reflectors:
         plane = vtkPlane()
-        plane.SetOrigin(*(MM * coordinate for coordinate in one.point))
-        plane.SetNormal(*one.normal)
+        plane.SetOrigin(*(MM * coordinate for coordinate in reflector.point))
+        plane.SetNormal(*reflector.normal)
         for actor in actors:
             actor.mapper.AddClippingPlane(plane)
 

@@ -259,7 +259,7 @@ def _name_row(ax: Axes, name: str) -> None:
 
 def _as_one_scene(pressure: Any, *others: Any) -> tuple[Any, ...]:
     """Return the arguments of one scene as mappings, by an empty name."""
-    nested = isinstance(pressure, Mapping) and any(isinstance(one, Mapping) for one in pressure.values())
+    nested = isinstance(pressure, Mapping) and any(isinstance(field, Mapping) for field in pressure.values())
     if nested or not isinstance(pressure, Mapping):
         accepted = "must be maps by name, as {'gabs': p}, for one plane; plot_plane plots a single map"
         raise invalid("pressure", pressure, accepted)

@@ -68,7 +68,9 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
         corners = MM * scene.observation_plane.corners[[0, 1, 3, 2]].numpy()
         ax.add_collection3d(Poly3DCollection([corners], facecolor=colours.PLANE_COLOUR, alpha=0.3, zorder=1))
     # From far to near: the order of drawing is fixed, and later obstacles cover earlier ones.
-    for obstacle in sorted(scene.obstacles, key=lambda one: (np.array(one.lower) + one.upper) @ _TO_VIEWER):
+    for obstacle in sorted(
+        scene.obstacles, key=lambda body: (np.array(body.lower) + body.upper) @ _TO_VIEWER
+    ):
         _add_obstacle(ax, obstacle, scene)
     foci = MM * scene.control_points.numpy()
     ax.scatter(*foci.T, color=colours.FOCUS_COLOUR, s=22, depthshade=False, label="control points", zorder=3)
@@ -125,11 +127,11 @@ def _place(ax: Axes3D, point: Array) -> Array:
 def _add_reflectors(ax: Axes3D, scene: Scene) -> None:
     """Draw the reflectors, below everything else or, if the viewer looks at their backs, above."""
     style: Any = {"edgecolor": colours.REFLECTOR_COLOUR, "lw": 0.8, "label": "reflectors"}
-    for one, corners in zip(
+    for reflector, corners in zip(
         scene.reflectors, parts_of_reflectors(scene.reflectors, scene.domain), strict=True
     ):
         if len(corners):
-            in_front = np.array(one.normal) @ _TO_VIEWER > 0
+            in_front = np.array(reflector.normal) @ _TO_VIEWER > 0
             order, opacity = (0.5, colours.REFLECTOR_OPACITY) if in_front else (4, colours.BACK_OPACITY)
             style["facecolor"] = to_rgba(colours.REFLECTOR_COLOUR, opacity)
             ax.add_collection3d(Poly3DCollection([MM * corners], zorder=order, **style))

@@ -97,7 +97,7 @@ def equilibrium(
         return sound - particle.weight * upwards
 
     def is_clear(place: torch.Tensor) -> bool:
-        apart = [float((place - one.center).norm()) - one.radius for one in others]
+        apart = [float((place - body.center).norm()) - body.radius for body in others]
         apart += [float(each.mirror.height(place)) for each in scene.reflectors]
         apart.append(_from_transducers(scene.array, place))
         return min(apart) >= particle.radius

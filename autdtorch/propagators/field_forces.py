@@ -54,7 +54,9 @@ def forces_on_obstacles(propagator: Propagator, drive: torch.Tensor) -> torch.Te
 def _is_alone(scene: Scene, bodies: list[ObstacleGroup], body: ObstacleGroup) -> bool:
     """Return whether nothing else is within the spheres around a body."""
     radius = body.radius + _APART[1] * scene.wavelength
-    others = [float((one.center - body.center).norm()) - one.radius for one in bodies if one is not body]
+    others = [
+        float((other.center - body.center).norm()) - other.radius for other in bodies if other is not body
+    ]
     others += [float(each.mirror.height(body.center)) for each in scene.reflectors]
     others.append(float((scene.array.nodes.positions - body.center).norm(dim=-1).min()))
     return min(others) > radius

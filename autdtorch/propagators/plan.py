@@ -247,7 +247,7 @@ def region_of(scene: Scene) -> Region:
     air = Fluid(medium.density, medium.sound_speed)
     return Region(
         air, scene.attenuation, scene.frequency, tuple(bodies), scene.domain, positions,
-        tuple(one.mirror for one in scene.reflectors),
+        tuple(reflector.mirror for reflector in scene.reflectors),
     )  # fmt: skip
 
 

@@ -218,7 +218,9 @@ def changed_array(array: TransducerArray, amounts: Amounts) -> TransducerArray:
 
 def changed_obstacles(obstacles: tuple[Obstacle, ...], amounts: Amounts) -> tuple[Obstacle, ...]:
     """Return obstacles after changes by amounts."""
-    each = [_moved((one,), f"obstacles[{index}]", amounts)[0] for index, one in enumerate(obstacles)]
+    each = [
+        _moved((obstacle,), f"obstacles[{index}]", amounts)[0] for index, obstacle in enumerate(obstacles)
+    ]
     return _moved(tuple(each), "obstacles", amounts)
 
 
@@ -258,10 +260,10 @@ def _in_medium(scene: Scene, medium: Medium) -> tuple[Obstacle, ...]:
     """Return the obstacles of a scene in another medium, which those of the medium's material share."""
     before = scene.medium.density, scene.medium.sound_speed, 0.0
     return tuple(
-        replace(one, density=medium.density, sound_speed=medium.sound_speed)
-        if (one.density, one.sound_speed, one.absorption) == before
-        else one
-        for one in scene.obstacles
+        replace(obstacle, density=medium.density, sound_speed=medium.sound_speed)
+        if (obstacle.density, obstacle.sound_speed, obstacle.absorption) == before
+        else obstacle
+        for obstacle in scene.obstacles
     )
 
 
@@ -272,8 +274,9 @@ def _domain_with(scene: Scene, array: TransducerArray, points: torch.Tensor) -> 
     """
     domain = torch.tensor(scene.domain, **REAL)
     lower, upper = domain
-    for one in scene.obstacles:
-        if (lower.new_tensor(one.lower) <= lower).any() or (upper.new_tensor(one.upper) >= upper).any():
+    for obstacle in scene.obstacles:
+        below, above = lower.new_tensor(obstacle.lower) <= lower, upper.new_tensor(obstacle.upper) >= upper
+        if below.any() or above.any():
             return scene.domain
     return _grown(domain, array, points)
 

@@ -137,7 +137,8 @@ def are_in_front(reflectors: Sequence[Reflector], points: torch.Tensor) -> torch
 def kinds_of(reflectors: Iterable[Reflector]) -> list[str]:
     """Return the number of reflectors of each factor as texts."""
     names: dict[complex, str] = {1: "rigid", -1: "soft"}
-    counts = Counter(names.get(one.reflection, f"reflection {one.reflection:.3g}") for one in reflectors)
+    ratios = [reflector.reflection for reflector in reflectors]
+    counts = Counter(names.get(ratio, f"reflection {ratio:.3g}") for ratio in ratios)
     return [f"{count} x {kind}" for kind, count in counts.items()]
 
 

@@ -171,7 +171,7 @@ class Scene(SceneContents):
     def images(self) -> tuple[Image, ...]:
         """The images of the space in the reflectors, the space itself first."""
         size = float((torch.tensor(self.domain[1], **REAL) - torch.tensor(self.domain[0], **REAL)).norm())
-        return images_of([one.mirror for one in self.reflectors], self.complex_wavenumber, size)
+        return images_of([reflector.mirror for reflector in self.reflectors], self.complex_wavenumber, size)
 
     def __repr__(self) -> str:
         """Return name, frequency, counts and extent, with units."""

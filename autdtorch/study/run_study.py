@@ -117,7 +117,7 @@ def run_study(
     # The digest of our source does not cover methods, obstacles and goals of users.
     code = [*map(code_of, methods.values()), *map(type, goals_of(goal))]
     code += [type(obstacle) for scene in scenes.values() for obstacle in scene.obstacles]
-    ours = all(one.__module__.partition(".")[0] == "autdtorch" for one in code)
+    ours = all(kind.__module__.partition(".")[0] == "autdtorch" for kind in code)
     provenance = provenance_now(config, seed)
     with open_folder(folder, provenance, scenes, counted_copies, reuse=bool(config) and ours) as stored:
         missing = {name: scene for name, scene in scenes.items() if name not in stored.scenes}
@@ -161,10 +161,10 @@ def _for_poses(scenes: Mapping[str, Scene], solver: Mapping[str, Any]) -> dict[s
         once = plan(scene, "tmatrix", spacing, **settings)
         if not TMatrixPropagator(once).serves(scene.control_points).all():
             return dict(solver)
-        bodies.update({one.body: one for one in placed_bodies(once)})
+        bodies.update({body.body: body for body in placed_bodies(once)})
         if len(bodies) > _MOST_BODIES:
             return dict(solver)
-    runs = sum(one.runs for one in bodies.values())
+    runs = sum(body.runs for body in bodies.values())
     if runs > len(scenes) * each.planned_runs:
         return dict(solver)
     logger.debug("T-matrices: %d runs for all poses", runs)

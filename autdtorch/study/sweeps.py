@@ -272,10 +272,10 @@ def _merged_trials(parts: Sequence[_Part]) -> MethodResult:
 
 
 def _joined_metrics(every: Sequence[FocusMetrics | None]) -> FocusMetrics | None:
-    metrics = [one for one in every if one is not None]
+    metrics = [foci for foci in every if foci is not None]
     if not metrics:
         return None
-    areas = [one.area for one in metrics if one.area is not None]
+    areas = [foci.area for foci in metrics if foci.area is not None]
     names = ("mean", "min", "std", "uniformity")
-    joint = {name: torch.cat([getattr(one, name) for one in metrics]) for name in names}
+    joint = {name: torch.cat([getattr(foci, name) for foci in metrics]) for name in names}
     return FocusMetrics(**joint, area=torch.cat(areas) if len(areas) == len(metrics) else None)

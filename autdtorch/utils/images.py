@@ -111,7 +111,7 @@ def images_of(
         else:
             rest.remove(facing)
             copies = _between(first, facing, wavenumber, size, held)
-        images = [one.after(other) for other in images for one in copies]
+        images = [copy.after(other) for other in images for copy in copies]
     return tuple(images)
 
 

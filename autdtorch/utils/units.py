@@ -64,13 +64,14 @@ def angles(name: str, value: object, degrees: object = None) -> Vector:
     """
     turn = finite_vector(name, value, "rad")
     if degrees is None:
-        shown = ", ".join(f"{one:g}" for one in turn)
+        shown = ", ".join(f"{angle:g}" for angle in turn)
         _warn_of_degrees(name, turn, f"{name.rpartition('.')[2]}_degrees=({shown})")
         return turn
     if any(turn):
         raise invalid(f"{name}_degrees", degrees, f"must not be given beside {name}, {turn} rad", "degrees")
     x, y, z = (
-        math.radians(math.remainder(one, 360)) for one in finite_vector(f"{name}_degrees", degrees, "degrees")
+        math.radians(math.remainder(angle, 360))
+        for angle in finite_vector(f"{name}_degrees", degrees, "degrees")
     )
     return x, y, z
 
@@ -116,6 +117,6 @@ def warned_within(place: str) -> Iterator[None]:
 
 def _warn_of_degrees(name: str, turn: Sequence[float], fix: str) -> None:
     """Warn of an angle beyond a turn in whole or half numbers; one that is counted on in rad is seldom so."""
-    if any(abs(one) >= _LEAST_DEGREES and (2 * one).is_integer() for one in turn):
+    if any(abs(angle) >= _LEAST_DEGREES and (2 * angle).is_integer() for angle in turn):
         shown = turn[0] if len(turn) == 1 else turn
         warn_user(f"{name}: {shown} rad is more than a turn; are these degrees? Then take {fix}")

@@ -327,7 +327,7 @@ def _holds_numbers(value: object) -> bool:
         lists = {id(entry): entry for entry in entries if _is_list(entry)}
         if not lists:
             return True
-        entries = [entry for one in lists.values() for entry in one]
+        entries = [entry for listed in lists.values() for entry in listed]
     return False
 
 

@@ -69,7 +69,7 @@ def sphere_mesh(scene: at.Scene, subdivisions: int) -> vedo.Mesh:
 
 def cube_mesh(scene: at.Scene, subdivisions: int) -> vedo.Mesh:
     """Return 12 * 4^subdivisions triangles per cube."""
-    cubes = [vedo.Box(one.center, size=one.size).triangulate() for one in scene.obstacles]
+    cubes = [vedo.Box(obstacle.center, size=obstacle.size).triangulate() for obstacle in scene.obstacles]
     return featured(vedo.merge([cube.subdivide(subdivisions, method=1) for cube in cubes]))
 
 

@@ -30,7 +30,7 @@ VARIANTS: dict[str, dict[str, str]] = {
     "numba-generic": {"NUMBA_CPU_NAME": "generic", COLD: ""},
     "odd-path": {},
 }
-VARIANTS["other-cpu"] = {key: value for one in VARIANTS.values() for key, value in one.items()} | {
+VARIANTS["other-cpu"] = {key: value for variant in VARIANTS.values() for key, value in variant.items()} | {
     "ATEN_CPU_CAPABILITY": "default"
 }
 """All variants at once; CI runs this one."""

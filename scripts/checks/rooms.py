@@ -136,10 +136,12 @@ def _scene(rng: np.random.Generator, bodies: list, reflectors: list) -> at.Scene
     """Return a scene with transducers and points in its air; None for too little of it, or bodies behind."""
     places = torch.from_numpy(SIZE * rng.uniform(0.07, 0.93, (400, 3)))
     gaps = [body.signed_distance(places) for body in bodies] + [
-        one.mirror.height(places) for one in reflectors
+        reflector.mirror.height(places) for reflector in reflectors
     ]
     free = places[torch.stack(gaps).amin(dim=0) > CLEARANCE]
-    hidden = any(one.mirror.height(body.surface()[0]).max() < 1e-4 for one in reflectors for body in bodies)
+    hidden = any(
+        reflector.mirror.height(body.surface()[0]).max() < 1e-4 for reflector in reflectors for body in bodies
+    )
     chosen: list[torch.Tensor] = []
     for place in free:  # no source next to a point
         if all((place - other).norm() > CLEARANCE for other in chosen):
@@ -219,13 +221,13 @@ def summary(outcomes: list[Outcome]) -> str:
     """Return a table of outcomes by label; a scene counts under each of its labels."""
     rows = []
     for label in ("any", *sorted({label for outcome in outcomes for label in outcome.labels})):
-        chosen = [one for one in outcomes if label == "any" or label in one.labels]
-        row = [label, str(len(chosen)), str(sum(bool(one.too_long) for one in chosen))]
-        row.append(str(sum(bool(one.failure) for one in chosen)))
-        compared = [one.reciprocity for one in chosen if not one.too_long]
+        chosen = [outcome for outcome in outcomes if label == "any" or label in outcome.labels]
+        row = [label, str(len(chosen)), str(sum(bool(outcome.too_long) for outcome in chosen))]
+        row.append(str(sum(bool(outcome.failure) for outcome in chosen)))
+        compared = [outcome.reciprocity for outcome in chosen if not outcome.too_long]
         row.append(f"{max(compared):.1e}" if compared else "none")
         for pair in ("box - full", "box - tmatrix"):
-            ratios = np.array([one.ratios[pair] for one in chosen if pair in one.ratios])
+            ratios = np.array([outcome.ratios[pair] for outcome in chosen if pair in outcome.ratios])
             figures = "none"
             if len(ratios):
                 within = f"{100 * (ratios <= 1).mean():.0f}, {100 * (ratios <= BEYOND).mean():.0f} %"

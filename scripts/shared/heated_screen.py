@@ -80,7 +80,7 @@ class HeatedScreen:
     def images(self, temperatures: np.ndarray) -> np.ndarray:
         """Return images (T, H, W) of temperatures (T, P) at `points`."""
         maps = temperatures.reshape(-1, *self.counts)
-        fine = [zoom(one, _FINER, order=3, mode="nearest", grid_mode=True).ravel() for one in maps]
+        fine = [zoom(heat, _FINER, order=3, mode="nearest", grid_mode=True).ravel() for heat in maps]
         return (self._sampling @ np.stack(fine, axis=1)).T.reshape(-1, *self.shape)
 
     def temperatures(self, pressure: torch.Tensor, times: np.ndarray, duration: float) -> np.ndarray:

@@ -113,7 +113,7 @@ def fits(
         slopes = torch.from_numpy(best.jac)
         variance = 2 * best.cost / (len(slopes) - 6) * torch.linalg.inv(slopes.mT @ slopes).diag()
         pose = torch.from_numpy(best.x)
-        misfit, first = (float(residual(one).square().mean().sqrt()) for one in (pose, start))
+        misfit, first = (float(residual(values).square().mean().sqrt()) for values in (pose, start))
         yield Fit(pose, misfit, first, best.nfev, variance.sqrt())
 
 

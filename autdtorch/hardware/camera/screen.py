@@ -209,7 +209,7 @@ class Cosines:
         nodes = [(-(3**0.5), 1 / 6), (0.0, 2 / 3), (3**0.5, 1 / 6)]
         row = np.repeat(np.arange(len(self.pixels)), 16)
         sampling = csr_array((len(self.pixels), int(self._cells.prod())))
-        for (across, weight), (down, other) in ((one, two) for one in nodes for two in nodes):
+        for (across, weight), (down, other) in ((first, second) for first in nodes for second in nodes):
             pixels = np.stack([columns + spread * across, rows + spread * down], axis=-1)
             position = (self._registration.to_plane(pixels) / self._size + 0.5) * self._cells - 0.5
             start = np.floor(position).astype(np.int64)

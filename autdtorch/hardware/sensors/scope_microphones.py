@@ -153,15 +153,16 @@ class ScopeSensor:
         self._captures = integer_at_least("captures", captures, 1)
         # Captures are alike, and a fit takes longer to prepare than to apply.
         self._prepared = functools.lru_cache(maxsize=1)(functools.partial(LockIn, self._frequency))
-        volts = [one._volts for one in self._microphones]
+        volts = [microphone._volts for microphone in self._microphones]
         self._volts_per_pascal = torch.tensor(volts, **REAL)
         self._coarsest = {
-            one.input: max(one.loudest * one._volts / _DIVISIONS, FINEST) for one in self._microphones
+            microphone.input: max(microphone.loudest * microphone._volts / _DIVISIONS, FINEST)
+            for microphone in self._microphones
         }
         self._scales = self._coarsest
         self.recaptures = 0
         if not self._scales or len(self._scales) < len(self._microphones):
-            inputs = [one.input for one in self._microphones]
+            inputs = [microphone.input for microphone in self._microphones]
             raise invalid("microphones", inputs, "must be at different inputs, at least one")
         scope.set_up(self._scales.keys(), _PERIODS_A_DIVISION / self._frequency)
 
@@ -188,7 +189,7 @@ class ScopeSensor:
         while True:
             waveforms = self._scope.capture(self._scales)
             lock_in = self._lock_in(waveforms)
-            fit = lock_in(torch.stack([one.volts for one in waveforms]))
+            fit = lock_in(torch.stack([waveform.volts for waveform in waveforms]))
             fitted = dict(self._scales)
             for number, waveform, noise in zip(fitted, waveforms, fit.residual.tolist(), strict=True):
                 if waveform.clipped:
@@ -206,14 +207,14 @@ class ScopeSensor:
                 loudest = f"by more than {microphone.loudest:g} Pa: raise `loudest`"
                 raise SensorError(f"input {microphone.input}: {clipped}, {loudest}")
         # Samples that all have the same code do not show the noise of their rounding.
-        steps = torch.tensor([one.resolution for one in waveforms], **REAL)
+        steps = torch.tensor([waveform.resolution for waveform in waveforms], **REAL)
         variance = fit.residual.square().maximum(steps.square() / 12)
         powers = torch.stack([fit.phasor.abs().square(), lock_in.noise_gain * variance], dim=1)
         return powers / self._volts_per_pascal[:, None].square()
 
     def _lock_in(self, waveforms: Sequence[Waveform]) -> LockIn:
         """Return the lock-in for waveforms, which must be sampled at the same moments."""
-        moments = {(one.time_step, len(one.volts)) for one in waveforms}
+        moments = {(waveform.time_step, len(waveform.volts)) for waveform in waveforms}
         if len(moments) > 1:
             raise SensorError(f"inputs differ in time step and number of samples: {sorted(moments)}")
         try:

@@ -213,7 +213,7 @@ class Outbox:
     async def send_bytes(self, message: bytes) -> None:
         """Queue a message."""
         if _is_frame(message):
-            self._messages = deque(one for one in self._messages if not _is_frame(one))
+            self._messages = deque(message for message in self._messages if not _is_frame(message))
         self._messages.append(message)
         self._filled.set()
 

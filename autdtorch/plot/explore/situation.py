@@ -180,7 +180,7 @@ class Situation:
         if moved == body:
             return self
         bodies = (*self.bodies[:index], moved, *self.bodies[index + 1 :])
-        obstacles = tuple(one.obstacle for one in bodies)
+        obstacles = tuple(body.obstacle for body in bodies)
         return replace(self, bodies=bodies, scene=replace(self.scene, obstacles=obstacles))
 
     def with_scene(self, scene: Scene) -> Situation:
@@ -317,7 +317,9 @@ def _middle(obstacle: Obstacle) -> Vector:
 
 def _most_steps(situation: Situation) -> int:
     """Return the number of steps in a history."""
-    size = sum(one.vertices.nbytes for one in situation.scene.obstacles if isinstance(one, Mesh))
+    size = sum(
+        obstacle.vertices.nbytes for obstacle in situation.scene.obstacles if isinstance(obstacle, Mesh)
+    )
     return max(1, min(_MOST_STEPS, _MOST_BYTES // max(size, 1)))
 
 

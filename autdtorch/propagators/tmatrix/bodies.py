@@ -73,10 +73,12 @@ def waves_to_simulate(scene: Scene, error: float, most: int | None = None) -> in
     obstacles = scene.obstacles
     if most is not None:  # without circumscribed spheres, which take time
         unknown = [obstacle for obstacle in obstacles if not has_closed_form([obstacle])]
-        if any(waves(max(np.subtract(one.upper, one.lower)) / 2) > most for one in unknown):
+        if any(waves(max(np.subtract(obstacle.upper, obstacle.lower)) / 2) > most for obstacle in unknown):
             return None
     bodies = bodies_of(obstacles)
-    if crossed := [number for number, one in enumerate(scene.reflectors) if not _in_front(one, bodies)]:
+    if crossed := [
+        number for number, reflector in enumerate(scene.reflectors) if not _in_front(reflector, bodies)
+    ]:
         if most is not None:
             return None
         accepted = f"needs the spheres around obstacles to be in front of reflector {crossed[0]}; take box"

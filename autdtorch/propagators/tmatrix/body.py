@@ -163,7 +163,7 @@ def placed(
     shift = torch.zeros(3, **REAL)
     if all(map(is_movable, still)):
         shift, _ = circumscribed(still)
-        still = tuple(shifted(one, -shift, _DIGITS) for one in still)
+        still = tuple(shifted(obstacle, -shift, _DIGITS) for obstacle in still)
     return Placed(StillBody(still, medium, frequency, solver, fewest_degrees), turn, turn @ shift)
 
 

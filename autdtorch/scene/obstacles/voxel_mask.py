@@ -144,7 +144,7 @@ class VoxelMask(Obstacle):
         """
         values, spacing, origin = _image_values(image, name)
         scale = positive("VoxelMask.scale", scale)
-        edges, lower = (tuple(scale * one for one in each) for each in (spacing, origin))
+        edges, lower = (tuple(scale * length for length in each) for each in (spacing, origin))
         material: dict[str, Any] = {"density": density, "sound_speed": sound_speed, "rigid": rigid}
         material |= {"absorption": absorption, "impedance": impedance}
         return cls(values, edges, lower, level, smooth, **material)

@@ -65,7 +65,7 @@ def of_trials(quantities: Mapping[str, Spread]) -> str:
     panels = []
     for letter, (label, values) in zip(ascii_lowercase, quantities.items(), strict=False):
         medians = {
-            scene: _span({method: _median(one) for method, one in by_method.items()})
+            scene: _span({method: _median(values) for method, values in by_method.items()})
             for scene, by_method in values.items()
         }
         panels.append(f"({letter}) {label}: {_by_scene(medians)}")
@@ -77,7 +77,7 @@ def of_convergence(scenes: Mapping[str, SceneResult]) -> str:
     ends = {}
     for name, scene in scenes.items():
         solutions = {method: result.solution for method, result in competitors(scene).items()}
-        scores = {method: _median(one.history[:, -1]) for method, one in solutions.items()}
+        scores = {method: _median(solution.history[:, -1]) for method, solution in solutions.items()}
         used = int(solutions[max(scores, key=lambda method: scores[method])].evaluations.max())
         bound = f", bound {scene.bound:.3g}" if math.isfinite(scene.bound) else ""
         unit = f" {scene.unit}".rstrip()
@@ -92,7 +92,7 @@ def of_costs(scenes: Mapping[str, SceneResult]) -> str:
     texts = {}
     for name, scene in scenes.items():
         methods = competitors(scene)
-        seconds = {method: _median(one.seconds) for method, one in methods.items()}
+        seconds = {method: _median(result.seconds) for method, result in methods.items()}
         fastest = min(methods, key=lambda method: seconds[method])
         best = max(methods, key=lambda method: median_score(methods[method]))
         places = (

@@ -77,7 +77,7 @@ class Claim:
         }
         if not comparisons:
             return None
-        margins = [margin for _, one in comparisons.values() for margin in one]
+        margins = [margin for _, comparison in comparisons.values() for margin in comparison]
         holds = all(margin.value > 0 for margin in margins)
         surely_holds = all(margin.low > 0 for margin in margins)
         clear = surely_holds if holds else any(margin.high <= 0 for margin in margins)
@@ -172,7 +172,7 @@ def _converged(solution: Solution) -> torch.Tensor:
 
 def _foci_form(scene: SceneResult, _: SceneResult) -> Comparison:
     metrics = (scene.methods[method].metrics for method in (BO, GABS))
-    bo, gabs = (bootstrap(one.min / one.mean) for one in metrics if one is not None)
+    bo, gabs = (bootstrap(foci.min / foci.mean) for foci in metrics if foci is not None)
     return _listed({"BO": bo, "GABS": gabs}), [_above(bo, FORMED), _above(gabs, FORMED)]
 
 
@@ -184,7 +184,7 @@ def _compared_with_empty(
     def compare(scene: SceneResult, empty: SceneResult) -> Comparison:
         shares = {}
         for method in methods:
-            both = (_values(one, method, "mean") for one in (scene, empty))
+            both = (_values(result, method, "mean") for result in (scene, empty))
             shares[label_of(method)] = bootstrap(*both, combine=operator.truediv)
         return _listed(shares), [margin(share, MUCH_WEAKER) for share in shares.values()]
 

@@ -141,9 +141,9 @@ def _cost_of_obstacles(results: StudyResult, best: Mapping[str, _Best]) -> str:
         return "No scene has obstacles."
     for empty_name, empty in results.scenes.items():
         same = {
-            name: one
-            for name, one in with_obstacles.items()
-            if _comparable(one, empty) and one.transfer_matrix.shape == empty.transfer_matrix.shape
+            name: scene
+            for name, scene in with_obstacles.items()
+            if _comparable(scene, empty) and scene.transfer_matrix.shape == empty.transfer_matrix.shape
         }
         if empty.obstacles == 0 and best[empty_name].score > 0 and same:
             break

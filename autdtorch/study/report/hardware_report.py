@@ -78,8 +78,8 @@ def write_hardware_report(
     evaluations, scene = log.evaluations, simulated.scene
     working = torch.ones(len(scene.array), **REAL)
     working[preflight.failed] = 0
-    measured = torch.stack([one.pressure for one in evaluations])
-    predicted = simulated(working * torch.stack([one.drive for one in evaluations]))
+    measured = torch.stack([evaluation.pressure for evaluation in evaluations])
+    predicted = simulated(working * torch.stack([evaluation.drive for evaluation in evaluations]))
     fit = compare(measured, predicted)
     # A pressure scales with the transducers; a score without unit does not.
     scale = fit.scale if goal.unit else 1.0
@@ -96,7 +96,7 @@ def write_hardware_report(
     names = _names(scene.control_points)
     again_mean = again.mean(dim=0)
     pressures = solution.pressure[0], again_mean, fit.scale * simulated(working * solution.drive)[0]
-    times = [datetime.fromisoformat(one.time) for one in evaluations]
+    times = [datetime.fromisoformat(evaluation.time) for evaluation in evaluations]
     gaps = [(later - earlier).total_seconds() for earlier, later in itertools.pairwise(times)]
     text = rendered(
         "hardware.md",
@@ -151,7 +151,7 @@ def _percent(share: float) -> str:
 
 def _as_text(value: Any) -> str:
     """Return a setting as JSON, consecutive integers as a range."""
-    integers = isinstance(value, list) and len(value) > 2 and all(isinstance(one, int) for one in value)
+    integers = isinstance(value, list) and len(value) > 2 and all(isinstance(entry, int) for entry in value)
     if integers and value == list(range(value[0], value[-1] + 1)):
         return f"{value[0]} to {value[-1]}"
     return json.dumps(value, ensure_ascii=False)
@@ -175,7 +175,7 @@ def _fits(names: list[str], measured: torch.Tensor, simulated: torch.Tensor) -> 
 
 
 def _names(places: torch.Tensor) -> list[str]:
-    return ["(" + ", ".join(f"{1e3 * one:.4g}" for one in place.tolist()) + ")" for place in places]
+    return ["(" + ", ".join(f"{1e3 * x:.4g}" for x in place.tolist()) + ")" for place in places]
 
 
 def measured_plane(
@@ -210,7 +210,7 @@ def measured_plane(
         "noise": float(measured.deviation[air].square().mean().sqrt() / size),
         "pictures": len(files),
         "relative": measured.relative,
-        "areas": [_area(one, scene) for one in (measured, simulated)],
+        "areas": [_area(field, scene) for field in (measured, simulated)],
         "foci": _foci(scene, names, measured, simulated),
         "doubts": measured.doubts,
     }
@@ -218,12 +218,14 @@ def measured_plane(
 
 def _mean(pictures: Sequence[Picture]) -> Picture:
     """Return the picture of the mean |p|^2, with the deviation of this mean."""
-    first, square = pictures[0], torch.stack([one.pressure.square() for one in pictures])
-    of_square = torch.stack([deviation_of_square(one.pressure, one.deviation) for one in pictures])
+    first, square = pictures[0], torch.stack([picture.pressure.square() for picture in pictures])
+    of_square = torch.stack(
+        [deviation_of_square(picture.pressure, picture.deviation) for picture in pictures]
+    )
     mean = square.mean(dim=0)
     spread = of_square.square().mean(dim=0).sqrt() / len(pictures) ** 0.5
-    doubts = dict.fromkeys(doubt for one in pictures for doubt in one.doubts)
-    frames = sum(one.frames for one in pictures)
+    doubts = dict.fromkeys(doubt for picture in pictures for doubt in picture.doubts)
+    frames = sum(picture.frames for picture in pictures)
     pressure = mean.sqrt()
     deviation = deviation_by_square(pressure, spread)
     return Picture(first.plane, pressure, deviation, first.relative, frames, first.latency, tuple(doubts))
@@ -241,14 +243,14 @@ def _foci(scene: Scene, names: Sequence[str], measured: Picture, simulated: Pict
     points = scene.control_points
     apart = torch.pdist(points).min() / 2 if len(points) > 1 else torch.inf
     radius = min(scene.wavelength, float(apart))
-    places = [one.foci(points, radius) for one in (measured, simulated)]
+    places = [source.foci(points, radius) for source in (measured, simulated)]
     columns = [
         1e3 * (one - other).norm(dim=1) for one, other in ((places[0], places[1]), (places[1], points))
     ]
-    columns += [one.at(place)[0] for one, place in zip((measured, simulated), places, strict=True)]
+    columns += [field.at(place)[0] for field, place in zip((measured, simulated), places, strict=True)]
     head = ["from the simulated [mm]", "simulated, from the point [mm]", "measured [Pa]", "simulated [Pa]"]
     rows = [
         [name, f"{apart:.2f}", f"{off:.2f}", in_digits(one, 4), in_digits(other, 4)]
-        for name, apart, off, one, other in zip(names, *(one.tolist() for one in columns), strict=True)
+        for name, apart, off, one, other in zip(names, *(column.tolist() for column in columns), strict=True)
     ]
     return [["control point [mm]", *head], *rows]

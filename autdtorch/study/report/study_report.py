@@ -133,7 +133,10 @@ def _markdown(
         baseline=label_of(tables.BASELINE) if any(map(tables.is_baseline, counts)) else "",
         simulations=tables.simulation_rows(results),
         missed=sum(not run.reached for scene in results.scenes.values() for run in scene.simulation.runs),
-        tolerances=[f"{one:g}" for one in sorted(one for one in tolerances if one is not None)],
+        tolerances=[
+            f"{tolerance:g}"
+            for tolerance in sorted(tolerance for tolerance in tolerances if tolerance is not None)
+        ],
         results_file=RESULTS_FILE,
         trials_file=TRIALS_FILE,
     )
@@ -174,7 +177,7 @@ def _always_level(results: StudyResult, name: str, other: str) -> bool:
         if (name in scene.methods) != (other in scene.methods):
             return False
         if name in scene.methods:
-            scores = [tables.median_score(scene.methods[one]) for one in (name, other)]
+            scores = [tables.median_score(scene.methods[method]) for method in (name, other)]
             if max(scores) - min(scores) > LEVEL * max(map(abs, scores)):
                 return False
     return True
@@ -185,17 +188,19 @@ def _draw_planes(
 ) -> list[str]:
     """Return the pictures of some methods, in files of a name."""
     every = _by_method(results, lambda result: result.plane_pressure)
-    chosen = {scene: {one: maps[one] for one in maps if one in methods} for scene, maps in every.items()}
+    chosen = {
+        scene: {method: maps[method] for method in maps if method in methods} for scene, maps in every.items()
+    }
     pressure = {scene: maps for scene, maps in chosen.items() if maps}
-    planes = {one: plane for one in pressure if (plane := scenes[one].observation_plane) is not None}
+    planes = {name: plane for name in pressure if (plane := scenes[name].observation_plane) is not None}
     names = list(planes)
     pictures: list[str] = []
     for start in range(0, len(names), _PLANES_A_FIGURE):
-        part = {one: pressure[one] for one in names[start : start + _PLANES_A_FIGURE]}
-        points = {one: scenes[one].control_points for one in part}
-        obstacles = {one: scenes[one].obstacles for one in part}
+        part = {name: pressure[name] for name in names[start : start + _PLANES_A_FIGURE]}
+        points = {name: scenes[name].control_points for name in part}
+        obstacles = {name: scenes[name].obstacles for name in part}
         file = _numbered(name, pictures)
-        reflectors = {one: scenes[one].reflectors for one in part}
+        reflectors = {name: scenes[name].reflectors for name in part}
         plot_planes(part, planes, points, obstacles, reflectors=reflectors).savefig(folder / file)
         pictures.append(picture(file, alt_texts.of_planes(part)))
     return pictures
@@ -204,15 +209,15 @@ def _draw_planes(
 def _draw_trials(results: StudyResult, folder: Path) -> tuple[str, list[str]]:
     """Return the picture and the labels of the quantities; both are empty if each has a single value."""
     quantities = {
-        "mean pressure of the foci [Pa]": _by_method(results, lambda one: one.of_foci("mean")),
+        "mean pressure of the foci [Pa]": _by_method(results, lambda metrics: metrics.of_foci("mean")),
         "area per focus [mm²]": _by_method(results, area_of),
-        "std among the foci [Pa]": _by_method(results, lambda one: one.of_foci("std")),
+        "std among the foci [Pa]": _by_method(results, lambda metrics: metrics.of_foci("std")),
     }
     forces = _grouped(results, lambda scene: "" if scene.of_pressures else scene.score_label)
     for label, scenes in forces.items():
         if label:
             part = replace(results, scenes=scenes)
-            quantities[label] = _by_method(part, lambda one: one.solution.score)
+            quantities[label] = _by_method(part, lambda result: result.solution.score)
     quantities = {label: values for label, values in quantities.items() if values}
     counts = [method.trials for scene in results.scenes.values() for method in scene.methods.values()]
     if counts == [1]:  # the table says it

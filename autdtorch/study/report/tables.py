@@ -64,7 +64,9 @@ def evidence_rows(judged: Iterable[tuple[Claim, Verdict | None]]) -> list[list[s
 
 def room_rows(scenes: Mapping[str, Scene]) -> list[list[str]]:
     """Return obstacles and reflectors of every scene; nothing where none reflects or absorbs."""
-    if not any(one.reflectors or any(body.is_lossy for body in one.obstacles) for one in scenes.values()):
+    if not any(
+        scene.reflectors or any(body.is_lossy for body in scene.obstacles) for scene in scenes.values()
+    ):
         return []
     rows = [["scene", "obstacles", "reflectors"]]
     for name, scene in scenes.items():
@@ -128,7 +130,7 @@ def simulation_rows(results: StudyResult) -> list[list[str]]:
     rows = [[*head, "reached", "matrix [s]", "plane [s]"]]
     spacings = [scene.simulation.spacing for scene in results.scenes.values()]
     # As many decimals as the spacing with most of them has.
-    decimals = max(len(f"{1e3 * (one or 0):g}".partition(".")[2]) for one in spacings)
+    decimals = max(len(f"{1e3 * (spacing or 0):g}".partition(".")[2]) for spacing in spacings)
     for name, scene in results.scenes.items():
         simulation, runs = scene.simulation, scene.simulation.runs
         if simulation.spacing is None:
@@ -138,7 +140,7 @@ def simulation_rows(results: StudyResult) -> list[list[str]]:
             cells = [simulation.method, f"{1e3 * simulation.spacing:.{decimals}f}", f"{a_wavelength:.1f}"]
             cells += _run_cells(runs) if runs else ["0, kept on disk", "-", "-", "-"]
         seconds = (simulation.matrix_seconds, simulation.plane_seconds)
-        rows.append([name, *cells, *(f"{one:.2f}" for one in seconds)])
+        rows.append([name, *cells, *(f"{duration:.2f}" for duration in seconds)])
     return rows
 
 

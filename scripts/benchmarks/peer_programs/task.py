@@ -35,7 +35,7 @@ class Stored:
     def load(cls, path: Path) -> Self:
         """Read a file of `save`."""
         with np.load(path) as stored:
-            values = {name: stored[name] for name in (one.name for one in fields(cls))}
+            values = {name: stored[name] for name in (field.name for field in fields(cls))}
         return cls(**{name: value if value.ndim else value.item() for name, value in values.items()})
 
 
