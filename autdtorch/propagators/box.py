@@ -12,10 +12,9 @@ import itertools
 import logging
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -32,6 +31,7 @@ from autdtorch.fdtd.turning import is_tilted
 from autdtorch.propagators.absorbed_power import Radiators, absorption
 from autdtorch.propagators.assembled_box import assembled_box
 from autdtorch.propagators.multiple_scattering import iterated
+from autdtorch.propagators.radiation import Judged, Radiation, Solved, spread_runs
 from autdtorch.propagators.simulation import (
     AbsorbingCells,
     PressureMap,
@@ -53,70 +53,7 @@ from autdtorch.utils.process import cached_property, one_library_thread, spread
 
 logger = logging.getLogger(__name__)
 
-_TOGETHER = 8  # Runs whose phasors one thread maps at once
 _ENTRY_BYTES = torch.complex128.itemsize
-
-
-class Judged(NamedTuple):
-    """Receivers that decide when a run has converged: each `every`-th of some, in groups that all must."""
-
-    receivers: Apertures
-    every: int
-    groups: tuple[slice, ...]
-
-    @classmethod
-    def of(cls, receivers: Apertures) -> Judged:
-        """Return at most `MOST_JUDGED` of the receivers, in one group."""
-        return cls(receivers, math.ceil(len(receivers.centers) / MOST_JUDGED), (slice(None),))
-
-
-@dataclass(frozen=True)
-class Radiation:
-    """A linear map from K drives to the scattered field outside of boxes.
-
-    Attributes:
-        boxes: the boxes.
-        amplitudes: of each box's Huygens surface (n, K) [Pa m].
-        runs: the simulations behind it.
-    """
-
-    boxes: Sequence[ScatteredField]
-    amplitudes: tuple[torch.Tensor, ...]
-    runs: tuple[Run, ...]
-
-    @property
-    def nbytes(self) -> int:
-        """Memory [bytes]."""
-        return sum(part.nbytes for part in self.amplitudes)
-
-    def reaches(self, points: torch.Tensor) -> bool:
-        """Return whether no point (P, 3) [m] is in a box, where its cells are read."""
-        return not any(box.inside(points).any() for box in self.boxes)
-
-    def pressure(self, receivers: Apertures) -> torch.Tensor:
-        """Return the scattered field (P, K) [Pa] at P receivers that it reaches."""
-        parts = zip(self.boxes, self.amplitudes, strict=True)
-        return torch.stack([box.near_to_far(receivers).radiated(part) for box, part in parts]).sum(dim=0)
-
-
-class Solved(NamedTuple):
-    """The steady states of R runs in boxes: the phasors (k, R) of the cells that each transform reads."""
-
-    transforms: Sequence[NearToFar]
-    phasors: Sequence[torch.Tensor]
-    runs: list[Run]
-
-    @property
-    def pressure(self) -> torch.Tensor:
-        """The scattered field (P, R) [Pa] at the receivers."""
-        parts = zip(self.transforms, self.phasors, strict=True)
-        return torch.stack([_spread_runs(transform.field, part) for transform, part in parts]).sum(dim=0)
-
-    @property
-    def amplitudes(self) -> list[torch.Tensor]:
-        """The amplitudes (n, R) [Pa m] of each box's Huygens surface."""
-        pairs = zip(self.transforms, self.phasors, strict=True)
-        return [_spread_runs(transform.amplitudes, part) for transform, part in pairs]
 
 
 class BoxSimulation(Simulation):
@@ -331,7 +268,7 @@ class BoxSimulation(Simulation):
 
         def observed(phasors: torch.Tensor, runs: Index) -> list[torch.Tensor]:
             parts = zip(readings, torch.split(phasors.cpu(), sizes), strict=True)
-            scattered = [_spread_runs(reading.field, part) for reading, part in parts]
+            scattered = [spread_runs(reading.field, part) for reading, part in parts]
             pressure = audible * (incident[:, runs] + torch.stack(scattered).sum(dim=0))
             return [pressure[group] for group in groups]
 
@@ -445,11 +382,6 @@ class _Scatterer:
             if coupling.rest:
                 field = field + box.radiated(outgoing, here.driven, coupling.rest)
         return torch.stack([here.forces(each) for each in field.mT], dim=1)
-
-
-def _spread_runs(linear: Callable[[torch.Tensor], torch.Tensor], phasors: torch.Tensor) -> torch.Tensor:
-    """Return a linear map of phasors (k, R), computed for some runs at a time on all threads."""
-    return torch.cat(spread(linear, torch.split(phasors, _TOGETHER, dim=1)), dim=1)
 
 
 def _images(box: ScatteredField, symmetry: Symmetry) -> Index:
