@@ -18,6 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -131,16 +132,22 @@ def uniform_state(
     """Return the state of rest, in all runs at a uniform pressure, on a grid of `shape`."""
     c, cells = coefficients, coefficients.layer_cells
 
+    def zeros(*size: int) -> Tensor:
+        """Return zeros in large pages, which NumPy asks the system for, unlike PyTorch."""
+        numbers = np.empty((runs, *size), c.layer_decay.numpy().dtype)
+        numbers.fill(0)
+        return torch.from_numpy(numbers)
+
     def silent(*size: int, axis: int) -> Layer:
-        psi, zeta = ((runs, *size[:axis], along, *size[axis + 1 :]) for along in (cells + 1, cells))
-        return Layer(c.layer_decay.new_zeros(psi), c.layer_decay.new_zeros(zeta))
+        return Layer(*(zeros(*size[:axis], along, *size[axis + 1 :]) for along in (cells + 1, cells)))
 
     sizes = (shape, shape, shape, (*shape[:2], 2 * cells))
     layers = (silent(2, *size, axis=axis + 1) for axis, size in zip((0, 1, 2, 1), sizes, strict=True))
-    core = c.layer_decay.new_full([runs, *(length - 2 for length in shape)], pressure)
-    now = torch.nn.functional.pad(core, (1,) * 6)
+    now, before = zeros(*shape), zeros(*shape)
+    for pressures in (now, before):
+        pressures[:, 1:-1, 1:-1, 1:-1] = pressure
     columns = (silent(0, len(each.index), axis=0) for each in (c.columns, c.crossed))
-    return WaveState(now, now.clone(), Memory(*layers, *columns))
+    return WaveState(now, before, Memory(*layers, *columns))
 
 
 @dataclass(frozen=True)
