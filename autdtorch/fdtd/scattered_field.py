@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from autdtorch.fdtd.assembly.neighbours import with_neighbours
 from autdtorch.fdtd.discrete_green import field_of_kernels
 from autdtorch.fdtd.face_nodes import FaceNodes
 from autdtorch.fdtd.interpolation import Interpolation
@@ -31,9 +32,9 @@ from autdtorch.fdtd.shapes import Shape, turned_shape
 from autdtorch.fdtd.stencil import flat_offsets, places_of
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.utils.apertures import Apertures, Discs, image_of
-from autdtorch.utils.array_types import COMPLEX, Array, Index
+from autdtorch.utils.array_types import COMPLEX, AnyArray, Array, Index
 from autdtorch.utils.images import NO_MIRRORS, SPACE_ITSELF, Image
-from autdtorch.utils.process import cached_property
+from autdtorch.utils.process import cached_property, parts_of_size, spread
 from autdtorch.utils.spatial import distinct_cells, places_among
 
 # Distance [cells] from the rim of the interior within which points are not read from the grid. Interpolation
@@ -61,7 +62,7 @@ class ScatteredField:
         """The images that send back what the box radiates."""
         return self.images[1:]
 
-    @property
+    @cached_property
     def driven(self) -> Tensor:
         """Positions (n, 3) [m] where the incident field is needed: heterogeneous cells and neighbours."""
         return self.positions(self._driven[0])
@@ -71,11 +72,13 @@ class ScatteredField:
         assembly, incident, around = self.assembly, field.numpy(), self._driven[1]
         factor = assembly.coefficients.face / assembly.stencil.face
         force = np.zeros(len(around), np.complex128)
-        for first in range(0, len(around), _ROWS):
-            rows = slice(first, first + _ROWS)
-            pressure = incident[around[rows]]
+
+        def add(ends: tuple[int, int]) -> None:
+            pressure = incident[around[(rows := slice(*ends))]]
             weight = assembly.heterogeneous.weight[rows] - assembly.stencil.weights
             force[rows] = factor * (weight * (pressure - pressure[:, 13, None])).sum(axis=1)
+
+        spread(add, parts_of_size(len(around), _ROWS))
         if len(lossy := assembly.coefficients.loss_index):
             place = np.searchsorted(assembly.heterogeneous.index, lossy.numpy())
             pressure = incident[around[place]]
@@ -242,9 +245,17 @@ class ScatteredField:
     @cached_property
     def _driven(self) -> tuple[Index, NDArray[np.int32]]:
         """Cells where the incident field is needed, and the neighbours (n, 27) by their place among them."""
-        around = self.assembly.heterogeneous.index[:, None] + flat_offsets(self.assembly.grid.shape)
-        cells = distinct_cells(around, count := math.prod(self.assembly.grid.shape))
-        return cells, places_among(cells, count)[around]
+        shape, index = self.assembly.grid.shape, self.assembly.heterogeneous.index
+        near = np.zeros(shape, bool)
+        near.ravel()[index] = True
+        cells = np.flatnonzero(with_neighbours(near))
+        place, around = places_among(cells, near.size), np.empty((len(index), 27), np.int32)
+
+        def look(ends: tuple[int, int]) -> None:
+            around[slice(*ends)] = place[index[slice(*ends), None] + flat_offsets(shape)]
+
+        spread(look, parts_of_size(len(index), _ROWS))
+        return cells, around
 
     @cached_property
     def _radiating(self) -> Index:
@@ -264,18 +275,20 @@ class ScatteredField:
         chi[grid.deeper(3)] = 1
         scale = assembly.coefficients.face / stencil.face * grid.spacing
         factor = scale / stencil.source_factor(float(assembly.steps_per_period))
-        count, read, value = [np.zeros(1, np.int64)], [], []
-        for first in range(0, len(index), _ROWS):
-            around = index[first : first + _ROWS, None] + flat_offsets(grid.shape)
+
+        def rows(ends: tuple[int, int]) -> tuple[Index, Index, AnyArray]:
+            around = index[slice(*ends), None] + flat_offsets(grid.shape)
             step = chi.ravel()[around] - chi.ravel()[around[:, 13], None]
             row, column = np.nonzero(step)
-            count.append(np.count_nonzero(step, axis=1))
-            read.append(around[row, column])
-            value.append(factor * stencil.weights[column] * step[row, column])
-        cells = distinct_cells(np.concatenate(read), chi.size)
-        place = places_among(cells, chi.size)[np.concatenate(read)]
-        first_of_row = np.cumsum(np.concatenate(count))
-        outward = csr_array((np.concatenate(value), place, first_of_row), (len(index), len(cells)))
+            value = factor * stencil.weights[column] * step[row, column]
+            return np.count_nonzero(step, axis=1), around[row, column], value
+
+        parts = zip(*spread(rows, parts_of_size(len(index), _ROWS)), strict=True)
+        count, read, value = map(np.concatenate, parts)
+        cells = distinct_cells(read, chi.size)
+        first_of_row = np.concatenate(([0], np.cumsum(count)))
+        place = places_among(cells, chi.size)[read]
+        outward = csr_array((value, place, first_of_row), (len(index), len(cells)))
         return self.positions(index), cells, outward
 
 

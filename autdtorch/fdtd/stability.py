@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
+from collections.abc import Sequence
 from fractions import Fraction
 
 import numpy as np
@@ -18,8 +19,10 @@ from numpy.typing import NDArray
 from scipy.linalg import eigvalsh_tridiagonal
 from scipy.sparse import csr_array
 
+from autdtorch.fdtd.assembly.neighbours import inner_cells, with_neighbours
 from autdtorch.fdtd.stencil import Stencil, flat_offsets, places_of
 from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.process import parts_of_size, spread
 
 logger = logging.getLogger(__name__)
 
@@ -37,7 +40,7 @@ _LANCZOS_STEPS = 60
 # Bodies of more cells are shortened to so many planes that repeat each other. A mode that is bound to a face
 # or an edge is as high on a part of it: with 32 planes, eigenvalues of five bodies fell by up to 0.13 %.
 _LARGE, _REPEATS = 20_000, 32
-_TOGETHER = 50_000  # Cells whose neighbours are looked at together
+_TOGETHER = 16_384  # Rows in a task: about a millisecond
 _ROUNDING = 1e-9  # Stencil rows within this of air's are those of air; most rows of maps are
 
 
@@ -58,34 +61,38 @@ def largest_eigenvalue(index: Index, weight: Array, stencil: Stencil, shape: tup
     rows, place = _with_rim(index, shape)
     forth = np.broadcast_to(stencil.weights, (len(rows), 27)).copy()
     forth[place[index]] = weight
-    parts = np.array_split(np.arange(len(rows), dtype=np.int32), 1 + len(rows) // _TOGETHER)
+    iterated = len(index) <= MOST_CELLS
 
-    def pairs(part: NDArray[np.int32]) -> tuple[NDArray[np.int32], Array]:
-        """Return the places of neighbours, -1 outside, and their weights of the cells of a part."""
-        neighbour = place[rows[part, None] + flat_offsets(shape)]
-        return neighbour, np.where(neighbour >= 0, forth[neighbour, _REVERSED], stencil.weights)
+    def part(ends: tuple[int, int]) -> tuple[float, csr_array | None]:
+        """Return the bound of some rows, and these rows of the symmetric matrix if it is iterated."""
+        ahead, here = forth[slice(*ends)], np.arange(*ends, dtype=np.int32)
+        neighbour = place[rows[here, None] + flat_offsets(shape)]
+        inside = neighbour >= 0
+        back = np.where(inside, forth[neighbour, _REVERSED], stencil.weights)
+        # Coupling K adds K (p_i - p_j)^2 <= max(K, 0) (1/m_i + 1/m_j) (m_i p_i^2 + m_j p_j^2) to the energy.
+        # Summed over the neighbours of a cell, this bounds the largest eigenvalue at any contrast.
+        bound = float(np.maximum(ahead + back, 0).sum(1).max())
+        if not iterated:
+            return bound, None
+        # zeros by rounding may differ in sign
+        product = np.where(inside, ahead * back, 0).clip(min=0)
+        matrix = -np.sign(ahead) * np.sqrt(product)
+        matrix[:, 13] = ahead.sum(1)
+        column = np.where(inside, neighbour, here[:, None])
+        first = np.arange(0, 27 * len(here) + 1, 27)
+        return bound, csr_array((matrix.ravel(), column.ravel(), first), (len(here), len(rows)))
 
-    # Coupling K adds K (p_i - p_j)^2 <= max(K, 0) (1/m_i + 1/m_j) (m_i p_i^2 + m_j p_j^2) to the energy.
-    # Summed over the neighbours of a cell, this bounds the largest eigenvalue at any contrast.
-    bound = max(float(np.maximum(forth[part] + pairs(part)[1], 0).sum(1).max()) for part in parts)
+    bounds, parts = zip(*spread(part, parts_of_size(len(rows), _TOGETHER)), strict=True)
+    bound: float = max(bounds)
     if bound <= CLOSE * air:
         return bound
-    if len(index) > MOST_CELLS:
+    if not iterated:
         logger.debug(
             "time step up to a quarter below the stability limit: %d heterogeneous cells, and the eigenvalue"
             " is iterated for at most %d", len(index), MOST_CELLS,
         )  # fmt: skip
         return bound
-    matrix, column = np.empty(forth.shape), np.empty(forth.shape, np.int32)
-    for part in parts:
-        neighbour, back = pairs(part)
-        # zeros by rounding may differ in sign
-        product = np.where(neighbour >= 0, forth[part] * back, 0).clip(min=0)
-        matrix[part] = -np.sign(forth[part]) * np.sqrt(product)
-        column[part] = np.where(neighbour >= 0, neighbour, part[:, None])
-    matrix[:, 13] = forth.sum(1)
-    first = np.arange(0, 27 * len(rows) + 1, 27)
-    reached = _lanczos(csr_array((matrix.ravel(), column.ravel(), first)), _LANCZOS_STEPS)
+    reached = _lanczos(parts, len(rows), _LANCZOS_STEPS)
     return min(bound, max(air, MARGIN * reached))
 
 
@@ -126,28 +133,30 @@ _REVERSED = 26 - np.arange(27)  # Index in `OFFSETS` of the opposite offset
 
 def _with_rim(index: Index, shape: tuple[int, int, int]) -> tuple[Index, NDArray[np.int32]]:
     """Return cells `index` and their neighbours, ascending, and the place of each grid cell among them."""
-    near = np.zeros(math.prod(shape), bool)
-    for offset in flat_offsets(shape):
-        near[index + offset] = True
-    near &= np.pad(np.ones([cells - 2 for cells in shape], bool), 1).ravel()  # not in the outermost ring
-    rows = np.flatnonzero(near)
-    place = np.full(len(near), -1, np.int32)
+    near = np.zeros(shape, bool)
+    near.ravel()[index] = True
+    rows = inner_cells(with_neighbours(near))
+    place = np.full(near.size, -1, np.int32)
     place[rows] = np.arange(len(rows))
     return rows, place
 
 
-def _lanczos(matrix: csr_array, steps: int) -> float:
+def _lanczos(parts: Sequence[csr_array], size: int, steps: int) -> float:
     """Return the largest Ritz value of a symmetric matrix, a lower bound of its largest eigenvalue.
 
-    Without reorthogonalisation Ritz values repeat, but none leaves the spectrum (Paige 1980). The sums do not
-    use BLAS, whose result depends on the number of threads.
+    Its rows (size, size) are those of all parts. Without reorthogonalisation Ritz values repeat, but none
+    leaves the spectrum (Paige 1980). The sums do not use BLAS, whose result depends on the number of threads.
     """
-    vector = np.random.default_rng(0).standard_normal(matrix.shape[0])
+
+    def product(vector: Array) -> Array:
+        return np.concatenate(spread(lambda rows: np.asarray(rows @ vector), parts))
+
+    vector = np.random.default_rng(0).standard_normal(size)
     vector /= math.sqrt((vector * vector).sum())
     previous, beta = np.zeros_like(vector), 0.0
     diagonal, beside = [], []
     for _ in range(steps):
-        image = matrix @ vector - beta * previous
+        image = product(vector) - beta * previous
         diagonal.append(float((vector * image).sum()))
         image -= diagonal[-1] * vector
         beta = math.sqrt((image * image).sum())

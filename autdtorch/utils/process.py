@@ -261,6 +261,11 @@ def even_parts(count: int, parts: int) -> list[tuple[int, int]]:
     return list(itertools.pairwise(count * part // parts for part in range(parts + 1)))
 
 
+def parts_of_size(count: int, size: int) -> list[tuple[int, int]]:
+    """Return the bounds of nearly equal parts of `count` things, of at most `size` each; see `even_parts`."""
+    return even_parts(count, 1 + count // size)
+
+
 def _processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 

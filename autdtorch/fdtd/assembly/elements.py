@@ -32,7 +32,7 @@ from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.process import spread
 from autdtorch.utils.progress import show_progress
 
-_CHUNK = 8192  # Interface elements assembled at a time
+_CHUNK = 4096  # Interface elements assembled at a time
 # Depths below its surface [cells]: a body that contains points this deep is thick. Sound would pass through
 # thinner walls of finite elements, whose vertices can belong to both sides.
 _DEPTHS = np.array([1.0, 1.6, 2.2])

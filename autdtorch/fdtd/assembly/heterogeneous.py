@@ -35,7 +35,7 @@ from autdtorch.fdtd.assembly.neighbours import (
 )
 from autdtorch.fdtd.stencil import Stencil, flat_offsets, flat_strides, places_of
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.process import even_parts, spread
+from autdtorch.utils.process import parts_of_size, spread
 
 logger = logging.getLogger(__name__)
 
@@ -126,7 +126,7 @@ def heterogeneous_cells(
         weight[part] /= mass[part, None]
         changed[part] |= (np.abs(weight[part] - stencil.weights) > _ROW_ROUNDING).any(axis=1)
 
-    spread(divide, _in_parts(len(touched)))
+    spread(divide, parts_of_size(len(touched), _TOGETHER))
     changed &= ~hard[touched]
     index, weight, mass, loss = touched[changed], weight[changed], mass[changed], loss[changed]
     uniform = _uniform_cells(elements, touched, hard, shape, stencil)
@@ -209,7 +209,7 @@ class _ElementSums(NamedTuple):
         kind, rows, sums = self.number.ravel(), np.empty((len(cells), 27)), np.empty((3, len(cells)))
         spread(
             lambda ends: add_elements(*ends, cells, kind, tables, numbers, hard, rows, sums),
-            _in_parts(len(cells)),
+            parts_of_size(len(cells), _TOGETHER),
         )
         return _Rows(rows, *sums)
 
@@ -264,11 +264,6 @@ def _uniform_elements(materials: Materials, stencil: Stencil) -> InterfaceElemen
     return InterfaceElements(coupling, materials.mass[number] / 8, number, np.zeros(count, bool), loss)
 
 
-def _in_parts(count: int) -> list[tuple[int, int]]:
-    """Return the bounds of parts of rows."""
-    return even_parts(count, 1 + count // _TOGETHER)
-
-
 def _densest(elements: Elements) -> float:
     """Return the largest density, relative to air."""
     return float(elements.materials.density[~elements.materials.rigid].max())
@@ -307,7 +302,7 @@ def _least_mass(coupling: Array, largest: float) -> Array:
         scaled = scale[:, :, None] * matrix * scale[:, None, :]
         masses[part] = alone * np.linalg.eigvalsh(scaled)[:, -1:] / largest
 
-    spread(limit, _in_parts(len(coupling)))
+    spread(limit, parts_of_size(len(coupling), _TOGETHER))
     return masses
 
 

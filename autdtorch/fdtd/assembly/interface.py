@@ -75,7 +75,6 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
     outside, inside = (distance > 0).all(axis=2) & ~crossed, (distance < 0).all(axis=2) & ~crossed
     distance = np.where(outside[:, :, None], FAR, np.where(inside[:, :, None], -FAR, distance))
     bodies = bodies._replace(distance=distance)
-    volumes = shares(volume_coverage, distance, material, len(materials.density))
     vertex = _vertex_materials(distance, material)
     layered = layered_axis(distance)
     near = (np.abs(distance) < FAR).any(axis=2)
@@ -85,10 +84,13 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
     coupling, mass = np.zeros((len(vertex), 28)), np.zeros(vertex.shape)
     if finite.any():
         coupling[finite], mass[finite] = _finite_elements(bodies.chosen(finite), materials, stencil)
-    if (other := ~finite).any():
-        cut = _Cut(vertex[other], volumes[other], coupling[other], mass[other])
-        _set_others(cut, bodies.chosen(other), layered[other], materials, stencil)
-        coupling[other], mass[other] = cut.coupling, cut.mass
+    for axis in range(3):
+        flat = np.flatnonzero(~finite & (layered == axis))
+        coupling[flat], mass[flat] = flat_elements(axis, distance[:, flat], material, materials, stencil)
+    if len(other := np.flatnonzero(~finite & (layered < 0))):
+        coupling[other], mass[other] = _oblique_elements(
+            vertex[other], bodies.chosen(other), materials, stencil
+        )
     return InterfaceElements(coupling, mass, vertex, finite, np.zeros((len(vertex), 0)))
 
 
@@ -101,23 +103,24 @@ class _Cut(NamedTuple):
     mass: Array  # (n, 8)
 
 
-def _set_others(cut: _Cut, bodies: Bodies, layered: Index, materials: Materials, stencil: Stencil) -> None:
-    """Set elements other than finite ones; `layered` (n,) is the only axis along which one varies, or -1."""
+def _oblique_elements(
+    vertex: Index, bodies: Bodies, materials: Materials, stencil: Stencil
+) -> tuple[Array, Array]:
+    """Return coupling (n, 28) and mass (n, 8) of elements that vary along several axes, not finite ones.
+
+    The materials at their vertices are `vertex` (n, 8).
+    """
     count, distance, material = len(materials.density), bodies.distance, bodies.material
-    vertex, volumes, coupling, mass = cut
-    moved = np.flatnonzero(layered < 0)
     grow = mean_thickness(materials, stencil)[material, None, None]
-    volumes[moved] = shares(volume_coverage, distance[:, moved] - grow, material, count)
+    volumes = shares(volume_coverage, distance - grow, material, count)
     lines = shares(line_coverage, distance, material, count)
-    coupling[:] = _series_coupling(lines, materials, stencil)
-    mass[:] = _lumped_mass(vertex, volumes, materials)
-    for axis in range(3):
-        flat = np.flatnonzero(layered == axis)
-        coupling[flat], mass[flat] = flat_elements(axis, distance[:, flat], material, materials, stencil)
+    coupling, mass = _series_coupling(lines, materials, stencil), _lumped_mass(vertex, volumes, materials)
     at_vertices = (vertex[:, :, None] == np.arange(count)).any(axis=1)
     present = volumes.mean(axis=1) > _ABSENT_SHARE
-    two = (at_vertices.sum(axis=1) == 2) & (present <= at_vertices).all(axis=1) & (layered < 0)
+    two = (at_vertices.sum(axis=1) == 2) & (present <= at_vertices).all(axis=1)
+    cut = _Cut(vertex, volumes, coupling, mass)
     _set_smooth(cut, bodies, at_vertices, np.flatnonzero(two), materials, stencil)
+    return coupling, mass
 
 
 def _set_smooth(

@@ -24,6 +24,7 @@ from autdtorch.fdtd.assembly.element import (
 )
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.spatial import distinct_rows
 
 # Square s of the sine of the second angle of incidence. The second-order term of the exact mass is (1 - s)^2.
 # The scheme has 1 - 1.25 s, which is nearest to it for s of 0 to 1: equal at 0 and 0.75.
@@ -161,9 +162,15 @@ def layered_axis(distance: Array) -> Index:
     """Return the only axis (n,) along which signed distances (K, n, 125) of bodies vary, or -1."""
     only = np.full(distance.shape[1], -1)
     cube = distance.reshape(*distance.shape[:2], *(SUBCELLS + 1,) * 3)
+    ends = slice(None, None, SUBCELLS)
     for axis in range(3):
         across = tuple(2 + other for other in range(3) if other != axis)
-        only[np.ptp(cube, axis=across).max(axis=(0, 2), initial=0) < _VARIATION] = axis
+
+        def flat(part: Array, across: tuple[int, ...] = across) -> NDArray[np.bool_]:
+            return np.asarray(np.ptp(part, axis=across).max(axis=(0, 2), initial=0) < _VARIATION)
+
+        some = np.flatnonzero(flat(cube[:, :, ends, ends, ends]))  # most vary among their vertices
+        only[some[flat(cube[:, some])]] = axis
     return only
 
 
@@ -195,13 +202,18 @@ def flat_elements(
 
     Arguments are signed distances (K, n, 125) of bodies, and their materials (K,).
     """
-    stacks = [_layers(line, material) for line in _lines(axis, distance)]
+    lines = _lines(axis, distance)
+    first, kind = distinct_rows(
+        lines.reshape(len(lines), len(material) * (SUBCELLS + 1))
+    )  # most have no face
+    stacks = [_layers(line, material) for line in lines[first]]
     most = max((len(width) for width, _ in stacks), default=1)
     width, layer = np.zeros((len(stacks), most)), np.zeros((len(stacks), most), np.int64)
     for row, (widths, inside) in enumerate(stacks):
         width[row, : len(widths)], layer[row] = widths, inside[-1]
         layer[row, : len(widths)] = inside
-    return layered_elements(axis, width, layer, materials.density, materials, stencil)
+    coupling, mass = layered_elements(axis, width, layer, materials.density, materials, stencil)
+    return coupling[kind], mass[kind]
 
 
 def _layers(line: Array, material: Index) -> tuple[Array, Index]:

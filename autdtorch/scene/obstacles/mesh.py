@@ -30,6 +30,7 @@ logger = logging.getLogger(__name__)
 
 _MOST = 2**53  # largest whole number that is exact in double precision
 _ON_SIDE = 1e-9  # barycentric coordinate of a nearest point that lies on a side of its triangle
+_ALONG_NORMAL = 1 - 1e-9  # least share of a distance along a normal with which it is a distance along it
 _FINE = 2.0  # accuracy of winding numbers as libigl counts it: errors are below 0.05
 _alive: WeakSet[MeshDistance] = WeakSet()
 
@@ -273,11 +274,17 @@ class MeshDistance:
         if len(points) == 0:
             return np.zeros(0)
         square, face, nearest = self._tree.squared_distance(self._vertices, self._faces, points)
+        distance = np.sqrt(square)
         if self._winding is None:
-            inside = ((points - nearest) * self._normals(face, nearest)).sum(axis=1) < 0
+            away = points - nearest
+            above = (away * self._face_normals[face]).sum(axis=1)
+            beside = np.flatnonzero(np.abs(above) < _ALONG_NORMAL * distance)  # nearest to a side or a corner
+            normals = self._normals(face[beside], nearest[beside])
+            above[beside] = (away[beside] * normals).sum(axis=1)
+            inside = above < 0
         else:
             inside = self._winding.winding_number((points - self._middle) / self._extent, _FINE) > 0.5
-        return np.asarray(np.where(inside, -np.sqrt(square), np.sqrt(square)))
+        return np.asarray(np.where(inside, -distance, distance))
 
     def _normals(self, face: Index, nearest: Array) -> Array:
         """Return the normals (N, 3) of the surface at points on triangles `face` (N,)."""
