@@ -68,18 +68,45 @@ def exclude_cells(
         return points
     weight = points.weight.copy()
     weight[rows] = 0
-    # The cells of all points have one arrangement, a product of three axes: one matrix holds all systems.
-    axes = map(np.unique, places_of(points.index[rows[0]], shape).T)
-    x, y, z = (np.sinc(kappa / np.pi * (along[:, None] - along)) for along in axes)
-    whole = np.kron(np.kron(x, y), z)
-    whole += _ONE_SIDED_REGULARISATION**2 * np.eye(len(whole))
-    for row in rows:
-        off = np.abs(places_of(points.index[row], shape) - cells[row])
-        left = np.flatnonzero(~excluded[row] & (off < ONE_SIDED_REACH).all(axis=1))
-        if (off[left] < 1).all(axis=1).any():
-            target = np.sinc(kappa / np.pi * off[left]).prod(axis=-1)
-            weight[row, left] = solve(whole[np.ix_(left, left)], target, assume_a="pos", check_finite=False)
+    # The cells of all points have one arrangement, a product of three axes.
+    corners, far = (places_of(points.index[rows, column], shape) for column in (0, -1))
+    counts = far[0] - corners[0] + 1
+    numbers = np.arange(points.index.shape[1]).reshape(counts)
+    for row, corner in zip(rows, corners, strict=True):
+        off = [np.abs(corner[axis] + np.arange(counts[axis]) - cells[row, axis]) for axis in range(3)]
+        near = [np.flatnonzero(along < ONE_SIDED_REACH) for along in off]
+        columns = numbers[np.ix_(*near)].ravel()
+        x, y, z = (along[places] for along, places in zip(off, near, strict=True))
+        out = excluded[row, columns]
+        beside = (x[:, None, None] < 1) & (y[:, None] < 1) & (z < 1)
+        if (beside.ravel() & ~out).any():
+            x, y, z = (np.sinc(kappa / np.pi * along) for along in (x, y, z))
+            target = np.where(out, 0.0, (x[:, None, None] * y[:, None] * z).ravel())
+            weight[row, columns] = _fit_to_others(target, out, _inverse_of_block(kappa, *map(len, near)))
     return Interpolation(points.index, weight)
+
+
+@lru_cache(maxsize=16)
+def _inverse_of_block(kappa: float, *counts: int) -> Array:
+    """Return the inverse of the system (n, n) of a block of cells, with `counts` along the axes."""
+    x, y, z = (np.sinc(kappa / np.pi * np.subtract.outer(*[np.arange(count)] * 2)) for count in counts)
+    # By eigenvalues: rounding of these cancels in the fit, that of an elimination would not.
+    values, vectors = np.linalg.eigh(np.kron(np.kron(x, y), z))
+    inverse: Array = (vectors / (values + _ONE_SIDED_REGULARISATION**2)) @ vectors.T
+    return inverse
+
+
+def _fit_to_others(target: Array, out: NDArray[np.bool_], inverse: Array) -> Array:
+    """Return the weights (n,) of the cells that are not `out` (n,), by the `inverse` of the system of all.
+
+    The few cells that are out then need a small system: weights of all, less those that make theirs 0.
+    """
+    weight = inverse @ target
+    if out.any():
+        part = inverse[:, out]
+        weight -= part @ solve(part[out], weight[out], assume_a="pos", check_finite=False)
+        weight[out] = 0
+    return weight
 
 
 @lru_cache(maxsize=64)
