@@ -18,11 +18,11 @@ from benchmarks.known_algorithms import ALGORITHMS, Losses
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_an_algorithm_brings_four_transducers_into_phase_within_its_budget(make_objective, name):
     objective = make_objective(torch.ones(1, 4, dtype=torch.complex128))
-    losses = Losses(objective, at.WeakestFocus(), 160)
+    fewest, most = (40, 80) if name == "TuRBO" else (100, 160)  # TuRBO ends with a small region
+    losses = Losses(objective, at.WeakestFocus(), most)
     with torch.random.fork_rng():
         drive = answer(ALGORITHMS[name], losses, seed=1, noisy=False)
-    fewest = 40 if name == "TuRBO" else 100  # whole populations; TuRBO ends with a small region
-    assert fewest < objective.evaluations <= 160
+    assert fewest < objective.evaluations <= most  # of whole populations
     assert objective(drive).item() > 3.6  # of 4 in phase; random phases have an rms of 2
 
 

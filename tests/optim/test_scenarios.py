@@ -89,21 +89,21 @@ def test_lssg_takes_the_evaluations_of_one_scene(scenarios):
         at.lssg(scenarios(), order=[0, 1, 2, 3, 4, 5])
 
 
-@settings(max_examples=8)
+@settings(max_examples=16)
 @given(
+    number=st.integers(0, 6),
     by=st.sampled_from(BY),
     scenes=st.integers(1, 6),
     points=st.integers(2, 4),
     transducers=st.integers(2, 16),
     seed=st.integers(0, 1000),
 )
-def test_no_drive_scores_above_the_bound(random_matrix, by, scenes, points, transducers, seed):
+def test_no_drive_scores_above_the_bound(random_matrix, number, by, scenes, points, transducers, seed):
     matrix, generator = random_matrix(scenes * points, transducers, seed), torch.Generator().manual_seed(seed)
     drives = random_drives(50, transducers, generator)
-    for goal in goals_for(points):
-        over = at.OverScenes(goal, scenes, by)
-        best = torch.cat([drives, climb(over, matrix, drives[:4], 60)[None], torch.zeros_like(drives[:1])])
-        assert over((best @ matrix.T).abs()).max() <= over.bound(matrix) * (1 + 1e-12) + 1e-12
+    over = at.OverScenes(goals_for(points)[number], scenes, by)
+    best = torch.cat([drives, climb(over, matrix, drives[:4], 60)[None], torch.zeros_like(drives[:1])])
+    assert over((best @ matrix.T).abs()).max() <= over.bound(matrix) * (1 + 1e-12) + 1e-12
 
 
 def test_a_quantile_is_the_kth_lowest_in_spite_of_rounding():
