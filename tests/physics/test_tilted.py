@@ -79,13 +79,13 @@ def test_a_tilted_half_space_of_a_fluid_reflects_in_its_place(normal, offset, in
 
 
 def tilted(rotation, material):
-    """A cube between two transducers and three points, all turned about the origin."""
+    """A cube between a transducer and three points, all turned about the origin."""
     turn = rotation_matrix(rotation).numpy()
-    transducers = np.array([[-5e-3, 1e-3, -13e-3], [4e-3, -2e-3, -15e-3]])
+    transducers = np.array([[-5e-3, 1e-3, -20e-3]])
     points = np.array([[1e-3, 2e-3, 14e-3], [7e-3, -3e-3, 13e-3], [-9e-3, 5e-3, 8e-3]])
     array = TransducerArray(transducers @ turn.T, turn @ [0.0, 0.0, 1.0])
     box = Box((0, 0, 0), (8e-3,) * 3, rotation, **material)
-    return Scene(array, AIR, 40e3, points @ turn.T, [box], domain=((-18e-3,) * 3, (18e-3,) * 3))
+    return Scene(array, AIR, 40e3, points @ turn.T, [box], domain=((-26e-3,) * 3, (26e-3,) * 3))
 
 
 @pytest.mark.parametrize("rotation", TILTS)
@@ -101,7 +101,8 @@ def fine_matrix(material):
     return make_propagator(tilted((0.0, 0.0, 0.0), dict(material)), "box", 0.4e-3).transfer_matrix()
 
 
-# measured for the dense cube 2.1 and 1.6 %; without finite elements at the edges 3.7 and 2.2 %
+# measured for the dense cube 2.2 and 1.7 %; with a second transducer 2.1 and 1.6 %, and without finite
+# elements at the edges 3.7 and 2.2 %
 @pytest.mark.parametrize("rotation", TILTS)
 @pytest.mark.parametrize(("material", "bound"), [(RIGID, 0.015), (DENSE, 0.019)], ids=["rigid", "dense"])
 def test_on_a_grid_that_is_not_turned_a_tilted_cube_converges(rotation, material, bound):
