@@ -5,9 +5,14 @@ from contextlib import contextmanager
 from typing import Any
 from unittest.mock import patch
 
+import pytest
 import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map
+
+HAS_GPU = torch.cuda.is_available()
+
+needs_gpu = pytest.mark.skipif(not HAS_GPU, reason="needs an NVIDIA GPU: modules are not emulated")
 
 CPU, GPU = torch.device("cpu"), torch.device("cuda", 0)
 OF_INDEX = ("index", "index_put", "index_put_", "_index_put_impl_")
@@ -17,10 +22,17 @@ ATTRIBUTES = {torch.Tensor.device: GPU, torch.Tensor.is_cuda: True, torch.Tensor
 @contextmanager
 def gpu() -> Iterator[Callable[[torch.Tensor], torch.Tensor]]:
     """Yield a function that moves tensors to the GPU."""
-    if torch.cuda.is_available():
+    if HAS_GPU:
         yield torch.Tensor.cuda
         return
-    with patch.object(torch.cuda, "_lazy_init", lambda: None), Emulation():
+    parsed = torch._C._nn._parse_to
+
+    def of_module(*args, **kwargs):  # what `Module.to` gets
+        device, *others = parsed(*args, **kwargs)
+        return GPU if any(map(_on_gpu, args)) else device, *others
+
+    ready = patch("torch.cuda._lazy_init", lambda: None)
+    with ready, patch("torch._C._nn._parse_to", of_module), Emulation():
         yield _Up.apply
 
 

@@ -30,7 +30,7 @@ from autdtorch.objectives.quiet import SeenPoints
 from autdtorch.objectives.readings import Readings
 from autdtorch.scene.drive import AMPLITUDE_TOLERANCE, drive_from_phases, phases_of
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.process import one_library_thread
+from autdtorch.utils.process import device_type, one_library_thread
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import integer_at_least, invalid, number_between, require_one_of
 
@@ -71,6 +71,11 @@ def _checked_noise(name: str, value: object) -> object:
     return number_between(name, value, 1e-6, 1)
 
 
+def _checked_device(name: str, value: object) -> object:
+    require_one_of(name, value, ("cpu", "cuda"))
+    return device_type(name, value)
+
+
 @dataclass(frozen=True)
 class BayesOpt(Method):
     """Maximise the score over the phases by Bayesian optimisation (Algorithm 1), all amplitudes being 1.
@@ -105,6 +110,8 @@ class BayesOpt(Method):
             of known deviations. The model "foci" spends the last evaluation at the maximum of the posterior
             mean, and returns the observed drive where the posterior mean is highest.
         prior: simulated transfer matrix, and how far to trust it, for the model "foci".
+        device: "cpu", or "cuda" for processes, acquisition and the goal on an NVIDIA GPU. Hyperparameters are
+            fitted on the CPU. The rounding of another device leads to other points.
 
     Raises:
         ValueError: a setting out of range.
@@ -123,6 +130,7 @@ class BayesOpt(Method):
     initial_points: Literal["sobol", "random"] = choice("sobol", "random")
     noise: float | Literal["inferred"] = setting(NOISE, _checked_noise)
     prior: Prior | None = setting(None, prior_of)
+    device: Literal["cpu", "cuda"] = setting("cpu", _checked_device)
 
     def __post_init__(self) -> None:
         """Check the settings, also against each other."""
@@ -217,8 +225,8 @@ class BayesOpt(Method):
             rows = None if rows is None else rows.of(foci)
         acquisition = self._acquisition(goal, values, points, fit, rows)
         if left == 0:
-            return Step(self._drives(points[:, :0]), {**search, "answer": acquisition.best})
-        point = acquisition.next_points(generators, last=left == 1)[:, None]
+            return Step(self._drives(points[:, :0]), {**search, "answer": acquisition.best.cpu()})
+        point = acquisition.next_points(generators, last=left == 1)[:, None].cpu()
         search |= {"points": torch.cat([search["points"], point], dim=1), "generators": states_of(generators)}
         return Step(self._drives(point), search)
 
@@ -352,6 +360,8 @@ class BayesOpt(Method):
         from autdtorch.methods.bayes.acquisition import FocusAcquisition, ScoreAcquisition
         from autdtorch.methods.bayes.gaussian_process import Processes
 
+        points, values, fit = points.to(self.device), values.to(self.device), fit.to(self.device)
+        rows = None if rows is None else rows.to(self.device)
         processes = Processes(self.kernel, points, values, fit, rows)
         if self.model == "weakest":
             return ScoreAcquisition(processes, points, values, self.acquisition == "log_ei")

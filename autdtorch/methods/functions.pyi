@@ -41,6 +41,7 @@ def bayes_opt(
     initial_points: Literal["sobol", "random"] = "sobol",
     noise: float | Literal["inferred"] = 1e-4,
     prior: Prior | None = None,
+    device: Literal["cpu", "cuda"] = "cpu",
     readings: Readings | None = None,
 ) -> Solution: ...
 def bo_foci(
@@ -58,6 +59,7 @@ def bo_foci(
     initial_points: Literal["sobol", "random"] = "sobol",
     noise: float | Literal["inferred"] = "inferred",
     prior: Prior | None = None,
+    device: Literal["cpu", "cuda"] = "cpu",
     readings: Readings | None = None,
 ) -> Solution: ...
 def identify(

@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from emulated_gpu import gpu
+from emulated_gpu import HAS_GPU, gpu, needs_gpu
 from public_calls import AIR_ALONE, BALL, DRIVE, MATRIX, SCENE, Call, limited_link, propagator, public_calls
 
 import autdtorch as at
 from autdtorch.fdtd.kernels import waves
+from autdtorch.methods.bayes.gaussian_process import Hyperparameters, Processes
 from autdtorch.propagators import free_space
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.utils.apertures import Discs, centers_of
@@ -187,3 +188,56 @@ def test_pictures_summed_on_the_gpu_are_those_of_the_cpu(method, radius, monkeyp
     with gpu():
         field = summed.field(torch.stack([DRIVE, 0.5j * DRIVE]), plane)
     assert (field - expected).norm() < 1e-5 * expected.norm()
+
+
+@pytest.fixture
+def accepted(monkeypatch):
+    """The setting ``device="cuda"``, accepted without a GPU."""
+    if not HAS_GPU:
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+        monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+
+
+@pytest.mark.usefixtures("accepted")
+@pytest.mark.parametrize(
+    "settings",
+    [
+        pytest.param({"evaluations": 7, "initial": 5}, marks=needs_gpu),
+        pytest.param(
+            {"evaluations": 7, "initial": 5, "kernel": "circle", "acquisition": "log_ei"}, marks=needs_gpu
+        ),
+        {"evaluations": 7, "initial": 5, "model": "foci", "kernel": "phasor"},
+        {"evaluations": 13, "initial": 11, "model": "foci", "kernel": "phasor", "noise": "inferred"},
+        {"evaluations": 2, "model": "foci", "kernel": "phasor", "prior": at.Prior(gain=0.1, phase=0.5)},
+    ],
+)
+def test_bayesian_optimisation_on_the_device_begins_as_on_the_cpu(settings):
+    objective = at.SimulatedObjective.of_matrix(AIR_ALONE, MATRIX)
+    expected = at.bayes_opt(objective, trials=2, **settings)
+    with gpu():
+        result = at.bayes_opt(objective, trials=2, device="cuda", **settings)
+    # two points by the acquisition, whose climbs amplify rounding
+    torch.testing.assert_close(result.history, expected.history, rtol=1e-4, atol=0)
+    assert result.drive.device == torch.device("cpu")
+
+
+@pytest.mark.usefixtures("accepted")
+@pytest.mark.parametrize(
+    "kernel", [pytest.param("phases", marks=needs_gpu), pytest.param("circle", marks=needs_gpu), "phasor"]
+)
+def test_the_processes_on_the_device_are_those_of_the_cpu(kernel):
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand((2, 9, 3), generator=generator, dtype=torch.float64)
+    values = 1 + torch.rand((2, 9, 2), generator=generator, dtype=torch.float64)
+    if kernel != "phasor":
+        values = values[..., :1]
+    shape = values.shape[::2]
+    fit = Hyperparameters(0.3 * torch.ones(shape).double(), 1e-3 * torch.ones(shape).double())
+    before = Processes(kernel, points, values, fit).at(points.flip(1) + 0.01)
+    with gpu() as to_gpu:
+        on_gpu = Processes(kernel, to_gpu(points), to_gpu(values), fit.to("cuda"))
+        after = on_gpu.at(to_gpu(points.flip(1) + 0.01))
+        assert on_gpu.model.train_targets.is_cuda
+        for one, other in zip(after, before, strict=True):
+            assert one.is_cuda
+            torch.testing.assert_close(one.cpu(), other, rtol=1e-7, atol=1e-9)

@@ -98,7 +98,7 @@ class FocusAcquisition:
         self._start = start
         self._processes, self._points, self._goal = processes, points, goal
         self._unit = processes.scale.amax(dim=-1, keepdim=True).sqrt()
-        self._normal = _normal_samples(processes.scale.shape[-1])
+        self._normal = _normal_samples(processes.scale.shape[-1]).to(processes.scale)
         with torch.no_grad():
             expected = self.expected(points)
         self.best = expected.argmax(dim=1)
@@ -158,7 +158,7 @@ def log_improvement(scaled: torch.Tensor) -> torch.Tensor:
 
 
 def _chosen(points: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
-    return points[torch.arange(len(points), device="cpu"), index]
+    return points[torch.arange(len(points), device=index.device), index]
 
 
 def _normal_samples(foci: int) -> torch.Tensor:
@@ -172,13 +172,13 @@ def _normal_samples(foci: int) -> torch.Tensor:
 def candidates(best: torch.Tensor, generators: Sequence[torch.Generator], count: int) -> torch.Tensor:
     """Return points (T, count, D): half of them anywhere, half at all distances around the best (T, D)."""
     points = []
-    for point, generator in zip(best, generators, strict=True):
+    for point, generator in zip(best.cpu(), generators, strict=True):  # numbers of the CPU, on any device
         anywhere, near = uniform(generator, 2, count // 2, len(point))
         # Normally distributed steps; their lengths are spread evenly in logarithm, from 0.001 to 0.3.
         scale = 10 ** (-3 + 2.5 * uniform(generator, len(near), 1))
         steps = scale * torch.randn(near.shape, dtype=torch.float64, generator=generator, device="cpu")
         points.append(torch.cat([anywhere, point + steps]))
-    return torch.stack(points)
+    return torch.stack(points).to(best)
 
 
 def highest(

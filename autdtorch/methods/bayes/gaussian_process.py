@@ -168,6 +168,10 @@ class Hyperparameters(NamedTuple):
         """Return the hyperparameters of some outputs."""
         return Hyperparameters(*(part[:, outputs] for part in self))
 
+    def to(self, device: str) -> Hyperparameters:
+        """Return them on a device."""
+        return Hyperparameters(*(part.to(device) for part in self))
+
 
 class MatrixRows(NamedTuple):
     """The rows of the transfer matrix as they are known before the observations.
@@ -185,6 +189,10 @@ class MatrixRows(NamedTuple):
     def of(self, outputs: list[int]) -> MatrixRows:
         """Return the rows of some outputs."""
         return MatrixRows(self.mean[:, outputs], self.variance[:, outputs], self.best)
+
+    def to(self, device: str) -> MatrixRows:
+        """Return the rows on a device."""
+        return MatrixRows(*(part.to(device) for part in self))
 
 
 class Posterior(NamedTuple):
@@ -245,7 +253,7 @@ class Processes:
         self._observed = self._by_output(observed)
         self._weights = cached.mean_cache.reshape(*shape, 1)
         factor = cached.lik_train_train_covar.cholesky().to_dense().reshape(*shape, points.shape[1])
-        one = torch.eye(points.shape[1], dtype=factor.dtype, device="cpu")
+        one = torch.eye(points.shape[1], dtype=factor.dtype, device=factor.device)
         self._whitening = torch.linalg.solve_triangular(factor, one, upper=False).mT
 
     def at(self, points: torch.Tensor) -> Posterior:
@@ -358,7 +366,7 @@ def _kernel(kernel: KernelName, fit: Hyperparameters, rows: MatrixRows | None, u
     """Return the covariance of the modelled values; `unit` of intensities (T, K)."""
     if kernel != "phasor":
         matern = MaternKernel(2.5, batch_shape=fit.length_scale.shape[:1])
-        matern.lengthscale = fit.length_scale[..., None]
+        matern.lengthscale = fit.length_scale[..., None].cpu()  # the model moves it
         return matern
     if rows is None:
         return PhasorKernel("drives")
@@ -367,6 +375,6 @@ def _kernel(kernel: KernelName, fit: Hyperparameters, rows: MatrixRows | None, u
 
 def _reach(kernel: KernelName, fit: Hyperparameters) -> torch.Tensor:
     if kernel == "phasor":
-        return torch.full(fit.noise.shape[:1], _PHASOR_REACH, **REAL)
+        return fit.noise.new_full(fit.noise.shape[:1], _PHASOR_REACH)
     shortest = fit.length_scale.amin(dim=-1)
     return shortest / (2 * math.pi) if kernel == "circle" else shortest
