@@ -293,7 +293,7 @@ def _forces(c: Coefficients, sources: Sources) -> tuple[AnyArray, AnyArray, AnyA
     """
     # numba compiles again for arrays with gaps, and crashed when it loaded that from disk
     force = sources.force[0].mT.contiguous().numpy()
-    if not torch.equal(sources.index, c.heterogeneous_index):
+    if not np.array_equal(sources.index.numpy(), c.heterogeneous_index.numpy()):
         return _unsigned(sources.index), force, np.zeros_like(force, shape=(0, 0))
     of_blocks = c.heterogeneous.laid(force)
     return _unsigned(sources.index[:0]), np.zeros_like(force, shape=(len(force), 0)), of_blocks
