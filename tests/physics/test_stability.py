@@ -22,6 +22,7 @@ from autdtorch.fdtd import stability
 from autdtorch.fdtd.assembly.element import stiffness_matrix
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import heterogeneous_cells
+from autdtorch.fdtd.assembly.losses import GROUND
 from autdtorch.fdtd.grid import make_grid
 from autdtorch.fdtd.kernels.contract import uniform_state
 from autdtorch.fdtd.kernels.cpu import CpuKernel
@@ -165,7 +166,12 @@ def test_energy_is_symmetric_positive_and_bounded(number):
     elements = elements_of(region, grid, stencil)
 
     # each element by itself, which is sufficient; rounding
-    eigenvalues = np.linalg.eigvalsh(stiffness_matrix(elements.interface.coupling))
+    stiffness = stiffness_matrix(elements.interface.coupling)
+    if elements.materials.losses is not None:
+        # finite elements also have the masses of impedances, as stiffness against silence
+        ground = np.where(elements.interface.finite[:, None], elements.interface.loss[:, GROUND], 0)
+        stiffness[:, range(8), range(8)] += ground
+    eigenvalues = np.linalg.eigvalsh(stiffness)
     assert (eigenvalues[:, 0] >= -1e-13 * eigenvalues[:, -1]).all()
     assert (elements.interface.mass >= 0).all()
 

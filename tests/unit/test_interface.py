@@ -11,8 +11,11 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from autdtorch.fdtd.assembly.element import (
+    CORNERS,
     FAR,
     LATTICE,
+    PAIRS,
+    SUBCELLS,
     VERTICES,
     Materials,
     stiffness_matrix,
@@ -20,6 +23,7 @@ from autdtorch.fdtd.assembly.element import (
 )
 from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
 from autdtorch.fdtd.assembly.smooth_faces import face_forces, fields, forces, smooth_stiffness, surfaces
+from autdtorch.fdtd.assembly.thin_walls import Side, sides_of
 from autdtorch.fdtd.stencil import tuned_stencil
 
 STENCIL = tuned_stencil(2 * math.pi / 8.5)
@@ -27,6 +31,7 @@ LONG = tuned_stencil(1e-3)  # of long waves: the terms of second order are 1e-6
 ONE = np.array([1])
 OFFSETS = st.floats(-0.4, 0.4)
 CONTRASTS = st.floats(-3, 5).map(lambda exponent: 10**exponent)
+OPEN = (Side(np.ones((1, SUBCELLS**3)), np.zeros((1, 8), bool)),)  # without walls
 NORMALS = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array).filter(lambda n: np.linalg.norm(n) > 0.1)
 
 
@@ -49,15 +54,15 @@ def element(*distance, density=(1, 77), mass=None, stencil=STENCIL):
     )
     count = len(distance)
     numbers, none = np.arange(count) + 1, np.zeros(count, bool)
-    near = Bodies(np.stack(distance)[:, None], numbers, none[:, None], np.zeros((1, 3, 3)))
+    near = Bodies(np.stack(distance)[:, None], numbers, none[:, None], np.zeros((1, 3, 3)), OPEN)
     return interface_elements(near, materials, stencil)
 
 
-def rigid_element(distance, reduction=0.0):
+def rigid_element(distance, reduction=0.0, sides=OPEN):
     """One element that a tilted rigid surface cuts."""
     materials = Materials(np.array([1, 1e5]), np.array([1, 1e-5]), np.ones(2), np.array([False, True]))
     reductions = np.broadcast_to(reduction, (1, 3, 3))
-    near = Bodies(distance[None, None], ONE, ONE[None] > 0, reductions)
+    near = Bodies(distance[None, None], ONE, ONE[None] > 0, reductions, sides)
     return interface_elements(near, materials, STENCIL)
 
 
@@ -295,3 +300,18 @@ def test_in_one_material_forces_are_those_of_linear_pressures():
     at_vertices = np.array(list(np.ndindex((2,) * 3))) - 0.5
     # half of the flow through each face that a vertex touches: a quarter of it, from each of three faces
     assert np.allclose(forces(here), at_vertices @ slope.transpose(0, 2, 1) / 2, atol=0.01)
+
+
+@given(NORMALS, st.floats(-0.8, 0.8), st.floats(0.35, 2.0))
+def test_a_thin_wall_parts_the_air_in_front_from_the_air_behind(normal, offset, thickness):
+    middle = plane(normal, offset)
+    level = np.abs(middle) - thickness / 2
+    assume((level < 0).any() and (level > 0.02).any())
+    nearest = np.sign(middle[CORNERS])[None, :, None] * normal / np.linalg.norm(normal)
+    sides = sides_of(level[None], nearest, np.ones(1, bool))
+    cut = rigid_element(level, sides=sides)
+    front = middle[CORNERS] > 0
+    across = front[PAIRS[:, 0]] != front[PAIRS[:, 1]]
+    assert np.abs(cut.coupling[0, across]).sum() < 1e-4  # along the grid, that of rigid bodies' density
+    assert np.linalg.eigvalsh(stiffness_matrix(cut.coupling))[0, 0] > -1e-12
+    assert cut.mass.sum() == pytest.approx(rigid_element(level).mass.sum(), rel=1e-12)

@@ -50,6 +50,7 @@ from autdtorch.fdtd.assembly.element import (
     subcell_gradients,
     subcell_means,
 )
+from autdtorch.fdtd.assembly.interface import Bodies
 from autdtorch.fdtd.stencil import Stencil, flat_strides
 from autdtorch.utils.array_types import Array, ComplexArray, Index
 
@@ -115,27 +116,26 @@ def _coverage(distance: Array) -> Array:
 
 
 def with_impedance(
-    elements: InterfaceElements,
-    distance: Array,
-    material: Index,
-    materials: Materials,
-    stencil: Stencil,
+    elements: InterfaceElements, bodies: Bodies, materials: Materials, stencil: Stencil
 ) -> InterfaceElements:
-    """Return n elements with the admittances of the surfaces in them; see `_facets` for the arguments."""
+    """Return n elements with the admittances of the surfaces of K bodies in them."""
     if materials.losses is None or not materials.losses.admittance.any():
         return elements
     admittance = materials.losses.admittance
     coupling, mass = np.zeros((len(elements.mass), 28), complex), np.zeros(elements.mass.shape, complex)
-    near = np.asarray((np.abs(distance) < FAR).any(axis=2))
+    near = np.asarray((np.abs(bodies.distance) < FAR).any(axis=2))
     for number in np.flatnonzero(admittance).tolist():
-        some = np.flatnonzero(near[material == number].any(axis=0))
-        surface = _facets(distance[:, some], material, number, materials)
-        finite = elements.finite[some]
-        for make, part in ((_consistent, finite), (_lumped, ~finite)):
-            chosen, solid = some[part], materials.rigid[elements.material[some[part]]]
-            added = make(surface.chosen(part), solid, admittance[number], stencil.kappa)
+        some = np.flatnonzero(near[bodies.material == number].any(axis=0))
+        surface = _facets(bodies.distance[:, some], bodies.material, number, materials)
+        finite, solid = elements.finite[some], materials.rigid[elements.material[some]]
+        parts = [(_lumped, ~finite, np.ones_like(surface.area), solid)]
+        parts += [(_consistent, finite, *side.chosen(some)) for side in bodies.sides]
+        for make, chosen, share, out in parts:
+            which = chosen & share.any(axis=1)
+            part = surface._replace(area=surface.area * share).chosen(which)
+            added = make(part, out[which], admittance[number], stencil.kappa)
             for total, each in zip((coupling, mass), added, strict=True):
-                total[chosen] += each
+                total[some[which]] += each
     factor = 0.5j * stencil.slope.real
     coupling, mass = factor * coupling, factor * mass
     loss = -coupling.imag, mass.imag, np.maximum(-mass.real, 0)
@@ -147,18 +147,22 @@ def with_impedance(
 
 
 def _consistent(
-    surface: _Facets, solid: NDArray[np.bool_], admittance: complex, kappa: float
+    surface: _Facets, out: NDArray[np.bool_], admittance: complex, kappa: float
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return T of finite elements: off its diagonal (n, 28), and sums of its rows (n, 8).
 
     Linear interpolation underestimates the power of a pressure that varies along the surface: the squares of
-    slopes along it are added.
+    slopes along it are added. Vertices `out` (n, 8) have no share.
     """
-    area, hats = surface.area[:, :, None], _hats(surface.place)
+    hats = _hats(surface.place) * ~out[:, None]
+    whole = hats.sum(axis=2, keepdims=True)
+    whole[whole == 0] = np.inf
+    area, hats = surface.area[:, :, None], hats / whole
     both = (1 - _EXCESS * kappa**2) * (area * hats).transpose(0, 2, 1) @ hats
     total, across = both.sum(axis=2), np.zeros_like(hats)
     for axis in range(3):
-        slope = _slopes(surface.place, axis)
+        slope = _slopes(surface.place, axis) * ~out[:, None] / whole
+        slope -= hats * slope.sum(axis=2, keepdims=True)
         both += _ALONG * (area * slope).transpose(0, 2, 1) @ slope
         across += surface.normal[:, :, axis, None] * slope
     both -= _ALONG * (area * across).transpose(0, 2, 1) @ across
@@ -167,14 +171,14 @@ def _consistent(
 
 
 def _lumped(
-    surface: _Facets, solid: NDArray[np.bool_], admittance: complex, kappa: float
+    surface: _Facets, out: NDArray[np.bool_], admittance: complex, kappa: float
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return T of other elements, at the vertices in fluids on the surface's outer side; see `_consistent`.
 
     The air between a vertex and the surface, a distance d away, is in the element's mass. With t = tan(k d),
     the admittance Y behind it acts as Y (1 + t^2) / (1 - i Y t).
     """
-    depth, hats = _outer_side(surface, solid)
+    depth, hats = _outer_side(surface, out)
     slope = np.tan(np.minimum(kappa * depth, _LARGEST_PHASE))
     behind = admittance * (1 + slope**2) / (1 - 1j * admittance * slope)
     return np.zeros((len(hats), 28), complex), (surface.area[:, :, None] * hats * behind).sum(axis=1)

@@ -110,6 +110,25 @@ def stiffness_matrix(coupling: Array, pairs: Index = PAIRS) -> Array:
     return matrix
 
 
+# Eigenvalues below this share of the largest are rounding in a condensed stiffness matrix. A higher value
+# would remove energy from nearly constant pressures.
+_NULL_EIGENVALUE = 1e-10
+
+
+def without_vertices(coupling: Array, gone: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Eliminate vertices `gone` (n, 8) from the coupling of elements (n, 28) by static condensation.
+
+    Their pressures take the values of least energy. Also returns the shares (n, 8, 8) of the others in them.
+    """
+    matrix = stiffness_matrix(coupling)
+    both = gone[:, :, None] & gone[:, None, :]
+    inverse = np.linalg.pinv(np.where(both, matrix, 0), rcond=_NULL_EIGENVALUE, hermitian=True)
+    across = np.where(gone[:, None, :], matrix, 0)
+    matrix = matrix - across @ inverse @ across.transpose(0, 2, 1)
+    matrix[gone[:, :, None] | gone[:, None, :]] = 0
+    return -matrix[:, PAIRS[:, 0], PAIRS[:, 1]], -inverse @ across.transpose(0, 2, 1)
+
+
 _FROM, _TO = VERTICES[PAIRS[:, 0], None], VERTICES[PAIRS[:, 1], None]
 _ALONG = SUBCELLS * _FROM + np.arange(SUBCELLS + 1)[:, None] * (_TO - _FROM)
 # Indices in the lattice of the points along the line between each pair of vertices (28, 5)

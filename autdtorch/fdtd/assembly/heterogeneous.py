@@ -23,6 +23,7 @@ from autdtorch.fdtd.assembly.element import (
     Materials,
     stiffness_matrix,
     uniform_coupling,
+    without_vertices,
 )
 from autdtorch.fdtd.assembly.elements import Elements
 from autdtorch.fdtd.assembly.losses import COUPLING, GROUND, MASS, condensed_loss
@@ -44,9 +45,6 @@ logger = logging.getLogger(__name__)
 # unknowns, except in slivers: the least sum is relative to the densest fluid, and above the body's 1e-5.
 _RIGID_COUPLING = 0.1
 _SLIVER_COUPLING, _LEAST_COUPLING = 1e-3, 3e-5
-# Eigenvalues below this share of the largest are rounding in a condensed stiffness matrix. A higher value
-# would remove energy from nearly constant pressures.
-_NULL_EIGENVALUE = 1e-10
 _ROW_ROUNDING = 1e-9  # Stencil rows within this of air's are those of air
 # Largest eigenvalue of elements, relative to a uniform material: lighter cells receive mass. From 5 cells per
 # wavelength on 1.15 takes 7 % of the time step, errs less than 1.5 and leaves enough mass around. So much
@@ -274,16 +272,10 @@ def condensed(interface: InterfaceElements, out: NDArray[np.bool_]) -> Interface
 
     Their pressure takes the value of least energy. To remove their coupling could make the energy negative.
     """
-    matrix = stiffness_matrix(interface.coupling)
-    both = out[:, :, None] & out[:, None, :]
-    inverse = np.linalg.pinv(np.where(both, matrix, 0), rcond=_NULL_EIGENVALUE, hermitian=True)
-    across = np.where(out[:, None, :], matrix, 0)
-    matrix = matrix - across @ inverse @ across.transpose(0, 2, 1)
-    matrix[out[:, :, None] | out[:, None, :]] = 0
+    coupling, followed = without_vertices(interface.coupling, out)
     loss = interface.loss
     if loss.shape[1]:
-        loss = condensed_loss(loss, -inverse @ across.transpose(0, 2, 1), out)
-    coupling = -matrix[:, PAIRS[:, 0], PAIRS[:, 1]]
+        loss = condensed_loss(loss, followed, out)
     return interface._replace(coupling=coupling, mass=np.where(out, 0, interface.mass), loss=loss)
 
 

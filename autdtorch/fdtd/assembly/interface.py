@@ -40,9 +40,11 @@ from autdtorch.fdtd.assembly.element import (
     subcell_means,
     uniform_coupling,
     volume_coverage,
+    without_vertices,
 )
 from autdtorch.fdtd.assembly.layers import crossed_by_layers, flat_elements, layered_axis, mean_thickness
 from autdtorch.fdtd.assembly.smooth_faces import Surface, fields, smooth_stiffness, surfaces
+from autdtorch.fdtd.assembly.thin_walls import Side
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 
@@ -59,11 +61,15 @@ class Bodies(NamedTuple):
     material: Index  # number of the material of each body (K,)
     finite: NDArray[np.bool_]  # mask of the bodies that finite elements represent in an element (K, n)
     reductions: Array  # relative reduction of the stiffness near edges of such bodies (n, 3, 3)
+    sides: tuple[Side, ...]  # of thin rigid walls
 
     def chosen(self, some: Index | NDArray[np.bool_]) -> Bodies:
         """Return the bodies near some of the elements."""
         return self._replace(
-            distance=self.distance[:, some], finite=self.finite[:, some], reductions=self.reductions[some]
+            distance=self.distance[:, some],
+            finite=self.finite[:, some],
+            reductions=self.reductions[some],
+            sides=tuple(side.chosen(some) for side in self.sides),
         )
 
 
@@ -157,8 +163,17 @@ def _finite_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -> 
     contrast = np.where(materials.rigid, 1, (materials.density - 1) / (materials.density + 1))
     contrast = contrast[bodies.material, None, None] * bodies.finite[:, :, None]
     grown = bodies.distance - _added_thickness(stencil.kappa) * contrast
-    part = shares(volume_coverage, grown, bodies.material, len(materials.density))
-    return _cut_coupling(part, materials, bodies.reductions, stencil), _cut_mass(part, materials)
+    volumes = shares(volume_coverage, grown, bodies.material, len(materials.density))
+    coupling, mass = np.zeros((len(volumes), 28)), np.zeros((len(volumes), 8))
+    for side in bodies.sides:
+        here = np.flatnonzero(side.share.any(axis=1))
+        part, out = volumes[here] * side.share[here, :, None], side.out[here]
+        added = _cut_coupling(part, materials, bodies.reductions[here], stencil)
+        parted = np.flatnonzero(out.any(axis=1))
+        added[parted], _ = without_vertices(added[parted], out[parted])
+        coupling[here] += added
+        mass[here] += _cut_mass(part, materials, out)
+    return coupling, mass
 
 
 def _vertex_materials(distance: Array, material: Index) -> Index:
@@ -267,9 +282,18 @@ def _cut_coupling(volumes: Array, materials: Materials, reductions: Array, stenc
     return np.asarray(-matrix[:, PAIRS[:, 0], PAIRS[:, 1]])
 
 
-def _cut_mass(volumes: Array, materials: Materials) -> Array:
-    """Return the masses at the vertices (n, 8), from the share of each material in sub-cells (n, 64, m)."""
-    return np.asarray(volumes @ np.where(materials.rigid, 0, materials.mass) @ _HATS / SUBCELLS**3)
+def _cut_mass(volumes: Array, materials: Materials, out: NDArray[np.bool_]) -> Array:
+    """Return the masses at the vertices (n, 8), from the share of each material in sub-cells (n, 64, m).
+
+    Vertices `out` (n, 8) leave theirs to the others.
+    """
+    cells = volumes @ np.where(materials.rigid, 0, materials.mass) / SUBCELLS**3
+    mass, parted = cells @ _HATS, np.flatnonzero(out.any(axis=1))
+    hats = _HATS * ~out[parted, None]
+    whole = hats.sum(axis=2, keepdims=True)
+    hats = np.divide(hats, whole, out=np.zeros_like(hats), where=whole > 0)
+    mass[parted] = (cells[parted, None] @ hats)[:, 0]
+    return np.asarray(mass)
 
 
 def _added_thickness(kappa: float) -> float:
