@@ -42,8 +42,8 @@ from autdtorch.utils.process import spread
 from autdtorch.utils.progress import show_progress
 
 _CHUNK = 4096  # Interface elements assembled at a time
-# Depths below its surface [cells]: a body that contains points this deep is thick. Sound would pass through
-# thinner walls of finite elements, whose vertices can belong to both sides.
+# Depths below its surface [cells]: a body that contains points this deep is thick. Vertices inside a thinner
+# wall can be near both of its sides.
 _DEPTHS = np.array([1.0, 1.6, 2.2])
 # Deviation [cells] of a signed distance from a quadratic one at which a second face is near
 _ROUGH = 0.01

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.assembly.element import (
     PAIR_OF,
-    PAIRS,
     VERTICES,
     InterfaceElements,
     Materials,

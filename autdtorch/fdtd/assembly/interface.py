@@ -11,7 +11,8 @@ In an element of one material both are those of the tuned stencil. An interface 
 Finite elements have trilinear functions, integrated over the part that is no such body (a cut finite element
 method, Burman et al. 2015, doi:10.1002/nme.4823). Vertices in the body have a pressure, which continues the
 field beyond the surface. A pressure that varies linearly along the surface then causes no force at any
-vertex, wherever the surface falls between the cells. The difference of the tuned stencil from finite elements
+vertex, wherever the surface falls between the cells. In thin walls, vertices continue the field of one side
+(`thin_walls.py`). The difference of the tuned stencil from finite elements
 is added in proportion to the volume.
 
 `docs/numerics.md` compares this treatment with others.

@@ -18,6 +18,7 @@ from autdtorch.fdtd.assembly.element import CORNERS, FAR, SUBCELLS, subcell_grad
 from autdtorch.utils.array_types import Array, Index
 
 _OPPOSITE = -0.5  # Cosine of the angle between two faces below which they look opposite ways
+_LEAST = 1 / len(CORNERS)  # Sum of the shares of sub-cells in which a side has one point of the lattice
 _NEIGHBOURS = np.zeros((3,) * 4, bool)  # of points of the lattices of n elements: six, of the same element
 _NEIGHBOURS[1] = generate_binary_structure(3, 1)
 
@@ -58,7 +59,7 @@ def _sides(level: Array, normal: Array) -> Iterator[Side]:
         here = labels == first
         labels[here] = 0
         part = subcell_means(here.astype(float))
-        facing = (part[:, None] @ gradient)[:, 0] / np.maximum(part.sum(axis=1, keepdims=True), 1)
+        facing = (part[:, None] @ gradient)[:, 0] / np.maximum(part.sum(axis=1, keepdims=True), _LEAST)
         opposite = (normal * facing[:, None]).sum(axis=2) < _OPPOSITE
         share = np.divide(part, whole, out=np.zeros_like(part), where=whole > 0)
         yield Side(share, np.where(inside, opposite, ~here[:, CORNERS]))
