@@ -444,6 +444,8 @@ OTHERS: dict[str, Any] = {
     "animate3d.path": Made(lambda folder: folder / "wave.gif"),
     **{f"{name}.evaluations": 4 for name in ("bayes_opt", "bo_foci")},
     "calibrate.folds": 0,
+    "holography.iterations": 2,
+    "robust_drive.rounds": 1,
     "cell_centers.scene": AIR_ALONE,
     "Calibration.predict.drives": DRIVE,
     "Calibration.predict.points": None,
