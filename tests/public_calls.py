@@ -61,8 +61,8 @@ lock_log open_autd3 uvc_frames
 #: Methods that the driver calls, and that authors of methods implement.
 INSIDE_METHODS = """
 advance at begin by_poses by_waves check checked climbed coarser farthest for_scene forms forward
-images_around joined levels most_at_once most_evaluations near numbers_kept offsets recorded require_fit
-section slope together_on wanted worst_bound write_file
+images_around in_poses joined levels most_at_once most_evaluations near numbers_kept offsets recorded
+require_fit section slope some_poses together_on wanted worst_bound write_file
 """
 
 

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
 from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_basis, drive_signal, fourier_sum
-from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.array_types import REAL, Array, Index
 from autdtorch.utils.process import even_parts, spread
 
 Observe = Callable[[Tensor, Index], Sequence[Tensor]]
@@ -156,7 +156,7 @@ class Extrapolation:
         self._most, self._count = most, 0
         # The stored values (n, R, k), and of cells that decide the means the last value (R, m), its steps
         # (R, n - 1, m) and their products (R, n - 1, n - 1); the oldest are overwritten
-        self._values = self._last = self._steps = self._products = torch.empty(0, device="cpu")
+        self._values = self._last = self._steps = self._products = torch.empty(0, **REAL)
 
     def __len__(self) -> int:
         """Return the number of stored values."""

@@ -24,7 +24,7 @@ from autdtorch.hardware.transport.port import Port
 from autdtorch.scene.drive import amplitudes_of, phases_of
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.hints import renamed_keywords
-from autdtorch.utils.validation import complex_tensor, indices, integers
+from autdtorch.utils.validation import complex_tensor, indices, integers, require_callable
 
 _GET_DESCRIPTOR, _STRING, _ENGLISH = 0x06, 0x03, 0x0409
 _FROM_DEVICE, _STANDARD_FROM_DEVICE = 0x80, 0x80
@@ -320,6 +320,8 @@ class EmulatedBench:
 
     def port(self, show: Callable[[str], object] | None = None) -> Port:
         """Return a port without USB, which shows each frame as text if there is a function to."""
+        if show is not None:
+            require_callable("show", show)
         return BenchPort(self, show)
 
     def receive(self, frame: bytes) -> None:
