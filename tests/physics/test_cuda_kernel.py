@@ -37,7 +37,7 @@ RIGID = Box((3.4e-3, 4.5e-3, 4.5e-3), (2.2e-3, 5e-3, 4e-3), rigid=True)
 WALL = Box((4.5e-3, 4.5e-3, 7.3e-3), (30e-3, 30e-3, 1.2e-3), density=5.0, sound_speed=300.0)
 """Continues through the absorbing layers of x and y."""
 
-WHOLE = BlockSizes(x=32, y=32, z=32, lanes=1024)
+WHOLE = BlockSizes(x=32, y=32, z=32, rows=2, lanes=1024)
 """One program a task: interpreted, a program takes the same time however large it is."""
 
 BLOCKS = None if torch.cuda.is_available() else WHOLE
@@ -123,7 +123,9 @@ def test_programs_run_in_any_order(monkeypatch):
     )
     case = parts((RIGID, WALL), torch.float64)
     expected = advance(ReferenceKernel(), case, (1,))
-    assert_same(advance(CudaKernel(BlockSizes(x=16, y=16, z=8, lanes=256)), case, (1,)), expected, 1e-12)
+    assert_same(
+        advance(CudaKernel(BlockSizes(x=16, y=16, z=8, rows=4, lanes=256)), case, (1,)), expected, 1e-12
+    )
 
 
 def test_a_returned_state_stays_while_another_is_stepped():

@@ -44,15 +44,16 @@ class BlockSizes(NamedTuple):
     x: int = 16  # planes that a tile marches through
     y: int = 4  # rows of a tile
     z: int = 32  # cells of its rows, which are contiguous
+    rows: int = 2  # rows that a thread steps
     lanes: int = 16  # columns through a boundary layer
 
 
 def blocks_of(shape: Cells, runs: int) -> BlockSizes:
-    """Return the blocks for runs on a grid, by timings on an H100; `docs/decisions/kernels.md` has them."""
+    """Return the blocks for runs on a grid, by timings on an H200; `docs/decisions/kernels.md` has them."""
     nx, ny, nz = shape
-    if runs * nx * ny * nz > _MOST_CACHED:
-        return BlockSizes(32, 1, 256)
-    blocks = BlockSizes()
+    blocks = BlockSizes(32, 16, 32, 4)
+    if runs * nx * ny * nz <= _MOST_CACHED:
+        blocks = BlockSizes(16, 8, 32, 2)
     tiles = runs * triton.cdiv(ny, blocks.y) * triton.cdiv(nz, blocks.z)
     # a march takes its time however few programs there are
     while blocks.x > 1 and triton.cdiv(nx, blocks.x) * tiles < _FEWEST_PROGRAMS:
@@ -170,7 +171,7 @@ class DeviceRun:
         cuda_steps.sweep[(m.runs * (m.tiles + triton.cdiv(m.columns.size, blocks.lanes)),)](
             now, other, m.shape, m.weights, m.profile, old, new, m.terms, m.columns, m.crossed, m.tiles,
             m.runs, COLUMNS_WIDTH=len(m.columns.weight), X=blocks.x, Y=blocks.y, Z=blocks.z,
-            num_warps=blocks.y * blocks.z // 32, **sizes,
+            ROWS=blocks.rows, num_warps=max(1, blocks.y * blocks.z // (32 * blocks.rows)), **sizes,
         )  # fmt: skip
         cuda_steps.settle[(m.runs * triton.cdiv(driven.size, lanes),)](
             other, m.shape, m.heterogeneous, m.settled, driven, m.terms, m.columns, self.signal, m.runs,
@@ -320,7 +321,8 @@ def column_table(columns: Columns, crossing: Tensor, device: torch.device) -> Co
     index, offset, weight, crossing = (
         each.to(device).T.contiguous() for each in (columns.index, columns.offset, columns.weight, crossing)
     )
-    return ColumnTable(index.shape[1], index, offset, weight, crossing)
+    count = index.shape[1]
+    return ColumnTable(count, index, offset, weight if count else weight[:0], crossing)
 
 
 def settled_table(c: Coefficients, device: torch.device) -> Settled:

@@ -11,7 +11,7 @@ neighbours, as they read the same coefficients.
 """
 
 # The arguments are values of Triton's compiler, which has no types for them.
-# mypy: disable-error-code="no-untyped-def, untyped-decorator"
+# mypy: disable-error-code="assignment, no-untyped-def, untyped-decorator, var-annotated"
 
 from __future__ import annotations
 
@@ -255,86 +255,100 @@ def prepare(p, before, shape, weights, profile, old, new, terms, heterogeneous, 
 
 
 @triton.jit
-def _plane(p, i, shape, tile, weights, terms_y, terms_z, terms_yz, CELLS: tl.constexpr):
-    """Return the sums over a plane across x for its cells and for the planes beside it."""
+def _tile(low_y, low_z, shape, CELLS: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr,
+          ROWS: tl.constexpr):  # fmt: skip
+    """Return the first row of each thread of a tile, cells along z, and where they are in layers."""
     ny, nz = shape.ny, shape.nz
-    column, inside, near_y, near_z, in_y, in_z, place_y, place_z, place_yz = tile
-    center, face, edge, corner = weights
-    here = p + i * (tl.cast(ny, tl.int64) * nz) + column
-    below, above = here - nz, here + nz
-    middle = tl.load(here, mask=inside)
-    faces = tl.load(below, mask=inside) + tl.load(above, mask=inside)
-    faces += tl.load(here - 1, mask=inside) + tl.load(here + 1, mask=inside)
-    edges = tl.load(below - 1, mask=inside) + tl.load(below + 1, mask=inside)
-    edges += tl.load(above - 1, mask=inside) + tl.load(above + 1, mask=inside)
-    if near_z:
-        at = terms_z + i * ny * (2 * CELLS) + place_z
-        faces += tl.load(at, mask=in_z, other=0)
-        edges += tl.load(at - 2 * CELLS, mask=in_z, other=0) + tl.load(at + 2 * CELLS, mask=in_z, other=0)
-    if near_y:
-        at = terms_y + i * (2 * CELLS) * nz + place_y
-        faces += tl.load(at, mask=in_y, other=0)
-        edges += tl.load(at - 1, mask=in_y, other=0) + tl.load(at + 1, mask=in_y, other=0)
-    if near_y & near_z:
-        at = terms_yz + i * (2 * CELLS) * (2 * CELLS) + place_yz
-        edges += tl.load(at, mask=in_y & in_z, other=0)
-    return center * middle + face * faces + edge * edges, face * middle + edge * faces + corner * edges
+    j, k = low_y + ROWS * tl.arange(0, Y // ROWS)[:, None], low_z + tl.arange(0, Z)[None, :]
+    inside = (k >= 1) & (k < nz - 1)
+    near_y = (low_y <= CELLS) | (low_y + Y >= ny - CELLS)
+    near_z = (low_z <= CELLS) | (low_z + Z >= nz - CELLS)
+    in_z = inside & ((k <= CELLS) | (k >= nz - 1 - CELLS))
+    return j, k, inside, near_y, near_z, in_z, tl.where(k <= CELLS, k - 1, CELLS + nz - 2 - k)
 
 
 @triton.jit
-def _tile(low_y, low_z, shape, CELLS: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr):
-    """Return the cells of a tile: their places in a plane and in the layers' terms."""
+def _plane(p, i, shape, tile, weights, terms_y, terms_z, terms_yz, CELLS: tl.constexpr, ROWS: tl.constexpr):
+    """Return, for each of a thread's rows, the sums over plane i: for its cells, and for those beside it.
+
+    A thread loads each row once, for the sums of three rows.
+    """
     ny, nz = shape.ny, shape.nz
-    j, k = low_y + tl.arange(0, Y)[:, None], low_z + tl.arange(0, Z)[None, :]
-    inside = (j >= 1) & (j < ny - 1) & (k >= 1) & (k < nz - 1)
-    near_y = (low_y <= CELLS) | (low_y + Y >= ny - CELLS)
-    near_z = (low_z <= CELLS) | (low_z + Z >= nz - CELLS)
-    in_y = inside & ((j <= CELLS) | (j >= ny - 1 - CELLS))
-    in_z = inside & ((k <= CELLS) | (k >= nz - 1 - CELLS))
-    place_y = tl.where(j <= CELLS, j - 1, CELLS + ny - 2 - j)
-    place_z = tl.where(k <= CELLS, k - 1, CELLS + nz - 2 - k)
-    place_yz = place_y * (2 * CELLS) + place_z
-    place_y, place_z = place_y * nz + k, j * (2 * CELLS) + place_z
-    return j * nz + k, inside, near_y, near_z, in_y, in_z, place_y, place_z, place_yz
+    first, k, inside, near_y, near_z, in_z, place_z = tile
+    center, face, edge, corner = weights
+    plane = p + i * (tl.cast(ny, tl.int64) * nz)
+    middle, along = (
+        (),
+        (),
+    )  # a row's pressures, and the sum of their neighbours along z, with the layers' term
+    for row in tl.static_range(-1, ROWS + 1):
+        j = first + row
+        mask = inside & (j >= 0) & (j < ny)
+        at = plane + (j * nz + k)
+        both = tl.load(at - 1, mask=mask, other=0) + tl.load(at + 1, mask=mask, other=0)
+        if near_z:
+            at_z = terms_z + (i * ny + j) * (2 * CELLS) + place_z
+            both += tl.load(at_z, mask=mask & in_z, other=0)
+        middle += (tl.load(at, mask=mask, other=0),)
+        along += (both,)
+    levels, besides = (), ()
+    for row in tl.static_range(ROWS):
+        j = first + row
+        faces, edges = middle[row] + middle[row + 2] + along[row + 1], along[row] + along[row + 2]
+        if near_y:
+            in_y = (j >= 1) & (j < ny - 1) & ((j <= CELLS) | (j >= ny - 1 - CELLS))
+            place_y = i * (2 * CELLS) + tl.where(j <= CELLS, j - 1, CELLS + ny - 2 - j)
+            at_y, mask = terms_y + place_y * nz + k, inside & in_y
+            faces += tl.load(at_y, mask=mask, other=0)
+            edges += tl.load(at_y - 1, mask=mask, other=0) + tl.load(at_y + 1, mask=mask, other=0)
+            if near_z:
+                edges += tl.load(terms_yz + place_y * (2 * CELLS) + place_z, mask=mask & in_z, other=0)
+        levels += (center * middle[row + 1] + face * faces + edge * edges,)
+        besides += (face * middle[row + 1] + edge * faces + corner * edges,)
+    return levels, besides
 
 
 @triton.jit
 def _march(p, q, shape, weights, profile, old, new, terms_y, terms_z, terms_yz, program,
-           CELLS: tl.constexpr, X: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr):  # fmt: skip
+           CELLS: tl.constexpr, X: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr,
+           ROWS: tl.constexpr):  # fmt: skip
     """Step a tile of y and z through X planes along x; each plane is summed once."""
     nx, ny, nz = shape.nx, shape.ny, shape.nz
     tiles_y, tiles_z = tl.cdiv(ny, Y), tl.cdiv(nz, Z)
-    tile = _tile(program // tiles_z % tiles_y * Y, program % tiles_z * Z, shape, CELLS, Y, Z)
-    column, inside = tile[0], tile[1]
+    tile = _tile(program // tiles_z % tiles_y * Y, program % tiles_z * Z, shape, CELLS, Y, Z, ROWS)
+    first_row, k, inside_z = tile[0], tile[1], tile[2]
     sums = (
         tl.load(weights + CENTER), tl.load(weights + FACE), tl.load(weights + EDGE), tl.load(weights + CORNER)
     )  # fmt: skip
     keep = tl.load(weights + KEEP)
-    area = tl.cast(ny, tl.int64) * nz
+    area, q_area = ny * nz, tl.cast(ny, tl.int64) * nz
     first = 1 + program // (tiles_y * tiles_z) * X
-    _, behind = _plane(p, first - 1, shape, tile, sums, terms_y, terms_z, terms_yz, CELLS)
-    level, here = _plane(p, first, shape, tile, sums, terms_y, terms_z, terms_yz, CELLS)
+    _, behind = _plane(p, first - 1, shape, tile, sums, terms_y, terms_z, terms_yz, CELLS, ROWS)
+    level, here = _plane(p, first, shape, tile, sums, terms_y, terms_z, terms_yz, CELLS, ROWS)
     for i in range(first, tl.minimum(first + X, nx - 1)):
-        at = q + i * area + column
-        before = tl.load(at, mask=inside)
-        level_ahead, ahead = _plane(p, i + 1, shape, tile, sums, terms_y, terms_z, terms_yz, CELLS)
-        value = level + (behind + ahead) - keep * before
-        if i <= CELLS:
-            half = (i - 1) * area + column
-            value += _stretch(behind, here, ahead, old, new, half, half, area, profile, i, inside, CELLS)
-        elif i >= nx - 1 - CELLS:
-            depth = nx - 1 - i
-            cell = (CELLS + depth - 1) * area + column
-            half = cell + area
-            value += _stretch(ahead, here, behind, old, new, half, cell, area, profile, depth, inside, CELLS)
-        tl.store(at, value, mask=inside)
+        level_ahead, ahead = _plane(p, i + 1, shape, tile, sums, terms_y, terms_z, terms_yz, CELLS, ROWS)
+        for row in tl.static_range(ROWS):
+            j = first_row + row
+            column, inside = j * nz + k, inside_z & (j >= 1) & (j < ny - 1)
+            at = q + i * q_area + column
+            value = level[row] + (behind[row] + ahead[row]) - keep * tl.load(at, mask=inside, other=0)
+            if i <= CELLS:
+                half = (i - 1) * area + column
+                value += _stretch(behind[row], here[row], ahead[row], old, new, half, half, area, profile, i,
+                                  inside, CELLS)  # fmt: skip
+            elif i >= nx - 1 - CELLS:
+                depth = nx - 1 - i
+                cell = (CELLS + depth - 1) * area + column
+                value += _stretch(ahead[row], here[row], behind[row], old, new, cell + area, cell, area,
+                                  profile, depth, inside, CELLS)  # fmt: skip
+            tl.store(at, value, mask=inside)
         behind, here, level = here, ahead, level_ahead
 
 
 @triton.jit
 def sweep(p, q, shape, weights, profile, old, new, terms, columns, crossed, tiles, runs,
           COLUMNS_WIDTH: tl.constexpr, CELLS: tl.constexpr, DEPTHS: tl.constexpr, LANES: tl.constexpr,
-          X: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr):  # fmt: skip
+          X: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr, ROWS: tl.constexpr):  # fmt: skip
     """The 27-point sum with all layers, in place of the pressures before, and the columns."""
     program, run = _task(runs)
     p = _field(p, shape, run)
@@ -345,8 +359,8 @@ def sweep(p, q, shape, weights, profile, old, new, terms, columns, crossed, tile
         at_z = terms.z + run * (2 * shape.nx * shape.ny * CELLS)
         at_yz = terms.yz + run * (shape.nx * (2 * CELLS) * (2 * CELLS))
         _march(p, _field(q, shape, run), shape, weights, profile, old_x, new_x, at_y, at_z, at_yz, program,
-               CELLS, X, Y, Z)  # fmt: skip
-    else:
+               CELLS, X, Y, Z, ROWS)  # fmt: skip
+    elif COLUMNS_WIDTH > 0:
         size = columns.size
         old_columns, new_columns = (
             _layer(old.columns, size, run, CELLS),
