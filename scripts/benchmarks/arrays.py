@@ -55,7 +55,7 @@ def main(page: Page) -> None:
 def planes() -> Iterator[list[str]]:
     """Time a plane of points and of discs."""
     for name, radius in (("points", None), ("discs", TRANSDUCER_RADIUS)):
-        scene, preparing = shortest(lambda radius=radius: _scene((), radius), REPEATS)
+        scene, preparing = shortest(lambda radius=radius: scene_of((), radius), REPEATS)
         points = at.Plane((0.0, 0.0, 0.15), (1.0, 0.0, 0.0), (0.1, 0.1)).points(1e-3)
         drive, propagator = torch.ones(len(scene.array), dtype=torch.complex128), at.make_propagator(scene)
         propagator.field(drive, points[:2, :2])  # loads the kernels
@@ -65,7 +65,7 @@ def planes() -> Iterator[list[str]]:
 
 def disc_error(size: float) -> float:
     """Return the largest relative error of a disc of a size k a."""
-    scene = _scene((), None)
+    scene = scene_of((), None)
     wavelength = 2 * math.pi / scene.wavenumber
     radius = size / scene.wavenumber
     rng = np.random.default_rng(0)
@@ -95,10 +95,10 @@ def large_bodies() -> Iterator[list[str]]:
             ]
 
 
-def by_tolerance(body: tuple[str, float]) -> tuple[torch.Tensor, float, float, int, float]:
+def by_tolerance(case: tuple[str, float]) -> tuple[torch.Tensor, float, float, int, float]:
     """Return matrix, spacing [m], time [s], memory [byte] and claimed error of a body."""
-    at.make_propagator(_scene(_body("plate", 0.02)), "box").transfer_matrix()  # loads the kernels
-    scene = _scene(_body(*body))
+    at.make_propagator(scene_of(body("plate", 0.02)), "box").transfer_matrix()  # loads the kernels
+    scene = scene_of(body(*case))
 
     def work() -> tuple[torch.Tensor, float, float]:
         propagator = at.make_propagator(scene, spacing=None, tolerance=TOLERANCE, cache=False)
@@ -112,17 +112,19 @@ def by_tolerance(body: tuple[str, float]) -> tuple[torch.Tensor, float, float, i
 def on_a_grid(case: tuple[str, float, float]) -> torch.Tensor:
     """Return the matrix of a body with cells of a size [m]."""
     kind, side, spacing = case
-    return at.make_propagator(_scene(_body(kind, side)), "box", spacing, cache=False).transfer_matrix()
+    return at.make_propagator(scene_of(body(kind, side)), "box", spacing, cache=False).transfer_matrix()
 
 
-def _body(kind: str, side: float) -> Sequence[at.Box]:
+def body(kind: str, side: float) -> Sequence[at.Box]:
+    """Return a tilted rigid plate, or a cube beside the array's axis, with a side [m]."""
     if kind == "plate":
         return [at.Box((0.0, 0.0, 0.15), (side, side, THICKNESS), rigid=True, rotation=TILT)]
     reach = 0.7 * side  # of the tilted cube along each axis, at most
     return [at.Box((reach + ASIDE, 0.0, reach + ABOVE), (side, side, side), rigid=True, rotation=TILT)]
 
 
-def _scene(bodies: Sequence[at.Box], radius: float | None = TRANSDUCER_RADIUS) -> at.Scene:
+def scene_of(bodies: Sequence[at.Box], radius: float | None = TRANSDUCER_RADIUS) -> at.Scene:
+    """Return the scene of bodies, with transducers of a radius [m]."""
     array = at.TransducerArray.sonicsurface((0.0, 0.0, 0.0), UP, radius=radius)
     foci = at.circle_points((-20e-3, 0.0, 0.25), 20e-3, 4, UP, angle=0.3)
     return at.Scene(array, AIR, FREQUENCY, foci, bodies)

@@ -89,26 +89,27 @@ def cell_rate(
     coefficients: Coefficients,
     seconds: float,
     wait: Callable[[], None] = lambda: None,
+    together: int = 1,
 ) -> float:
     """Return the cells stepped per second, without sources and receivers; small grids side by side.
 
-    `wait` returns when the steps are done.
+    `wait` returns when the steps are done. A call steps runs `together`.
     """
-    runs = kernel.at_once(shape)
-    states = [uniform_state(shape, coefficients, 1e-20) for _ in range(runs)]
+    calls = kernel.at_once(shape)
+    states = [uniform_state(shape, coefficients, 1e-20, together) for _ in range(calls)]
     dtype = coefficients.layer_decay.dtype
-    sources = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((1, 0, 2)))
+    sources = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((together, 0, 2)))
     receivers = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=dtype))
 
     def step(times: int) -> None:
         nonlocal states
         signal = torch.zeros((times, 2), dtype=dtype)
         states = spread(
-            lambda state: kernel.advance(state, coefficients, sources, receivers, signal)[0], states, runs
+            lambda state: kernel.advance(state, coefficients, sources, receivers, signal)[0], states, calls
         )
         wait()
 
-    return fastest(step, float(runs * np.prod(shape)), seconds)
+    return fastest(step, float(calls * together * np.prod(shape)), seconds)
 
 
 def assemblies() -> dict[str, Assembly]:

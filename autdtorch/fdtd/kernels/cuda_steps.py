@@ -216,7 +216,7 @@ def _read(p, receivers, row, program, run, LANES: tl.constexpr):
     tl.store(receivers.recorded + tl.cast(row, tl.int64) * receivers.size + r, total, mask=mask)
 
 
-@triton.jit(do_not_specialize=["offset"])
+@triton.jit(do_not_specialize=["runs", "offset"])
 def prepare(p, before, shape, weights, profile, old, new, terms, heterogeneous, crossed, receivers, ends,
             runs, first, offset, LOSSY: tl.constexpr, CROSSED_WIDTH: tl.constexpr, CELLS: tl.constexpr,
             DEPTHS: tl.constexpr, LANES: tl.constexpr):  # fmt: skip
@@ -345,7 +345,7 @@ def _march(p, q, shape, weights, profile, old, new, terms_y, terms_z, terms_yz, 
         behind, here, level = here, ahead, level_ahead
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["tiles", "runs"])
 def sweep(p, q, shape, weights, profile, old, new, terms, columns, crossed, tiles, runs,
           COLUMNS_WIDTH: tl.constexpr, CELLS: tl.constexpr, DEPTHS: tl.constexpr, LANES: tl.constexpr,
           X: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr, ROWS: tl.constexpr):  # fmt: skip
@@ -374,7 +374,7 @@ def sweep(p, q, shape, weights, profile, old, new, terms, columns, crossed, tile
                          COLUMNS_WIDTH, True, CELLS, DEPTHS, LANES)  # fmt: skip
 
 
-@triton.jit(do_not_specialize=["offset"])
+@triton.jit(do_not_specialize=["runs", "offset"])
 def settle(q, shape, heterogeneous, settled, driven, terms, columns, signal, runs, first, offset,
            SHARES: tl.constexpr, SIGNALS: tl.constexpr, CELLS: tl.constexpr,
            LANES: tl.constexpr):  # fmt: skip
@@ -401,7 +401,7 @@ def settle(q, shape, heterogeneous, settled, driven, terms, columns, signal, run
     tl.store(at, tl.where(hard, 0, value), mask=mask)
 
 
-@triton.jit(do_not_specialize=["row"])
+@triton.jit(do_not_specialize=["runs", "row"])
 def read_last(p, shape, receivers, runs, row, LANES: tl.constexpr):
     """Read the receivers after the last step."""
     program, run = _task(runs)
