@@ -10,8 +10,8 @@ import autdtorch as at
 
 def main(dtype: str) -> None:
     """Simulate in a box and in free space, differentiate, run holography, let spheres scatter."""
-    scene = small_scene((CUBE,))
-    matrix = at.make_propagator(scene, "box", 2e-3, dtype=dtype, cache=False).transfer_matrix()
+    scene, rigid = small_scene((CUBE,)), small_scene((at.Sphere(CUBE.center, 3e-3, rigid=True),))
+    matrix = at.make_propagator(rigid, "box", 2e-3, dtype=dtype, cache=False).transfer_matrix()
     density = torch.tensor([CUBE.density], dtype=torch.float64, requires_grad=True)
     drive = torch.ones(4, dtype=torch.complex128)
     field = at.differentiable_field(scene, drive, density=density, spacing=2e-3, dtype=dtype)

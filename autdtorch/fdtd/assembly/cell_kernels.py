@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from autdtorch.fdtd.kernels.compiled import entry
 
 
@@ -17,28 +19,34 @@ def add_elements(first, last, cells, kind, tables, numbers, hard, coupling, sums
         cells: flat indices (n,).
         kind: of the element whose first vertex is a cell, of all cells.
         tables: coupling (k, 28) of the kinds, and two values of each vertex (k, 8).
-        numbers: offsets of the vertices (8,) and of the neighbours (27,) of a cell, the number of each pair
-            of vertices in the table (8, 8), and that of the neighbour at the second vertex of a pair (8, 8).
+        numbers: unsigned, offsets of the vertices (8,) and of the neighbours (27,) of a cell; of the pairs of
+            a vertex with the seven others the columns in the table and in a row (8, 7).
         hard: mask of the cells that are coupled to none.
         coupling: the rows.
         sums: the two values, and the sum of the magnitudes of a row (3, n).
     """
     (links, one, two), (vertices, neighbours, pair, place) = tables, numbers
+    total, values, before = np.zeros(27), np.zeros(2), np.full(8, -1, np.int32)
     for row in range(first, last):
-        cell, here = cells[row], coupling[row]
-        here[:] = 0.0
-        sums[:, row] = 0.0
+        cell, same = np.uint64(cells[row]), True
         for vertex in range(8):
-            element = kind[cell - vertices[vertex]]
-            for other in range(8):
-                if other != vertex:
-                    here[place[vertex, other]] += links[element, pair[vertex, other]]
-            sums[0, row] += one[element, vertex]
-            sums[1, row] += two[element, vertex]
+            here = kind[cell - vertices[vertex]]
+            same &= here == before[vertex]
+            before[vertex] = here
+        if not same:  # at flat faces most cells are as the one before
+            total[:], values[:] = 0.0, 0.0
+            for vertex in range(8):
+                element = np.uint64(before[vertex])
+                for other in range(7):
+                    total[place[vertex, other]] += links[element, pair[vertex, other]]
+                values[0] += one[element, vertex]
+                values[1] += two[element, vertex]
+        magnitude, closed = 0.0, hard[cell]
         for number in range(27):
-            if hard[cell] or hard[cell + neighbours[number]]:
-                here[number] = 0.0
-            sums[2, row] += abs(here[number])
+            link = 0.0 if closed or hard[cell + neighbours[number]] else total[number]
+            coupling[row, number] = link
+            magnitude += abs(link)
+        sums[0, row], sums[1, row], sums[2, row] = values[0], values[1], magnitude
 
 
 @entry(Path(__file__).parent)

@@ -79,7 +79,7 @@ class InterfaceElements(NamedTuple):
         """Return the elements of several parts in their order."""
         return cls(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
-    def chosen(self, some: Index) -> InterfaceElements:
+    def chosen(self, some: Index | slice) -> InterfaceElements:
         """Return some of the elements."""
         return self._replace(
             coupling=self.coupling[some],

@@ -160,6 +160,12 @@ def _cell_material(elements: Elements) -> NDArray[np.int16]:
     return np.pad(elements.material, ((1, 0),) * 3, mode="edge").ravel()
 
 
+_OTHERS = np.array([[other for other in range(8) if other != vertex] for vertex in range(8)])
+# Of a vertex and the seven others: numbers of the pairs, and numbers of the neighbours in `OFFSETS` (8, 7)
+_PAIR = np.take_along_axis(PAIR_OF, _OTHERS, axis=1)
+_NEIGHBOUR = (VERTICES[_OTHERS] - VERTICES[:, None] + 1) @ (9, 3, 1)
+
+
 class _Rows(NamedTuple):
     """Sums over the elements around n cells."""
 
@@ -194,13 +200,8 @@ class _ElementSums(NamedTuple):
         from autdtorch.fdtd.assembly.cell_kernels import add_elements  # loads numba
 
         shape = self.number.shape
-        places = VERTICES - VERTICES[:, None] + 1
-        numbers = (
-            VERTICES @ flat_strides(shape),
-            flat_offsets(shape),
-            PAIR_OF,
-            np.ravel_multi_index(tuple(np.moveaxis(places, -1, 0)), (3, 3, 3)),
-        )
+        vertices, neighbours = VERTICES @ flat_strides(shape), flat_offsets(shape)
+        numbers = tuple(each.astype(np.uint64) for each in (vertices, neighbours, _PAIR, _NEIGHBOUR))
         # numba compiles again for arrays with gaps
         tables = tuple(map(np.ascontiguousarray, (coupling, mass, least)))
         kind, rows, sums = self.number.ravel(), np.empty((len(cells), 27)), np.empty((3, len(cells)))
@@ -242,7 +243,7 @@ def _without_rigid(
         some = np.flatnonzero(out.any(axis=1))
         both = kind[some] << 8 | np.packbits(out[some], axis=1)[:, 0]
         _, first, other = np.unique(both, return_index=True, return_inverse=True)
-        less = condensed(every.chosen(kind[some[first]]), out[some[first]])
+        less = _all_condensed(every.chosen(kind[some[first]]), out[some[first]])
         number.ravel()[vertices[some, 0]] = len(least) + other
         needed = np.concatenate((least, _least_mass(less.coupling, largest)))
         sums = _ElementSums(number, InterfaceElements.joined([every, less]), needed)
@@ -264,6 +265,12 @@ def _uniform_elements(materials: Materials, stencil: Stencil) -> InterfaceElemen
 def _densest(elements: Elements) -> float:
     """Return the largest density, relative to air."""
     return float(elements.materials.density[~elements.materials.rigid].max())
+
+
+def _all_condensed(interface: InterfaceElements, out: NDArray[np.bool_]) -> InterfaceElements:
+    """Return `condensed` elements, computed in threads."""
+    parts = [slice(*ends) for ends in parts_of_size(len(out), _TOGETHER)]
+    return InterfaceElements.joined(spread(lambda part: condensed(interface.chosen(part), out[part]), parts))
 
 
 def condensed(interface: InterfaceElements, out: NDArray[np.bool_]) -> InterfaceElements:
