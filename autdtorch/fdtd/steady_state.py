@@ -41,7 +41,7 @@ _FEWEST_PHASORS, _MOST_PHASORS = 12, 64
 _MOST_NUMBERS = 20_000_000  # Most complex numbers of the stored phasors: 160 MB of single precision
 _MOST_FITTED = 2048  # Most cells whose phasors decide the means
 # Numbers of stored phasors that are summed at once: as many as the CPU's cache holds, and for a GPU more
-_SUMMED, _SUMMED_ON_GPU = 2**16, 2**24
+_SUMMED, _SUMMED_ON_GPU = 2**15, 2**24
 _ROUNDING = 1e-13  # Regularisation of the normal equations, relative to the mean square of the differences
 # Pressure relative to that in free space, -80 dB, below which errors are relative to this floor: behind a
 # wall or in an enclosure nothing arrives
