@@ -35,12 +35,12 @@ class BoxRun:
         self.assembly = assembly = assemble_on(make_box(region, spacing), region, torch.float32, None)
         self.box = box = ScatteredField(assembly, complex(WAVENUMBER), np.eye(3))
         self.source = Apertures.of_points(torch.from_numpy(SOURCE[None]))
-        force = box.driving(self.source, torch.ones(1, dtype=torch.complex128))
+        force = box.driving([(self.source, torch.ones(1, dtype=torch.complex128))])
         self.transform = box.near_to_far(Apertures.of_points(torch.from_numpy(sphere(0.03))))
         self.cells = np.unique(np.concatenate((self.transform.cells, extra(assembly))))
         place = torch.from_numpy(np.searchsorted(self.cells, self.transform.cells))
         (state,) = run_to_steady_state(
-            assembly, CpuKernel(), lambda runs: box.sources(force[:, None]), self.cells, [1e-5], 200,
+            assembly, CpuKernel(), lambda runs: box.sources(force), self.cells, [1e-5], 200,
             lambda phasors, runs: [self.transform.field(phasors[place])], lambda periods: None,
             torch.zeros((1, 1), dtype=torch.float64),
         )  # fmt: skip

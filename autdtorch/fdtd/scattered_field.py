@@ -42,6 +42,7 @@ from autdtorch.utils.spatial import distinct_cells, places_among
 # point.
 _BESIDE = 1.25
 _TOGETHER = 16  # Targets whose waves are computed at once
+_NUMBERS = 2**19  # Numbers of incident fields whose forces are computed together
 _ROWS = 8192  # Stencil rows that are looked at together, which stay in the cache
 _FEWER = 0.7  # Most nodes of the Huygens surface that are worth their errors, relative to its cells
 
@@ -67,26 +68,29 @@ class ScatteredField:
         """Positions (n, 3) [m] where the incident field is needed: heterogeneous cells and neighbours."""
         return self.positions(self._driven[0])
 
-    def forces(self, field: Tensor) -> Tensor:
-        """Return the forces (h,) on heterogeneous cells of an incident field (n,) at `driven` positions."""
-        assembly, incident, around = self.assembly, field.numpy(), self._driven[1]
+    def forces(self, fields: Tensor) -> Tensor:
+        """Return forces (h, R) on heterogeneous cells of incident fields (n, R) at `driven` positions."""
+        assembly, around = self.assembly, self._driven[1]
         factor = assembly.coefficients.face / assembly.stencil.face
-        force = np.zeros(len(around), np.complex128)
+        values = torch.view_as_real(fields.contiguous()).flatten(1).numpy()
+        force = np.empty((len(around), values.shape[1]))
 
         def add(ends: tuple[int, int]) -> None:
-            pressure = incident[around[(rows := slice(*ends))]]
-            weight = assembly.heterogeneous.weight[rows] - assembly.stencil.weights
-            force[rows] = factor * (weight * (pressure - pressure[:, 13, None])).sum(axis=1)
+            rows = slice(*ends)
+            weight = factor * (assembly.heterogeneous.weight[rows] - assembly.stencil.weights)
+            weight[:, 13] -= weight.sum(axis=1)  # they are of differences from the cell itself
+            force[rows] = _rows(weight, around[rows], len(values)) @ values
 
         spread(add, parts_of_size(len(around), _ROWS))
+        total = torch.view_as_complex(torch.from_numpy(force).reshape(len(around), fields.shape[1], 2))
         if len(lossy := assembly.coefficients.loss_index):
             place = np.searchsorted(assembly.heterogeneous.index, lossy.numpy())
-            pressure = incident[around[place]]
             change = 1 - np.exp(2j * np.pi / float(assembly.steps_per_period))  # over a step, of a phasor
             loss, ground = assembly.coefficients.loss_weight, assembly.coefficients.loss_ground
-            force[place] += change * (loss.double().numpy() * pressure).sum(axis=1)
-            force[place] -= ground.double().numpy() * pressure[:, 13]
-        return torch.from_numpy(force)
+            matrix = _rows(loss.double().numpy(), around[place], len(values))
+            total[place] += change * torch.from_numpy(matrix @ fields.numpy())
+            total[place] -= ground.double()[:, None] * fields[around[place, 13]]
+        return total
 
     def sources(self, force: Tensor) -> Sources:
         """Return complex forces (h, R) at the heterogeneous cells of R runs as kernels take them."""
@@ -117,21 +121,29 @@ class ScatteredField:
         """Return the incident field (P,) at points (P, 3) [m] of sources with strengths (N,) [Pa m]."""
         return self.waves(points, sources.places, strength[:, None])[:, 0]
 
-    def driving(self, sources: Apertures, strength: Tensor) -> Tensor:
-        """Return the forces (h,) of the incident field of sources with strengths (N,) [Pa m]."""
-        driven, near = self.driven, self._in_box(sources)
-        field = self.incident(driven, sources.chosen(~near), strength[~near])
-        if not near.any():
-            return self.forces(field)
-        on_grid, more = self._driving_on_grid(sources.chosen(near), strength[near], driven)
-        return self.forces(field + on_grid) + more
+    def driving(self, drives: Sequence[tuple[Apertures, Tensor]]) -> Tensor:
+        """Return forces (h, R) of the incident fields of R drives, sources and strengths (N,) [Pa m]."""
+        ends = parts_of_size(len(drives), max(1, _NUMBERS // max(1, len(self.driven))))
+        return torch.cat(spread(self._driving, [drives[slice(*each)] for each in ends]), dim=1)
 
-    def _driving_on_grid(self, sources: Apertures, strength: Tensor, driven: Tensor) -> tuple[Tensor, Tensor]:
+    def _driving(self, drives: Sequence[tuple[Apertures, Tensor]]) -> Tensor:
+        fields, further = (
+            torch.zeros((count, len(drives)), **COMPLEX) for count in (len(self.driven), len(self._driven[1]))
+        )
+        for run, (sources, strength) in enumerate(drives):
+            near = self._in_box(sources)
+            fields[:, run] = self.incident(self.driven, sources.chosen(~near), strength[~near])
+            if near.any():
+                on_grid, further[:, run] = self._driving_on_grid(sources.chosen(near), strength[near])
+                fields[:, run] += on_grid
+        return self.forces(fields) + further
+
+    def _driving_on_grid(self, sources: Apertures, strength: Tensor) -> tuple[Tensor, Tensor]:
         """Return the incident field (n,) of sources in the box, and forces (h,) beyond those it causes.
 
         Nodes in the box are spread over cells. Those of another mass than air's take another force.
         """
-        grid, cells = self.assembly.grid, self.assembly.heterogeneous
+        grid, cells, driven = self.assembly.grid, self.assembly.heterogeneous, self.driven
         nodes, shares = sources.positions, strength[:, None] * sources.weights
         inside = self.inside(nodes)
         kernels = self.assembly.interpolation(self._on_axes(nodes[inside]))
@@ -290,6 +302,12 @@ class ScatteredField:
         place = places_among(cells, chi.size)[read]
         outward = csr_array((value, place, first_of_row), (len(index), len(cells)))
         return self.positions(index), cells, outward
+
+
+def _rows(weight: Array, place: NDArray[np.int32], count: int) -> csr_array:
+    """Return the matrix (h, count) of stencil rows (h, 27), of cells by their place (h, 27)."""
+    first_of_row = np.arange(0, weight.size + 1, weight.shape[1], dtype=place.dtype)
+    return csr_array((weight.ravel(), place.ravel(), first_of_row), (len(weight), count))
 
 
 def _chosen(points: Tensor | Discs, mask: Tensor) -> Tensor | Discs:

@@ -49,7 +49,7 @@ from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL, Index
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.images import Image, Mirror
-from autdtorch.utils.process import cached_property, one_library_thread, spread
+from autdtorch.utils.process import cached_property, one_library_thread
 
 logger = logging.getLogger(__name__)
 
@@ -277,7 +277,7 @@ class BoxSimulation(Simulation):
             for box, transform in zip(self.boxes, transforms, strict=True)
         ]
         begin, count, tolerance = time.perf_counter(), len(drives), self.plan.tolerance
-        driving = [body.driving(drives) for body in bodies]
+        driving = [box.driving(drives) for box in self.boxes]
         if len(bodies) == 1 and not bodies[0].comes_back_later:
             states = bodies[0].answers(driving[0], [tolerance] * count, observed, least)
         else:
@@ -322,10 +322,6 @@ class _Scatterer:
         """True if mirrors send back an incident field of a further run."""
         return self.echo is not None and bool(self.echo.rest)
 
-    def driving(self, drives: Sequence[tuple[Apertures, torch.Tensor]]) -> torch.Tensor:
-        """Return the forces (h, R) of the incident fields of R drives, sources and their strengths."""
-        return torch.stack(spread(lambda drive: self.transform.box.driving(*drive), drives), dim=1)
-
     def answers(
         self,
         incoming: torch.Tensor,
@@ -346,8 +342,8 @@ class _Scatterer:
 
         def echoed(phasors: torch.Tensor, runs: Index) -> Sources:
             assert self.echo
-            back = spread(box.forces, self.echo.field(self.outgoing(phasors)).mT)
-            return box.sources(incoming[:, loud[runs]] + torch.stack(back, dim=1))
+            back = self.echo.field(self.outgoing(phasors))
+            return box.sources(incoming[:, loud[runs]] + box.forces(back))
 
         def observed(phasors: torch.Tensor, runs: Index) -> Sequence[torch.Tensor]:
             return observe(phasors, loud[runs]) if observe else [self.outgoing(phasors.cpu())]
@@ -381,7 +377,7 @@ class _Scatterer:
             field = coupling.field(outgoing)
             if coupling.rest:
                 field = field + box.radiated(outgoing, here.driven, coupling.rest)
-        return torch.stack([here.forces(each) for each in field.mT], dim=1)
+        return here.forces(field)
 
 
 def _images(box: ScatteredField, symmetry: Symmetry) -> Index:

@@ -247,8 +247,8 @@ class BodyWaves:
 
         def drive(runs: Index) -> Sources:
             waves = (self.runs[run] for run in runs)
-            fields = ((incoming[:, some] / size[some]).sum(dim=1) for some in waves)
-            return box.sources(torch.stack([box.forces(field) for field in fields], dim=1))
+            fields = [(incoming[:, some] / size[some]).sum(dim=1) for some in waves]
+            return box.sources(box.forces(torch.stack(fields, dim=1)))
 
         count = len(self.runs)
         periods = math.ceil(count * USUAL_PERIODS * fewest_periods(box.assembly.grid.arrival))
