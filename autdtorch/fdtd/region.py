@@ -21,6 +21,7 @@ from autdtorch.fdtd.turning import FlatFaces, flat_faces, slender_faces
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.images import Image, Mirror, images_of
 from autdtorch.utils.process import cached_property
+from autdtorch.utils.spatial import volume_and_area
 from autdtorch.utils.validation import LENGTH_TOLERANCE, Vector, invalid, positive
 
 logger = logging.getLogger(__name__)
@@ -120,6 +121,14 @@ class Region:
     def shortest_wavelength(self) -> float:
         """Wavelength [m] where sound is slowest."""
         return min(self.sound_speeds.values()) / self.frequency
+
+    @cached_property
+    def mean_thickness(self) -> float:
+        """Twice the volume of all bodies that end over their area [m]; infinite without such bodies."""
+        surfaces = [body.shape.surface() for body in self.bodies if not body.continued]
+        parts = [volume_and_area(vertices.numpy(), triangles.numpy()) for vertices, triangles in surfaces]
+        volume, area = np.array(parts).reshape(-1, 2).sum(axis=0).tolist()
+        return 2 * volume / area if area else math.inf
 
     @property
     def unbounded(self) -> Self:

@@ -134,7 +134,9 @@ class Plan:
     @property
     def law(self) -> Law:
         """The growth of its errors with the spacing."""
-        return Law(self.region.shortest_wavelength, self.grouping.aligned)
+        region = self.region
+        aligned = self.grouping.aligned
+        return Law(region.shortest_wavelength, aligned, region.wavelength, region.mean_thickness)
 
     @property
     def on_grids(self) -> Self:

@@ -110,11 +110,16 @@ def paired_sides(triangles: Index) -> Index:
     return np.asarray(order[np.repeat(count == 2, count)].reshape(-1, 2))
 
 
+def volume_and_area(vertices: Array, triangles: Index) -> tuple[float, float]:
+    """Return volume and area of a closed surface, vertices (V, 3), triangles (T, 3)."""
+    corners = vertices[triangles] - vertices.mean(axis=0)
+    return float(abs(np.linalg.det(corners).sum() / 6)), float(areas_of(corners).sum())
+
+
 def mean_thickness(vertices: Array, triangles: Index) -> float:
     """Return twice the volume over the area of a closed surface, vertices (V, 3), triangles (T, 3)."""
-    corners = vertices[triangles] - vertices.mean(axis=0)
-    area = areas_of(corners).sum()
-    return float(2 * abs(np.linalg.det(corners).sum() / 6) / area)
+    volume, area = volume_and_area(vertices, triangles)
+    return 2 * volume / area
 
 
 def extents(vertices: Array) -> Array:
