@@ -33,8 +33,8 @@ class Blocks(NamedTuple):
 def blocks_of(index: Index, rows: AnyArray) -> Blocks:
     """Return the blocks of cells with flat indices (N,), ascending, and weights (N, 27).
 
-    At flat faces few blocks are distinct. A block reaches no further than the last cell, so that neighbours
-    of its cells are inside the grid.
+    At flat faces few blocks are distinct. A block reaches no further than the last cell, and begins fewer
+    than `BLOCK` cells before the first one, so that its neighbours are inside any grid with layers.
     """
     starts = np.diff(index, prepend=-2) != 1
     along = np.arange(len(index)) - np.flatnonzero(starts)[np.cumsum(starts) - 1]
