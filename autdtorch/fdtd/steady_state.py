@@ -241,7 +241,7 @@ class WindowedRuns:
         ones = torch.ones((len(cells), 1), dtype=assembly.dtype, device="cpu")
         self._receivers = Receivers(torch.from_numpy(cells[:, None]), ones)
         self._nothing = Receivers(self._receivers.index[:0], ones[:0])
-        self._state, self._basis = assembly.silence(sources), drive_basis(self._steps, periods)
+        self._state, self._basis = assembly.silence(sources, kernel.device), drive_basis(self._steps, periods)
         self._time = 0
         # Fourier sums (R, k) from the first recorded step, until now and to where windows begin and end
         self._total: Any = 0.0

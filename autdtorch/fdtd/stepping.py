@@ -25,7 +25,7 @@ from autdtorch.fdtd.interpolation import (
     exclude_cells,
     interpolate_points,
 )
-from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, WaveState, uniform_state
+from autdtorch.fdtd.kernels.contract import CPU, Coefficients, Receivers, Sources, WaveState, uniform_state
 from autdtorch.fdtd.perfectly_matched_layer import layer_columns, tuned_profile
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.shapes import Shape, distance_from, sees
@@ -70,10 +70,10 @@ class Assembly:
         """Precision of the fields."""
         return self.coefficients.heterogeneous_weight.dtype
 
-    def silence(self, sources: Sources) -> WaveState:
-        """Return the state of all runs before the drive is switched on."""
+    def silence(self, sources: Sources, device: torch.device = CPU) -> WaveState:
+        """Return the state of all runs, on a device, before the drive is switched on."""
         faint = _BACKGROUND * float(sources.force.detach().abs().max())
-        return uniform_state(self.grid.shape, self.coefficients, faint, len(sources.force))
+        return uniform_state(self.grid.shape, self.coefficients, faint, len(sources.force), device)
 
     def interpolation(self, points: Tensor, weights: Tensor = _ONE_NODE) -> Interpolation:
         """Return cells and weights of points (P, 3) [m], or of nodes (P, n, 3) with `weights` (n,)."""

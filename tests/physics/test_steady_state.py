@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from emulated_gpu import gpu
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import CUBE, assembled_parts, relative_error, small_scene
 
 from autdtorch import Box, Reflector, make_propagator
-from autdtorch.fdtd.kernels.contract import Sources
+from autdtorch.fdtd.kernels.contract import CPU, Layer, Memory, Sources, WaveState
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.steady_state import Extrapolation, run_to_steady_state
 from autdtorch.propagators.store import BODIES
@@ -57,21 +58,38 @@ class Kernel(CpuKernel):
         return super().advance(state, *arguments)
 
 
-@pytest.mark.parametrize("most_periods", [200, 10])
-def test_runs_together_end_each_at_its_time(most_periods):
+class KernelOfGpu(Kernel):
+    """Its states and records are on the GPU, as those of the kernel for GPUs."""
+
+    device = torch.device("cuda", 0)
+
+    def advance(self, state, *arguments):
+        state, recorded = super().advance(moved(state, CPU), *arguments)
+        return moved(state, self.device), recorded.to(self.device)
+
+
+def moved(state, device):
+    memory = Memory(*(Layer(*(part.to(device) for part in layer)) for layer in state.memory))
+    return WaveState(state.now.to(device), state.before.to(device), memory)
+
+
+def states_of_five_runs(kernel, most_periods):
+    """Runs of different forces and tolerances."""
     assembly, sources, receivers = assembled_parts(small_scene((CUBE,)), 2e-3, torch.float64)
     cells, tolerances = np.unique(receivers.index), [1e-2, 1e-6, 1e-2, 1e-4, 1e-9]
     random = torch.Generator().manual_seed(1)
     forces = sources.force * torch.randn((5, len(sources.index), 1), generator=random, dtype=torch.float64)
+    return run_to_steady_state(
+        assembly, kernel, lambda runs: Sources(sources.index, forces[runs]), cells, tolerances,
+        most_periods, lambda phasors, runs: [phasors], lambda periods: None, torch.zeros((1, 5)),
+    )  # fmt: skip
 
-    def states(kernel):
-        return run_to_steady_state(
-            assembly, kernel, lambda runs: Sources(sources.index, forces[runs]), cells, tolerances,
-            most_periods, lambda phasors, runs: [phasors], lambda periods: None, torch.zeros((1, 5)),
-        )  # fmt: skip
 
+@pytest.mark.parametrize("most_periods", [200, 10])
+def test_runs_together_end_each_at_its_time(most_periods):
     together, alone = Kernel(5), Kernel(1)
-    for state, single in zip(states(together), states(alone), strict=True):
+    states, singles = (states_of_five_runs(kernel, most_periods) for kernel in (together, alone))
+    for state, single in zip(states, singles, strict=True):
         assert (state.periods, state.converged) == (single.periods, single.converged)
         # rounding, which the extrapolation of small differences magnifies
         assert relative_error(state.pressure, single.pressure) < 1e-10
@@ -80,6 +98,17 @@ def test_runs_together_end_each_at_its_time(most_periods):
     assert sum(together.stepped) <= 2 * sum(alone.stepped)  # at most half of those stepped have converged
     if most_periods == 200:
         assert together.stepped[-1] < 5
+
+
+def test_phasors_stay_on_the_gpu_of_the_record():
+    """Without a GPU on tensors that refuse to meet those of the CPU."""
+    with gpu():
+        states = states_of_five_runs(KernelOfGpu(5), 30)
+    for state, single in zip(states, states_of_five_runs(Kernel(5), 30), strict=True):
+        assert state.pressure.device == CPU
+        assert (state.periods, state.converged) == (single.periods, single.converged)
+        # rounding, as sums have other parts
+        assert relative_error(state.pressure, single.pressure) < 1e-10
 
 
 PLATE = Box((12e-3, 12e-3, 12e-3), (4e-3, 9e-3, 3e-3), rigid=True, rotation=(0.3, 0.2, 0.1))

@@ -126,14 +126,23 @@ class WaveState:
         return WaveState(self.now[runs], self.before[runs], Memory(*memory))
 
 
+CPU = torch.device("cpu")
+
+
 def uniform_state(
-    shape: tuple[int, int, int], coefficients: Coefficients, pressure: float, runs: int = 1
+    shape: tuple[int, int, int],
+    coefficients: Coefficients,
+    pressure: float,
+    runs: int = 1,
+    device: torch.device = CPU,
 ) -> WaveState:
     """Return the state of rest, in all runs at a uniform pressure, on a grid of `shape`."""
     c, cells = coefficients, coefficients.layer_cells
 
     def zeros(*size: int) -> Tensor:
-        """Return zeros in large pages, which NumPy asks the system for, unlike PyTorch."""
+        """Return zeros, in large pages of the CPU, which NumPy asks the system for, unlike PyTorch."""
+        if device != CPU:
+            return torch.zeros((runs, *size), dtype=c.layer_decay.dtype, device=device)
         numbers = np.empty((runs, *size), c.layer_decay.numpy().dtype)
         numbers.fill(0)
         return torch.from_numpy(numbers)
@@ -173,6 +182,9 @@ class Receivers:
 
 class Kernel(Protocol):
     """Advances the states of runs by whole steps."""
+
+    device: torch.device
+    """Where states are between calls; those on another are copied."""
 
     def at_once(self, shape: tuple[int, int, int]) -> int:
         """Return the number of calls on a grid of `shape` that threads may make concurrently."""

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from autdtorch.fdtd.kernels.blocks import BLOCK, Blocks
 from autdtorch.fdtd.kernels.compiled import INNER, entry, meanwhile
 from autdtorch.fdtd.kernels.contract import (
+    CPU,
     Coefficients,
     Columns,
     Receivers,
@@ -331,6 +332,8 @@ def _unsigned(index: torch.Tensor) -> AnyArray:
 
 class CpuKernel:
     """Kernel on the CPU, which updates the state in place; see `kernels.contract`."""
+
+    device = CPU
 
     def __init__(self) -> None:
         """Assume free processors at first."""

@@ -188,7 +188,7 @@ class CudaKernel:
         interpreted = triton.knobs.runtime.interpret
         if not interpreted and not torch.cuda.is_available():
             raise invalid("kernel", "cuda", no_cuda())
-        self._device = torch.device("cpu" if interpreted else "cuda")
+        self.device = torch.device("cpu" if interpreted else "cuda")
         self._blocks = blocks
         self._medium: DeviceMedium | None = None
         self._run: DeviceRun | None = None
@@ -201,7 +201,7 @@ class CudaKernel:
         """Return as many as fit half of the free memory, at most enough to occupy the device."""
         cells = math.prod(shape)
         most = max(1, min(_MOST_RUNS, _MOST_CELLS // cells))
-        if self._device.type == "cpu":
+        if self.device.type == "cpu":
             return most
         numbers = _FIELD_NUMBERS * cells + _RECORD_NUMBERS * receivers
         free, _ = torch.cuda.mem_get_info()
@@ -217,7 +217,7 @@ class CudaKernel:
         if medium is None or medium.coefficients is not c or (medium.shape, medium.runs) != (shape, runs):
             self._run = run = None
             blocks = self._blocks or blocks_of(shape, runs)
-            self._medium = medium = DeviceMedium(c, shape, runs, blocks, self._device)
+            self._medium = medium = DeviceMedium(c, shape, runs, blocks, self.device)
         if (
             run is None or run.state is not state or run.sources is not sources
             or run.receivers is not receivers or len(run.signal) != len(signal)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from autdtorch.fdtd.kernels.contract import (
+    CPU,
     Coefficients,
     Columns,
     Layer,
@@ -31,6 +32,8 @@ def middle(field: Tensor, axis: int) -> Tensor:
 
 class ReferenceKernel:
     """One torch expression per line of the contract, none of them in place."""
+
+    device = CPU
 
     def at_once(self, shape: tuple[int, int, int]) -> int:
         """Return 1: this kernel is not meant to be fast."""
