@@ -31,8 +31,9 @@ def gpu() -> Iterator[Callable[[torch.Tensor], torch.Tensor]]:
         device, *others = parsed(*args, **kwargs)
         return GPU if any(map(_on_gpu, args)) else device, *others
 
-    ready = patch("torch.cuda._lazy_init", lambda: None)
-    with ready, patch("torch._C._nn._parse_to", of_module), Emulation():
+    ready = patch("torch.cuda._lazy_init", lambda: None), patch("torch._C._nn._parse_to", of_module)
+    no_triton = patch("autdtorch.fdtd.kernels.waves.find_spec", lambda name: None)
+    with ready[0], ready[1], no_triton, Emulation():
         yield _Up.apply
 
 

@@ -52,7 +52,7 @@ def waves_of(points: torch.Tensor, sources: torch.Tensor | Discs, wavenumber: co
     if not near.all():
         far = _series(between[~near], normals[~near], place[~near.cpu()], series, wavenumber)
         waves = waves.index_put((~near,), far)
-    return waves.index_put((near,), _along_rim(between[near], normals[near], radius[near], wavenumber))
+    return waves.index_put((near,), along_rim(between[near], normals[near], radius[near], wavenumber))
 
 
 def _wave(r: torch.Tensor, wavenumber: complex) -> torch.Tensor:
@@ -81,7 +81,7 @@ def _series(
     return total * _wave(r, wavenumber)
 
 
-def _along_rim(
+def along_rim(
     between: torch.Tensor, normals: torch.Tensor, radius: torch.Tensor, wavenumber: complex
 ) -> torch.Tensor:
     """Return the integral (Q,) along the rim at places (Q, 3) from the centre.
@@ -113,7 +113,7 @@ def _by_nodes(
     count: int,
     wavenumber: complex,
 ) -> torch.Tensor:
-    """Return the integral of `_along_rim` by so many nodes, which stand still in derivatives."""
+    """Return the integral of `along_rim` by so many nodes, which stand still in derivatives."""
     along = (between * normals).sum(dim=-1, keepdim=True)
     aside = between - along * normals
     across = torch.linalg.cross(normals, torch.eye(3, **REAL).to(normals)[normals.abs().argmin(dim=1)])

@@ -8,8 +8,13 @@ from collections.abc import Sequence
 
 import torch
 
-from autdtorch.analytic.discs import waves_of
-from autdtorch.fdtd.kernels.waves import AT_ONCE, WORTH_A_GPU, superposition_on
+from autdtorch.fdtd.kernels.waves import (
+    AT_ONCE,
+    WORTH_A_GPU,
+    is_differentiated,
+    superposition_on,
+    waves_on_device,
+)
 from autdtorch.propagators.absorbed_power import AbsorbedPower, power_into_reflectors, radiators_of_array
 from autdtorch.propagators.propagator import ScenePropagator
 from autdtorch.scene.arrays import TransducerArray, apertures_of, complex_strengths_of
@@ -48,7 +53,7 @@ def free_space_matrix(
     require_memory("points", tuple(points.shape), PAIR_BYTES * len(points) * len(array))
     transducers, amplitude = _sources_of(array, images)
     count = len(array)
-    if len(points) * len(amplitude) > _FEW and points.device.type == "cpu" and not _is_differentiated(points):
+    if len(points) * len(amplitude) > _FEW and points.device.type == "cpu" and not is_differentiated(points):
         from autdtorch.fdtd.kernels.cpu_waves import wave_matrix  # loads numba
 
         return wave_matrix(points.detach(), transducers.places, amplitude, count, wavenumber)
@@ -57,7 +62,7 @@ def free_space_matrix(
         matrix = torch.zeros((), **COMPLEX).to(points.device)
         for first in range(0, len(amplitude), count):  # image by image, with memory for one
             part = slice(first, first + count)
-            waves = waves_of(some, transducers.chosen(part).places, complex(wavenumber))
+            waves = waves_on_device(some, transducers.chosen(part).places, wavenumber)
             matrix = matrix + amplitude[part].to(points.device) * waves
         return matrix
 
@@ -68,12 +73,6 @@ def _sources_of(array: TransducerArray, images: Sequence[Image]) -> tuple[Apertu
     """Return all images of an array's transducers, one image after the other, and amplitudes [Pa m]."""
     transducers, weights = apertures_of(array).with_images(images)
     return transducers, weights * complex_strengths_of(array).repeat(len(weights) // len(array))
-
-
-def _is_differentiated(points: torch.Tensor) -> bool:
-    """Return whether derivatives by the points may be asked for, backward or forward."""
-    forward = torch.autograd.forward_ad.unpack_dual(points).tangent is not None  # type: ignore[no-untyped-call]
-    return points.requires_grad or forward or torch._C._functorch.is_functorch_wrapped_tensor(points)
 
 
 class FreeSpacePropagator(ScenePropagator):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import torch
 from torch import Tensor
 
@@ -41,7 +43,7 @@ def superposition_on(
     amplitude: Tensor,
     wavenumber: complex,
 ) -> Tensor:
-    """Return the fields (P, R) on a device by PyTorch, a few points at a time; differentiable.
+    """Return the fields (P, R) on a device, a few points at a time; differentiable.
 
     There is a point and a source at least; either may be discs.
     """
@@ -51,11 +53,26 @@ def superposition_on(
         some = slice(first, first + rows)
         if isinstance(points, Discs):  # reciprocity
             discs = _moved(Discs(*(part[some] for part in points)), device)
-            waves = waves_of(centers_of(sources), discs, complex(wavenumber)).mT
+            waves = waves_on_device(centers_of(sources), discs, wavenumber).mT
         else:
-            waves = waves_of(points[some].to(device), sources, complex(wavenumber))
+            waves = waves_on_device(points[some].to(device), sources, wavenumber)
         parts.append(waves @ amplitude)
     return torch.cat(parts)
+
+
+def waves_on_device(points: Tensor, sources: Tensor | Discs, wavenumber: complex) -> Tensor:
+    """Return the waves (P, N) at points (P, 3) [m] on their device; see `waves_of`."""
+    if points.is_cuda and find_spec("triton") is not None and not is_differentiated(points):
+        from autdtorch.fdtd.kernels.cuda_waves import waves_on_gpu
+
+        return waves_on_gpu(points, sources, complex(wavenumber))
+    return waves_of(points, sources, complex(wavenumber))
+
+
+def is_differentiated(points: Tensor) -> bool:
+    """Return whether derivatives by the points may be asked for, backward or forward."""
+    forward = torch.autograd.forward_ad.unpack_dual(points).tangent is not None  # type: ignore[no-untyped-call]
+    return points.requires_grad or forward or torch._C._functorch.is_functorch_wrapped_tensor(points)
 
 
 def _moved(places: Tensor | Discs, device: torch.device | str) -> Tensor | Discs:
