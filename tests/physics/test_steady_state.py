@@ -1,4 +1,4 @@
-"""Steady states of runs that are stepped together: each is that of the run alone."""
+"""Steady states of runs that are stepped together, against those of runs alone."""
 
 from dataclasses import replace
 
