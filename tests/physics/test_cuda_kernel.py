@@ -19,10 +19,11 @@ from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.cuda import BlockSizes, CudaKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import assemble
-from autdtorch.propagators import make_propagator
+from autdtorch.propagators import differentiable_field, make_propagator
 from autdtorch.propagators.plan import plan, region_of
 from autdtorch.scene.drive import drive_from_phases
-from autdtorch.scene.obstacles import Box
+from autdtorch.scene.obstacles import Box, Sphere
+from autdtorch.scene.reflectors import Reflector
 
 needs_gpu = pytest.mark.skipif(
     not torch.cuda.is_available(), reason="needs an NVIDIA GPU: torch.cuda.is_available() is false"
@@ -197,11 +198,38 @@ def test_captured_steps_are_those_of_the_cpu_kernel(dtype, tolerance):
     assert_same(advance(CudaKernel(), case, (53, 53, 53)), expected, tolerance)
 
 
+FLOOR = Reflector((0.0, 0.0, -3e-3), (0.0, 0.0, 1.0))
+LOSSY = Sphere((11e-3, 12e-3, 12e-3), 4e-3, density=20 + 1j, sound_speed=300 - 20j)
+LINED = Box((14e-3, 13e-3, 11e-3), (5e-3, 6e-3, 4e-3), impedance=2 - 1j, rotation=(0.2, 0.3, 0.1))
+SCENES = {
+    "fluid": small_scene((CUBE,)),
+    "lossy": small_scene((LOSSY,), absorption=40.0),
+    "impedance": small_scene((LINED,)),
+    "reflector": replace(small_scene((CUBE,)), reflectors=[FLOOR]),
+}
+
+
+# rounding in float32, of all of a run
 @needs_gpu
-def test_transfer_matrix_is_that_of_the_cpu_kernel():
-    scene = small_scene((CUBE,))
-    on_gpu, on_cpu = (make_propagator(scene, spacing=2e-3, device=device) for device in ("cuda", "cpu"))
-    matrix, drive = on_gpu.transfer_matrix(), drive_from_phases([0.0, 1.0, 2.0, 3.0])
-    assert relative_error(matrix, on_cpu.transfer_matrix()) < 1e-4  # rounding in float32, of all of a run
-    by_gpu = on_gpu.field(drive.cuda(), scene.control_points)
-    assert relative_error(by_gpu, on_cpu.field(drive, scene.control_points)) < 1e-4
+@pytest.mark.parametrize("method", ["full", "box"])
+@pytest.mark.parametrize("name", SCENES)
+def test_pressures_are_those_of_the_cpu_kernel(name, method):
+    scene, drive = SCENES[name], drive_from_phases([0.0, 1.0, 2.0, 3.0])
+    on_gpu, on_cpu = (make_propagator(scene, method, 2e-3, device=device) for device in ("cuda", "cpu"))
+    assert relative_error(on_gpu.transfer_matrix(), on_cpu.transfer_matrix()) < 1e-4
+    points = scene.control_points + 1e-3
+    by_gpu = on_gpu.field(drive.cuda(), points)
+    assert relative_error(by_gpu.cpu(), on_cpu.field(drive, points)) < 1e-4
+
+
+@needs_gpu
+def test_gradients_are_those_of_the_cpu_kernel():
+    scene, drive = small_scene((CUBE,)), drive_from_phases([0.0, 1.0, 2.0, 3.0])
+
+    def slopes(device):
+        leaf, density = drive.clone().requires_grad_(), torch.tensor([20.0], requires_grad=True)
+        field = differentiable_field(scene, leaf, spacing=2e-3, periods=6, density=density, device=device)
+        return torch.autograd.grad(field.abs().sum(), (leaf, density))
+
+    for by_gpu, by_cpu in zip(slopes("cuda"), slopes("cpu"), strict=True):
+        assert relative_error(by_gpu.cpu(), by_cpu) < 1e-4
