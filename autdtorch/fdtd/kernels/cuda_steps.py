@@ -294,7 +294,7 @@ def _with_layers_of_y(faces, edges, i, shape, tile, terms_y, terms_yz, CELLS: tl
                       ROWS: tl.constexpr):  # fmt: skip
     """Return the sums over faces and edges with the terms of the layers across y."""
     ny, nz = shape.ny, shape.nz
-    first, k, inside, near_y, in_z, place_z = tile
+    first, k, inside, _, in_z, place_z = tile
     more_faces, more_edges = (), ()
     for row in tl.static_range(ROWS):
         j = first + row
