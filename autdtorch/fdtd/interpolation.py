@@ -28,6 +28,7 @@ _REGULARISATION = 1e-5  # Keeps weights small where the fit does not determine t
 _ONE_SIDED_REGULARISATION = 1e-2
 # Distance [cells] along each axis of the cells that are then fitted: larger systems take long
 ONE_SIDED_REACH = 3
+_AT_CENTRE = 1e-6  # Distance from a cell's centre that is rounding [cells]
 _ABSCISSA, _QUADRATURE = np.polynomial.legendre.leggauss(24)  # of wavenumbers up to the drive's
 
 
@@ -61,9 +62,12 @@ def exclude_cells(
     """Return kernels of points at `cells` (P, 3) without the `excluded` cells (P, n), fitted to the others.
 
     The fit covers all waves up to the drive's wavenumber. Points get no weight if all cells next to them are
-    excluded.
+    excluded. At the centre of a cell that is not, points have its pressure: a fit would leave out the short
+    waves of a grid at a surface.
     """
-    rows = np.flatnonzero(excluded.any(axis=1))
+    centred = (np.abs(cells - cells.round()) < _AT_CENTRE).all(axis=1)
+    centred &= ~np.take_along_axis(excluded, points.weight.argmax(axis=1)[:, None], axis=1)[:, 0]
+    rows = np.flatnonzero(excluded.any(axis=1) & ~centred)
     if len(rows) == 0:
         return points
     weight = points.weight.copy()

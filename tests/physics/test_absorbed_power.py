@@ -60,12 +60,13 @@ def test_a_plane_beside_a_rigid_one_absorbs_what_the_image_sends_too():
 def test_power_is_what_flows_through_a_sphere_around_the_body(reflection):
     """The flow into a sphere of 14 mm, by pressures 0.02 mm inside and outside.
 
-    1 % at 0.6 mm: the flow is an eighth of that in and out, which a grid knows to 0.1 %.
+    On a grid both are equal, but for the kernels of points: these are good to 0.03 % of the flow in and out,
+    which is eight times as large. Next to its image the body counts as scatterer again and again.
     """
     reflectors = [] if reflection is None else [at.Reflector(*FLOOR, reflection)]
     matched = at.Sphere(BALL.center, 5e-3, impedance=1.0)
     scene = scene_of(monopole((25e-3, 10e-3, 10e-3)), [matched], reflectors)
-    propagator = at.make_propagator(scene, "box", 0.6e-3)
+    propagator = at.make_propagator(scene, "box", 1e-3, tolerance=1e-4)
     power = propagator.absorbed_power(unit(1)).obstacles
     directions = at.sphere_points((0.0, 0.0, 0.0), 1.0, 600)
     half, radius = 0.02e-3, 14e-3
@@ -73,7 +74,7 @@ def test_power_is_what_flows_through_a_sphere_around_the_body(reflection):
     low, high = (propagator.field(unit(1), center + (radius + step) * directions) for step in (-half, half))
     velocity = (high - low) / (2 * half) / (1j * scene.angular_frequency * AIR.density)
     flow = -0.5 * ((low + high).conj() / 2 * velocity).real.mean() * 4 * np.pi * radius**2
-    assert float(power[0]) == pytest.approx(float(flow), rel=1e-2)
+    assert float(power[0]) == pytest.approx(float(flow), rel=3e-3 if reflection is None else 1e-2)
 
 
 def power_by_series(ball, source):
@@ -97,7 +98,7 @@ def power_by_series(ball, source):
     [
         (at.porous(200e3, FREQUENCY, AIR), 0.01),
         ({"density": 2.0, "sound_speed": 300.0, "absorption": 300.0}, 0.01),
-        ({"impedance": 2.0}, 0.04),  # of the surface's area in cells of a fifth of the radius
+        ({"impedance": 2.0}, 0.01),
     ],
 )
 def test_spheres_absorb_the_power_of_their_series(material, tolerance):
