@@ -67,7 +67,7 @@ class Emulation(TorchFunctionMode):
 class _Up(torch.autograd.Function):
     @staticmethod
     def forward(ctx, tensor):
-        return EmulatedTensor(tensor.clone())
+        return EmulatedTensor(tensor.resolve_conj().clone())
 
     @staticmethod
     def backward(ctx, slope):
@@ -109,6 +109,10 @@ def called(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
             raise TypeError("can't convert a tensor on cuda:0 to numpy")
         if function is kind.as_subclass:
             return first
+        if function in (kind.conj, torch.conj):  # a lazy one would be done nowhere
+            return first.conj_physical()
+        if getattr(function, "__self__", None) is kind.mH:
+            return first.mT.conj_physical()
         if function in (kind.tolist, kind.numpy, kind.__repr__):
             return function(first.held.detach(), *args[1:], **kwargs)
     if function in (kind.cpu, kind.cuda):

@@ -21,11 +21,13 @@ from triton.runtime import driver
 from triton.runtime.jit import JITFunction
 
 from autdtorch.fdtd.kernels.cuda import Cells, DeviceMedium, DeviceRun, blocks_of
+from autdtorch.fdtd.kernels.cuda_waves import waves_on_gpu
 from autdtorch.fdtd.stepping import assemble, drive_signal
 from autdtorch.propagators.plan import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box
 from autdtorch.scene.scene import Medium, Scene
+from autdtorch.utils.apertures import Discs
 
 CUOBJDUMP = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
 
@@ -45,7 +47,7 @@ def main(capability: int, dtype: str) -> None:
 
 
 def compiled(capability: int, dtype: torch.dtype) -> dict[str, Any]:
-    """Return the compiled launches of a step by name."""
+    """Return the compiled launches of a step, and of waves, by name."""
     wall = Box((12e-3, 12e-3, 20e-3), (40e-3, 40e-3, 2e-3), density=5.0, sound_speed=300.0)
     solid = Box((12e-3, 12e-3, 10e-3), (5e-3, 6e-3, 7e-3), rigid=True)
     array = TransducerArray.grid((2, 2), pitch=8e-3, center=(1.2e-3, 12e-3, 12e-3))
@@ -67,7 +69,9 @@ def compiled(capability: int, dtype: torch.dtype) -> dict[str, Any]:
         get_current_stream=lambda device: 0,
     )
     driver.set_active(absent_gpu)
+    discs = Discs(array.positions, array.normals, torch.full((4,), 4e-3, dtype=torch.float64))
     with patch.object(JITFunction, "run", compile_only):
+        waves_on_gpu(scene.control_points, discs, complex(740.0, 1.0))
         shape = Cells(*assembly.grid.shape)
         medium = DeviceMedium(assembly.coefficients, shape, 1, blocks_of(shape, 1), torch.device("cpu"))
         DeviceRun(medium, assembly.silence(sources), sources, receivers, len(signal)).advance(signal)

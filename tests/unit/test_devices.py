@@ -190,6 +190,19 @@ def test_pictures_summed_on_the_gpu_are_those_of_the_cpu(method, radius, monkeyp
     assert (field - expected).norm() < 1e-5 * expected.norm()
 
 
+@pytest.mark.parametrize("free", [False, True])
+@pytest.mark.parametrize("algorithm", ["naive", "gs", "wgs", "gs_pat", "diff_pat"])
+def test_holograms_are_those_of_the_kernel_for_cpus(algorithm, free):
+    matrix = torch.randn(3, 4, 16, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
+    settings = {"algorithm": algorithm, "iterations": 30, "free_amplitudes": free, "starts": 2}
+    expected = at.holography(matrix, **settings)
+    with gpu() as to_gpu:
+        result = at.holography(to_gpu(matrix), **settings)
+        assert result.is_cuda
+        # rounding of double precision, through 30 iterations
+        torch.testing.assert_close(result.cpu(), expected, rtol=0, atol=1e-7)
+
+
 @pytest.fixture
 def accepted(monkeypatch):
     """The setting ``device="cuda"``, accepted without a GPU."""
