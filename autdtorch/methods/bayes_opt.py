@@ -71,11 +71,6 @@ def _checked_noise(name: str, value: object) -> object:
     return number_between(name, value, 1e-6, 1)
 
 
-def _checked_device(name: str, value: object) -> object:
-    require_one_of(name, value, ("cpu", "cuda"))
-    return device_type(name, value)
-
-
 @dataclass(frozen=True)
 class BayesOpt(Method):
     """Maximise the score over the phases by Bayesian optimisation (Algorithm 1), all amplitudes being 1.
@@ -130,11 +125,12 @@ class BayesOpt(Method):
     initial_points: Literal["sobol", "random"] = choice("sobol", "random")
     noise: float | Literal["inferred"] = setting(NOISE, _checked_noise)
     prior: Prior | None = setting(None, prior_of)
-    device: Literal["cpu", "cuda"] = setting("cpu", _checked_device)
+    device: Literal["cpu", "cuda"] = choice("cpu", "cuda")
 
     def __post_init__(self) -> None:
         """Check the settings, also against each other."""
         super().__post_init__()
+        device_type("device", self.device)  # refuses a GPU that is not there
         least = self.initial + 1 if self.prior is None else 2
         evaluations = integer_at_least("evaluations", self.evaluations, least)
         object.__setattr__(self, "evaluations", evaluations)
