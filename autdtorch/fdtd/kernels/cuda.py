@@ -34,8 +34,8 @@ _MOST_CAPTURED = 2**25
 _MOST_CACHED = 2**22  # Most cells whose two fields, in single precision, stay in 50 MB of cache
 _FEWEST_PROGRAMS = 1000  # That occupy a GPU of 132 multiprocessors
 _MOST_RUNS, _MOST_CELLS = 256, 2**27  # Of a launch; more take their time one after the other
-# Numbers stored for a cell of a run, with its layers, and for a receiver, most of them its record
-_FIELD_NUMBERS, _RECORD_NUMBERS = 4, 400
+# Memory [bytes] of a cell with its layers, and of a receiver, mostly its record, in double precision
+_FIELD_BYTES, _RECORD_BYTES = 32, 3200
 
 
 class BlockSizes(NamedTuple):
@@ -203,9 +203,9 @@ class CudaKernel:
         most = max(1, min(_MOST_RUNS, _MOST_CELLS // cells))
         if self.device.type == "cpu":
             return most
-        numbers = _FIELD_NUMBERS * cells + _RECORD_NUMBERS * receivers
+        size = _FIELD_BYTES * cells + _RECORD_BYTES * receivers
         free, _ = torch.cuda.mem_get_info()
-        return max(1, min(most, int(free / 2 / (4 * numbers))))
+        return max(1, min(most, int(free / 2 / size)))
 
     @torch.no_grad()
     def advance(
