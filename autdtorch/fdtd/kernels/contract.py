@@ -6,8 +6,8 @@ R runs in one medium are stepped side by side; none depends on another. A step t
 1. new = center now + face F + edge E + corner C - keep before, with F, E, C the sums over the 6, 12 and 8
    neighbours;
 2. in heterogeneous cells instead new = (1 + keep) now - keep before + sum_j weight_j (now_j - now);
-3. the boundary layers (`perfectly_matched_layer.py`) add the stretching of the two neighbours' sum along each
-   axis, as in air, times `layer_scale` in heterogeneous cells, and by column the difference at interfaces;
+3. the absorbing layers (`perfectly_matched_layer.py`) add the stretching of the two neighbours' sum along
+   each axis, as in air, times `layer_scale` in heterogeneous cells, and by column the difference at interfaces;
 4. in lossy cells new += sum_j loss_j (now_j - before_j) - ground now, with the cell itself among the j;
 5. the sources are added: new += sum_s signal_s force_s, of the S signals that they share;
 6. the outermost ring and the sound-hard cells stay zero.
@@ -34,7 +34,7 @@ class Layer(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """Memory of the boundary layers: of E_x, E_y and E_z, of E_y acting on E_z p, and of columns."""
+    """Memory of the absorbing layers: of E_x, E_y and E_z, of E_y acting on E_z p, and of columns."""
 
     x: Layer
     y: Layer
@@ -46,7 +46,7 @@ class Memory(NamedTuple):
 
 @dataclass(frozen=True)
 class Columns:
-    """m columns of L cells through a boundary layer, from the ring to the first cell inside."""
+    """m columns of L cells through an absorbing layer, from the ring to the first cell inside."""
 
     index: Tensor  # flat indices of their cells (m, L + 2) int64, from the ring inwards
     offset: Tensor  # flat offsets from a cell to w cells across the column (m, w) int64
@@ -75,12 +75,12 @@ class Coefficients:
     heterogeneous_index: Tensor  # flat indices (n,) int64 of the heterogeneous cells, ascending
     heterogeneous_weight: Tensor  # their weights (n, 27)
     sound_hard_index: Tensor  # flat indices (k,) int64 of the sound-hard cells
-    # b of the boundary layer at half cells and cells, interleaved, from outside (2 L + 1,)
+    # b of the absorbing layer at half cells and cells, interleaved, from outside (2 L + 1,)
     layer_decay: Tensor
     layer_gain: Tensor  # a, likewise
     layer_index: Tensor  # flat indices (k,) int64 of the heterogeneous cells in the layers, ascending
     layer_scale: Tensor  # their layer terms over those of air (k,)
-    columns: Columns  # interfaces through the boundary layers
+    columns: Columns  # interfaces through the absorbing layers
     crossed: Columns  # interfaces through two layers at once, along one of them
     # flat place, among the terms (L, n) of the `crossed`, of the term to add to the sums across each cell of
     # the columns (m, L + 2) int64; L n for none
@@ -96,7 +96,7 @@ class Coefficients:
 
     @property
     def layer_cells(self) -> int:
-        """Thickness of the boundary layers."""
+        """Thickness of the absorbing layers."""
         return len(self.layer_decay) // 2
 
     @cached_property
@@ -114,7 +114,7 @@ class Coefficients:
 
 @dataclass
 class WaveState:
-    """The two pressure fields (R, nx, ny, nz) of R runs, and the memory of their boundary layers."""
+    """The two pressure fields (R, nx, ny, nz) of R runs, and the memory of their absorbing layers."""
 
     now: Tensor
     before: Tensor

@@ -191,8 +191,8 @@ def _advance(  # type: ignore[no-untyped-def]
     """Do tasks until none is left; each worker calls this with the same arguments.
 
     A step has two phases with a task for each chunk, sweep it and finish it. One is before these if cells are
-    lossy, and one after if interfaces pass through the boundary layers. The first records the step before.
-    Chunks at both ends, whose planes are in the boundary layers, are done first: they take longest.
+    lossy, and one after if interfaces pass through the absorbing layers. The first records the step before.
+    Chunks at both ends, whose planes are in the absorbing layers, are done first: they take longest.
     """
     chunks, steps, read = len(medium[0]) - 1, len(signal), recorded.shape[1]
     swept = 1 if len(losses[0]) else 0  # the phase of the sweep
@@ -224,7 +224,7 @@ def _advance(  # type: ignore[no-untyped-def]
 
 
 def _cuts(shape: tuple[int, ...]) -> NDArray[np.int64]:
-    """Return the first planes of the chunks, each thicker than a boundary layer, and one past the last."""
+    """Return the first planes of the chunks, each thicker than an absorbing layer, and one past the last."""
     planes = shape[0] - 2
     cells = math.prod(shape)
     of_cells = cells // _CHUNK_CELLS

@@ -45,7 +45,7 @@ class BlockSizes(NamedTuple):
     y: int = 4  # rows of a tile
     z: int = 32  # cells of its rows, which are contiguous
     rows: int = 2  # rows that a thread steps
-    lanes: int = 16  # columns through a boundary layer
+    lanes: int = 16  # columns through an absorbing layer
 
 
 def blocks_of(shape: Cells, runs: int) -> BlockSizes:
