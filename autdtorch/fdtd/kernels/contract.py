@@ -7,7 +7,8 @@ R runs in one medium are stepped side by side; none depends on another. A step t
    neighbours;
 2. in heterogeneous cells instead new = (1 + keep) now - keep before + sum_j weight_j (now_j - now);
 3. the absorbing layers (`perfectly_matched_layer.py`) add the stretching of the two neighbours' sum along
-   each axis, as in air, times `layer_scale` in heterogeneous cells, and by column the difference at interfaces;
+   each axis, as in air, times `layer_scale` in heterogeneous cells, and by column the difference at
+   interfaces;
 4. in lossy cells new += sum_j loss_j (now_j - before_j) - ground now, with the cell itself among the j;
 5. the sources are added: new += sum_s signal_s force_s, of the S signals that they share;
 6. the outermost ring and the sound-hard cells stay zero.
