@@ -95,26 +95,18 @@ def reflection(profile: LayerProfile, along: Array, turn: Array) -> NDArray[np.c
     `along` (n,) is the wavenumber along the normal times spacing, `turn` (n,) the frequency times time step
     [rad].
     """
-    decay, gain = profile.decay[..., None, :], profile.gain[..., None, :]
-    stretch = 1 + gain / (1 - decay * np.exp(1j * turn)[:, None])
-    half, full = stretch[..., 0::2], stretch[..., 1::2]
-    # Unknowns: pressure in cells 1 .. L of the layer and in the first cell of air, and the amplitude r. In
-    # air cell j the pressure is e^{-i along j} + r e^{i along j}.
-    cells = full.shape[-1]
-    matrix = np.zeros((*stretch.shape[:-1], cells + 2, cells + 2), complex)
-    rows = np.arange(cells)
-    matrix[..., rows, rows] = (2 - 2 * np.cos(along))[:, None] - full * (half[..., :-1] + half[..., 1:])
-    matrix[..., rows, rows + 1] = full * half[..., 1:]
-    matrix[..., rows[1:], rows[:-1]] = full[..., 1:] * half[..., 1:-1]
-    matrix[..., cells, cells] = 1
-    matrix[..., cells, cells + 1] = -1
-    matrix[..., cells + 1, cells - 1] = 1
-    matrix[..., cells + 1, cells] = -2 * np.cos(along)
-    matrix[..., cells + 1, cells + 1] = np.exp(1j * along)
-    right = np.zeros((len(along), cells + 2, 1), complex)
-    right[:, cells, 0] = 1
-    right[:, cells + 1, 0] = -np.exp(-1j * along)
-    return np.asarray(np.linalg.solve(matrix, right)[..., -1, 0], np.complex128)
+    decay, gain = (np.moveaxis(part, -1, 0)[..., None] for part in profile)
+    stretch = 1 + gain / (1 - decay * np.exp(1j * turn))
+    half, full = stretch[0::2], stretch[1::2]
+    # From the outer end, where the pressure is zero, inwards: waves grow, and rounding does not. The last
+    # pressure is that in the first cell of air; in air cell j it is e^{-i along j} + r e^{i along j}.
+    drop, rise = (2 - 2 * np.cos(along)) / full, 1 / half
+    outer, pressure, flow = np.zeros_like(drop[0]), np.ones_like(drop[0]), half[0]
+    for cell in range(len(full)):
+        flow = flow - drop[cell] * pressure
+        outer, pressure = pressure, pressure + rise[cell + 1] * flow
+    ahead = np.exp(1j * along)
+    return np.asarray((pressure * ahead - outer) / (outer - pressure / ahead), np.complex128)
 
 
 @lru_cache(maxsize=64)

@@ -20,7 +20,7 @@ from scipy.linalg import eigvalsh_tridiagonal
 from scipy.sparse import csr_array
 
 from autdtorch.fdtd.assembly.neighbours import inner_cells, with_neighbours
-from autdtorch.fdtd.stencil import Stencil, flat_offsets, places_of
+from autdtorch.fdtd.stencil import ROW_ROUNDING, Stencil, flat_offsets, places_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.process import parts_of_size, spread
 
@@ -41,7 +41,6 @@ _LANCZOS_STEPS = 60
 # or an edge is as high on a part of it: with 32 planes, eigenvalues of five bodies fell by up to 0.13 %.
 _LARGE, _REPEATS = 20_000, 32
 _TOGETHER = 16_384  # Rows in a task: about a millisecond
-_ROUNDING = 1e-9  # Stencil rows within this of air's are those of air; most rows of maps are
 
 
 def largest_eigenvalue(index: Index, weight: Array, stencil: Stencil, shape: tuple[int, int, int]) -> float:
@@ -52,7 +51,7 @@ def largest_eigenvalue(index: Index, weight: Array, stencil: Stencil, shape: tup
     itself, zero in air, counts as stiffness against silence.
     """
     air = stencil.largest_symbol
-    unlike = (np.abs(weight - stencil.weights) > _ROUNDING).any(axis=1)
+    unlike = stencil.differs_from(weight)  # most rows of maps are those of air
     index, weight = index[unlike], weight[unlike]
     if len(index) == 0:
         return air
@@ -80,7 +79,9 @@ def largest_eigenvalue(index: Index, weight: Array, stencil: Stencil, shape: tup
         matrix[:, 13] = ahead.sum(1)
         column = np.where(inside, neighbour, here[:, None])
         first = np.arange(0, 27 * len(here) + 1, 27)
-        return bound, csr_array((matrix.ravel(), column.ravel(), first), (len(here), len(rows)))
+        symmetric = csr_array((matrix.ravel(), column.ravel(), first), (len(here), len(rows)))
+        symmetric.eliminate_zeros()
+        return bound, symmetric
 
     bounds, parts = zip(*spread(part, parts_of_size(len(rows), _TOGETHER)), strict=True)
     bound: float = max(bounds)
@@ -116,7 +117,7 @@ def _shortened(
         repeats = np.zeros(lengths[axis], np.int64)
         for number in alike:
             before, here = pairs[number]
-            if np.abs(weight[here] - weight[before]).max(initial=0) <= _ROUNDING:
+            if np.abs(weight[here] - weight[before]).max(initial=0) <= ROW_ROUNDING:
                 repeats[number + 1] = repeats[number] + 1
         few = repeats < _REPEATS
         stays = few[place[:, axis]]

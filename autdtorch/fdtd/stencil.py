@@ -30,6 +30,7 @@ from autdtorch.utils.array_types import Array, Index
 
 # The 27 neighbour offsets in row-major order; entry 13 is the cell itself
 OFFSETS = tuple((x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1))
+ROW_ROUNDING = 1e-9  # Stencil rows that differ by less are equal
 
 
 def flat_strides(shape: Sequence[int]) -> NDArray[np.int64]:
@@ -65,6 +66,10 @@ class Stencil:
         """Weights (27,) in the order of `OFFSETS`, zero for the cell itself."""
         by_distance = (0.0, self.face, self.edge, self.corner)
         return np.array([by_distance[sum(map(abs, offset))] for offset in OFFSETS])
+
+    def differs_from(self, rows: Array) -> NDArray[np.bool_]:
+        """Return which stencil rows (n, 27) are not those of air."""
+        return np.asarray((np.abs(rows - self.weights) > ROW_ROUNDING).any(axis=1))
 
     @property
     def total(self) -> float:

@@ -38,7 +38,7 @@ from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.shapes import bounds
 from autdtorch.fdtd.stencil import Stencil, places_of
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.process import spread
+from autdtorch.utils.process import one_library_thread, spread
 from autdtorch.utils.progress import show_progress
 
 _CHUNK = 4096  # Interface elements assembled at a time
@@ -68,6 +68,7 @@ class Elements:
     interface: InterfaceElements  # coupling coefficients and masses of the kinds
 
 
+@one_library_thread()  # fits of edges depend on the number of threads
 def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
     """Return the material of every element, set by the last body there, and the interface elements."""
     bodies, materials = unions_of(region, grid, stencil)

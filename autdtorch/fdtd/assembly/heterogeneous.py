@@ -44,7 +44,6 @@ logger = logging.getLogger(__name__)
 # unknowns, except in slivers: the least sum is relative to the densest fluid, and above the body's 1e-5.
 _RIGID_COUPLING = 0.1
 _SLIVER_COUPLING, _LEAST_COUPLING = 1e-3, 3e-5
-_ROW_ROUNDING = 1e-9  # Stencil rows within this of air's are those of air
 # Largest eigenvalue of elements, relative to a uniform material: lighter cells receive mass. From 5 cells per
 # wavelength on 1.15 takes 7 % of the time step, errs less than 1.5 and leaves enough mass around. So much
 # transferred mass holds waves at a surface on coarser grids: a hand at 4 cells took 250 periods, 33 with 2.1.
@@ -121,7 +120,7 @@ def heterogeneous_cells(
     def divide(ends: tuple[int, int]) -> None:
         part = slice(*ends)
         weight[part] /= mass[part, None]
-        changed[part] |= (np.abs(weight[part] - stencil.weights) > _ROW_ROUNDING).any(axis=1)
+        changed[part] |= stencil.differs_from(weight[part])
 
     spread(divide, parts_of_size(len(touched), _TOGETHER))
     changed &= ~hard[touched]

@@ -73,7 +73,7 @@ def _series(c, y):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _set_waves(place, number, others, block, wave, disc, room):  # type: ignore[no-untyped-def]
-    """Set the parts of the waves from the place (6,) of a number to those of a block of `others` (3, N)."""
+    """Set the parts of the waves from a place, a row of a number, to those of a block of `others` (3, N)."""
     series, lanes, bits = room
     turns_per_metre, halvings_per_metre, nearest = wave
     x, y, z = place[0], place[1], place[2]
@@ -133,7 +133,7 @@ def _move(total, fields, block):  # type: ignore[no-untyped-def]
 def _sum_at_points(points, first, last, sources, amplitude, wave, disc, room, fields):  # type: ignore[no-untyped-def]
     """Write the parts of fields (2, R, P / LANES, LANES) at the blocks `first` to `last` of points.
 
-    The points are (3, P), the sources with normals (N, 6), the parts of their amplitudes (2, R, N).
+    The points are (3, P), the sources `_rows`, and the parts of their amplitudes (2, R, N).
     """
     runs, count = amplitude.shape[1:]
     total = np.zeros((2, runs, LANES), amplitude.dtype)
@@ -157,7 +157,7 @@ def _add_products(total, amplitude, r, waves):  # type: ignore[no-untyped-def]
 def _sum_over_sources(points, first, last, sources, amplitude, wave, disc, room, fields):  # type: ignore[no-untyped-def]
     """Write the parts of fields (2, R, P) at the points `first` to `last`.
 
-    The points with normals are (P, 6), the sources (3, N), the parts of their amplitudes
+    The points are `_rows`, the sources (3, N), the parts of their amplitudes
     (2, R, N / LANES, LANES).
     """
     runs, blocks = amplitude.shape[1:3]
@@ -184,7 +184,7 @@ def _sum_over_sources(points, first, last, sources, amplitude, wave, disc, room,
 
 @entry()
 def _write_matrix(points, first, last, sources, columns, amplitude, wave, disc, room, matrix):  # type: ignore[no-untyped-def]
-    """Add the waves of sources (N, 6) to their columns (N,) of a matrix (M, P / LANES, LANES) of blocks."""
+    """Add the waves of sources (`_rows`) to their columns (N,) of a matrix (M, P / LANES, LANES)."""
     for block in range(first, last):
         for s in range(len(sources)):
             _set_waves(sources[s], s, points, block, wave, disc, room)
@@ -268,10 +268,10 @@ def _wave(wavenumber: complex) -> tuple[float, float, float]:
 
 
 def _rows(places: Tensor | Discs) -> AnyArray:
-    """Return positions and normals (N, 6); points have none."""
+    """Return positions (N, 3) of points, or positions and normals (N, 6) of discs."""
     if isinstance(places, Discs):
         return torch.cat((places.centers, places.normals), dim=1).numpy()
-    return np.pad(places.numpy(), ((0, 0), (0, 3)))
+    return np.ascontiguousarray(places.numpy())  # numba compiles again for another order
 
 
 def _filled(rows: AnyArray, mode: Literal["edge", "constant"]) -> AnyArray:
