@@ -38,7 +38,7 @@ RIGID = Box((3.4e-3, 4.5e-3, 4.5e-3), (2.2e-3, 5e-3, 4e-3), rigid=True)
 WALL = Box((4.5e-3, 4.5e-3, 7.3e-3), (30e-3, 30e-3, 1.2e-3), density=5.0, sound_speed=300.0)
 """Continues through the absorbing layers of x and y."""
 
-WHOLE = BlockSizes(x=32, y=32, z=32, rows=2, lanes=1024)
+WHOLE = BlockSizes(x=32, y=32, z=32, lanes=1024)
 """One program a task: interpreted, a program takes the same time however large it is."""
 
 BLOCKS = None if torch.cuda.is_available() else WHOLE
@@ -185,8 +185,9 @@ def test_every_launch_compiles_for_a_gpu(tmp_path):
         env=environment | {"TRITON_CACHE_DIR": str(tmp_path)}, check=True, capture_output=True, text=True,
     )  # fmt: skip
     rows = [line.split("|")[1:-1] for line in run.stdout.splitlines()[2:]]
-    assert [row[0].strip() for row in rows] == ["prepare", "sweep", "settle", "read_last"]
-    assert all(int(row[-1]) == 0 for row in rows)  # nothing spilled
+    stack = {row[0].strip(): int(row[-1]) for row in rows}
+    assert stack.pop("_write_waves") < 100  # of sine and cosine in double precision
+    assert stack == dict.fromkeys(("prepare", "sweep", "settle", "read_last"), 0)  # nothing spilled
 
 
 @needs_gpu

@@ -32,7 +32,8 @@ _GRAPH_STEPS = 16  # Steps of a captured graph; even, so that both fields return
 # Python, some 100 us: 17 million cells take 112 us on an H100.
 _MOST_CAPTURED = 2**25
 _MOST_CACHED = 2**22  # Most cells whose two fields, in single precision, stay in 50 MB of cache
-_FEWEST_PROGRAMS = 1000  # That occupy a GPU of 132 multiprocessors
+_FEWEST_PROGRAMS = 1400  # That occupy a GPU of 132 multiprocessors
+_OF_LARGE_GRIDS = 16, 4, 64, 4
 _MOST_RUNS, _MOST_CELLS = 256, 2**27  # Of a launch; more take their time one after the other
 # Memory [bytes] of a cell with its layers, and of a receiver, mostly its record, in double precision
 _FIELD_BYTES, _RECORD_BYTES = 32, 3200
@@ -42,8 +43,8 @@ class BlockSizes(NamedTuple):
     """Sizes of a program's work, powers of two."""
 
     x: int = 16  # planes that a tile marches through
-    y: int = 4  # rows of a tile
-    z: int = 32  # cells of its rows, which are contiguous
+    y: int = 2  # rows of a tile
+    z: int = 64  # cells of its rows, which are contiguous
     rows: int = 2  # rows that a thread steps
     lanes: int = 16  # columns through an absorbing layer
 
@@ -51,9 +52,9 @@ class BlockSizes(NamedTuple):
 def blocks_of(shape: Cells, runs: int) -> BlockSizes:
     """Return the blocks for runs on a grid, by timings on an H200; `docs/decisions/kernels.md` has them."""
     nx, ny, nz = shape
-    blocks = BlockSizes(32, 16, 32, 4)
-    if runs * nx * ny * nz <= _MOST_CACHED:
-        blocks = BlockSizes(16, 8, 32, 2)
+    if runs * nx * ny * nz > _MOST_CACHED:
+        return BlockSizes(*_OF_LARGE_GRIDS)
+    blocks = BlockSizes()
     tiles = runs * triton.cdiv(ny, blocks.y) * triton.cdiv(nz, blocks.z)
     # a march takes its time however few programs there are
     while blocks.x > 1 and triton.cdiv(nx, blocks.x) * tiles < _FEWEST_PROGRAMS:
