@@ -36,10 +36,10 @@ _ELEMENTS, _MOST_ELEMENTS = 1.4, 4096
 _RECORDED = 44
 """Memory [bytes] of a recorded number, and of what is made of it for the Fourier sums."""
 
-_CELL_STEPS, _COLUMN_STEPS, _LOSSY = 15.0, 150.0, 2.0
-"""Time of a step of a heterogeneous cell, and of one that a surface cuts in an absorbing layer [steps of a
-cell of air, as in the following times]. Cells of bodies that absorb have two rows: the factor on
-the former."""
+_CELL_STEPS, _UNLIKE_STEPS, _COLUMN_STEPS, _LOSSY = 3.0, 9.0, 150.0, 2.0
+"""Time of a step of a heterogeneous cell, what it takes longer if its stencil row is unlike those of others,
+and of one that a surface cuts in an absorbing layer [steps of a cell of air, as in the following times].
+Cells of bodies that absorb have two rows: the factor on the former two."""
 
 _PAIR_STEPS, _ASSEMBLY_STEPS, _MESH_STEPS = 11.0, 60_000.0, 60_000.0
 """Time of one term of a sum over radiating cells, of the assembly of a heterogeneous cell, and of what a mesh
@@ -58,6 +58,7 @@ class Heterogeneity(NamedTuple):
 
     cut: float  # elements that surfaces cut
     cells: float  # heterogeneous cells: beside surfaces, and inside another medium
+    unlike: float  # those beside surfaces oblique to the grid
     columns: float  # elements that surfaces cut in the absorbing layers
     meshed: float  # those at meshes
     assembled: float  # those beside surfaces, by the time of assembling them
@@ -110,7 +111,7 @@ class Costs:
     def work(self) -> float:
         """Expected time of all runs, in steps of a cell of air."""
         grids, passes, filled = self.grouping.grids, self.grouping.passes, self._heterogeneity
-        single = _CELL_STEPS * filled.cells + _COLUMN_STEPS * filled.columns
+        single = _CELL_STEPS * filled.cells + _UNLIKE_STEPS * filled.unlike + _COLUMN_STEPS * filled.columns
         stepping = sum(grid.work for grid in grids) + max(grid.steps for grid in grids) * single
         # coupled boxes are stepped to looser tolerances, and empty grids have no resonances
         ringing = USUAL_PERIODS if filled.cells and passes == 1 and self.in_boxes else 1.0
@@ -129,7 +130,7 @@ class Costs:
             inner = np.array(region.domain)
             layer = domain_extent(region, spacing).layer.cells(region.wavenumber * spacing)
             outer = inner + spacing * layer * np.array([[-1.0], [1.0]])
-        cut = cells = columns = meshed = assembled = 0.0
+        cut = cells = unlike = columns = meshed = assembled = 0.0
         for body, is_mesh in zip(region.bodies, self.meshes, strict=True):
             vertices, triangles = (part.numpy() for part in body.shape.surface())
             doubled = doubled_normals(np.clip(vertices, *inner)[triangles])
@@ -142,12 +143,13 @@ class Costs:
             absorbs = body.impedance is not None or (body.fluid is not None and body.fluid.is_lossy)
             rows = _LOSSY if absorbs else 1.0
             cells += rows * beside
+            unlike += 0.0 if self.grouping.aligned else rows * beside
             meshed += beside if is_mesh else 0.0
             assembled += beside * (_ALIKE if self.grouping.aligned else _FORCES if body.fluid else 1)
             if body.fluid and (absorbs or body.fluid.sound_speed != region.fluid.sound_speed):
                 box = np.clip([body.shape.lower, body.shape.upper], *inner)
                 cells += rows * _SHARE_INSIDE * float(np.prod(box[1] - box[0])) / spacing**3
-        return Heterogeneity(cut, cells, columns, meshed, assembled)
+        return Heterogeneity(cut, cells, unlike, columns, meshed, assembled)
 
     @property
     def _cells_read(self) -> int:

@@ -156,21 +156,20 @@ def mean_thickness(materials: Materials, stencil: Stencil) -> Array:
 
 _VARIATION = 1e-6  # Largest variation of a distance along a face [cells]: rounding
 _STEP = 1 / SUBCELLS  # Distance of the points of a profile [cells]
+_BESIDE_FIRST = SUBCELLS * (SUBCELLS + 1) ** np.array([2, 1, 0])  # vertices of the lattice, along each axis
 
 
 def layered_axis(distance: Array) -> Index:
     """Return the only axis (n,) along which signed distances (K, n, 125) of bodies vary, or -1."""
     only = np.full(distance.shape[1], -1)
-    cube = distance.reshape(*distance.shape[:2], *(SUBCELLS + 1,) * 3)
-    ends = slice(None, None, SUBCELLS)
+    # most vary between the first vertex and those beside it
+    change = np.abs(distance[..., _BESIDE_FIRST] - distance[..., :1]).max(axis=0, initial=0)
     for axis in range(3):
-        across = tuple(2 + other for other in range(3) if other != axis)
-
-        def flat(part: Array, across: tuple[int, ...] = across) -> NDArray[np.bool_]:
-            return np.asarray(np.ptp(part, axis=across).max(axis=(0, 2), initial=0) < _VARIATION)
-
-        some = np.flatnonzero(flat(cube[:, :, ends, ends, ends]))  # most vary among their vertices
-        only[some[flat(cube[:, some])]] = axis
+        across = [other for other in range(3) if other != axis]
+        some = np.flatnonzero((change[:, across] < _VARIATION).all(axis=1))
+        cube = distance[:, some].reshape(len(distance), len(some), *(SUBCELLS + 1,) * 3)
+        variation = np.ptp(cube, axis=(2 + across[0], 2 + across[1])).max(axis=(0, 2), initial=0)
+        only[some[variation < _VARIATION]] = axis
     return only
 
 
