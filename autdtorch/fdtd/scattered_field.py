@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, vstack
 from torch import Tensor
 
 from autdtorch.fdtd.assembly.neighbours import with_neighbours
@@ -32,7 +32,7 @@ from autdtorch.fdtd.shapes import Shape, turned_shape
 from autdtorch.fdtd.stencil import flat_offsets, places_of
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.utils.apertures import Apertures, Discs, image_of
-from autdtorch.utils.array_types import COMPLEX, AnyArray, Array, Index
+from autdtorch.utils.array_types import COMPLEX, Array, Index
 from autdtorch.utils.images import NO_MIRRORS, SPACE_ITSELF, Image
 from autdtorch.utils.process import cached_property, parts_of_size, spread
 from autdtorch.utils.spatial import distinct_cells, places_among
@@ -279,29 +279,26 @@ class ScatteredField:
 
     @cached_property
     def surface(self) -> tuple[Tensor, Index, csr_array]:
-        """Positions (n, 3) of the Huygens surface, the cells (m,) it reads, and their weights (n, m)."""
-        assembly = self.assembly
-        grid, stencil = assembly.grid, assembly.stencil
+        """Positions (n, 3) of the Huygens surface, its cells (n,), and the weights (n, n) of their phasors.
 
-        chi, index = np.zeros(grid.shape, np.int8), self._radiating
+        It reads the cells that radiate: those on both sides of the step.
+        """
+        assembly, index = self.assembly, self._radiating
+        grid, stencil = assembly.grid, assembly.stencil
+        chi, place = np.zeros(grid.shape, np.int8), places_among(index, math.prod(grid.shape))
         chi[grid.deeper(3)] = 1
         scale = assembly.coefficients.face / stencil.face * grid.spacing
         factor = scale / stencil.source_factor(float(assembly.steps_per_period))
 
-        def rows(ends: tuple[int, int]) -> tuple[Index, Index, AnyArray]:
+        def rows(ends: tuple[int, int]) -> csr_array:
             around = index[slice(*ends), None] + flat_offsets(grid.shape)
-            step = chi.ravel()[around] - chi.ravel()[around[:, 13], None]
-            row, column = np.nonzero(step)
-            value = factor * stencil.weights[column] * step[row, column]
-            return np.count_nonzero(step, axis=1), around[row, column], value
+            step = chi.ravel()[around] - chi.ravel()[index[slice(*ends)], None]
+            part = _rows(stencil.weights * step, place[around], len(index))
+            part.eliminate_zeros()
+            return part
 
-        parts = zip(*spread(rows, parts_of_size(len(index), _ROWS)), strict=True)
-        count, read, value = map(np.concatenate, parts)
-        cells = distinct_cells(read, chi.size)
-        first_of_row = np.concatenate(([0], np.cumsum(count)))
-        place = places_among(cells, chi.size)[read]
-        outward = csr_array((value, place, first_of_row), (len(index), len(cells)))
-        return self.positions(index), cells, outward
+        outward = factor * vstack(spread(rows, parts_of_size(len(index), _ROWS)), format="csr")
+        return self.positions(index), index, outward
 
 
 def _rows(weight: Array, place: NDArray[np.int32], count: int) -> csr_array:

@@ -149,9 +149,9 @@ def lossy_cells(loss: Array) -> LossyCells | None:
 
 def _vertices(elements: Elements, shape: GridShape) -> Index:
     """Return the cells (n, 8) at the vertices of the interface elements."""
-    first = places_of(elements.index, elements.material.shape)
-    places = np.moveaxis(first[:, None] + VERTICES, -1, 0)
-    return np.asarray(np.ravel_multi_index(tuple(places), shape), np.int64)
+    strides = flat_strides(shape)
+    first = places_of(elements.index, elements.material.shape) @ strides
+    return np.asarray(first[:, None] + VERTICES @ strides)
 
 
 def _cell_material(elements: Elements) -> NDArray[np.int16]:
