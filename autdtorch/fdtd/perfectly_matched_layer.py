@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -37,8 +37,10 @@ from autdtorch.utils.array_types import Array, Index
 
 # Angles of incidence at which the profile is fitted [rad]
 TUNED_ANGLES = np.radians((0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 55.0, 60.0, 65.0, 70.0, 75.0, 80.0))
-# Strength and order of the power-law profiles that the fit starts from; the better result is used
+# Strength and order of the power-law profiles that the fit starts from; the one better after so many
+# evaluations goes on. Both to the end take 1.7 times as long, for as little reflection.
 _STARTS = ((10.0, 1.5), (20.0, 2.5))
+_FIRST_EVALUATIONS, _MOST_EVALUATIONS = 8, 60
 # Frequency shift alpha over w. At frequencies above alpha a layer gives energy to evanescent waves: with a
 # small shift the near field of a light obstacle grows. The fit alone would choose 0.01, which gives ten times
 # as much energy; 0.3 would cost 16 dB of reflection.
@@ -135,11 +137,11 @@ def tuned_profile(kappa: float, steps_per_period: float, cells: int) -> LayerPro
         return np.asarray((values[1:] - values[0]).T / _DIFFERENCE)
 
     depth = np.linspace(1, 0.5 / cells, 2 * cells + 1)
-    fits = []
-    for strength, order in _STARTS:
-        start = np.log(strength / (kappa * cells) * depth**order)
-        fits.append(least_squares(residual, start, slopes, bounds=_BOUNDS, max_nfev=60))
-    return profile(min(fits, key=lambda fit: float(fit.cost)).x)
+    fit = partial(least_squares, residual, jac=slopes, bounds=_BOUNDS)
+    starts = [np.log(strength / (kappa * cells) * depth**order) for strength, order in _STARTS]
+    begun = [fit(start, max_nfev=_FIRST_EVALUATIONS) for start in starts]
+    better = min(begun, key=lambda each: float(each.cost)).x
+    return profile(fit(better, max_nfev=_MOST_EVALUATIONS).x)
 
 
 def layer_columns(
