@@ -51,8 +51,7 @@ _ROUGH = 0.01
 # density ratio 77 have errors of up to 2.4 and 2.7 % (15 mm) and 2.8 and 2.1 % (8 mm) at 1 mm.
 _FLUID_REDUCTION = 0.3
 _SAME = 1e-9  # Difference of distances [cells] up to which elements are alike
-# Distances [cells] from a vertex of the place where its nearest face is sought, and of points around that
-_BESIDE, _STEP = np.array((3.1e-4, 1.7e-4, 0.9e-4)), 2e-5
+_STEP = 2e-5  # Distance [cells] from a vertex of the points that tell its nearest face
 _GROUND_GRADIENT = 0.3  # Least mean gradient of a signed distance in an element with one surface
 
 
@@ -212,14 +211,14 @@ def _wall_normals(
 ) -> Array:
     """Return the normals (n, 8, 3) of the nearest faces at vertices inside thin rigid walls, else 0.
 
-    Elements that share a vertex have the same one: also half-way between two faces, it belongs to one.
+    Elements that share a vertex have the same one. It is 0 half-way between two faces.
     """
     normal = np.zeros((len(first), 8, 3))
     for body, level in zip(bodies, distance, strict=True):
         if not body.rigid:
             continue
         row, vertex = np.nonzero((level[:, CORNERS] <= 0) & walls[:, None])
-        places = (first[row] + VERTICES[vertex] + _BESIDE).astype(np.float64)
+        places = (first[row] + VERTICES[vertex]).astype(np.float64)
         sides = [body.distance(places + side * _STEP * np.eye(3)[:, None], grid) for side in (1, -1)]
         normal[row, vertex] = (sides[0] - sides[1]).T / (2 * _STEP)
     return normal

@@ -2,7 +2,7 @@
 
 The air in an element that walls cross is in several parts, its sides. To a side belong the vertices in its
 air, and those inside a wall whose nearest face does not look the opposite way. Sound would pass through
-others.
+others. Vertices half-way between two faces belong to no side, as a mirror image would choose the other one.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from autdtorch.fdtd.assembly.element import CORNERS, FAR, SUBCELLS, subcell_grad
 from autdtorch.utils.array_types import Array, Index
 
 _OPPOSITE = -0.5  # Cosine of the angle between two faces below which they look opposite ways
+_UNDECIDED = 0.5  # Length of a gradient of the distance below which a vertex is half-way between faces
 _LEAST = 1 / len(CORNERS)  # Sum of the shares of sub-cells in which a side has one point of the lattice
 _NEIGHBOURS = np.zeros((3,) * 4, bool)  # of points of the lattices of n elements: six, of the same element
 _NEIGHBOURS[1] = generate_binary_structure(3, 1)
@@ -52,6 +53,7 @@ def _sides(level: Array, normal: Array) -> Iterator[Side]:
     """Yield the sides of walls in elements that all have walls; see `sides_of`."""
     outside, gradient = level > 0, subcell_gradients(level)
     inside, whole = ~outside[:, CORNERS], subcell_means(outside.astype(float))
+    undecided = np.linalg.norm(normal, axis=2) < _UNDECIDED
     labels, count = label(outside.reshape(-1, *(SUBCELLS + 1,) * 3), _NEIGHBOURS)
     labels = labels.reshape(level.shape)
     while labels.any():
@@ -62,7 +64,7 @@ def _sides(level: Array, normal: Array) -> Iterator[Side]:
         facing = (part[:, None] @ gradient)[:, 0] / np.maximum(part.sum(axis=1, keepdims=True), _LEAST)
         opposite = (normal * facing[:, None]).sum(axis=2) < _OPPOSITE
         share = np.divide(part, whole, out=np.zeros_like(part), where=whole > 0)
-        yield Side(share, np.where(inside, opposite, ~here[:, CORNERS]))
+        yield Side(share, np.where(inside, opposite | undecided, ~here[:, CORNERS]))
 
 
 def rigid_level(distance: Array, rigid: Sequence[bool]) -> Array:
