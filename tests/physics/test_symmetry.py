@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from small_scenes import AIR, relative_error
 
@@ -163,7 +163,12 @@ OBSTACLES = st.one_of(
 )
 
 
-@settings(max_examples=6)
+# A vertex of the grid is half-way between two faces: mirror images chose different ones.
+HALF_WAY = Cylinder((11.71875e-3, 15.625e-3, 15.625e-3), 1.953125e-3 / 2, 3.90625e-3, (1, 1, 0.5), rigid=True)
+
+
+@settings(max_examples=5)
+@example(HALF_WAY, 0.0014194609350529578)
 @given(OBSTACLES, st.floats(1.2e-3, 1.6e-3))
 def test_random_symmetric_scenes(obstacle, spacing):
     signs = itertools.product((1, -1), repeat=2)
