@@ -248,6 +248,32 @@ def test_the_thickness_of_a_wall_is_measured(share, tilt):
     assert wall.signed_distance(torch.from_numpy(place)).abs() < 1e-9
 
 
+def test_a_wall_that_a_later_fluid_leaves_of_a_rigid_body_is_rigid_and_told(caplog):
+    """No sound passes it: the field is that of the whole body."""
+    sources = [(26e-3, 14e-3, 12e-3), (13e-3, 27e-3, 16e-3)]
+    points = [(-3e-3, 10e-3, 14e-3), (9e-3, -2e-3, 5e-3), (25e-3, 19e-3, 10e-3)]
+    whole = Mesh.from_surface(pyvista.Icosphere(radius=7.0, nsub=1), scale=1e-3, offset=CENTER, rigid=True)
+    light = {"density": 0.5 * AIR.density, "sound_speed": 1.2 * AIR.sound_speed}
+    inside = Mesh.from_surface(pyvista.Icosphere(radius=6.5, nsub=1), scale=1e-3, offset=CENTER, **light)
+
+    def matrix(*bodies):
+        scene = Scene(TransducerArray(sources, (1, 0, 0)), AIR, 40e3, points, bodies)
+        return make_propagator(scene, "box", SPACING, 1e-3).transfer_matrix()
+
+    solid = matrix(whole)
+    assert "obstacle 0" not in caplog.text
+    with pytest.warns(UserWarning, match="overlaps"):
+        hollow = matrix(whole, inside)
+    # at such a wall the error is of first order: 2 % here. Through one that leaks 20 % come back
+    assert relative_error(hollow, solid) < 0.05
+    assert "obstacle 0 has a wall of 0.4" in caplog.text
+
+
+def test_a_lining_that_overlaps_a_body_leaves_no_thin_wall():
+    lining = Box((12.2e-3, 11.9e-3, 14.1e-3), (4e-3, 4e-3, 0.6e-3), density=3.0, sound_speed=340.0)
+    assert thin_wall(THICK[0], SPACING, [lining]) is None
+
+
 THICK = [
     Box(CENTER, (4e-3,) * 3, rigid=True),
     Sphere(CENTER, 2e-3, rigid=True),

@@ -175,7 +175,7 @@ def _finite(
     walls = np.zeros(len(first), bool)
     for body, mask, level, here in zip(bodies, finite, distance, near, strict=True):
         if body.rigid and body.finite:
-            walls[mask] |= ~_thick(body, level[mask], first[mask], whole, grid)
+            walls[mask] |= ~_thick(bodies, level[mask], first[mask], whole, grid)
         elif body.rigid:
             crossed |= (level < 0).any(axis=1) & (level > 0).any(axis=1)
             thin |= here
@@ -188,12 +188,20 @@ def _finite(
     return finite, np.asarray(walls & finite.any(axis=0))
 
 
-def _thick(
-    body: Union, distance: Array, first: Index, whole: NDArray[np.int16], grid: Grid
-) -> NDArray[np.bool_]:
-    """Return whether a rigid body has one face in elements (n,), with enough of the body behind it.
+def _rigid_distance(bodies: list[Union], places: Array, grid: Grid) -> Array:
+    """Return the signed distance (...) [cells] of places (..., 3) [cells] from rigid bodies."""
+    return rigid_level(
+        np.stack([body.distance(places, grid) for body in bodies]), [body.rigid for body in bodies]
+    )
 
-    `whole` (nx - 1, ny - 1, nz - 1) is the material of elements that no surface intersects, else -1.
+
+def _thick(
+    bodies: list[Union], distance: Array, first: Index, whole: NDArray[np.int16], grid: Grid
+) -> NDArray[np.bool_]:
+    """Return whether a rigid body has one face in elements (n,), with enough rigid material behind it.
+
+    A later fluid body may leave only a wall of it. `distance` (n, 125) is that of the body, and `whole`
+    (nx - 1, ny - 1, nz - 1) the material of elements that no surface intersects, else -1.
     """
     gradient, middle = mean_gradient(distance), distance.mean(axis=1)
     steep = np.linalg.norm(gradient, axis=1)  # small where the two faces of a plate cancel
@@ -201,25 +209,28 @@ def _thick(
     below = (middle[:, None] + _DEPTHS)[:, :, None] * normal[:, None]
     places = first[:, None] + 0.5 - below
     element = np.clip(places.astype(np.int64), 0, np.array(whole.shape) - 1)
-    inside = whole[tuple(np.moveaxis(element, -1, 0))] == body.material
-    inside[~inside] = body.distance(places[~inside], grid) < 0
+    material = whole[tuple(np.moveaxis(element, -1, 0))]
+    inside = np.isin(material, [body.material for body in bodies if body.rigid])
+    cut = material < 0
+    inside[cut] = _rigid_distance(bodies, places[cut], grid) < 0
     return np.asarray(inside.all(axis=1) & (steep > _GROUND_GRADIENT))
 
 
 def _wall_normals(
-    bodies: list[Union], distance: Array, first: Index, walls: NDArray[np.bool_], grid: Grid
+    bodies: list[Union], level: Array, first: Index, walls: NDArray[np.bool_], grid: Grid
 ) -> Array:
     """Return the normals (n, 8, 3) of the nearest faces at vertices inside thin rigid walls, else 0.
 
-    Elements that share a vertex have the same one. It is 0 half-way between two faces.
+    Elements that share a vertex have the same one. It is 0 half-way between two faces. `level` (n, 125) is
+    the signed distance from rigid bodies.
     """
     normal = np.zeros((len(first), 8, 3))
-    for body, level in zip(bodies, distance, strict=True):
-        if not body.rigid:
-            continue
-        row, vertex = np.nonzero((level[:, CORNERS] <= 0) & walls[:, None])
+    row, vertex = np.nonzero((level[:, CORNERS] <= 0) & walls[:, None])
+    if len(row):
         places = (first[row] + VERTICES[vertex]).astype(np.float64)
-        sides = [body.distance(places + side * _STEP * np.eye(3)[:, None], grid) for side in (1, -1)]
+        sides = [
+            _rigid_distance(bodies, places + side * _STEP * np.eye(3)[:, None], grid) for side in (1, -1)
+        ]
         normal[row, vertex] = (sides[0] - sides[1]).T / (2 * _STEP)
     return normal
 
@@ -271,8 +282,8 @@ def _interface(
         distance = _distances(bodies, first, grid)
         edged = np.asarray(less.any(axis=(1, 2)))
         finite, walls = _finite(bodies, distance, first, edged, whole, grid)
-        normal = _wall_normals(bodies, distance, first, walls, grid)
-        sides = sides_of(rigid_level(distance, [body.rigid for body in bodies]), normal, walls)
+        level = rigid_level(distance, [body.rigid for body in bodies])
+        sides = sides_of(level, _wall_normals(bodies, level, first, walls, grid), walls)
         kinds, kind = _distinct(distance, finite, less, sides)
         near = Bodies(distance, numbers, finite, less, sides).chosen(kinds)
         elements = with_losses(lambda these: interface_elements(near, these, stencil), materials, stencil)

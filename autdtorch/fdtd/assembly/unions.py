@@ -38,6 +38,7 @@ _RIGID_DENSITY = 1e5
 
 _PLACES, _DEPTHS = 200, 16  # Places of a surface where the thickness is measured, and depths below each
 _LEAST_SHARE = 0.05  # Least share of a surface that is a thin wall; at sharp edges less is
+_ROUNDING = 1e-3  # Distance above a surface [depths] that is rounding
 _PARALLEL = 0.85  # Least cosine of the angle between the faces of a wall
 _ALIKE = 2.0  # Ratio of densities up to which a thin wall of fluid causes only a small error
 
@@ -304,7 +305,8 @@ def warn_of_thin_walls(region: Region, spacing: float, grids: Iterable[tuple[Ite
             body = region.bodies[number]
             if region.is_as_heavy(body, _ALIKE) or body.is_along(axes, spacing):
                 continue
-            if (wall := thin_wall(body.shape, spacing)) is not None:
+            fluids = [later.shape for later in region.bodies[number + 1 :] if later.fluid is not None]
+            if (wall := thin_wall(body.shape, spacing, fluids)) is not None:
                 thickness, place = wall
                 logger.warning(
                     "obstacle %d has a wall of %.2g mm at %s mm, oblique to the grid and thinner than a cell"
@@ -313,11 +315,11 @@ def warn_of_thin_walls(region: Region, spacing: float, grids: Iterable[tuple[Ite
                 )  # fmt: skip
 
 
-def thin_wall(shape: Shape, spacing: float) -> tuple[float, Array] | None:
+def thin_wall(shape: Shape, spacing: float, fluids: Sequence[Shape] = ()) -> tuple[float, Array] | None:
     """Return the median thickness [m] of the walls of a shape thinner than a cell, and its place (3,) [m].
 
     Thickness is measured along the inward normal, at places that share the area evenly, up to a face that is
-    nearly parallel.
+    nearly parallel: of the shape, or of later `fluids` inside it. Places that these cover do not count.
     """
     vertices, triangles = (part.numpy() for part in shape.surface())
     if extents(vertices)[1] < spacing:
@@ -328,14 +330,22 @@ def thin_wall(shape: Shape, spacing: float) -> tuple[float, Array] | None:
     some = spread_evenly(area, _PLACES)
     places, inwards = corners[some].mean(axis=1), -normals[some] / area[some, None]
     step = spacing / _DEPTHS
-    depths = step * np.arange(1, _DEPTHS + 2)  # one beyond a cell, for the slope there
+    depths = step * np.arange(_DEPTHS + 2)  # one beyond a cell, for the slope there
     below = places[:, None] + depths[:, None] * inwards[:, None]
-    distance = shape.signed_distance(torch.from_numpy(below)).numpy()
-    first = (distance[:, :-1] > 0).argmax(axis=1)  # depth behind the opposite face
+    distance = _distance_outside(fluids, shape, below)
+    covered = distance[:, 0] > _ROUNDING * step
+    first = 1 + (distance[:, 1:-1] > 0).argmax(axis=1)  # depth behind the opposite face
     behind, farther = (distance[np.arange(_PLACES), first + more] for more in (0, 1))
-    thin = (behind > 0) & (farther - behind > _PARALLEL * step)
+    thin = (behind > 0) & (farther - behind > _PARALLEL * step) & ~covered
     if thin.mean() < _LEAST_SHARE:
         return None
     thickness = depths[first[thin]] - behind[thin]
     median = int(np.argsort(thickness)[len(thickness) // 2])
     return float(thickness[median]), np.asarray(places[thin][median])
+
+
+def _distance_outside(fluids: Sequence[Shape], shape: Shape, points: Array) -> Array:
+    """Return the signed distance (...) [m] of points (..., 3) from a shape without the fluids inside it."""
+    where = torch.from_numpy(points)
+    distance = shape.signed_distance(where)
+    return (torch.maximum(distance, -distance_from(fluids, where)) if fluids else distance).numpy()
