@@ -31,6 +31,7 @@ _FLAT = 0.5  # least ratio of the distance of neighbours in a drawing to their d
 _FILLED = 0.44  # radius of a dot, in distances of neighbours
 _UNSURE = 0.55  # radius of the dot of a transducer that the readings hardly determine, in those of others
 _HARDLY = 0.5  # share of the prior's variance that is left of such a transducer, at least
+_LEAST_RANGE = 0.01  # of the colours of gains and of phases [rad]; equal transducers differ by rounding alone
 
 
 @styled
@@ -166,7 +167,7 @@ def _draw_on_array(
     drawn = PatchCollection(
         dots,
         cmap=colours.WAVE_MAP,
-        norm=CenteredNorm(middle, np.abs(values - middle).max() or 1.0),
+        norm=CenteredNorm(middle, max(np.abs(values - middle).max(), _LEAST_RANGE)),
         edgecolors=colours.EDGE_COLOUR,
         linewidths=0.3,
     )

@@ -39,7 +39,7 @@ def of_calibration(calibration: Calibration) -> str:
     held, gain, phase = calibration.held_back, calibration.gain, calibration.phase
     errors = f", {held.before:.1%} off before and {held.error:.1%} after" if held is not None else ""
     gains = f"gains of the transducers from {gain.min():.2f} to {gain.max():.2f}"
-    phases = f"phases from {phase.min():.2f} to {phase.max():.2f} rad"
+    phases = f"phases from {phase.min():z.2f} to {phase.max():z.2f} rad"
     return f"Predictions against readings{errors}; {gains}, {phases}"
 
 
