@@ -50,7 +50,7 @@ class BlockSizes(NamedTuple):
 
 
 def blocks_of(shape: Cells, runs: int) -> BlockSizes:
-    """Return the blocks for runs on a grid, by timings on an H200; `docs/decisions/kernels.md` has them."""
+    """Return the blocks for runs on a grid, by timings on an H200."""
     nx, ny, nz = shape
     if runs * nx * ny * nz > _MOST_CACHED:
         return BlockSizes(*_OF_LARGE_GRIDS)
