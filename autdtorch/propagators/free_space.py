@@ -24,7 +24,7 @@ from autdtorch.scene.scene import Scene
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.images import NO_MIRRORS, Image
-from autdtorch.utils.process import one_library_thread, require_memory
+from autdtorch.utils.process import device_type, one_library_thread, require_memory
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import ArrayLike, differentiable_points, require_kind
 
@@ -83,10 +83,14 @@ class FreeSpacePropagator(ScenePropagator):
         device: "cpu" or "cuda", where fields of many points are summed.
     """
 
-    def __init__(self, scene: Scene, device: str = "cpu") -> None:
-        """Make the propagator of a scene; ignored obstacles are logged."""
+    def __init__(self, scene: Scene, device: torch.device | str | None = None) -> None:
+        """Make the propagator of a scene, by default on the CPU; ignored obstacles are logged.
+
+        Raises:
+            ValueError: an unknown or missing device.
+        """
         require_kind("scene", scene, Scene)
-        self.scene, self.device = scene, device
+        self.scene, self.device = scene, device_type("device", device) or "cpu"
         if scene.obstacles:
             count = len(scene.obstacles)
             logger.warning("free_space ignores %s of scene %r", counted(count, "obstacle"), scene.name)

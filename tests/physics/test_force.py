@@ -295,7 +295,7 @@ def test_many_poses_at_once_are_each_on_its_own(cube):
         torque, matrices = at.radiation_torque(many, DRIVE, **setting), at.force_matrices(many, 1, **setting)
         assert force.shape == (2, 3, 3)
         for number in range(3):
-            pair = [each._in_poses((3,))._some(number, 1) for each in many.bodies]
+            pair = [each.in_poses((3,)).some_poses(number, 1) for each in many.bodies]
             pair = at.TMatrixCluster([replace(e, center=e.center[0], axes=e.axes[0]) for e in pair])
             for row, drive in enumerate(drives[:, 0]):
                 alone = at.radiation_force(pair, drive, 1, **setting)

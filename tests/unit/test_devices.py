@@ -168,7 +168,7 @@ def test_sums_of_waves_are_those_of_the_cpu(kinds, wavenumber, monkeypatch):
 
 @pytest.mark.parametrize("method", ["free_space", "box"])
 @pytest.mark.parametrize("radius", [0.0, 4e-3])
-def test_pictures_summed_on_the_gpu_are_those_of_the_cpu(method, radius, monkeypatch):
+def test_pictures_summed_on_the_gpu_are_those_of_the_cpu(method, radius, monkeypatch, accepted):
     scene = replace(
         SCENE, array=replace(SCENE.array, radius=radius), reflectors=[at.Reflector((40e-3, 0, 0), (-1, 0, 0))]
     )
