@@ -16,6 +16,7 @@ from torch import Tensor
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
 from autdtorch.fdtd.assembly.neighbours import corners_around, flat_index
+from autdtorch.fdtd.assembly.thin_walls import nearest_normals
 from autdtorch.fdtd.damping import at_time_step, fewest_stable_steps
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.interpolation import (
@@ -30,7 +31,7 @@ from autdtorch.fdtd.perfectly_matched_layer import layer_columns, tuned_profile
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.shapes import Shape, distance_from, sees
 from autdtorch.fdtd.stability import whole_steps
-from autdtorch.fdtd.stencil import Stencil, tuned_stencil
+from autdtorch.fdtd.stencil import Stencil, places_of, tuned_stencil
 from autdtorch.utils.array_types import REAL, Array, Index
 from autdtorch.utils.validation import LENGTH_TOLERANCE, invalid
 
@@ -108,10 +109,26 @@ class Assembly:
             row, cell = np.nonzero((off < reach) & (free[place] > 0) & ~seen)
             seen[row, cell] = sees(points[some[row]], ends[row, cell], shapes, spacing)
             if extending := region.extending(spacing):
-                seen |= (distance_from(extending, centers).numpy() < 0)[place]
+                outward = self._outward(numbers, extending)[place]
+                seen |= (outward * way).sum(axis=2) < 0
             beside = (seen & ~rigid[some] & (off < spacing)).any(axis=1)
             behind[some] = ~seen & (off < reach) & beside[:, None]
         return behind
+
+    def _outward(self, cells: Index, shapes: list[Shape]) -> Array:
+        """Return the normals (n, 3) of the nearest faces at cells (n,) in shapes, 0 outside.
+
+        Cells in a wall extend the pressure on its nearest side alone.
+        """
+        places, origin = places_of(cells, self.grid.shape), np.array(self.grid.origin)
+
+        def measure(place: Array) -> Array:
+            points = torch.from_numpy(origin + self.grid.spacing * place)
+            return np.asarray(distance_from(shapes, points).numpy() / self.grid.spacing)
+
+        normals, inside = np.zeros((len(cells), 3)), measure(places.astype(np.float64)) < 0
+        normals[inside] = nearest_normals(measure, places[inside].astype(np.float64))
+        return normals
 
     def is_enclosed(self, points: Tensor, walls: Sequence[Shape]) -> NDArray[np.bool_]:
         """Return whether points (N, 3) [m] are nearer to enclosed cells than to others of air.

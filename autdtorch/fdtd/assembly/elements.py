@@ -31,7 +31,7 @@ from autdtorch.fdtd.assembly.element import (
 from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
 from autdtorch.fdtd.assembly.losses import with_losses
 from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, quadratic, roughness
-from autdtorch.fdtd.assembly.thin_walls import Side, rigid_level, sides_of
+from autdtorch.fdtd.assembly.thin_walls import Side, nearest_normals, rigid_level, sides_of
 from autdtorch.fdtd.assembly.unions import Union, unions_of
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Region
@@ -51,7 +51,6 @@ _ROUGH = 0.01
 # density ratio 77 have errors of up to 2.4 and 2.7 % (15 mm) and 2.8 and 2.1 % (8 mm) at 1 mm.
 _FLUID_REDUCTION = 0.3
 _SAME = 1e-9  # Difference of distances [cells] up to which elements are alike
-_STEP = 2e-5  # Distance [cells] from a vertex of the points that tell its nearest face
 _GROUND_GRADIENT = 0.3  # Least mean gradient of a signed distance in an element with one surface
 
 
@@ -227,11 +226,8 @@ def _wall_normals(
     normal = np.zeros((len(first), 8, 3))
     row, vertex = np.nonzero((level[:, CORNERS] <= 0) & walls[:, None])
     if len(row):
-        places = (first[row] + VERTICES[vertex]).astype(np.float64)
-        sides = [
-            _rigid_distance(bodies, places + side * _STEP * np.eye(3)[:, None], grid) for side in (1, -1)
-        ]
-        normal[row, vertex] = (sides[0] - sides[1]).T / (2 * _STEP)
+        cells = (first[row] + VERTICES[vertex]).astype(np.float64)
+        normal[row, vertex] = nearest_normals(partial(_rigid_distance, bodies, grid=grid), cells)
     return normal
 
 

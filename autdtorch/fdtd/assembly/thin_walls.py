@@ -7,7 +7,7 @@ others. Vertices half-way between two faces belong to no side, as a mirror image
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,8 @@ from autdtorch.fdtd.assembly.element import CORNERS, FAR, SUBCELLS, subcell_grad
 from autdtorch.utils.array_types import Array, Index
 
 _OPPOSITE = -0.5  # Cosine of the angle between two faces below which they look opposite ways
-_UNDECIDED = 0.5  # Length of a gradient of the distance below which a vertex is half-way between faces
+_UNDECIDED = 0.5  # Length of a gradient of the distance below which a cell is half-way between faces
+_STEP = 2e-5  # Distance [cells] from a cell's centre of the points that tell its nearest face
 _LEAST = 1 / len(CORNERS)  # Sum of the shares of sub-cells in which a side has one point of the lattice
 _NEIGHBOURS = np.zeros((3,) * 4, bool)  # of points of the lattices of n elements: six, of the same element
 _NEIGHBOURS[1] = generate_binary_structure(3, 1)
@@ -53,7 +54,7 @@ def _sides(level: Array, normal: Array) -> Iterator[Side]:
     """Yield the sides of walls in elements that all have walls; see `sides_of`."""
     outside, gradient = level > 0, subcell_gradients(level)
     inside, whole = ~outside[:, CORNERS], subcell_means(outside.astype(float))
-    undecided = np.linalg.norm(normal, axis=2) < _UNDECIDED
+    undecided = ~normal.any(axis=2)
     labels, count = label(outside.reshape(-1, *(SUBCELLS + 1,) * 3), _NEIGHBOURS)
     labels = labels.reshape(level.shape)
     while labels.any():
@@ -65,6 +66,17 @@ def _sides(level: Array, normal: Array) -> Iterator[Side]:
         opposite = (normal * facing[:, None]).sum(axis=2) < _OPPOSITE
         share = np.divide(part, whole, out=np.zeros_like(part), where=whole > 0)
         yield Side(share, np.where(inside, opposite | undecided, ~here[:, CORNERS]))
+
+
+def nearest_normals(measure: Callable[[Array], Array], cells: Array) -> Array:
+    """Return the normals (n, 3) of the faces nearest to cell centres (n, 3), 0 half-way between faces.
+
+    `measure` returns signed distances [cells] of places in cells.
+    """
+    ahead, behind = (measure(cells + side * _STEP * np.eye(3)[:, None]) for side in (1, -1))
+    normal = np.asarray((ahead - behind).T / (2 * _STEP))
+    normal[np.linalg.norm(normal, axis=1) < _UNDECIDED] = 0
+    return normal
 
 
 def rigid_level(distance: Array, rigid: Sequence[bool]) -> Array:
