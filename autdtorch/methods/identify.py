@@ -41,7 +41,7 @@ _CLIMB_STEPS = 300
 _SAMPLE_STEPS = 60  # of the climb on a sample of the matrix, from the best drive
 _GROWTH = 24  # a round observes one drive for so many that were observed
 _WORSE = 9.0  # The last drive is not the solution if so many median deviations (6 sigma) below another one,
-_LEAST_WORSE = 0.05  # and by this share of the score
+_LEAST_WORSE = 0.05  # and by this share of the score, or of its distance from the median, as targets score 0
 
 
 @dataclass(frozen=True)
@@ -290,5 +290,6 @@ def _answer(goal: GoalFunction, search: Mapping[str, torch.Tensor]) -> torch.Ten
     off = (score - scores_of(goal, search["fitted"][:, :-1])).abs().nanmedian(dim=1).values
     index = _best_believed(score)
     highest = score.gather(1, index[:, None])[:, 0]
-    worse = last < highest - torch.maximum(_WORSE * off, _LEAST_WORSE * highest.abs())
+    scale = torch.maximum(highest.abs(), highest - score.nanmedian(dim=1).values)
+    worse = last < highest - torch.maximum(_WORSE * off, _LEAST_WORSE * scale)
     return torch.where(worse, index, score.shape[1])
