@@ -37,9 +37,9 @@ _RECORDED = 44
 """Memory [bytes] of a recorded number, and of what is made of it for the Fourier sums."""
 
 _CELL_STEPS, _UNLIKE_STEPS, _COLUMN_STEPS, _LOSSY = 3.0, 9.0, 150.0, 2.0
-"""Time of a step of a heterogeneous cell, what it takes longer if its stencil row is unlike those of others,
-and of one that a surface cuts in an absorbing layer [steps of a cell of air, as in the following times].
-Cells of bodies that absorb have two rows: the factor on the former two."""
+"""Times of a step, in steps of a cell of air, as in the following: of a heterogeneous cell, the additional
+time if its stencil row is unlike those of others, and of a cell that a surface cuts in an absorbing layer.
+The last is the factor on the first two for bodies that absorb, whose cells have two rows."""
 
 _PAIR_STEPS, _ASSEMBLY_STEPS, _MESH_STEPS = 11.0, 60_000.0, 60_000.0
 """Time of one term of a sum over radiating cells, of the assembly of a heterogeneous cell, and of what a mesh

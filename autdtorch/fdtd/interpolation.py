@@ -94,7 +94,7 @@ def exclude_cells(
 def _inverse_of_block(kappa: float, *counts: int) -> Array:
     """Return the inverse of the system (n, n) of a block of cells, with `counts` along the axes."""
     x, y, z = (np.sinc(kappa / np.pi * np.subtract.outer(*[np.arange(count)] * 2)) for count in counts)
-    # By eigenvalues: rounding of these cancels in the fit, that of an elimination would not.
+    # By eigenvalues: their rounding errors cancel in the fit, but those of an elimination would not.
     values, vectors = np.linalg.eigh(np.kron(np.kron(x, y), z))
     inverse: Array = (vectors / (values + _ONE_SIDED_REGULARISATION**2)) @ vectors.T
     return inverse

@@ -263,8 +263,8 @@ class Levitate(_ParticleGoal):
     """The lift of a small sphere in traps, in weights of it: 1 holds it, more is the margin.
 
     The score is the least of two forces over the weight: the upward one, and over directions the restoring
-    one at `reach`. From the latter, the sideways force times reach / displacement is subtracted. With a score
-    of s >= 1 and an upward force of l >= s weights, the drive times l^(-1/2) holds the sphere within
+    one at `reach`. From the latter, the sideways force times reach / displacement is subtracted. Take a score
+    of s >= 1, an upward force of l >= s weights, and the drive times l^(-1/2). It holds the sphere within
     `displacement` of the point across gravity, and within l / s of `reach` along it if its weight doubles.
     Forces are those of `Trap`.
 

@@ -1,4 +1,4 @@
-"""What runs in boxes give: steady states at receivers, and the scattered field that they radiate."""
+"""Results of runs in boxes: steady states at receivers, and the scattered field that they radiate."""
 
 from __future__ import annotations
 

@@ -199,8 +199,8 @@ def _thick(
 ) -> NDArray[np.bool_]:
     """Return whether a rigid body has one face in elements (n,), with enough rigid material behind it.
 
-    A later fluid body may leave only a wall of it. `distance` (n, 125) is that of the body, and `whole`
-    (nx - 1, ny - 1, nz - 1) the material of elements that no surface intersects, else -1.
+    A later fluid body may leave only a wall of it. `distance` (n, 125) is the body's signed distance.
+    `whole` (nx - 1, ny - 1, nz - 1) is the material of elements that no surface intersects, else -1.
     """
     gradient, middle = mean_gradient(distance), distance.mean(axis=1)
     steep = np.linalg.norm(gradient, axis=1)  # small where the two faces of a plate cancel

@@ -185,7 +185,7 @@ class Kernel(Protocol):
     """Advances the states of runs by whole steps."""
 
     device: torch.device
-    """Where states are between calls; those on another are copied."""
+    """The device of states between calls; states on another one are copied."""
 
     def at_once(self, shape: tuple[int, int, int]) -> int:
         """Return the number of calls on a grid of `shape` that threads may make concurrently."""

@@ -17,7 +17,7 @@ from autdtorch.fdtd.kernels.contract import (
 )
 from autdtorch.fdtd.stencil import flat_offsets
 
-_X, _Y, _Z = 1, 2, 3  # Axes of fields, after that of the runs
+_X, _Y, _Z = 1, 2, 3  # Axes of fields; axis 0 is the runs
 
 
 def neighbours(field: Tensor, axis: int) -> Tensor:

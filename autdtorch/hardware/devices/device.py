@@ -40,7 +40,7 @@ class Firmware(Protocol):
 class EmulatedBoards(Protocol):
     """Emulated boards of a device, as the device sees them; `EmulatedBench` describes them.
 
-    `bus` is a backend of pyusb, and `firmware` that of the first board.
+    `bus` is a backend of pyusb, and `firmware` belongs to the first board.
     """
 
     bus: Any

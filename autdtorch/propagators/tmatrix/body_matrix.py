@@ -29,7 +29,7 @@ class BodyMatrix:
 
     @property
     def varies(self) -> bool:
-        """Whether gradients by the body are asked for."""
+        """True if gradients by the body are asked for."""
         return any(part.requires_grad for part in (self.matrix, self.center, self.axes))
 
     def in_poses(self, poses: Sequence[int]) -> Self:

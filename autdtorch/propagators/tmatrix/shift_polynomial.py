@@ -1,11 +1,11 @@
 """The transfer matrix of obstacles that shift as one body, as a polynomial of the shift with a proven error.
 
 The scattered field is w(u)^T T d(u): d are the waves that come to the body at the shift u, and w brings to a
-point what it scatters. Along any direction, the derivative of the waves of degree n consists of waves of the
-degrees n - 1 and n + 1, times the wavenumber and maps of norms s(n) and s(n + 1). Here s(n) is
-n / (4 n^2 - 1)^(1/2). The norm of the outgoing waves of a degree falls with the distance. So norms at the
-least distance bound the derivatives of any order, the product rule bounds those of the field, and these the
-error of interpolation in Chebyshev points.
+point what it scatters. Along any direction, the derivative of waves of degree n consists of waves of the
+degrees n - 1 and n + 1. Their factors are the wavenumber and maps of norms s(n) and s(n + 1), with
+s(n) = n / (4 n^2 - 1)^(1/2). The norm of the outgoing waves of a degree falls with the distance. So norms at
+the least distance bound the derivatives of any order, the product rule bounds those of the field, and these
+the error of interpolation in Chebyshev points.
 """
 
 from __future__ import annotations
