@@ -98,7 +98,7 @@ def _aligned(
     """
     kinds, kind = blocks.kinds_among(index)
     elements = with_losses(lambda these: aligned_elements(kinds, blocks, these, stencil), materials, stencil)
-    if not materials.reacting.any():
+    if not len(index) or not materials.reacting.any():
         return elements, kind
     here, shape = uncut.ravel()[index], uncut.shape
     every = with_impedance_faces(elements.chosen(kind), index, shape, here, blocks, materials, stencil)
