@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from autdtorch.analytic.green import directivity
@@ -153,7 +152,7 @@ class Absorption:
 def absorption(assembly: Assembly, region: Region, axes: Array | None = None) -> Absorption:
     """Return the absorption of a region's bodies on a grid.
 
-    A cell belongs to the nearest body that absorbs. `axes` are those of a turned grid, one a row (3, 3).
+    A cell belongs to one body, see `_owners`. `axes` are those of a turned grid, one a row (3, 3).
     """
     cells, grid, stencil = assembly.heterogeneous, assembly.grid, assembly.stencil
     nothing = np.zeros(0, np.int64), np.zeros((0, 27)), np.zeros(0), np.zeros(0)
@@ -165,23 +164,35 @@ def absorption(assembly: Assembly, region: Region, axes: Array | None = None) ->
     watts = grid.spacing / (2 * 2 * np.pi * region.frequency * region.fluid.density.real)
     watts *= 2 * stencil.kappa / stencil.slope.real
     places = grid.centers_of(index)
-    body = _nearest(torch.from_numpy(places @ (np.eye(3) if axes is None else axes)), region)
+    turned = np.eye(3) if axes is None else axes
+    body, nearest = _owners(torch.from_numpy(places @ turned), region, turned, grid.spacing)
     # of a fluid the mass also absorbs as air does, which its losses leave out
-    in_fluid = np.array([each.fluid is not None for each in region.bodies], bool)[body]
+    in_fluid = np.array([each.fluid is not None for each in region.bodies], bool)[nearest]
     mass = losses.mass + np.where(in_fluid, stencil.loss * cells.mass[losses.place], 0)
     return Absorption(
         used, body, len(region.bodies), place.reshape(around.shape), watts * mass, watts / 2 * losses.coupling
     )
 
 
-def _nearest(places: torch.Tensor, region: Region) -> NDArray[np.int64]:
-    """Return the number (n,) of the absorbing body that is nearest to each place (n, 3) [m]."""
-    absorbing = [
-        number
-        for number, body in enumerate(region.bodies)
-        if body.impedance is not None or (body.fluid is not None and body.fluid.is_lossy)
-    ]
-    if not absorbing:
-        return np.zeros(len(places), np.int64)
-    distance = [region.bodies[number].shape.signed_distance(places) for number in absorbing]
-    return np.asarray(np.array(absorbing)[torch.stack(distance).argmin(dim=0).numpy()], np.int64)
+def _owners(places: torch.Tensor, region: Region, axes: Array, spacing: float) -> tuple[Index, Index]:
+    """Return the numbers of the bodies that absorb at places (n, 3) [m], and that are nearest to them (n,).
+
+    Later bodies replace earlier ones where they overlap. The nearest body absorbs, except in the cells that
+    represent a surface with an impedance, which may be in a fluid: one layer, or two along the grid.
+    """
+    nearness = torch.full((len(region.bodies), len(places)), math.inf, **REAL)
+    surface, later = nearness.clone(), torch.full((len(places),), math.inf, **REAL)
+    for number in reversed(range(len(region.bodies))):
+        body = region.bodies[number]
+        distance = body.shape.signed_distance(places)
+        if body.impedance is not None:
+            layers = 2 if body.is_along(axes, spacing) else 1
+            beside = torch.maximum(distance.abs(), -later)
+            surface[number] = beside.where(beside < layers * spacing, math.inf)
+        if body.impedance is not None or (body.fluid is not None and body.fluid.is_lossy):
+            nearness[number] = torch.maximum(distance, -later)
+        later = torch.minimum(later, distance)
+    if not len(places):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    nearest, (least, beside) = nearness.argmin(dim=0), surface.min(dim=0)
+    return torch.where(least < math.inf, beside, nearest).numpy(), nearest.numpy()

@@ -139,6 +139,7 @@ class ScenePropagator(ABC):
         Returns:
             The power [W], float64, of the obstacles (..., K) and the reflectors (..., J), on the device of
             the drive. Power lost in the medium is not counted, and none in obstacles that free space ignores.
+            Where obstacles that absorb touch, FDTD counts the cells at their common face for one of them.
 
         Raises:
             ValueError: a drive of another shape or out of range, or a reflector that absorbs and has a

@@ -143,6 +143,28 @@ def test_box_and_domain_absorb_alike_and_what_is_rigid_absorbs_nothing():
     assert float(box.obstacles[2]) == float(full.obstacles[2]) == 0
 
 
+@pytest.mark.parametrize(
+    ("core", "least"),
+    [
+        (at.Sphere(BALL.center, 3e-3, density=2.0, sound_speed=300.0, absorption=300.0), 0.85),
+        (at.Sphere(BALL.center, 3e-3, impedance=2.0), 0.97),
+        (at.Box(BALL.center, (4e-3,) * 3, impedance=2.0), 0.97),
+    ],
+    ids=["fluid", "surface", "surface along the grid"],
+)
+@pytest.mark.filterwarnings("ignore:.*overlaps")
+def test_a_core_in_a_fluid_that_hardly_absorbs_absorbs_nearly_all(core, least):
+    """Cells that a fluid's face cuts, a tenth, count for either side of it."""
+    shell = at.Sphere(BALL.center, 5e-3, density=2.0, sound_speed=300.0, absorption=1e-2)
+    outer, inner = (
+        at.make_propagator(scene_of(monopole(), [shell, core]), "box", 1e-3)
+        .absorbed_power(unit(1))
+        .obstacles.tolist()
+    )
+    assert inner > least * (outer + inner)
+    assert outer > 0
+
+
 def test_power_of_several_drives_is_quadratic_and_silence_absorbs_nothing():
     """Half the amplitude is a quarter of the power: single precision of a run, 1e-4."""
     propagator = at.make_propagator(scene_of(monopole(), [BALL]), "box", 2e-3)
