@@ -73,8 +73,9 @@ class Assembly:
 
     def silence(self, sources: Sources, device: torch.device = CPU) -> WaveState:
         """Return the state of all runs, on a device, before the drive is switched on."""
-        faint = _BACKGROUND * float(sources.force.detach().abs().max())
-        return uniform_state(self.grid.shape, self.coefficients, faint, len(sources.force), device)
+        faint = _BACKGROUND * sources.force.detach().abs().amax(dim=(1, 2)).double().to(device)
+        runs = len(sources.force)
+        return uniform_state(self.grid.shape, self.coefficients, faint[:, None, None, None], runs, device)
 
     def interpolation(self, points: Tensor, weights: Tensor = _ONE_NODE) -> Interpolation:
         """Return cells and weights of points (P, 3) [m], or of nodes (P, n, 3) with `weights` (n,)."""

@@ -73,12 +73,13 @@ def moved(state, device):
     return WaveState(state.now.to(device), state.before.to(device), memory)
 
 
-def states_of_five_runs(kernel, most_periods):
-    """Runs of different forces and tolerances."""
+def states_of_five_runs(kernel, most_periods, loudness=1.0):
+    """Runs of different forces, the last one `loudness` times as loud, and of different tolerances."""
     assembly, sources, receivers = assembled_parts(small_scene((CUBE,)), 2e-3, torch.float64)
     cells, tolerances = np.unique(receivers.index), [1e-2, 1e-6, 1e-2, 1e-4, 1e-9]
     random = torch.Generator().manual_seed(1)
     forces = sources.force * torch.randn((5, len(sources.index), 1), generator=random, dtype=torch.float64)
+    forces[-1] *= loudness
     return run_to_steady_state(
         assembly, kernel, lambda runs: Sources(sources.index, forces[runs]), cells, tolerances,
         most_periods, lambda phasors, runs: [phasors], lambda periods: None, torch.zeros((1, 5)),
@@ -98,6 +99,12 @@ def test_runs_together_end_each_at_its_time(most_periods):
     assert sum(together.stepped) <= 2 * sum(alone.stepped)  # at most half of those stepped have converged
     if most_periods == 200:
         assert together.stepped[-1] < 5
+
+
+def test_a_faint_run_does_not_depend_on_loud_ones_beside_it():
+    faint, alone = states_of_five_runs(Kernel(5), 30, 1e-17)[-1], states_of_five_runs(Kernel(1), 30)[-1]
+    # rounding, as above
+    assert relative_error(1e17 * faint.pressure, alone.pressure) < 1e-9
 
 
 def test_phasors_stay_on_the_gpu_of_the_record():

@@ -133,11 +133,11 @@ CPU = torch.device("cpu")
 def uniform_state(
     shape: tuple[int, int, int],
     coefficients: Coefficients,
-    pressure: float,
+    pressure: float | Tensor,
     runs: int = 1,
     device: torch.device = CPU,
 ) -> WaveState:
-    """Return the state of rest, in all runs at a uniform pressure, on a grid of `shape`."""
+    """Return the state of rest, at a uniform pressure (R, 1, 1, 1) or of all runs, on a grid of `shape`."""
     c, cells = coefficients, coefficients.layer_cells
 
     def zeros(*size: int) -> Tensor:
