@@ -138,6 +138,20 @@ def test_a_returned_state_stays_while_another_is_stepped():
     assert torch.equal(state.now, pressure)
 
 
+@pytest.mark.parametrize(("reserved", "allocated"), [(0, 0), (3 * 2**28, 0), (2**29, 2**27)])
+def test_runs_together_do_not_depend_on_memory_that_pytorch_keeps(reserved, allocated, monkeypatch):
+    """As after runs before: PyTorch does not return to the driver what it has freed."""
+    kernel = CudaKernel()
+    kernel.device = torch.device("cuda")
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (2**30 - reserved + allocated, 2**31))
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda: reserved)
+    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda: allocated)
+    # in double precision, two fields and their records fit half of the memory
+    runs = kernel.together((60, 60, 60), 20_000)
+    assert runs == 7
+    assert 2 * runs * 60**3 * torch.float64.itemsize < 2**29
+
+
 def small_propagator(**options):
     return make_propagator(small_scene((HEAVY,), SIZE), "full", **options)
 

@@ -35,8 +35,9 @@ _MOST_CACHED = 2**22  # Most cells whose two fields, in single precision, stay i
 _FEWEST_PROGRAMS = 1400  # That occupy a GPU of 132 multiprocessors
 _OF_LARGE_GRIDS = 16, 4, 64, 4
 _MOST_RUNS, _MOST_CELLS = 256, 2**27  # Of a launch; more take their time one after the other
-# Memory [bytes] of a cell with its layers, and of a receiver, mostly its record, in double precision
-_FIELD_BYTES, _RECORD_BYTES = 32, 3200
+# Memory [bytes], in double precision, of a cell with its layers on a grid of 60^3, and of a receiver, mostly
+# its record
+_FIELD_BYTES, _RECORD_BYTES = 48, 3200
 
 
 class BlockSizes(NamedTuple):
@@ -206,7 +207,9 @@ class CudaKernel:
             return most
         size = _FIELD_BYTES * cells + _RECORD_BYTES * receivers
         free, _ = torch.cuda.mem_get_info()
-        return max(1, min(most, int(free / 2 / size)))
+        # PyTorch keeps what runs before have freed
+        unused = torch.cuda.memory_reserved() - torch.cuda.memory_allocated()
+        return max(1, min(most, int((free + unused) / 2 / size)))
 
     @torch.no_grad()
     def advance(
