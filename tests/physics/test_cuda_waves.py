@@ -6,6 +6,7 @@ import torch
 pytest.importorskip("triton", reason="the CUDA kernel needs Triton: install autdtorch[cuda]")
 
 from autdtorch.analytic.discs import waves_of
+from autdtorch.fdtd.kernels import cuda_waves
 from autdtorch.fdtd.kernels.cuda_waves import waves_on_gpu
 from autdtorch.fdtd.kernels.waves import superposition
 from autdtorch.utils.apertures import Discs
@@ -54,3 +55,19 @@ def test_sums_of_them_are_those_of_the_cpu():
         assert (summed - compiled).norm() < 1e-7 * compiled.norm()
     alone = waves_on_gpu(centers[:1].to(DEVICE), centers[:1], complex(740.0))
     assert alone.abs().item() == pytest.approx(1 / LENGTH_TOLERANCE, rel=1e-12)
+
+
+def test_a_launch_has_room_for_millions_of_sources(monkeypatch):
+    """On a GPU, only the first axis of a grid of programs may be longer than 65535."""
+    grids = []
+
+    class Launch:
+        def __getitem__(self, grid):
+            grids.append(grid)
+            return lambda *arguments, **sizes: None
+
+    monkeypatch.setattr(cuda_waves, "_write_waves", Launch())
+    waves_on_gpu(drawn(5, 0), torch.zeros(64 * 65536, 3, dtype=torch.float64), complex(740.0))
+    (grid,) = grids
+    assert grid[0] == 2 * 65536  # two rows of tiles
+    assert all(size <= 65535 for size in grid[1:])

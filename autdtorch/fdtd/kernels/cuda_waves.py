@@ -36,8 +36,11 @@ def _write_waves(
     `EvenWaves.steps` (STEPS, 9). `ends` has ENDS distances, each with the number of steps that suffices from
     there on for all kinds.
     """
-    row = (tl.program_id(0) * ROWS + tl.arange(0, ROWS))[:, None]
-    column = (tl.program_id(1) * COLUMNS + tl.arange(0, COLUMNS))[None, :]
+    tiles = tl.cdiv(
+        columns, COLUMNS
+    )  # of a row; only the first axis of a grid has room for millions of sources
+    row = (tl.program_id(0) // tiles * ROWS + tl.arange(0, ROWS))[:, None]
+    column = (tl.program_id(0) % tiles * COLUMNS + tl.arange(0, COLUMNS))[None, :]
     there, here = row < rows, column < columns
     x = tl.load(points + 3 * row, mask=there, other=0) - tl.load(centers + 3 * column, mask=here, other=0)
     y = tl.load(points + 3 * row + 1, mask=there, other=0)
@@ -104,8 +107,8 @@ def waves_on_gpu(points: torch.Tensor, sources: torch.Tensor | Discs, wavenumber
         kinds = torch.from_numpy(kind).to(points.device)
         steps, ends = (torch.from_numpy(part).to(points) for part in (table, limits))
         normals = sources.normals.to(points).contiguous()
-    grid = triton.cdiv(len(points), _ROWS), triton.cdiv(len(centers), _COLUMNS)
-    _write_waves[grid](
+    tiles = triton.cdiv(len(points), _ROWS) * triton.cdiv(len(centers), _COLUMNS)
+    _write_waves[(tiles,)](
         points, centers, normals, wave, matrix, len(points), len(centers), kinds, steps, ends,
         DISCS=isinstance(sources, Discs), ENDS=len(ends) if ends.ndim > 1 else 1,
         STEPS=steps.shape[1] // 9 if steps.ndim > 1 else 0, ROWS=_ROWS, COLUMNS=_COLUMNS,
