@@ -89,7 +89,8 @@ def test_the_field_passes_the_rim_of_the_box_smoothly():
 
 
 def test_of_overlapping_obstacles_the_later_wins():
-    later = Sphere(SPHERE.center, 2e-3, density=2 * AIR.density, sound_speed=AIR.sound_speed)
+    x, y, z = SPHERE.center
+    later = Sphere((x - 2.2e-3, y, z), 2.5e-3, density=2 * AIR.density, sound_speed=AIR.sound_speed)
     for obstacles, fluid in (((SPHERE, later), True), ((later, SPHERE), False)):
         with pytest.warns(OverlapWarning):
             scene = small_scene(obstacles)
