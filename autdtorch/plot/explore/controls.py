@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from autdtorch.plot.explore.display import ANGLES, FOCUS, MM, POSITION, first_state, four_digits, in_mm
+from autdtorch.plot.data import MM
+from autdtorch.plot.explore.display import ANGLES, FOCUS, POSITION, first_state, four_digits, in_mm
 from autdtorch.plot.explore.grip import DIGITS
 from autdtorch.plot.explore.page import CAMERA
 from autdtorch.plot.explore.session import Session
@@ -72,7 +73,7 @@ class Controls:
             return
         index = self._display.chosen("body", len(now.bodies))
         if entered := self._entered((*POSITION, *ANGLES), self._display.body_values(now, index)):
-            x, y, z = (round(MM * number, DIGITS) for number in entered[:3])
+            x, y, z = (round(number / MM, DIGITS) for number in entered[:3])
             a, b, c = map(math.radians, entered[3:])
             self._attempt(lambda: now.with_body(index, (x, y, z), (a, b, c)))
 
@@ -81,7 +82,7 @@ class Controls:
         points = now.scene.control_points.clone()
         index = self._display.chosen("focus", len(points))
         if entered := self._entered(FOCUS, self._display.focus_values(now, index)):
-            points[index] = points.new_tensor([round(MM * number, DIGITS) for number in entered])
+            points[index] = points.new_tensor([round(number / MM, DIGITS) for number in entered])
             self._attempt(lambda: now.with_points(points))
 
     def _edit_drive(self) -> None:
@@ -101,7 +102,7 @@ class Controls:
     def _move_plane(self) -> None:
         now = self._session.now
         if entered := self._entered(("height",), (in_mm(now.height),)):
-            self._attempt(lambda: now.with_plane(now.plane, MM * entered[0]))
+            self._attempt(lambda: now.with_plane(now.plane, entered[0] / MM))
 
     def _choose_scale(self) -> None:
         display, now = self._display, self._session.now

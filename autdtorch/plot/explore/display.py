@@ -12,7 +12,7 @@ import numpy as np
 from autdtorch.methods.base import Method
 from autdtorch.methods.catalogue import METHODS, VARIANTS, label_of
 from autdtorch.plot import colours
-from autdtorch.plot.data import in_decibels
+from autdtorch.plot.data import MM, in_decibels
 from autdtorch.plot.explore.calculation import Result
 from autdtorch.plot.explore.rendering import Rendering, Scale
 from autdtorch.plot.explore.situation import SCENE_PLANE, History, Situation, devices_of, free_folder
@@ -21,8 +21,6 @@ from autdtorch.scene.drive import amplitudes_of, phases_of
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.text import decimals_of
 from autdtorch.utils.units import prefixed
-
-MM = 1e-3
 
 POSITION, ANGLES = ("body_x", "body_y", "body_z"), ("turn_x", "turn_y", "turn_z")
 """Names of a body's position [mm] and angles [degrees] in the state of the page."""
@@ -174,7 +172,7 @@ def _scene_state(situation: Situation) -> dict[str, Any]:
 
 def in_mm(length: float) -> float:
     """Return a length [m] in mm, without rounding errors."""
-    return round(length / MM, 4) + 0.0
+    return round(MM * length, 4) + 0.0
 
 
 def four_digits(value: float) -> float:
@@ -218,7 +216,7 @@ def _rows(result: Result, reference: float) -> list[list[str]]:
     levels = in_decibels(result.pressure.numpy(), reference)
     foci = zip(points.tolist(), result.pressure.tolist(), levels.tolist(), strict=True)
     return [
-        [str(index), *(f"{number / MM:.1f}" for number in point), _three_digits(pressure), f"{level:.1f}"]
+        [str(index), *(f"{MM * number:.1f}" for number in point), _three_digits(pressure), f"{level:.1f}"]
         for index, (point, pressure, level) in enumerate(foci)
     ]
 
@@ -232,7 +230,7 @@ def _summary(result: Result) -> str:
         text += f", {share:.0f} % of what any drive can reach ({most} Pa)"
     if result.spacing is None and not result.error:
         return f"{text}. In closed form, without cells."
-    cells = "without cells" if result.spacing is None else f"cells of {result.spacing / MM:.3g} mm"
+    cells = "without cells" if result.spacing is None else f"cells of {MM * result.spacing:.3g} mm"
     if result.error is None:
         return f"{text}. {'Fine' if result.request.fine else 'Coarse'}, {cells}."
     return f"{text}. Estimated error {100 * result.error:.2g} %, {cells}."

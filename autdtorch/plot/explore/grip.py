@@ -36,7 +36,7 @@ class Grip(NamedTuple):
 
     def dragged(self, situation: Situation, place: Array) -> Situation:
         """Return a situation with the body or focus moved so that its grip is at a place (3,) [m]."""
-        offset = np.round((place - self.place) / MM, 1) * MM
+        offset = np.round(MM * (place - self.place), 1) / MM
         center = (self.origin + offset).round(DIGITS)
         if self.kind == "body":
             x, y, z = center.tolist()
