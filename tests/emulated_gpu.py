@@ -118,10 +118,10 @@ def called(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if function in (kind.cpu, kind.cuda):
         return _moved(first, function.__name__)
     if function is kind.to:
-        given = [*args[1:], *kwargs.values()]
-        others = [part for part in given if isinstance(part, kind)]
-        devices = [part.device for part in others] + [p for p in given if isinstance(p, str | torch.device)]
-        types = [part.dtype for part in others] + [p for p in given if isinstance(p, torch.dtype)]
+        wanted = [*args[1:], *kwargs.values()]
+        others = [part for part in wanted if isinstance(part, kind)]
+        devices = [part.device for part in others] + [p for p in wanted if isinstance(p, str | torch.device)]
+        types = [part.dtype for part in others] + [p for p in wanted if isinstance(p, torch.dtype)]
         tensor = _moved(first, devices[0]) if devices else first
         return tensor.type(types[0]) if types else tensor
     of_gpu = kwargs.get("device") is not None and torch.device(kwargs["device"]).type == "cuda"

@@ -202,9 +202,8 @@ def flat_elements(
     Arguments are signed distances (K, n, 125) of bodies, and their materials (K,).
     """
     lines = _lines(axis, distance)
-    first, kind = distinct_rows(
-        lines.reshape(len(lines), len(material) * (SUBCELLS + 1))
-    )  # most have no face
+    # most have no face
+    first, kind = distinct_rows(lines.reshape(len(lines), len(material) * (SUBCELLS + 1)))
     stacks = [_layers(line, material) for line in lines[first]]
     most = max((len(width) for width, _ in stacks), default=1)
     width, layer = np.zeros((len(stacks), most)), np.zeros((len(stacks), most), np.int64)

@@ -33,7 +33,6 @@ _GRAPH_STEPS = 16  # Steps of a captured graph; even, so that both fields return
 _MOST_CAPTURED = 2**25
 _MOST_CACHED = 2**22  # Most cells whose two fields, in single precision, stay in 50 MB of cache
 _FEWEST_PROGRAMS = 1400  # That occupy a GPU of 132 multiprocessors
-_OF_LARGE_GRIDS = 16, 4, 64, 4
 _MOST_RUNS, _MOST_CELLS = 256, 2**27  # Of a launch; more take their time one after the other
 # Memory [bytes], in double precision, of a cell with its layers on a grid of 60^3, and of a receiver, mostly
 # its record
@@ -54,7 +53,7 @@ def blocks_of(shape: Cells, runs: int) -> BlockSizes:
     """Return the blocks for runs on a grid, by timings on an H200."""
     nx, ny, nz = shape
     if runs * nx * ny * nz > _MOST_CACHED:
-        return BlockSizes(*_OF_LARGE_GRIDS)
+        return BlockSizes(y=4, rows=4)
     blocks = BlockSizes()
     tiles = runs * triton.cdiv(ny, blocks.y) * triton.cdiv(nz, blocks.z)
     # a march takes its time however few programs there are
