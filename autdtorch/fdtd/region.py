@@ -16,7 +16,7 @@ from typing import NamedTuple, Self
 import numpy as np
 import torch
 
-from autdtorch.fdtd.shapes import Bounded, Shape, Turned, is_turned, turned_shape
+from autdtorch.fdtd.shapes import Bounded, Shape, Solids, Turned, is_turned, turned_shape
 from autdtorch.fdtd.turning import FlatFaces, flat_faces, slender_faces
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.images import Image, Mirror, images_of
@@ -141,19 +141,14 @@ class Region:
         return [body.shape for body in self.bodies]
 
     @property
-    def walls(self) -> list[Shape]:
-        """Shapes of the bodies that no sound enters."""
-        return [body.shape for body in self.bodies if body.fluid is None]
+    def walls(self) -> Solids:
+        """The bodies that no sound enters."""
+        return Solids(self.shapes, [body.fluid is None for body in self.bodies])
 
     @property
-    def kinked(self) -> list[Shape]:
-        """Shapes of the bodies at whose surface the pressure gradient jumps."""
-        return [body.shape for body in self.bodies if not self.is_as_heavy(body, _AS_HEAVY)]
-
-    def extending(self, spacing: float) -> list[Shape]:
-        """Return the shapes of rigid bodies at an angle to cells [m], which extend the pressure outside."""
-        hard = (body for body in self.bodies if body.fluid is None)
-        return [body.shape for body in hard if not body.is_along(np.eye(3), spacing)]
+    def kinked(self) -> Solids:
+        """The bodies at whose surface the pressure gradient jumps."""
+        return Solids(self.shapes, [not self.is_as_heavy(body, _AS_HEAVY) for body in self.bodies])
 
     def is_as_heavy(self, body: Body, ratio: float) -> bool:
         """Return whether the density of a body is air's, within a ratio > 1."""

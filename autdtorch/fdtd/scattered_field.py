@@ -28,7 +28,6 @@ from autdtorch.fdtd.face_nodes import FaceNodes
 from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.kernels.waves import superposition
-from autdtorch.fdtd.shapes import Shape, turned_shape
 from autdtorch.fdtd.stencil import flat_offsets, places_of
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.utils.apertures import Apertures, Discs, image_of
@@ -237,13 +236,11 @@ class ScatteredField:
         near[near.clone()] = self.inside(apertures.chosen(near).positions).any(dim=1)
         return near
 
-    def enclosed(self, points: Tensor, walls: Sequence[Shape]) -> Tensor:
-        """Return the mask of points (..., 3) [m] in air that rigid bodies, the `walls`, enclose."""
+    def enclosed(self, points: Tensor) -> Tensor:
+        """Return the mask of points (..., 3) [m] in air that rigid bodies enclose."""
         enclosed, inside = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu"), self.inside(points)
         if inside.any():
-            turned = [turned_shape(wall, self.axes) for wall in walls]
-            mask = self.assembly.is_enclosed(self._on_axes(points[inside]), turned)
-            enclosed[inside] = torch.from_numpy(mask)
+            enclosed[inside] = torch.from_numpy(self.assembly.is_enclosed(self._on_axes(points[inside])))
         return enclosed
 
     def positions(self, cells: Index) -> Tensor:

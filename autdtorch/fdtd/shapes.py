@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -50,10 +51,39 @@ def distance_from(shapes: Sequence[Shape], points: Tensor) -> Tensor:
     return torch.stack([shape.signed_distance(points) for shape in shapes]).amin(dim=0)
 
 
-def sees(begin: Array, end: Array, shapes: Sequence[Shape], precision: float) -> NDArray[np.bool_]:
-    """Return whether no shape is between places (..., 3) and others (..., 3) [m], to a precision [m].
+def remaining(distances: Iterable[Array], solid: Sequence[bool]) -> Array:
+    """Return the signed distance (...) from shapes that are `solid` (K,), from those of all (K, ...).
 
-    Each step goes as far as the distance from the nearest shape.
+    Later shapes that are not solid cut into those before. The distance is infinite without solid ones.
+    """
+    level = np.array(math.inf)
+    for distance, is_solid in zip(distances, solid, strict=True):
+        level = np.minimum(level, distance) if is_solid else np.maximum(level, -distance)
+    return level
+
+
+@dataclass(frozen=True)
+class Solids:
+    """Solid shapes among others: later ones that are not solid cut into those before."""
+
+    shapes: Sequence[Shape]
+    solid: Sequence[bool]  # which of them are
+
+    def __bool__(self) -> bool:
+        """Return whether any is solid."""
+        return any(self.solid)
+
+    def distance(self, points: Array) -> Array:
+        """Return the signed distance (...) [m] of points (..., 3) from these; infinite without any."""
+        where = torch.from_numpy(points)
+        level = remaining((shape.signed_distance(where).numpy() for shape in self.shapes), self.solid)
+        return np.broadcast_to(level, points.shape[:-1])
+
+
+def sees(begin: Array, end: Array, solids: Solids, precision: float) -> NDArray[np.bool_]:
+    """Return whether nothing solid is between places (..., 3) and others (..., 3) [m], to a precision [m].
+
+    Each step goes as far as the distance from the nearest.
     """
     begin, end = np.broadcast_arrays(begin, end)
     grid, (begin, end) = begin.shape[:-1], (begin.reshape(-1, 3), end.reshape(-1, 3))
@@ -65,8 +95,7 @@ def sees(begin: Array, end: Array, shapes: Sequence[Shape], precision: float) ->
         if not len(going):
             break
         share = (gone[going] / length[going])[:, None]
-        places = torch.from_numpy((1 - share) * begin[going] + share * end[going])
-        distance = distance_from(shapes, places).numpy()
+        distance = solids.distance((1 - share) * begin[going] + share * end[going])
         # a place on a shape looks away from it
         seen[going] = (distance >= least) | (distance > before[going])
         before[going] = distance

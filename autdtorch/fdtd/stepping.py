@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -16,7 +15,7 @@ from torch import Tensor
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
 from autdtorch.fdtd.assembly.neighbours import corners_around, flat_index
-from autdtorch.fdtd.assembly.thin_walls import nearest_normals
+from autdtorch.fdtd.assembly.unions import Union, nearest_normals, rigid_distance, unions_of
 from autdtorch.fdtd.damping import at_time_step, fewest_stable_steps
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.interpolation import (
@@ -29,10 +28,11 @@ from autdtorch.fdtd.interpolation import (
 from autdtorch.fdtd.kernels.contract import CPU, Coefficients, Receivers, Sources, WaveState, uniform_state
 from autdtorch.fdtd.perfectly_matched_layer import layer_columns, tuned_profile
 from autdtorch.fdtd.region import Region
-from autdtorch.fdtd.shapes import Shape, distance_from, sees
+from autdtorch.fdtd.shapes import Solids, sees
 from autdtorch.fdtd.stability import whole_steps
 from autdtorch.fdtd.stencil import Stencil, places_of, tuned_stencil
 from autdtorch.utils.array_types import REAL, Array, Index
+from autdtorch.utils.process import cached_property
 from autdtorch.utils.validation import LENGTH_TOLERANCE, invalid
 
 logger = logging.getLogger(__name__)
@@ -89,52 +89,64 @@ class Assembly:
     def _behind_surfaces(self, points: Array, cells: Index, rigid: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return which cells (P, n) a surface parts from points (P, 3) [m]: the pressure has a kink there.
 
-        Points in bodies see all cells, and so do those in gaps where only `rigid` cells (P, n) are in sight.
+        Of points in fluid bodies only rigid surfaces part cells.
         """
-        region, spacing = self.region, self.grid.spacing
+        behind, kinked, walls = np.zeros(cells.shape, bool), self.region.kinked, self.region.walls
+        outside = kinked.distance(points) > -LENGTH_TOLERANCE
+        for solids, some in ((kinked, outside), (walls, ~outside)):
+            if solids and some.any():
+                behind[some] = self._behind(solids, points[some], cells[some], rigid[some])
+        return behind
+
+    def _behind(
+        self, solids: Solids, points: Array, cells: Index, rigid: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Return which cells (P, n) are behind solid bodies, as seen from points (P, 3) [m].
+
+        Points in these see all cells, and so do those in gaps where only `rigid` cells (P, n) are in sight.
+        """
+        spacing = self.grid.spacing
         behind, reach = np.zeros(cells.shape, bool), ONE_SIDED_REACH * spacing
-        if not (shapes := region.kinked):
-            return behind
-        around = distance_from(shapes, torch.from_numpy(points)).numpy()
+        around = solids.distance(points)
         near = np.flatnonzero((around > -LENGTH_TOLERANCE) & (around < math.sqrt(3) * reach))
         for first in range(0, len(near), _LOOKING):
             some = near[first : first + _LOOKING]
             numbers, place = np.unique(cells[some], return_inverse=True)
             place = place.reshape(len(some), -1)
-            centers = torch.from_numpy(self.grid.centers_of(numbers))
-            free = distance_from(shapes, centers).numpy()
-            ends = centers.numpy()[place]
+            centers = self.grid.centers_of(numbers)
+            free, ends = solids.distance(centers), centers[place]
             way = ends - points[some, None]
             seen = np.linalg.norm(way, axis=2) <= around[some, None] + free[place]
             off = np.abs(way).max(axis=2)
             row, cell = np.nonzero((off < reach) & (free[place] > 0) & ~seen)
-            seen[row, cell] = sees(points[some[row]], ends[row, cell], shapes, spacing)
-            if extending := region.extending(spacing):
-                outward = self._outward(numbers, extending)[place]
-                seen |= (outward * way).sum(axis=2) < 0
+            seen[row, cell] = sees(points[some[row]], ends[row, cell], solids, spacing)
+            seen |= (self._outward(numbers)[place] * way).sum(axis=2) < 0
             beside = (seen & ~rigid[some] & (off < spacing)).any(axis=1)
             behind[some] = ~seen & (off < reach) & beside[:, None]
         return behind
 
-    def _outward(self, cells: Index, shapes: list[Shape]) -> Array:
-        """Return the normals (n, 3) of the nearest faces at cells (n,) in shapes, 0 outside.
+    def _outward(self, cells: Index) -> Array:
+        """Return the normals (n, 3) of the nearest faces at cells (n,) in rigid bodies, 0 outside.
 
-        Cells in a wall extend the pressure on its nearest side alone.
+        Cells in those at an angle to the grid extend the pressure on their nearest side. Others extend none.
         """
-        places, origin = places_of(cells, self.grid.shape), np.array(self.grid.origin)
-
-        def measure(place: Array) -> Array:
-            points = torch.from_numpy(origin + self.grid.spacing * place)
-            return np.asarray(distance_from(shapes, points).numpy() / self.grid.spacing)
-
-        normals, inside = np.zeros((len(cells), 3)), measure(places.astype(np.float64)) < 0
-        normals[inside] = nearest_normals(measure, places[inside].astype(np.float64))
+        places, bodies = places_of(cells, self.grid.shape).astype(np.float64), self._extending
+        normals = np.zeros((len(cells), 3))
+        if any(body.rigid for body in bodies):
+            inside = rigid_distance(bodies, places, self.grid) < 0
+            normals[inside] = nearest_normals(bodies, places[inside], self.grid)
         return normals
 
-    def is_enclosed(self, points: Tensor, walls: Sequence[Shape]) -> NDArray[np.bool_]:
+    @cached_property
+    def _extending(self) -> list[Union]:
+        """The bodies without rigid ones along the grid."""
+        bodies, _ = unions_of(self.region, self.grid, self.stencil)
+        return [body.measured(self.grid.spacing) for body in bodies if not (body.rigid and body.aligned)]
+
+    def is_enclosed(self, points: Tensor) -> NDArray[np.bool_]:
         """Return whether points (N, 3) [m] are nearer to enclosed cells than to others of air.
 
-        Cells behind rigid `walls`, in the coordinates of the grid, do not count.
+        Cells behind rigid bodies do not count.
         """
         if not len(self.heterogeneous.enclosed):
             return np.zeros(len(points), bool)
@@ -146,7 +158,7 @@ class Assembly:
         open_air = ~np.isin(index, self.heterogeneous.rigid)
         if len(both := np.flatnonzero(enclosed.any(axis=1) & open_air.any(axis=1))):
             places = np.array(self.grid.origin) + self.grid.spacing * corners[both]
-            seen = sees(points.numpy()[both, None], places, walls, self.grid.spacing)
+            seen = sees(points.numpy()[both, None], places, self.region.walls, self.grid.spacing)
             enclosed[both] &= seen
             open_air[both] &= seen
         nearest = [np.where(kind, far, np.inf).min(axis=1) for kind in (enclosed, open_air)]

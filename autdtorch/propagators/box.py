@@ -135,7 +135,7 @@ class BoxSimulation(Simulation):
     def _in_enclosed_cells(self, points: torch.Tensor) -> torch.Tensor:
         enclosed = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu")
         for box in self.boxes:
-            enclosed |= box.enclosed(points, self.plan.region.walls)
+            enclosed |= box.enclosed(points)
         return enclosed
 
     def _orbits_of_transducers(self, points: torch.Tensor) -> Orbits:

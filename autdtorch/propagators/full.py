@@ -50,7 +50,7 @@ class DomainSimulation(Simulation):
         return []
 
     def _in_enclosed_cells(self, points: torch.Tensor) -> torch.Tensor:
-        enclosed = self.assemblies[0].is_enclosed(points.reshape(-1, 3), self.plan.region.walls)
+        enclosed = self.assemblies[0].is_enclosed(points.reshape(-1, 3))
         return torch.from_numpy(enclosed).reshape(points.shape[:-1])
 
     def _check(self, points: torch.Tensor) -> None:

@@ -241,6 +241,22 @@ def test_points_beside_a_thin_wall_oblique_to_the_grid_read_their_side_of_it(thi
     assert relative_error(held.transfer_matrix(), turned.transfer_matrix()) < 0.18
 
 
+@pytest.mark.filterwarnings("ignore::autdtorch.OverlapWarning")
+@pytest.mark.parametrize("fluid", [{}, {"density": 5.0, "sound_speed": 400.0}])
+@pytest.mark.parametrize("tilt", [(0.0, 0.0, 0.0), (0.4, 0.2, 0.0)])
+def test_points_in_a_cavity_that_a_fluid_cuts_read_no_cells_beyond_its_wall(tilt, fluid):
+    """Cells beyond a wall of 0.6 mm, at 1 mm, made the pressure in a cup wrong by 31 %."""
+    cavity = {"density": AIR.density, "sound_speed": AIR.sound_speed} | fluid
+    tube = Box(CENTER, (9e-3, 9e-3, 14e-3), tilt, rigid=True)
+    within = Box(CENTER, (7.8e-3, 7.8e-3, 14e-3), tilt, **cavity)
+    sides = np.random.default_rng(0).uniform((3.0e-3, -2.5e-3, -1e-3), (3.8e-3, 2.5e-3, 1e-3), (20, 3))
+    points = torch.tensor(np.array(CENTER) + sides @ rotation_matrix(tilt).numpy().T)
+    grid = assemble(region_of(small_scene((tube, within))), SPACING)
+    kernels = grid.interpolation(points)
+    read = kernels.index[kernels.weight != 0]
+    assert not (tube.signed_distance(torch.from_numpy(grid.grid.centers_of(read))) > 0).any()
+
+
 @pytest.mark.parametrize("material", [{"rigid": True}, {"density": 1e3, "sound_speed": 2e3}])
 def test_a_thin_wall_oblique_to_the_grid_is_told(material, caplog):
     flat = Box(CENTER, (9e-3, 9e-3, 4e-3), **material)

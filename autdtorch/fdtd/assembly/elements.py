@@ -31,8 +31,14 @@ from autdtorch.fdtd.assembly.element import (
 from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
 from autdtorch.fdtd.assembly.losses import with_losses
 from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, quadratic, roughness
-from autdtorch.fdtd.assembly.thin_walls import Side, nearest_normals, rigid_level, sides_of
-from autdtorch.fdtd.assembly.unions import Union, unions_of
+from autdtorch.fdtd.assembly.thin_walls import Side, sides_of
+from autdtorch.fdtd.assembly.unions import (
+    Union,
+    nearest_normals,
+    rigid_distance,
+    rigid_level,
+    unions_of,
+)
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.shapes import bounds
@@ -187,13 +193,6 @@ def _finite(
     return finite, np.asarray(walls & finite.any(axis=0))
 
 
-def _rigid_distance(bodies: list[Union], places: Array, grid: Grid) -> Array:
-    """Return the signed distance (...) [cells] of places (..., 3) [cells] from rigid bodies."""
-    return rigid_level(
-        np.stack([body.distance(places, grid) for body in bodies]), [body.rigid for body in bodies]
-    )
-
-
 def _thick(
     bodies: list[Union], distance: Array, first: Index, whole: NDArray[np.int16], grid: Grid
 ) -> NDArray[np.bool_]:
@@ -211,7 +210,7 @@ def _thick(
     material = whole[tuple(np.moveaxis(element, -1, 0))]
     inside = np.isin(material, [body.material for body in bodies if body.rigid])
     cut = material < 0
-    inside[cut] = _rigid_distance(bodies, places[cut], grid) < 0
+    inside[cut] = rigid_distance(bodies, places[cut], grid) < 0
     return np.asarray(inside.all(axis=1) & (steep > _GROUND_GRADIENT))
 
 
@@ -227,7 +226,7 @@ def _wall_normals(
     row, vertex = np.nonzero((level[:, CORNERS] <= 0) & walls[:, None])
     if len(row):
         cells = (first[row] + VERTICES[vertex]).astype(np.float64)
-        normal[row, vertex] = nearest_normals(partial(_rigid_distance, bodies, grid=grid), cells)
+        normal[row, vertex] = nearest_normals(bodies, cells, grid)
     return normal
 
 
@@ -278,7 +277,7 @@ def _interface(
         distance = _distances(bodies, first, grid)
         edged = np.asarray(less.any(axis=(1, 2)))
         finite, walls = _finite(bodies, distance, first, edged, whole, grid)
-        level = rigid_level(distance, [body.rigid for body in bodies])
+        level = rigid_level(bodies, distance)
         sides = sides_of(level, _wall_normals(bodies, level, first, walls, grid), walls)
         kinds, kind = _distinct(distance, finite, less, sides)
         near = Bodies(distance, numbers, finite, less, sides).chosen(kinds)

@@ -7,19 +7,17 @@ others. Vertices half-way between two faces belong to no side, as a mirror image
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import generate_binary_structure, label
 
-from autdtorch.fdtd.assembly.element import CORNERS, FAR, SUBCELLS, subcell_gradients, subcell_means
+from autdtorch.fdtd.assembly.element import CORNERS, SUBCELLS, subcell_gradients, subcell_means
 from autdtorch.utils.array_types import Array, Index
 
 _OPPOSITE = -0.5  # Cosine of the angle between two faces below which they look opposite ways
-_UNDECIDED = 0.5  # Length of a gradient of the distance below which a cell is half-way between faces
-_STEP = 2e-5  # Distance [cells] from a cell's centre of the points that tell its nearest face
 _LEAST = 1 / len(CORNERS)  # Sum of the shares of sub-cells in which a side has one point of the lattice
 _NEIGHBOURS = np.zeros((3,) * 4, bool)  # of points of the lattices of n elements: six, of the same element
 _NEIGHBOURS[1] = generate_binary_structure(3, 1)
@@ -66,22 +64,3 @@ def _sides(level: Array, normal: Array) -> Iterator[Side]:
         opposite = (normal * facing[:, None]).sum(axis=2) < _OPPOSITE
         share = np.divide(part, whole, out=np.zeros_like(part), where=whole > 0)
         yield Side(share, np.where(inside, opposite | undecided, ~here[:, CORNERS]))
-
-
-def nearest_normals(measure: Callable[[Array], Array], cells: Array) -> Array:
-    """Return the normals (n, 3) of the faces nearest to cell centres (n, 3), 0 half-way between faces.
-
-    `measure` returns signed distances [cells] of places in cells.
-    """
-    ahead, behind = (measure(cells + side * _STEP * np.eye(3)[:, None]) for side in (1, -1))
-    normal = np.asarray((ahead - behind).T / (2 * _STEP))
-    normal[np.linalg.norm(normal, axis=1) < _UNDECIDED] = 0
-    return normal
-
-
-def rigid_level(distance: Array, rigid: Sequence[bool]) -> Array:
-    """Return the signed distances (n, 125) of bodies that are `rigid` (K,), from those of all (K, n, 125)."""
-    level = np.full(distance.shape[1:], FAR)
-    for far, hard in zip(distance, rigid, strict=True):
-        level = np.minimum(level, far) if hard else np.maximum(level, -far)
-    return level

@@ -17,11 +17,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from autdtorch.fdtd.assembly.element import MaterialLosses, Materials
+from autdtorch.fdtd.assembly.element import FAR, MaterialLosses, Materials
 from autdtorch.fdtd.assembly.losses import STEP
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Body, Fluid, Region
-from autdtorch.fdtd.shapes import Shape, bounds, distance_from
+from autdtorch.fdtd.shapes import Shape, Solids, bounds, distance_from, remaining
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.turning import slender_faces, staircase_excess
 from autdtorch.utils.array_types import Array, Index
@@ -41,6 +41,9 @@ _LEAST_SHARE = 0.05  # Least share of a surface that is a thin wall; at sharp ed
 _ROUNDING = 1e-3  # Distance above a surface [depths] that is rounding
 _PARALLEL = 0.85  # Least cosine of the angle between the faces of a wall
 _ALIKE = 2.0  # Ratio of densities up to which a thin wall of fluid causes only a small error
+
+_STEP = 2e-5  # Distance [cells] from a cell's centre of the points that tell its nearest face
+_UNDECIDED = 0.5  # Length of a gradient of the distance below which a cell is half-way between faces
 
 _THINNEST = 0.32  # Least thickness of a rigid sheet [cells]
 _OPEN = 1e-9  # Thickness [cells] up to which a surface is open, as of a half-space
@@ -110,6 +113,25 @@ class Union:
         axes = zip(positions, grid.origin, ends, strict=True)
         ranges = [np.searchsorted(origin + grid.spacing * along, both) for along, origin, both in axes]
         return np.array(ranges, np.int64).T
+
+
+def rigid_level(bodies: Sequence[Union], distances: Iterable[Array]) -> Array:
+    """Return the signed distance (...) [cells] from rigid bodies, from those of all (K, ...)."""
+    return np.asarray(np.minimum(remaining(distances, [body.rigid for body in bodies]), FAR))
+
+
+def rigid_distance(bodies: Sequence[Union], cells: Array, grid: Grid) -> Array:
+    """Return the signed distance (...) [cells] of positions (..., 3) in cells from rigid bodies."""
+    return rigid_level(bodies, (body.distance(cells, grid) for body in bodies))
+
+
+def nearest_normals(bodies: Sequence[Union], cells: Array, grid: Grid) -> Array:
+    """Return the normals (n, 3) of the rigid faces nearest to cell centres (n, 3), 0 half-way between two."""
+    steps = _STEP * np.eye(3)[:, None]
+    ahead, behind = (rigid_distance(bodies, cells + step, grid) for step in (steps, -steps))
+    normal = np.asarray((ahead - behind).T / (2 * _STEP))
+    normal[np.linalg.norm(normal, axis=1) < _UNDECIDED] = 0
+    return normal
 
 
 def unions_of(region: Region, grid: Grid, stencil: Stencil) -> tuple[list[Union], Materials]:
@@ -332,7 +354,8 @@ def thin_wall(shape: Shape, spacing: float, fluids: Sequence[Shape] = ()) -> tup
     step = spacing / _DEPTHS
     depths = step * np.arange(_DEPTHS + 2)  # one beyond a cell, for the slope there
     below = places[:, None] + depths[:, None] * inwards[:, None]
-    distance = _distance_outside(fluids, shape, below)
+    remainder = Solids((shape, *fluids), (True, *[False] * len(fluids)))
+    distance = remainder.distance(below)
     covered = distance[:, 0] > _ROUNDING * step
     first = 1 + (distance[:, 1:-1] > 0).argmax(axis=1)  # depth behind the opposite face
     behind, farther = (distance[np.arange(_PLACES), first + more] for more in (0, 1))
@@ -342,10 +365,3 @@ def thin_wall(shape: Shape, spacing: float, fluids: Sequence[Shape] = ()) -> tup
     thickness = depths[first[thin]] - behind[thin]
     median = int(np.argsort(thickness)[len(thickness) // 2])
     return float(thickness[median]), np.asarray(places[thin][median])
-
-
-def _distance_outside(fluids: Sequence[Shape], shape: Shape, points: Array) -> Array:
-    """Return the signed distance (...) [m] of points (..., 3) from a shape without the fluids inside it."""
-    where = torch.from_numpy(points)
-    distance = shape.signed_distance(where)
-    return (torch.maximum(distance, -distance_from(fluids, where)) if fluids else distance).numpy()
