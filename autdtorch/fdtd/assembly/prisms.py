@@ -10,24 +10,21 @@ large.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import least_squares, lsq_linear
+from scipy.optimize import lsq_linear
 
+from autdtorch.fdtd.assembly.edge_fit import fitted_couplings, importance
 from autdtorch.fdtd.assembly.element import PAIRS, coupling_by_edges, stiffness_matrix
 from autdtorch.fdtd.assembly.sections import (
     COLUMN_PAIRS,
     COLUMNS,
     RING,
     MaterialKey,
-    PlaneFields,
     Section,
     layered_element,
-    mean_densities,
     plane_fields,
     uniform_columns,
 )
@@ -170,7 +167,7 @@ def _fitted(section: Section, materials: MaterialKey, stencil: Stencil) -> Prism
     if not varied:
         return fit
     fields = plane_fields(section, materials.mobility, min(_FIELDS + 2 * (len(varied) - 1), _MOST_FIELDS))
-    couplings = _fitted_couplings(section, varied, fields, materials, stencil)
+    couplings = fitted_couplings(section, varied, fields, materials, stencil)
     for (x, y), coupling in zip(varied, couplings, strict=True):
         fit.coupling[x, y] = _by_columns(coupling / uniform)
         reached = np.bincount(COLUMN_PAIRS.ravel(), np.repeat(coupling, 2), 4) / (2 * uniform.sum() / 4)
@@ -197,7 +194,7 @@ def _lumped(values: Array, integrals: Array, order: Array, most: Array) -> Array
     The integral of the constant field is nearly exact, the others as exact as weights from 0 up to `most`
     (4,) allow.
     """
-    weight = _importance(order)
+    weight = importance(order)
     weight[0] = _SUM
     bounds = np.zeros(4), np.maximum(most, _LEAST_WEIGHT)
     fit = lsq_linear(
@@ -209,208 +206,3 @@ def _lumped(values: Array, integrals: Array, order: Array, most: Array) -> Array
         max_iter=_MOST_STEPS,
     )
     return np.asarray(fit.x.reshape(2, 2))
-
-
-# Order up to which fields count in the fit, and steepness of the decay of their weights beyond: no coupling
-# reproduces the rapid variation of higher fields between cells
-_ORDER, _STEEPNESS = 2.6, 8
-_PRIOR = 1e-4  # Weight of the first guess, for couplings that the fields do not determine
-_LEAST_START = 0.03  # Least coupling to start from, relative to air: no slope leads away from zero
-# Relative change at which a fit ends: symmetric scenes remain symmetric, and derivatives by density are
-# smooth
-_FIT_EXACT = 1e-13
-_GROUND = 1e-9  # Stiffness to zero pressure, for a cavity that rigid material closes within the window
-_MOST_FIT_STEPS = 80  # of a fit; within a heavy cylinder it is too flat to end by itself
-
-
-def _importance(order: Array) -> Array:
-    """Return the weights (m,) of fields by their order."""
-    return np.asarray(1 / (1 + (order / _ORDER) ** _STEEPNESS))
-
-
-def _fitted_couplings(
-    section: Section,
-    varied: list[tuple[int, int]],
-    fields: PlaneFields,
-    materials: MaterialKey,
-    stencil: Stencil,
-) -> Array:
-    """Return the couplings (k, 6) between the columns of the elements `varied` of a section.
-
-    The stiffness matrix of an element is B R R^T B^T with R triangular, so that no energy is negative. B
-    spans the differences of its columns outside rigid materials.
-    """
-    window = _Window(section, varied, fields, materials, stencil)
-    means = np.stack([mean_densities(section, *place, materials) for place in varied])
-    guess = uniform_columns(stencil) * np.maximum(1 / means, _LEAST_START)
-    roots = _Roots([window.present[columns] for columns in window.columns])
-    start = roots.of(guess)
-    if not len(start):  # at most one column of each element is outside rigid materials
-        return np.zeros_like(guess)
-
-    def missed(root: Array) -> Array:
-        coupling = roots.couplings(root)
-        return np.concatenate((window.missed(coupling), _PRIOR * (coupling / guess - 1).ravel()))
-
-    def slopes(root: Array) -> Array:
-        by_coupling = window.slopes(roots.couplings(root))
-        by_coupling = np.concatenate((by_coupling, _PRIOR * np.diag(1 / guess.ravel())))
-        return np.asarray(by_coupling @ roots.slopes(root))
-
-    fit = least_squares(
-        missed, start, slopes, ftol=_FIT_EXACT, xtol=_FIT_EXACT, gtol=_FIT_EXACT, max_nfev=_MOST_FIT_STEPS
-    )
-    parts = [section.parts(*place, materials.rigid) for place in varied]
-    couplings = roots.couplings(fit.x)
-    return np.stack([_apart(coupling, part) for coupling, part in zip(couplings, parts, strict=True)])
-
-
-def _apart(coupling: Array, part: Index) -> Array:
-    """Return the coupling (6,) of an element without any between columns (4,) in different parts.
-
-    The energy of pressures that vary in one part only is unchanged, so that no energy is negative.
-    """
-    matrix, separate = stiffness_matrix(coupling, COLUMN_PAIRS), np.zeros((4, 4))
-    for number in range(1, int(part.max()) + 1):
-        basis = _differences(np.asarray(part == number))
-        separate += basis @ (basis.T @ matrix @ basis) @ basis.T
-    return np.asarray(-separate[tuple(COLUMN_PAIRS.T)])
-
-
-class _Window:
-    """The vertices of a window, the stiffness of its known elements, and the fields."""
-
-    def __init__(
-        self,
-        section: Section,
-        varied: list[tuple[int, int]],
-        fields: PlaneFields,
-        materials: MaterialKey,
-        stencil: Stencil,
-    ) -> None:
-        """Assemble all elements but those `varied`."""
-        self.present = fields.present.ravel()
-        inside = np.zeros(fields.present.shape, bool)
-        inside[1:-1, 1:-1] = True
-        self._fixed, self._free = self.present & ~inside.ravel(), self.present & inside.ravel()
-        self._fields = (fields.values[:, :, 1:] * _importance(fields.order[1:])).reshape(
-            len(self.present), -1
-        )
-        self._matrix = _known_stiffness(section, materials, stencil)[self._free]
-        self.columns = [_columns(section, place) for place in varied]
-        judged = self._free.copy()
-        judged[np.concatenate(self.columns)] = False
-        self._judged = judged[self._free]
-        pairs = np.concatenate([columns[COLUMN_PAIRS] for columns in self.columns])
-        self._one, self._other = pairs.T  # the vertices that each coupling connects
-
-    def missed(self, coupling: Array) -> Array:
-        """Return the difference of the pressure at the vertices of other elements from the fields."""
-        solution, _ = self._solved(coupling)
-        return np.asarray((solution - self._fields)[self._free][self._judged].ravel())
-
-    def slopes(self, coupling: Array) -> Array:
-        """Return the derivatives (n, 6 k) of `missed` by the couplings."""
-        solution, inverse = self._solved(coupling)
-        change = solution[self._one] - solution[self._other]
-        padded = np.zeros((int(self._judged.sum()), len(self.present)))
-        padded[:, self._free] = inverse[self._judged]
-        response = padded[:, self._other] - padded[:, self._one]
-        return np.asarray((response[:, None] * change.T).reshape(-1, len(change)))
-
-    def _solved(self, coupling: Array) -> tuple[Array, Array]:
-        """Return the fields with the scheme's pressures inside the rim, and the inverse of the stiffness."""
-        flat, whole = coupling.ravel(), np.zeros((len(self.present),) * 2)
-        one, other = self._one, self._other
-        for rows, columns, sign in ((one, other, -1), (other, one, -1), (one, one, 1), (other, other, 1)):
-            np.add.at(whole, (rows, columns), sign * flat)
-        matrix = self._matrix + whole[self._free]
-        inverse = np.linalg.inv(matrix[:, self._free] + _GROUND * np.eye(len(matrix)))
-        solution = self._fields.copy()
-        solution[self._free] = -inverse @ (matrix[:, self._fixed] @ self._fields[self._fixed])
-        return solution, np.asarray(inverse)
-
-
-def _columns(section: Section, place: Sequence[int]) -> Index:
-    """Return the flat indices (4,) of the columns of an element among the vertices of the window."""
-    return np.asarray((COLUMNS + place + RING) @ (section.size[1] + 2 * RING + 1, 1))
-
-
-def _known_stiffness(section: Section, materials: MaterialKey, stencil: Stencil) -> Array:
-    """Return the stiffness matrix of the elements of a window that do not vary along both axes.
-
-    Elements beyond the section continue those beside it.
-    """
-    wide, tall = section.size
-    alike = {
-        (x, y): layered_element(section, x, y, materials, stencil)
-        for x, y in itertools.product(range(-1, wide + 1), range(-1, tall + 1))
-    }
-    pairs, values = [], []
-    for x, y in itertools.product(range(-RING, wide + RING), range(-RING, tall + RING)):
-        element = alike[min(max(x, -1), wide), min(max(y, -1), tall)]
-        if element is not None:
-            pairs.append(_columns(section, (x, y))[COLUMN_PAIRS])
-            values.append(element.coupling)
-    one, other = np.concatenate(pairs).T
-    value, cells = np.concatenate(values), (wide + 2 * RING + 1) * (tall + 2 * RING + 1)
-    rows, columns = np.concatenate((one, other, one, other)), np.concatenate((other, one, one, other))
-    entries = np.concatenate((-value, -value, value, value))
-    matrix = np.bincount(rows * cells + columns, entries, cells**2)
-    return np.asarray(matrix.reshape(cells, cells), np.float64)
-
-
-class _Roots:
-    """The triangular matrices, flat and joined, of the couplings of k elements."""
-
-    def __init__(self, present: list[NDArray[np.bool_]]) -> None:
-        """Start from masks (4,) of the columns of each element outside rigid materials."""
-        self._bases = [_differences(columns) for columns in present]
-        counts = [basis.shape[1] * (basis.shape[1] + 1) // 2 for basis in self._bases]
-        self._ends = list(itertools.pairwise(np.cumsum([0, *counts])))
-
-    def of(self, coupling: Array) -> Array:
-        """Return the roots of couplings (k, 6) of positive energy between the columns that are present."""
-        roots = []
-        for basis, of_element in zip(self._bases, coupling, strict=True):
-            present = np.asarray(basis.any(axis=1))[COLUMN_PAIRS].all(axis=1)
-            matrix = stiffness_matrix(np.where(present, of_element, 0), COLUMN_PAIRS)
-            roots.append(np.linalg.cholesky(basis.T @ matrix @ basis)[np.tril_indices(basis.shape[1])])
-        return np.concatenate(roots)
-
-    def couplings(self, root: Array) -> Array:
-        """Return the couplings (k, 6) of roots."""
-        halves = [
-            basis @ _triangle(root[first:last], basis)
-            for basis, (first, last) in zip(self._bases, self._ends, strict=True)
-        ]
-        return np.stack([-(half @ half.T)[tuple(COLUMN_PAIRS.T)] for half in halves])
-
-    def slopes(self, root: Array) -> Array:
-        """Return the derivatives (6 k, n) of the couplings by the roots."""
-        slopes = np.zeros((6 * len(self._bases), len(root)))
-        for number, (basis, (first, last)) in enumerate(zip(self._bases, self._ends, strict=True)):
-            half = basis @ _triangle(root[first:last], basis)
-            for place, unit in enumerate(np.eye(last - first)):
-                change = basis @ _triangle(unit, basis) @ half.T
-                by_pairs = -(change + change.T)[tuple(COLUMN_PAIRS.T)]
-                slopes[6 * number : 6 * number + 6, first + place] = by_pairs
-        return slopes
-
-
-def _triangle(root: Array, basis: Array) -> Array:
-    """Return the lower triangular matrix of flat entries."""
-    size = basis.shape[1]
-    triangle = np.zeros((size, size))
-    triangle[np.tril_indices(size)] = root
-    return triangle
-
-
-def _differences(present: NDArray[np.bool_]) -> Array:
-    """Return orthonormal differences (4, n - 1) of the n columns that are present."""
-    some = np.flatnonzero(present)
-    basis = np.zeros((4, max(len(some) - 1, 0)))
-    for number in range(1, len(some)):
-        basis[some[:number], number - 1] = 1 / np.sqrt(number * (number + 1))
-        basis[some[number], number - 1] = -number / np.sqrt(number * (number + 1))
-    return basis

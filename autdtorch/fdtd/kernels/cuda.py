@@ -14,7 +14,7 @@ import torch
 import triton
 from torch import Tensor
 
-from autdtorch.fdtd.kernels import cuda_steps
+from autdtorch.fdtd.kernels import cuda_steps, cuda_sweep
 from autdtorch.fdtd.kernels.contract import (
     Coefficients,
     Columns,
@@ -169,7 +169,7 @@ class DeviceRun:
             received, m.ends, m.runs, self._first, offset, LOSSY=len(m.heterogeneous.loss) > 0,
             CROSSED_WIDTH=len(m.crossed.weight), **sizes,
         )  # fmt: skip
-        cuda_steps.sweep[(m.runs * (m.tiles + triton.cdiv(m.columns.size, blocks.lanes)),)](
+        cuda_sweep.sweep[(m.runs * (m.tiles + triton.cdiv(m.columns.size, blocks.lanes)),)](
             now, other, m.shape, m.weights, m.profile, old, new, m.terms, m.columns, m.crossed, m.tiles,
             m.runs, COLUMNS_WIDTH=len(m.columns.weight), X=blocks.x, Y=blocks.y, Z=blocks.z,
             ROWS=blocks.rows, num_warps=max(1, blocks.y * blocks.z // (32 * blocks.rows)), **sizes,
