@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 from emulated_gpu import HAS_GPU, gpu, needs_gpu
-from public_calls import AIR_ALONE, BALL, DRIVE, MATRIX, SCENE, Call, limited_link, propagator, public_calls
+from public_calls import Call, public_calls
+from public_values import AIR_ALONE, BALL, DRIVE, MATRIX, SCENE, limited_link, propagator
 
 import autdtorch as at
 from autdtorch.fdtd.kernels import waves
