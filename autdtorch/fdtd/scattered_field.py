@@ -236,6 +236,14 @@ class ScatteredField:
         near[near.clone()] = self.inside(apertures.chosen(near).positions).any(dim=1)
         return near
 
+    def read_at(self, points: Tensor) -> Tensor:
+        """Return the places (P, 3) [m] that are read for points (P, 3) [m]; see `Assembly.read_at`."""
+        inside, places = self.inside(points), points.clone()
+        if inside.any():
+            on_axes = self.assembly.read_at(self._on_axes(points[inside]))
+            places[inside] = on_axes @ torch.from_numpy(self.axes)
+        return places
+
     def enclosed(self, points: Tensor) -> Tensor:
         """Return the mask of points (..., 3) [m] in air that rigid bodies enclose."""
         enclosed, inside = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu"), self.inside(points)

@@ -51,6 +51,8 @@ _BACKGROUND = 1e-20
 _FEWEST_IDLE = 32  # Cells of a row from which it is quicker to skip them than to step them
 _LOOKING = 512  # Points whose kernels are looked at together
 _TOGETHER = 16_384  # Receivers whose records in double precision stay in the CPU's cache
+_LAYERS = 4  # Cells along an axis, two on each side of a point, that tell whether it is in a slit
+_BLOCK = np.moveaxis(np.indices((_LAYERS,) * 3), 0, -1).reshape(-1, 3)  # those of all axes, from the first
 _ONE_NODE = torch.ones(1, **REAL)  # Weight of a point with a single node
 
 
@@ -85,6 +87,32 @@ class Assembly:
         excluded |= self._behind_surfaces(nodes.numpy(), kernels.index, excluded)
         kernels = exclude_cells(kernels, grid.to_cells(nodes), excluded, grid.shape, grid.kappa)
         return average_nodes(kernels, weights.numpy())
+
+    def read_at(self, points: Tensor) -> Tensor:
+        """Return the places (P, 3) [m] that are read for points (P, 3) [m]; they differ in narrow slits.
+
+        A single layer of cells between two walls does not tell the slope of the pressure across. It is small
+        there, but that of the incident field, which a box adds to what it reads, is not. So points in such a
+        slit are moved into the layer.
+        """
+        grid, cells = self.grid, self.grid.to_cells(points)
+        around = self.region.kinked.distance(points.numpy())
+        some = np.flatnonzero((around > -LENGTH_TOLERANCE) & (around < grid.spacing))
+        if not len(some):
+            return points
+        first = np.floor(cells[some]).astype(np.int64) - 1
+        block = np.ravel_multi_index(tuple(np.moveaxis(first[:, None] + _BLOCK, -1, 0)), grid.shape)
+        rigid = np.isin(block, self.heterogeneous.rigid)
+        behind = self._behind_surfaces(points[some].numpy(), block, rigid)
+        seen = ~(rigid | behind).reshape(-1, *(_LAYERS,) * 3)
+        places = points.clone()
+        for axis in range(3):
+            column = np.moveaxis(seen, axis + 1, 1)[:, :, 1:-1, 1:-1]  # the cells beside the point across
+            layers = np.asarray(column.any(axis=(2, 3)))
+            only = (layers.sum(axis=1) == 1) & layers[:, 1:-1].any(axis=1)
+            layer = first[only, axis] + layers[only].argmax(axis=1)
+            places[some[only], axis] = torch.from_numpy(grid.origin[axis] + grid.spacing * layer)
+        return places
 
     def _behind_surfaces(self, points: Array, cells: Index, rigid: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return which cells (P, n) a surface parts from points (P, 3) [m]: the pressure has a kink there.

@@ -138,6 +138,11 @@ class BoxSimulation(Simulation):
             enclosed |= box.enclosed(points)
         return enclosed
 
+    def _read_at(self, points: torch.Tensor) -> torch.Tensor:
+        for box in self.boxes:
+            points = box.read_at(points)
+        return points
+
     def _orbits_of_transducers(self, points: torch.Tensor) -> Orbits:
         if not self._radiates(points):
             return super()._orbits_of_transducers(points)

@@ -53,6 +53,9 @@ class DomainSimulation(Simulation):
         enclosed = self.assemblies[0].is_enclosed(points.reshape(-1, 3))
         return torch.from_numpy(enclosed).reshape(points.shape[:-1])
 
+    def _read_at(self, points: torch.Tensor) -> torch.Tensor:
+        return self.assemblies[0].read_at(points)
+
     def _check(self, points: torch.Tensor) -> None:
         require_inside(self.plan.scene.domain, "points", points)
         require_in_front(self.plan.scene.reflectors, "points", points)

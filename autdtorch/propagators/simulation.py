@@ -156,6 +156,10 @@ class Simulation(ABC):
         """Return which points (..., 3) are in cells of air that rigid obstacles enclose."""
 
     @abstractmethod
+    def _read_at(self, points: torch.Tensor) -> torch.Tensor:
+        """Return the places (P, 3) that are read for points (P, 3); see `Assembly.read_at`."""
+
+    @abstractmethod
     def _check(self, points: torch.Tensor) -> None:
         """Refuse points (P, 3) whose pressure cannot be computed."""
 
@@ -307,7 +311,7 @@ class Simulation(ABC):
         matrix = torch.zeros((len(points), len(self.plan.scene.array)), **COMPLEX)
         if not audible.any():
             return PressureMap(matrix)
-        result = self._matrix(points[audible])
+        result = self._matrix(self._read_at(points[audible]))
         matrix[audible] = result.matrix
         return replace(result, matrix=matrix)
 
@@ -315,7 +319,7 @@ class Simulation(ABC):
         """Simulate the pressure of drives at points, by no run if no sound reaches any."""
         if self.silent(points[:, None]).all():
             return PressureMap(torch.zeros((len(points), len(drive)), **COMPLEX))
-        return self._fields(drive, points)
+        return self._fields(drive, self._read_at(points))
 
     def _matrix(self, points: torch.Tensor) -> PressureMap:
         """Simulate the transfer matrix of unit strengths at points (P, 3), none of them silent."""
