@@ -154,8 +154,8 @@ def force_forms(ratios: ComplexArray, wavenumber: float, scale: float) -> torch.
     each = degrees(degree)
     padded = torch.cat([torch.from_numpy(ratios), torch.zeros(2, **COMPLEX)])
     scattered = torch.diag(padded[each])
-    one = torch.eye(len(each), **COMPLEX)
-    force = scale * taken_up(linear_momentum, one, scattered)
-    shift = 1j * wavenumber * linear_momentum(one)
+    identity = torch.eye(len(each), **COMPLEX)
+    force = scale * taken_up(linear_momentum, identity, scattered)
+    shift = 1j * wavenumber * linear_momentum(identity)
     changes = [-(force[i] @ shift[j] + force[j] @ shift[i]) for i, j in PAIRS]
     return torch.cat([force, torch.stack([(each + each.mH) / 2 for each in changes])])

@@ -86,8 +86,8 @@ def stepped_cells(
     rows = (weight[place] * before[:, None] - tangent * coupling) / here[:, None]
     late = factor / math.sin(turn) * coupling / here[:, None]
     keep = (before * (1 - of_air) - lost) / (before * (1 + of_air) + lost)
-    own = keep - (1 - of_air) / (1 + of_air) - late.sum(dim=1)
-    loss = late.index_add(1, torch.tensor([13], dtype=torch.int64, device="cpu"), own[:, None])
+    middle = keep - (1 - of_air) / (1 + of_air) - late.sum(dim=1)
+    loss = late.index_add(1, torch.tensor([13], dtype=torch.int64, device="cpu"), middle[:, None])
     return SteppedCells(weight.index_copy(0, place, rows), whole, loss, factor * ground / here)
 
 

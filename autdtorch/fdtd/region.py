@@ -339,7 +339,7 @@ def _cut(vertices: torch.Tensor, triangles: torch.Tensor, mirror: Mirror) -> tor
     height = torch.where(height.abs() < LENGTH_TOLERANCE, 0.0, height)
     whole = (height >= 0).all(dim=1) & (height > 0).any(dim=1)
     parts = [corners[whole]]
-    for one, above in zip(corners[~whole], height[~whole], strict=True):
+    for triangle, above in zip(corners[~whole], height[~whole], strict=True):
         if (above <= 0).all():
             continue
         polygon = []
@@ -347,9 +347,9 @@ def _cut(vertices: torch.Tensor, triangles: torch.Tensor, mirror: Mirror) -> tor
             here, there = above[number - 1], above[number]
             if here * there < 0:
                 share = here / (here - there)
-                polygon.append(one[number - 1] + share * (one[number] - one[number - 1]))
+                polygon.append(triangle[number - 1] + share * (triangle[number] - triangle[number - 1]))
             if there >= 0:
-                polygon.append(one[number])
+                polygon.append(triangle[number])
         fan = [torch.stack([polygon[0], *polygon[n : n + 2]]) for n in range(1, len(polygon) - 1)]
         parts.append(torch.stack(fan))
     return torch.cat(parts)

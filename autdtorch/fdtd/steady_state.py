@@ -86,17 +86,17 @@ def run_to_steady_state(
     earliest, (steps, block) = fewest_periods(assembly.grid.arrival), block_of(assembly.steps_per_period)
     if echo:
         earliest += block  # the first answer to an echo is a block late
-    kept = phasors_kept(len(cells))
+    length = phasors_kept(len(cells))
     first_judged = min(earliest, max_periods) - (_JUDGED - 1) * block
     ramp = math.ceil(RAMP_PERIODS * assembly.steps_per_period)
-    unused = (math.ceil(first_judged / block) - 1) * steps - (kept - 1) * _shift(steps)
+    unused = (math.ceil(first_judged / block) - 1) * steps - (length - 1) * _shift(steps)
     limit = np.array(tolerances)
 
     @torch.no_grad()  # holds in one thread only
     def together(bounds: tuple[int, int]) -> list[SteadyState]:
         runs = np.arange(*bounds)
         stepping = WindowedRuns(assembly, kernel, drive(runs), cells, runs, echo, unused)
-        sequences = Extrapolation(kept, single=assembly.dtype == torch.float32)
+        sequences = Extrapolation(length, single=assembly.dtype == torch.float32)
         judging = _Judging(observe, floors[:, runs])
         places = torch.arange(len(runs), device="cpu")  # among the runs that are stepped
         states: dict[int, SteadyState] = {}

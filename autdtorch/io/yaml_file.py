@@ -173,11 +173,11 @@ def load_trusted(where: str, target: object, modules: Collection[Any], ours: str
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # searched for the user's modules, after the installed packages
     try:
-        found = getattr(importlib.import_module(module), name, None)
+        named = getattr(importlib.import_module(module), name, None)
     except (Exception, SystemExit) as error:  # the user's module may raise anything
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise ValueError(f"{where}: {target!r}; {module} cannot be imported ({reason})") from error
     # What the module merely imports is not trusted.
-    if not isinstance(found, FunctionType | type) or not f"{found.__module__}.".startswith(f"{module}."):
+    if not isinstance(named, FunctionType | type) or not f"{named.__module__}.".startswith(f"{module}."):
         raise ValueError(f"{where}: {target!r}; must be a function or class that {module} defines")
-    return found
+    return named

@@ -83,19 +83,19 @@ def differentiable_field(
     targets = scene.control_points if points is None else points_tensor("points", points).cpu()
     require_inside(scene.domain, "points", targets)
     require_in_front(scene.reflectors, "points", targets)
-    given = _material("density", density, scene), _material("sound_speed", sound_speed, scene)
-    region, given_speed = region_of(scene), given[1]
+    materials = _material("density", density, scene), _material("sound_speed", sound_speed, scene)
+    region, sound_speed = region_of(scene), materials[1]
     if region.mirrors:
         region.require_domain("scene", scene.name)
         region = region.whole
-        given = _of_images(given[0], region), _of_images(given[1], region)
+        materials = _of_images(materials[0], region), _of_images(materials[1], region)
     grid = make_grid(region, positive("spacing", spacing, "m"))
     speeds = region.sound_speeds
-    if given_speed is not None:
+    if sound_speed is not None:
         rigid = torch.tensor(
-            [one.sound_speed is None for one in scene.obstacles], dtype=torch.bool, device="cpu"
+            [obstacle.sound_speed is None for obstacle in scene.obstacles], dtype=torch.bool, device="cpu"
         )
-        effective = given_speed.detach() if given_speed.ndim == 3 else given_speed.detach()[~rigid]
+        effective = sound_speed.detach() if sound_speed.ndim == 3 else sound_speed.detach()[~rigid]
         speeds = speeds | ({"the medium given": float(effective.min())} if effective.numel() else {})
     require_fine(speeds, scene.frequency, spacing)
     warn_if_coarse(speeds, scene.frequency, spacing)
@@ -105,8 +105,8 @@ def differentiable_field(
         periods = fewest_periods(2 * grid.crossing)
     periods = integer_at_least("periods", periods, 1)
     time_step = None if time_step is None else positive("time_step", time_step, "s")
-    by_maps = any(one is not None and one.ndim == 3 for one in given)
-    cells = (cells_of_maps if by_maps else cells_of_obstacles)(region, grid, *given)
+    by_maps = any(values is not None and values.ndim == 3 for values in materials)
+    cells = (cells_of_maps if by_maps else cells_of_obstacles)(region, grid, *materials)
     assembly = cells.assembly(grid, region, precision, time_step)
     receivers, stepper = assembly.receivers(targets), make_kernel(kernel)
     nodes, weights = apertures_of(scene.array, scene.wavenumber).with_images(scene.images)
@@ -145,11 +145,11 @@ def _of_images(values: torch.Tensor | None, region: Region) -> torch.Tensor | No
     return None if values is None else values[[body.number for body in region.bodies]]
 
 
-def _material(name: str, given: ArrayLike | None, scene: Scene) -> torch.Tensor | None:
+def _material(name: str, values: ArrayLike | None, scene: Scene) -> torch.Tensor | None:
     """Return values (K,) of the obstacles or (nx, ny, nz) of the cells, after checking them."""
-    if given is None:
+    if values is None:
         return None
-    values, count = real_tensor(name, given).cpu(), len(scene.obstacles)
+    values, count = real_tensor(name, values).cpu(), len(scene.obstacles)
     if values.shape != (count,) and (values.ndim != 3 or count > 0):
         accepted = f"must be ({count},)" if count else "must be (nx, ny, nz), in a scene without obstacles"
         raise ValueError(f"{name}: shape {tuple(values.shape)}; {accepted}")

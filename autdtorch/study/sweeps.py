@@ -253,9 +253,8 @@ def _merged_trials(parts: Sequence[_Part]) -> MethodResult:
     """Join the trials of all seeds, for each seed those of its longest study."""
     longest = sorted(parts, key=lambda part: (part.seed, part.result.trials))
     by_seed = list({part.seed: part.result for part in longest}.values())
-    one = by_seed[0].solution
-    others = [result.solution for result in by_seed]
-    if all(torch.equal(one.drive, it.drive) and torch.equal(one.history, it.history) for it in others):
+    first, *others = [result.solution for result in by_seed]
+    if all(torch.equal(first.drive, it.drive) and torch.equal(first.history, it.history) for it in others):
         by_seed = by_seed[:1]  # the method makes no random choices
     solution = joined([result.solution for result in by_seed])
     # A study keeps the observation plane of one trial. The one nearest to the joint median is shown.

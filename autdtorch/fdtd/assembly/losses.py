@@ -49,7 +49,7 @@ def with_losses(
     still, *sides = map(make, materials.losses.variants)
     if not sides:
         return still._replace(loss=np.zeros((len(still.mass), GROUND.stop)))
-    values = ((one.coupling, one.mass) for one in (still, *sides))
+    values = ((part.coupling, part.mass) for part in (still, *sides))
     coupling, mass = (_continued(*each) for each in zip(*values, strict=True))
     # the stiffness of a step at the largest tangent of half its phase
     tangent = LARGEST_TANGENT / max(materials.losses.tangent, LARGEST_TANGENT)

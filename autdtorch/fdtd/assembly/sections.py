@@ -277,9 +277,9 @@ def _smoothest(step: Array, mobility: Array, count: int) -> tuple[Array, Array]:
     ahead = np.roll(here, -1)
     stiffness, mass = np.zeros((size, size)), np.zeros(size)
     slope = mobility / step
-    for one in (here, ahead):
-        np.add.at(stiffness, (one, one), slope)
-        np.add.at(mass, one, mobility * step / 2)
+    for end in (here, ahead):
+        np.add.at(stiffness, (end, end), slope)
+        np.add.at(mass, end, mobility * step / 2)
     np.add.at(stiffness, (here, ahead), -slope)
     np.add.at(stiffness, (ahead, here), -slope)
     some = np.flatnonzero(mass)

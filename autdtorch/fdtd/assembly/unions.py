@@ -79,7 +79,7 @@ class Union:
 
     def faces(self, grid: Grid) -> list[Array]:
         """Return the places [cells] of its faces along each axis, up to its end on a grid."""
-        corners = [grid.to_cells(one.surface()[0]) for one in self.shapes]
+        corners = [grid.to_cells(shape.surface()[0]) for shape in self.shapes]
         by_shape = [slender_faces(each) or list(each.T) for each in corners]
         faces = []
         for axis, places in enumerate(map(np.concatenate, zip(*by_shape, strict=True))):

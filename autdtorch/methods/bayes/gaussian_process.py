@@ -253,8 +253,8 @@ class Processes:
         self._observed = self._by_output(observed)
         self._weights = cached.mean_cache.reshape(*shape, 1)
         factor = cached.lik_train_train_covar.cholesky().to_dense().reshape(*shape, points.shape[1])
-        one = torch.eye(points.shape[1], dtype=factor.dtype, device=factor.device)
-        self._whitening = torch.linalg.solve_triangular(factor, one, upper=False).mT
+        identity = torch.eye(points.shape[1], dtype=factor.dtype, device=factor.device)
+        self._whitening = torch.linalg.solve_triangular(factor, identity, upper=False).mT
 
     def at(self, points: torch.Tensor) -> Posterior:
         """Return the posterior at points (T, C, D), in the units of scores, or of intensities.

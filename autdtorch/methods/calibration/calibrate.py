@@ -155,10 +155,8 @@ def _require_in_step(expected: torch.Tensor, observed: torch.Tensor) -> None:
         return
     level = _correlation(expected, observed)
     for shift in _SHIFTS:
-        one, other = (
-            (expected[shift:], observed[:-shift]) if shift > 0 else (expected[:shift], observed[-shift:])
-        )
-        if (shifted := _correlation(one, other)) > max(_FOLLOWS, level + 4 / observed.numel() ** 0.5):
+        pair = (expected[shift:], observed[:-shift]) if shift > 0 else (expected[:shift], observed[-shift:])
+        if (shifted := _correlation(*pair)) > max(_FOLLOWS, level + 4 / observed.numel() ** 0.5):
             follow = f"{counted(abs(shift), 'row')} {'later' if shift > 0 else 'earlier'}"
             pairs = (f"{shift}:", f":{-shift}") if shift > 0 else (f":{shift}", f"{-shift}:")
             raise ValueError(
@@ -216,20 +214,20 @@ def _failed(expected: torch.Tensor, readings: Readings) -> torch.Tensor:
     least = torch.zeros_like(expected[0])
     if readings.deviation is not None:
         least = _CLEAR * readings.deviation.nanmedian(dim=0).values
-    for one, other, dark in zip(expected.T, readings.pressure.T, least, strict=True):
-        known = ~other.isnan()
-        varies = torch.maximum(_VARIES * one[known].mean(), dark)
-        judged = int(known.sum()) >= _COMPARED and bool(one[known].std() > varies)
-        failed.append(judged and _correlation(one[:, None], other[:, None]) < _FOLLOWS)
+    for wanted, read, dark in zip(expected.T, readings.pressure.T, least, strict=True):
+        known = ~read.isnan()
+        varies = torch.maximum(_VARIES * wanted[known].mean(), dark)
+        judged = int(known.sum()) >= _COMPARED and bool(wanted[known].std() > varies)
+        failed.append(judged and _correlation(wanted[:, None], read[:, None]) < _FOLLOWS)
     return torch.tensor(failed, dtype=torch.bool, device="cpu")
 
 
 def _correlation(expected: torch.Tensor, observed: torch.Tensor) -> float:
     """Return the mean over points of the rank correlation of magnitudes (N, P), without gaps."""
     levels = []
-    for one, other in zip(expected.T, observed.T, strict=True):
-        known = ~other.isnan()
-        ranks = torch.stack([_ranks(each[known]) for each in (one, other)])
+    for pair in zip(expected.T, observed.T, strict=True):
+        known = ~pair[1].isnan()
+        ranks = torch.stack([_ranks(values[known]) for values in pair])
         if ranks.shape[1] > 2:
             levels.append(torch.corrcoef(ranks)[0, 1].nan_to_num())
     return float(torch.stack(levels).mean()) if levels else 0.0

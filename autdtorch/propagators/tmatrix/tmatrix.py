@@ -125,9 +125,9 @@ class TMatrix(BodyMatrix):
     @property
     def energy(self) -> float:
         """The rms of |S^H S - 1| over waves, S = 1 + 2 T: 0 for an exact T of a body that absorbs nothing."""
-        one = torch.eye(len(self.matrix), **COMPLEX)
-        scattering = one + 2 * self.matrix
-        return float((scattering.mH @ scattering - one).norm() / math.sqrt(len(one)))
+        identity = torch.eye(len(self.matrix), **COMPLEX)
+        scattering = identity + 2 * self.matrix
+        return float((scattering.mH @ scattering - identity).norm() / math.sqrt(len(identity)))
 
     def moved(
         self,

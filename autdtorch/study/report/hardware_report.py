@@ -245,12 +245,12 @@ def _foci(scene: Scene, names: Sequence[str], measured: Picture, simulated: Pict
     radius = min(scene.wavelength, float(apart))
     places = [source.foci(points, radius) for source in (measured, simulated)]
     columns = [
-        1e3 * (one - other).norm(dim=1) for one, other in ((places[0], places[1]), (places[1], points))
+        1e3 * (first - second).norm(dim=1) for first, second in ((places[0], places[1]), (places[1], points))
     ]
     columns += [field.at(place)[0] for field, place in zip((measured, simulated), places, strict=True)]
     head = ["from the simulated [mm]", "simulated, from the point [mm]", "measured [Pa]", "simulated [Pa]"]
     rows = [
-        [name, f"{apart:.2f}", f"{off:.2f}", in_digits(one, 4), in_digits(other, 4)]
-        for name, apart, off, one, other in zip(names, *(column.tolist() for column in columns), strict=True)
+        [name, f"{apart:.2f}", f"{off:.2f}", in_digits(loud, 4), in_digits(due, 4)]
+        for name, apart, off, loud, due in zip(names, *(column.tolist() for column in columns), strict=True)
     ]
     return [["control point [mm]", *head], *rows]
