@@ -94,7 +94,7 @@ def load_provenance(folder: Path) -> Provenance:
 
 
 @dataclass(frozen=True)
-class Simulation:
+class SceneSimulation:
     """The simulation of the field of one scene.
 
     Attributes:
@@ -123,7 +123,7 @@ class Simulation:
             else f"spacing {1e3 * self.spacing:.4g} mm, {counted(len(self.runs), 'run')}, "
         )
         times = f"matrix {self.matrix_seconds:.2g} s, plane {self.plane_seconds:.2g} s"
-        return f"Simulation({self.method}, {grid}{times})"
+        return f"SceneSimulation({self.method}, {grid}{times})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +177,7 @@ class SceneResult:
     obstacles: int
     transfer_matrix: torch.Tensor
     bound: float
-    simulation: Simulation
+    simulation: SceneSimulation
     methods: dict[str, MethodResult]
     goal: Mapping[str, Any] = field(default_factory=PAPERS_GOAL.copy)
     unit: str = "Pa"

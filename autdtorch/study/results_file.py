@@ -26,7 +26,7 @@ from autdtorch.study.results import (
     MethodResult,
     Provenance,
     SceneResult,
-    Simulation,
+    SceneSimulation,
     StudyResult,
     stored_numbers,
     stored_solution,
@@ -155,12 +155,12 @@ def _read_goal(attributes: Any) -> tuple[dict[str, Any], str]:
     return goal, unit
 
 
-def _read_simulation(group: Any) -> Simulation:
+def _read_simulation(group: Any) -> SceneSimulation:
     attributes, runs = group.attrs, _entry(group, "runs")
     columns = [_array(runs, key).tolist() for key in _RUN]
     method = attributes["method"].replace("operator", "tmatrix")  # a name of version 0.1
     require_one_of("method", method, ("free_space", "box", "full", "tmatrix"))
-    return Simulation(
+    return SceneSimulation(
         method,
         positive("wavelength", attributes["wavelength"], "m"),
         positive("spacing", attributes["spacing"], "m") if "spacing" in attributes else None,

@@ -30,7 +30,7 @@ from autdtorch.study.problems import blank_problem, method_for_bodies, objective
 from autdtorch.study.results import (
     MethodResult,
     SceneResult,
-    Simulation,
+    SceneSimulation,
     StudyResult,
     median_trial,
     provenance_now,
@@ -227,7 +227,9 @@ def _run_scene(
         shown = median_trial(solution.score)
         shown_plane = None if pressure is None else pressure[shown].clone()
         results[method_name] = MethodResult(solution, metrics, seconds, shown, shown_plane)
-    simulation = Simulation("free_space", scene.wavelength, None, None, (), matrix_seconds, plane_seconds)
+    simulation = SceneSimulation(
+        "free_space", scene.wavelength, None, None, (), matrix_seconds, plane_seconds
+    )
     if isinstance(propagator, SimulatedPropagator | TMatrixPropagator):
         grid = {"spacing": propagator.spacing, "tolerance": propagator.tolerance}
         simulation = replace(simulation, method=propagator.method, **grid, runs=tuple(propagator.runs))
@@ -280,7 +282,7 @@ def _in_short(propagator: Propagator, result: SceneResult) -> str:
     return "; ".join(parts)
 
 
-def _accuracy(propagator: SimulatedPropagator | TMatrixPropagator, simulation: Simulation) -> str:
+def _accuracy(propagator: SimulatedPropagator | TMatrixPropagator, simulation: SceneSimulation) -> str:
     """Return the number of simulations, and the relative error as far as it is known."""
     if isinstance(propagator, TMatrixPropagator):
         waves = f"{propagator.planned_runs} waves" if propagator.cells else "exact waves"

@@ -15,11 +15,11 @@ from autdtorch.methods.solution import Solution
 from autdtorch.objectives.metrics import FocusMetrics
 from autdtorch.study import statistics
 from autdtorch.study.report.claims import CLAIMS, judge_claims
-from autdtorch.study.results import MethodResult, Provenance, SceneResult, Simulation, StudyResult
+from autdtorch.study.results import MethodResult, Provenance, SceneResult, SceneSimulation, StudyResult
 from autdtorch.study.statistics import CONFIDENCE, FEWEST_TRIALS, Interval, bootstrap, bound_gap
 from autdtorch.utils.text import decimals_of, in_digits
 
-SIMULATION = Simulation("free_space", 8.5e-3, None, None, (), 0.0, 0.0)
+SIMULATION = SceneSimulation("free_space", 8.5e-3, None, None, (), 0.0, 0.0)
 
 # Data as in the paper's claims: mean pressure and standard deviation [Pa], area [mm^2], weakest
 # focus over mean, gain by the last tenth of the evaluations.

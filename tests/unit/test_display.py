@@ -13,7 +13,7 @@ from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.objectives.perturbations import Noise
 from autdtorch.plot.style import ShownFigure
 from autdtorch.propagators import make_propagator
-from autdtorch.study.results import MethodResult, Provenance, SceneResult, Simulation, StudyResult
+from autdtorch.study.results import MethodResult, Provenance, SceneResult, SceneSimulation, StudyResult
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def objective() -> SimulatedObjective:
 def results(objective: SimulatedObjective) -> StudyResult:
     solution = gabs(objective, levels=4, trials=3)
     method = MethodResult(solution, focus_metrics(solution.pressure), torch.ones(3), 0, None)
-    simulation = Simulation("free_space", 8.5e-3, None, None, (), 0.1, 0.2)
+    simulation = SceneSimulation("free_space", 8.5e-3, None, None, (), 0.1, 0.2)
     scene = SceneResult(0, torch.ones(3, 4, dtype=torch.complex128), 2.0, simulation, {"gabs": method})
     return StudyResult(Provenance("a: 1\n", 0, {}, "", "2026-01-01"), {"a<b": scene})
 

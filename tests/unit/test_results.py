@@ -23,16 +23,16 @@ from autdtorch.study.results import (
     MethodResult,
     Provenance,
     SceneResult,
-    Simulation,
+    SceneSimulation,
     StudyResult,
     load_provenance,
 )
 from autdtorch.study.results_file import RESULTS_FILE, load_results, save_results
 from autdtorch.utils.files import line_of
 
-FREE_SPACE = Simulation("free_space", 8.5e-3, None, None, (), 0.25, 0.5)
+FREE_SPACE = SceneSimulation("free_space", 8.5e-3, None, None, (), 0.25, 0.5)
 RUN_PAIR = (Run(183, 1.9e-3, True, 4.5), Run(600, 3e-2, False, 9.0))
-FULL = Simulation("full", 8.5e-3, 1e-3, 2e-3, RUN_PAIR, 20.0, 80.0)
+FULL = SceneSimulation("full", 8.5e-3, 1e-3, 2e-3, RUN_PAIR, 20.0, 80.0)
 
 
 def method_result(trials, plane, seed):
