@@ -173,9 +173,6 @@ def test_amplitudes_rounded_up_to_full_are_accepted_and_more_is_not() -> None:
         hw.AUTD3.levels([1.1 + 0j])
 
 
-NEAREST = {"autd3": "AUTD3", "autd33": "AUTD3", "OpenMDP": "OPENMPD", "x": "SONICSURFACE"}
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
