@@ -226,6 +226,8 @@ OTHERS: dict[str, Any] = {
     "Mesh.from_surface.surface": Made(lambda _: CUBE.surface()),
     "Mesh.path": Made(mesh_file),
     "OpenMPDBoard.load.path": Made(board_file),
+    "Quantity.name": "force",
+    "Quantity.unit": "mN",
     "QuietPoints.points": [1],
     "SeenPoints.points": [1],
     "Sequence.drives": torch.stack([DRIVE, DRIVE]),

@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -29,6 +29,7 @@ from autdtorch.cli.settings import (
     solver_of,
 )
 from autdtorch.hardware.camera.picture import turned
+from autdtorch.hardware.objective import goal_of
 from autdtorch.hardware.sensors.sensor import AnySensor
 from autdtorch.io.drive_file import save_drive
 from autdtorch.io.goal_section import goal_section, load_goal, score_label
@@ -51,8 +52,6 @@ from autdtorch.utils.progress import Progress, show_progress
 from autdtorch.utils.validation import invalid
 
 logger = logging.getLogger(__name__)
-
-_Measured: TypeAlias = tuple[Solution, torch.Tensor, hardware.Preflight, hardware.EvaluationLog]
 
 _LOG_FILE = "trial.jsonl"
 _MOST_PICTURES = 24  # of 249 transducers and 500 places, these take some 30 s
@@ -92,6 +91,16 @@ def _left_on(error: BaseException | None) -> BaseException | None:
     while error is not None and not isinstance(error, hardware.OffError):
         error = error.__cause__ or error.__context__
     return error
+
+
+class _Measured(NamedTuple):
+    """A trial as it was measured; the drive of the solution was read `again` (R, P)."""
+
+    solution: Solution
+    again: torch.Tensor
+    goal: Goal
+    preflight: hardware.Preflight
+    log: hardware.EvaluationLog
 
 
 class _Trial:
@@ -153,27 +162,27 @@ class _Trial:
             return
         folder = self._folder
         folder.mkdir(parents=True, exist_ok=True)
-        solution, again, preflight, log = self._measure(folder / _LOG_FILE)
-        save_drive(folder / "drive.npz", solution.drive[0], self._scene.array)
+        measured = self._measure(folder / _LOG_FILE)
+        save_drive(folder / "drive.npz", measured.solution.drive[0], self._scene.array)
         command = shlex.join(["autdtorch", *sys.argv[1:]])
         report = write_hardware_report(
             folder,
-            log,
-            solution,
-            again,
+            measured.log,
+            measured.solution,
+            measured.again,
             self._propagator,
             self._simulated,
             self._expected,
-            preflight,
-            self._goal,
+            measured.preflight,
+            measured.goal,
             command,
-            self._calibration(preflight),
+            self._calibration(measured),
         )
-        score = _shown(self._goal, again.mean(dim=0))
+        score = _shown(measured.goal, measured.again.mean(dim=0))
         print(f"{score}, measured once more; the report is {report}")
 
     def _measure(self, log: Path) -> _Measured:
-        """Check the transducers, run the method on the device, and read its drive again (R, P) [Pa]."""
+        """Check the transducers, run the method on the device, and read its drive again (R, P)."""
         bench, points = self._bench, len(self._scene.control_points)
         usual = 1 if bench.by_hand else 4
         with (
@@ -183,7 +192,7 @@ class _Trial:
             show_progress(self._expected.history.shape[1]) as progress,
             contextlib.ExitStack() as at_the_end,
         ):
-            limited = hardware.LimitedLink(link, bench.limits)
+            limited, goal = hardware.LimitedLink(link, bench.limits), self._goal_of(sensor)
             readings = 2 if isinstance(sensor, hardware.PulsedSensor) else usual  # a pulse takes seconds
             pictures = _Pictures(log.parent / PICTURES, sensor)
             objective = hardware.HardwareObjective(
@@ -192,7 +201,7 @@ class _Trial:
                 sensor,
                 log,
                 self._settings,
-                _watcher(progress, self._goal, pictures),
+                _watcher(progress, goal, pictures),
                 simulated_matrix(self._simulated),
             )
             self.begun = not bench.is_dry
@@ -203,7 +212,7 @@ class _Trial:
             preflight = self._preflight(limited, sensor, readings, progress)
             pictures.skip()
             progress.begin(f"running {name_of(self._method)} on {bench.device.name}")
-            solution = solve(self._method, objective, [0], self._seed, self._goal, readings=self._readings)
+            solution = solve(self._method, objective, [0], self._seed, goal, readings=self._readings)
             progress.begin("the drive of the method, once more")
             rows = []
             for number in range(readings):
@@ -216,10 +225,21 @@ class _Trial:
                 silent = hardware.hears_silence(sensor, preflight, points, readings)
             if not silent:
                 logger.warning("the sensor reads more than before the trial: are the outputs off?")
-        return solution, again, preflight, objective.log
+        return _Measured(solution, again, goal, preflight, objective.log)
 
-    def _calibration(self, preflight: hardware.Preflight) -> Calibration | str:
+    def _goal_of(self, sensor: AnySensor) -> Goal:
+        """Return the goal of the trial, or for a sensor of another quantity than the pressure its own."""
+        if (goal := goal_of(sensor)).of_pressures:
+            return self._goal
+        if self._goal != WEAKEST_FOCUS:
+            accepted = f"must be {WEAKEST_FOCUS.name} with a sensor of {goal.name}, for its least reading"
+            raise invalid("goal", self._goal.name, accepted)
+        return goal
+
+    def _calibration(self, measured: _Measured) -> Calibration | str:
         """Return the simulation fitted to the evaluations, or the reason why there is none."""
+        if not measured.goal.of_pressures:
+            return f"the sensor reads {measured.goal.name}, and the simulation gives pressures"
         pictures, plane = self._folder / PICTURES, self._scene.observation_plane
         if plane is not None and pictures_of_evaluations(pictures):  # they see more than the points
             places = plane.points(_SEEN_APART * self._scene.wavelength).reshape(-1, 3)
@@ -229,7 +249,7 @@ class _Trial:
         if len(readings.drives) == 1:
             return "one evaluation does not tell the transducers apart"
         drives = readings.drives.clone()
-        drives[:, preflight.failed] = 0
+        drives[:, measured.preflight.failed] = 0
         rows = torch.linspace(0, len(drives) - 1, min(len(drives), most), **REAL).round().long()
         try:
             return calibrate(self._propagator, replace(readings, drives=drives)[rows])
@@ -241,11 +261,9 @@ class _Trial:
         self, limited: hardware.LimitedLink, sensor: AnySensor, readings: int, progress: Progress
     ) -> hardware.Preflight:
         count, points = len(self._scene.array), len(self._scene.control_points)
-        if isinstance(sensor, hardware.PulsedSensor):
-            logger.info(
-                "the sensor does not see a transducer alone: silence and one picture are checked instead"
-            )
-            progress.begin("a first picture, of the simulated drive")
+        if isinstance(sensor, hardware.PulsedSensor) or not goal_of(sensor).of_pressures:
+            logger.info("the sensor does not see a transducer alone: silence and one drive are checked")
+            progress.begin("a first reading, of the simulated drive")
             check = hardware.check_picture(limited, sensor, points, self._expected.drive[0], readings)
             self._warn_of_turned(getattr(sensor, "picture", None))
             return check
@@ -262,9 +280,10 @@ class _Trial:
             )
         if len(check.failed) == count:
             loudest = ", and try a lower loudest" if self._settings["sensor"] == "scope" else ""
-            strongest = f"{float(check.pressure.max()):.3g} Pa from the strongest transducer"
-            accepted = f"above {check.threshold:.3g} Pa; check the device's power, and the sensor{loudest}"
-            raise ValueError(f"hardware.sensor: {strongest}; must be {accepted}")
+            strongest = f"{float(check.pressure.max()):.3g} {check.unit} from the strongest transducer"
+            accepted = f"must be above {check.threshold:.3g} {check.unit}"
+            advice = f"check the device's power, and the sensor{loudest}"
+            raise ValueError(f"hardware.sensor: {strongest}; {accepted}; {advice}")
         logger.info("%d of %d transducers work", count - len(check.failed), count)
         if check.failed:
             logger.warning("failed transducers, counted from 0: %s", ", ".join(map(str, check.failed)))

@@ -53,6 +53,7 @@ from .sensors.scpi_scope import Waveform as Waveform
 from .sensors.scpi_scope import open_scope as open_scope
 from .sensors.sensor import EmulatedSensor as EmulatedSensor
 from .sensors.sensor import PulsedSensor as PulsedSensor
+from .sensors.sensor import Quantity as Quantity
 from .sensors.sensor import Sensor as Sensor
 from .sensors.sensor import SensorError as SensorError
 from .streaming import Playback as Playback

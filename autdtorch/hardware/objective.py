@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 
@@ -13,13 +14,47 @@ from autdtorch.hardware.devices.device import Device
 from autdtorch.hardware.link import AmplitudeScale, Wiring
 from autdtorch.hardware.log import Evaluation, EvaluationLog
 from autdtorch.hardware.safety import LimitedLink, LimitError
-from autdtorch.hardware.sensors.sensor import AnySensor, require_sensor
+from autdtorch.hardware.sensors.sensor import PRESSURE, AnySensor, Quantity, quantity_of, require_sensor
+from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.objectives.objective import Objective, observe_drives, validate_matrix
 from autdtorch.objectives.perturbations import Perturbation
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import path_of
-from autdtorch.utils.validation import invalid, require_callable, require_kind
+from autdtorch.utils.validation import ArrayLike, invalid, require_callable, require_kind
+
+
+@dataclass(frozen=True)
+class LeastReading(Goal):
+    """The goal of a sensor of another quantity than the pressure: its least reading.
+
+    Attributes:
+        quantity: of the readings.
+    """
+
+    of_pressures: ClassVar[bool] = False
+
+    quantity: Quantity
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        """The name of the quantity."""
+        return self.quantity.name
+
+    @property
+    def unit(self) -> str:  # type: ignore[override]
+        """The unit of the readings."""
+        return self.quantity.unit
+
+    def __call__(self, pressure: ArrayLike) -> torch.Tensor:
+        """Return the least of readings (..., P)."""
+        return self.checked(pressure).amin(dim=-1)
+
+
+def goal_of(sensor: AnySensor) -> Goal:
+    """Return the goal of a sensor's readings: the weakest focus, or the least of another quantity."""
+    quantity = quantity_of(sensor)
+    return WEAKEST_FOCUS if quantity == PRESSURE else LeastReading(quantity)
 
 
 class HardwareObjective:
@@ -35,6 +70,7 @@ class HardwareObjective:
         scene: the scene on the bench.
         log: of the evaluations.
         transfer_matrix: simulated G (P, M) [Pa], or None.
+        goal: the weakest focus; of a sensor of another quantity its least reading, which takes its place.
     """
 
     def __init__(
@@ -85,6 +121,9 @@ class HardwareObjective:
         if transfer_matrix is not None:
             self.transfer_matrix = validate_matrix("transfer_matrix", transfer_matrix, points, count)
         self.scene, self._link, self._sensor, self._watch = scene, link, sensor, watch
+        self.goal = goal_of(sensor)
+        if not self.goal.of_pressures:
+            named["quantity"] = f"{self.goal.name} [{self.goal.unit}]"
         self._sensed: Callable[[torch.Tensor], torch.Tensor] | None = getattr(sensor, "deviation", None)
         origin = {
             "scene": f"{scene.name} {digest_of(scene)[:16]}",
@@ -100,7 +139,7 @@ class HardwareObjective:
         link.logs.add(place)
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
-        """Play drives (..., M), |q| <= 1, one by one; return magnitudes (..., P) [Pa], float64.
+        """Play drives (..., M), |q| <= 1, one by one; return readings (..., P), float64.
 
         The outputs are off afterwards, also after an error.
 

@@ -1,4 +1,4 @@
-"""The check before a trial: the pressure of each transducer, or of a picture, against silence."""
+"""The check before a trial: the reading of each transducer, or of one drive, against silence."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from autdtorch.hardware.sensors.sensor import (
     Sensor,
     SensorError,
     checked_reading,
+    quantity_of,
     require_sensor,
 )
 from autdtorch.utils.array_types import COMPLEX, REAL
@@ -29,18 +30,20 @@ _WEAK = 0.1  # threshold below the median of all transducers: 20 dB, as some sen
 
 @dataclass(frozen=True, eq=False)
 class Preflight:
-    """The pressure of each transducer alone, and of silence.
+    """The pressure of each transducer alone, and of silence, or what else a sensor reads.
 
     Attributes:
-        pressure: of each transducer (M,) [Pa], rms over readings and control points; (0,) where a sensor does
-            not see a transducer alone.
-        silence: with the outputs off [Pa].
-        threshold: pressure that a working transducer exceeds [Pa].
+        pressure: of each transducer (M,), rms over readings and control points; (0,) where a sensor does not
+            see a transducer alone.
+        silence: reading with the outputs off.
+        threshold: reading that a working transducer exceeds.
+        unit: of the three.
     """
 
     pressure: torch.Tensor
     silence: float
     threshold: float
+    unit: str = "Pa"
 
     @property
     def failed(self) -> list[int]:
@@ -101,19 +104,19 @@ def check_transducers(
         link.off()
     pressure = torch.tensor(powers, **REAL).sqrt()
     threshold = max(_above_noise(silence, readings * points), _WEAK * float(pressure.median()))
-    return Preflight(pressure, math.sqrt(silence), threshold)
+    return Preflight(pressure, math.sqrt(silence), threshold, quantity_of(sensor).unit)
 
 
 def check_picture(
-    link: LimitedLink, sensor: PulsedSensor, points: int, drive: torch.Tensor, readings: int = 4
+    link: LimitedLink, sensor: AnySensor, points: int, drive: torch.Tensor, readings: int = 4
 ) -> Preflight:
-    """Read silence and one drive (M,), in place of single transducers, which a camera does not see.
+    """Read silence and one drive (M,), as a camera or a balance does not see a transducer alone.
 
     The threshold is as of `check_transducers`, with the drive's loudest control point for all transducers.
     `SensorError` if the drive is not above it anywhere; other errors are those of `check_transducers`.
     """
     require_kind("link", link, LimitedLink)
-    require_kind("sensor", sensor, PulsedSensor)
+    require_sensor(sensor)
     points = integer_at_least("points", points, 1)
     readings = readings_count("readings", readings)
     silence = _power(_silent(sensor, points), readings)
@@ -121,13 +124,11 @@ def check_picture(
     if (deviation := getattr(sensor, "deviation", None)) is not None:  # its silence may be 0 by chance
         of_silence = float(deviation(torch.zeros(points, **REAL)).max())
         threshold = max(threshold, math.sqrt(_DEVIATIONS) * of_silence)
-    loudest = float(link.measure(drive, sensor, points).max())
-    if loudest <= threshold:
-        accepted = f"must be above {threshold:.3g} Pa, the noise; check the device's power, and the sensor"
-        raise SensorError(
-            f"the first picture shows {loudest:.3g} Pa at the loudest control point; {accepted}"
-        )
-    return Preflight(torch.empty(0, **REAL), math.sqrt(silence), max(threshold, _WEAK * loudest))
+    largest, unit = float(link.measure(drive, sensor, points).max()), quantity_of(sensor).unit
+    if largest <= threshold:
+        accepted = f"must be above the noise, {threshold:.3g} {unit}; check the power, and the sensor"
+        raise SensorError(f"the largest reading of a drive is {largest:.3g} {unit}; {accepted}")
+    return Preflight(torch.empty(0, **REAL), math.sqrt(silence), max(threshold, _WEAK * largest), unit)
 
 
 def hears_silence(sensor: AnySensor, check: Preflight, points: int, readings: int = 4) -> bool:
@@ -143,12 +144,12 @@ def hears_silence(sensor: AnySensor, check: Preflight, points: int, readings: in
 
 
 def _above_noise(power: float, numbers: int) -> float:
-    """Return the pressure [Pa] above noise of a mean power [Pa^2] over so many numbers."""
+    """Return the reading above noise of a mean square over so many numbers."""
     return math.sqrt(power * (1 + _DEVIATIONS / math.sqrt(numbers)))
 
 
 def _silent(sensor: AnySensor, points: int) -> Callable[[], torch.Tensor]:
-    """Return a function that reads (P,) [Pa] and leaves the outputs off."""
+    """Return a function that reads (P,) and leaves the outputs off."""
     silent = Pulse(sensor, _nothing, _nothing) if isinstance(sensor, PulsedSensor) else sensor
     return partial(checked_reading, silent, points)
 

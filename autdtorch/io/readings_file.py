@@ -216,6 +216,8 @@ def _array_table(path: Path, arrays: dict[str, AnyArray]) -> tuple[Table, torch.
 def _from_log(path: Path, points: torch.Tensor | None) -> Readings:
     """Return the readings of a hardware trial, with the drives that its device played."""
     origin, evaluations = read_log(path)
+    if (quantity := origin.get("quantity")) is not None:
+        raise ValueError(f"{path}: readings of {quantity}; must be pressures")
     if not evaluations:
         raise ValueError(f"{path}: no evaluation; must have at least one")
     drives = torch.stack([evaluation.drive for evaluation in evaluations])

@@ -103,12 +103,12 @@ def _log_lost_gradient() -> None:
     )
 
 
-def validate_magnitudes(name: str, value: object, points: int) -> torch.Tensor:
-    """Return observed magnitudes (P,) [Pa] of `points` control points as float64, after checking them."""
-    pressure = real_tensor(name, value, "Pa")
-    if pressure.shape != (points,) or pressure.min() < 0:
-        raise invalid(name, value, f"must be {points} numbers >= 0", "Pa")
-    return pressure
+def validate_magnitudes(name: str, value: object, points: int, unit: str = "Pa") -> torch.Tensor:
+    """Return observed magnitudes (P,) of `points` control points as float64, after checking them."""
+    magnitudes = real_tensor(name, value, unit)
+    if magnitudes.shape != (points,) or magnitudes.min() < 0:
+        raise invalid(name, value, f"must be {points} numbers >= 0", unit)
+    return magnitudes
 
 
 def validate_matrix(name: str, value: object, points: int, transducers: int) -> torch.Tensor:

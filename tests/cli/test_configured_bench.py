@@ -12,9 +12,19 @@ import yaml
 
 from autdtorch.cli.configured_bench import Bench
 from autdtorch.cli.main import CONFIGS
-from autdtorch.hardware import DEVICES, SENSORS, Device, LinkError, MovedMicrophone, Oscilloscope, ScopeSensor
+from autdtorch.hardware import (
+    DEVICES,
+    SENSORS,
+    Device,
+    LinkError,
+    MovedMicrophone,
+    Oscilloscope,
+    Quantity,
+    ScopeSensor,
+)
 from autdtorch.hardware.sensors.sensor import SensorConfig
 from autdtorch.io.drive_file import load_drive
+from autdtorch.io.readings_file import load_readings
 from autdtorch.io.scene_file import load_scene
 from autdtorch.scene.drive import PhaseLevels
 from autdtorch.utils.validation import integer_at_least
@@ -119,6 +129,68 @@ class DeafConfig(SensorConfig):
     @contextlib.contextmanager
     def open(self, setup):
         yield mock.Mock(["read"], read=lambda: self.fraction * setup.bench.pressure().abs())
+
+
+class Balance:
+    """A force that is the square of the pressure on an emulated bench."""
+
+    quantity = Quantity("force", "mN")
+
+    def __init__(self, bench):
+        self.bench = bench
+
+    def read(self):
+        return self.bench.pressure().abs().square()
+
+
+@dataclass(frozen=True)
+class BalanceConfig(SensorConfig):
+    """The config of a `Balance`."""
+
+    @contextlib.contextmanager
+    def open(self, setup):
+        yield Balance(setup.bench)
+
+
+def test_readings_of_another_quantity_have_its_name_and_unit_and_are_not_compared(
+    trial, write, tmp_path, monkeypatch
+):
+    monkeypatch.setitem(SENSORS, "balance", BalanceConfig)
+    bench = "device: sonicsurface\nlimits: {amplitude: 1}\nsensor: {kind: balance}\n"
+    write("ours/hardware/mine.yaml", f"defaults: [base, _self_]\n{bench}")
+    words = ("hardware=mine", "hardware.emulated=true")
+    status, out, _ = trial(*words, "method.levels=4")
+    assert (status, "force " in out, " mN, measured once more" in out) == (0, True, True)
+    folder = tmp_path / "out"
+    report, trial_log = (folder / "report.md").read_text(), folder / "trial.jsonl"
+    assert "- force: **" in report
+    assert "| control point [mm] | when found [mN] | again [mN] |" in report
+    assert "simulated pressures" not in report
+    assert " Pa" not in report.split("## Settings")[0]
+    assert json.loads(trial_log.read_text().splitlines()[0])["origin"]["quantity"] == "force [mN]"
+    with pytest.raises(ValueError, match=r"readings of force \[mN\]; must be pressures"):
+        load_readings(trial_log)
+    for setting, message in [
+        ("method=identify", "goal: 'force'; must be of pressures at control points"),
+        ("goal=mean_pressure", "goal: 'mean_pressure'; must be weakest_focus with a sensor of force"),
+    ]:
+        status, _, log = trial(*words, setting, folder="output=other")
+        assert (status, message in log) == (2, True), log
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ("hardware.sensor.quantity=force", "hardware.sensor.unit=null"),
+            "hardware.sensor.quantity: unit: None; a name",
+        ),
+        (("hardware.sensor.unit=mN",), "quantity: unit: 'mN'; must be Pa for the quantity pressure"),
+    ],
+)
+def test_a_quantity_without_a_unit_of_it_is_refused(trial, words, message):
+    status, _, log = trial(*EMULATED, "hardware/sensor=manual", *words)
+    assert (status, message in log) == (2, True), log
 
 
 def test_a_device_and_a_sensor_are_one_entry_each(trial, write, tmp_path, monkeypatch):

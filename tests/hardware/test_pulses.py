@@ -109,7 +109,7 @@ def test_a_first_picture_takes_the_place_of_the_check_by_single_transducers(tria
         sensor.noise = 0.2 * strongest  # of outputs that are on, or of a leak
         assert not hw.hears_silence(sensor, check, 2)
         sensor.noise = 2 * strongest
-        with pytest.raises(hw.SensorError, match="the first picture shows"):
+        with pytest.raises(hw.SensorError, match="the largest reading of a drive is"):
             hw.check_picture(link, sensor, 2, FULL)
 
 
@@ -132,7 +132,7 @@ def test_a_first_picture_must_be_above_the_deviation_that_a_sensor_states(trial)
         sensor.deviation = lambda pressure: torch.full_like(pressure, 0.3 * peak)
         assert hw.check_picture(link, sensor, 2, FULL).threshold > 0.3 * peak
         sensor.deviation = lambda pressure: torch.full_like(pressure, peak)
-        with pytest.raises(hw.SensorError, match="first picture"):
+        with pytest.raises(hw.SensorError, match="largest reading of a drive"):
             hw.check_picture(link, sensor, 2, FULL)
 
 

@@ -12,7 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autdtorch.hardware import FileSensor, ManualSensor, MovedMicrophone, SensorError
+from autdtorch.hardware import FileSensor, ManualSensor, MovedMicrophone, Quantity, SensorError
 from autdtorch.hardware.safety import Signalled, ended_by_signals
 from autdtorch.hardware.sensors import reading_file
 from autdtorch.hardware.sensors.by_hand import typed
@@ -62,8 +62,25 @@ def test_a_manual_sensor_asks_for_each_point_until_the_answer_is_a_pressure():
 
     assert ManualSensor(POINTS, ask).read().tolist() == [12.5, 300.0]
     assert questions[0] == "Pressure at control point 1 of 2 at (80.0, 10.0, 0.0) mm [Pa]: "
+    balance = ManualSensor(
+        POINTS[:1], lambda question: questions.append(question) or "2", Quantity("force", "mN")
+    )
+    assert balance.read().tolist() == [2.0]
+    assert questions.pop().startswith("Force at control point 1 of 1 at (80.0, 10.0, 0.0) mm [mN]: ")
     for question, answer in zip(questions[2:], ("1,5", "-1", "nan"), strict=True):
         assert question.startswith(f"'{answer}': must be a number >= 0")
+
+
+def test_the_instrument_of_a_person_may_read_another_quantity():
+    questions: list[str] = []
+
+    def ask(question: str) -> str:
+        questions.append(question)
+        return "2"
+
+    balance = ManualSensor(POINTS[:1], ask, Quantity("force", "mN"))
+    assert MovedMicrophone(balance, POINTS[:1], lambda question: "").read().tolist() == [2.0]
+    assert questions == ["Force at control point 1 of 1 at (80.0, 10.0, 0.0) mm [mN]: "]
 
 
 def test_the_end_of_the_input_and_a_sensor_of_several_points_that_moves_are_errors():

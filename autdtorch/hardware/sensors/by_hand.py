@@ -11,7 +11,16 @@ from dataclasses import dataclass
 
 import torch
 
-from autdtorch.hardware.sensors.sensor import Sensor, SensorConfig, SensorError, Setup, checked_reading
+from autdtorch.hardware.sensors.sensor import (
+    PRESSURE,
+    InstrumentConfig,
+    Quantity,
+    Sensor,
+    SensorError,
+    Setup,
+    checked_reading,
+    quantity_of,
+)
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.progress import is_terminal
 from autdtorch.utils.validation import ArrayLike, not_negative, points_tensor, require_callable, require_kind
@@ -38,22 +47,27 @@ def typed(question: str) -> str:
 class ManualSensor:
     """A person who reads an instrument and types its values, point by point."""
 
-    def __init__(self, control_points: ArrayLike, ask: Callable[[str], str] = typed) -> None:
-        """Set the control points (P, 3) [m], and the function that shows a question and returns the answer.
+    def __init__(
+        self, control_points: ArrayLike, ask: Callable[[str], str] = typed, quantity: Quantity = PRESSURE
+    ) -> None:
+        """Set the control points (P, 3) [m], the function that asks, and the quantity of the instrument.
 
-        `ValueError` for other control points, or if `ask` is no function.
+        `ask` shows a question and returns the answer. `ValueError` for other control points, if `ask` is no
+        function, or for no quantity.
         """
         require_callable("ask", ask)
+        require_kind("quantity", quantity, Quantity)
         self._points = points_tensor("control_points", control_points)
-        self._ask = ask
+        self._ask, self.quantity = ask, quantity
 
     def read(self) -> torch.Tensor:
-        """Return magnitudes (P,) [Pa]; asks again for a point until the answer is a number >= 0.
+        """Return magnitudes (P,); asks again for a point until the answer is a number >= 0.
 
         `SensorError` if the input has ended.
         """
         places = (_place(number, self._points) for number in range(len(self._points)))
-        readings = [self._answer(f"Pressure at {place} [Pa]: ") for place in places]
+        name, unit = self.quantity.name.capitalize(), self.quantity.unit
+        readings = [self._answer(f"{name} at {place} [{unit}]: ") for place in places]
         return torch.tensor(readings, **REAL)
 
     def _answer(self, question: str) -> float:
@@ -61,7 +75,7 @@ class ManualSensor:
         while True:
             text = _asked(self._ask, hint + question)
             try:
-                return not_negative("pressure", float(text), "Pa")
+                return not_negative(self.quantity.name, float(text), self.quantity.unit)
             except ValueError:
                 hint = f"{text!r}: must be a number >= 0 with a decimal point, as 1.5\n"
 
@@ -77,11 +91,11 @@ class MovedMicrophone:
         """
         require_kind("sensor", sensor, Sensor)
         require_callable("ask", ask)
-        self._sensor, self._ask = sensor, ask
+        self._sensor, self._ask, self.quantity = sensor, ask, quantity_of(sensor)
         self._points = points_tensor("control_points", control_points)
 
     def read(self) -> torch.Tensor:
-        """Return magnitudes (P,) [Pa].
+        """Return magnitudes (P,).
 
         `SensorError` if the input has ended, `ValueError` if the sensor reads more than one point.
         """
@@ -105,7 +119,7 @@ def _place(number: int, points: torch.Tensor) -> str:
 
 
 @dataclass(frozen=True)
-class ManualConfig(SensorConfig):
+class ManualConfig(InstrumentConfig):
     """The config of a `ManualSensor`."""
 
     @property
@@ -115,4 +129,4 @@ class ManualConfig(SensorConfig):
 
     def open(self, setup: Setup) -> AbstractContextManager[Sensor]:
         """Return a context with the sensor."""
-        return nullcontext(ManualSensor(setup.control_points, setup.ask))
+        return nullcontext(ManualSensor(setup.control_points, setup.ask, self.read_quantity()))

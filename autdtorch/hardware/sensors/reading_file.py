@@ -10,10 +10,24 @@ from typing import Any
 
 import torch
 
-from autdtorch.hardware.sensors.sensor import Sensor, SensorConfig, SensorError, Setup
+from autdtorch.hardware.sensors.sensor import (
+    PRESSURE,
+    InstrumentConfig,
+    Quantity,
+    Sensor,
+    SensorError,
+    Setup,
+)
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.files import path_of
-from autdtorch.utils.validation import integer_at_least, invalid, not_negative, number_between, positive
+from autdtorch.utils.validation import (
+    integer_at_least,
+    invalid,
+    not_negative,
+    number_between,
+    positive,
+    require_kind,
+)
 
 _LONGEST = 3600.0  # of the times of a reading [s]
 _POLL = 0.02  # [s] between looks at the file
@@ -22,11 +36,18 @@ _POLL = 0.02  # [s] between looks at the file
 class FileSensor:
     """A file into which another program writes each reading.
 
-    The file holds the magnitudes of all control points [Pa] in their order, separated by blanks, commas or
+    The file holds the magnitudes of all control points in their order, separated by blanks, commas or
     line ends, and ends with a line end. Write it under another name, then rename it.
     """
 
-    def __init__(self, path: str | Path, points: int, settle: float = 0.0, timeout: float = 60.0) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        points: int,
+        settle: float = 0.0,
+        timeout: float = 60.0,
+        quantity: Quantity = PRESSURE,
+    ) -> None:
         """Set the file.
 
         Args:
@@ -35,16 +56,19 @@ class FileSensor:
             settle: time after a drive began in which the file may still be of the drive before [s], up to an
                 hour.
             timeout: time limit for the file to change then [s], up to an hour.
+            quantity: of the readings, and their unit.
 
         `ValueError` for an argument out of range.
         """
+        require_kind("quantity", quantity, Quantity)
+        self.quantity = quantity
         self._path = path_of("path", path)
         self._points = integer_at_least("points", points, 1)
         self._settle = number_between("settle", settle, 0.0, _LONGEST, "s")
         self._timeout = number_between("timeout", positive("timeout", timeout, "s"), 0.0, _LONGEST, "s")
 
     def read(self) -> torch.Tensor:
-        """Return the magnitudes (P,) [Pa], once the file has changed.
+        """Return the magnitudes (P,), once the file has changed.
 
         `SensorError` if it does not change in time, or then holds anything but P numbers >= 0.
         """
@@ -56,7 +80,7 @@ class FileSensor:
             if self._stamp() == before:
                 continue
             try:
-                return self._pressure()
+                return self._magnitudes()
             except (OSError, ValueError) as error:  # it may not be complete yet
                 trouble = f"holds no reading: {error}"
         raise SensorError(f"{self._path} {trouble}, within {self._timeout:g} s")
@@ -68,27 +92,30 @@ class FileSensor:
             return None
         return status.st_mtime_ns, status.st_size, status.st_ino
 
-    def _pressure(self) -> torch.Tensor:
+    def _magnitudes(self) -> torch.Tensor:
         text = self._path.read_text(encoding="utf-8")
         if not text.endswith("\n"):
             raise ValueError("no line end after the last number")
-        numbers = [not_negative("pressure", float(word), "Pa") for word in text.replace(",", " ").split()]
+        name, unit = self.quantity.name, self.quantity.unit
+        numbers = [not_negative(name, float(word), unit) for word in text.replace(",", " ").split()]
         if len(numbers) != self._points:
-            raise invalid("pressure", numbers, f"must be {self._points} numbers", "Pa")
+            raise invalid(name, numbers, f"must be {self._points} numbers", unit)
         return torch.tensor(numbers, **REAL)
 
 
 @dataclass(frozen=True)
-class FileConfig(SensorConfig):
+class FileConfig(InstrumentConfig):
     """The config of a `FileSensor`."""
 
     path: Any
 
     def check(self, emulated: bool) -> None:
-        """Require a path."""
+        """Require a path, and check the quantity."""
+        super().check(emulated)
         if self.path is None:
             raise invalid("hardware.sensor.path", None, "must be the file that holds the readings")
 
     def open(self, setup: Setup) -> AbstractContextManager[Sensor]:
         """Return a context with the sensor."""
-        return nullcontext(FileSensor(self.path, len(setup.control_points)))
+        points = len(setup.control_points)
+        return nullcontext(FileSensor(self.path, points, quantity=self.read_quantity()))

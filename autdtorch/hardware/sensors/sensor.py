@@ -17,8 +17,16 @@ import torch
 from autdtorch.objectives.objective import validate_magnitudes
 from autdtorch.objectives.perturbations import SNRS, random_rms
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.files import require_name
 from autdtorch.utils.process import send
-from autdtorch.utils.validation import finite_number, integer_at_least, invalid, number_between, require_kind
+from autdtorch.utils.validation import (
+    finite_number,
+    integer_at_least,
+    invalid,
+    number_between,
+    require_kind,
+    within,
+)
 
 if TYPE_CHECKING:
     from autdtorch.hardware.emulator.bench import EmulatedBench
@@ -38,9 +46,37 @@ class _Overdue(BaseException):
     """A reading takes too long; not an `Exception`, which a sensor may handle and then wait on."""
 
 
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity that a sensor reads.
+
+    A sensor of another quantity than the pressure has an attribute `quantity`. Methods then maximise its
+    least reading, and nothing compares readings with simulated pressures.
+
+    Attributes:
+        name: such as "force".
+        unit: of the readings, such as "mN"; "Pa" for "pressure".
+    """
+
+    name: str
+    unit: str
+
+    def __post_init__(self) -> None:
+        """Check name and unit."""
+        require_name("name", self.name)
+        if self.name == "pressure" and self.unit != "Pa":
+            raise invalid("unit", self.unit, "must be Pa for the quantity pressure")
+        for part in self.unit.split("/") if isinstance(self.unit, str) else [self.unit]:  # as of mm/s
+            require_name("unit", part)
+
+
+PRESSURE = Quantity("pressure", "Pa")
+"""PRESSURE: the quantity of a sensor that states none."""
+
+
 @runtime_checkable
 class Sensor(Protocol):
-    """A sensor that reads the pressure at the control points while a drive is played."""
+    """A sensor that reads the pressure, or another `Quantity`, at the control points of a drive."""
 
     def read(self) -> torch.Tensor:
         """Return magnitudes (P,) [Pa] at the control points, once the field is steady."""
@@ -66,6 +102,13 @@ def require_sensor(sensor: object) -> None:
         require_kind("sensor", sensor, Sensor)
 
 
+def quantity_of(sensor: AnySensor) -> Quantity:
+    """Return the quantity that a sensor reads."""
+    quantity: Quantity = getattr(sensor, "quantity", PRESSURE)
+    require_kind("sensor.quantity", quantity, Quantity)
+    return quantity
+
+
 @dataclass(frozen=True)
 class Pulse:
     """A pulse of sound that a sensor reads."""
@@ -80,7 +123,7 @@ class Pulse:
 
 
 def checked_reading(sensor: Sensor, points: int, seconds: float = LONGEST) -> torch.Tensor:
-    """Return the reading (P,) [Pa], float64, of a sensor.
+    """Return the reading (P,), float64, of a sensor, in its unit.
 
     In the main thread, a reading is interrupted after a number of seconds, wherever Python can interrupt it:
     where it sleeps, or waits for a file or a socket, but not in a driver that never returns.
@@ -89,7 +132,9 @@ def checked_reading(sensor: Sensor, points: int, seconds: float = LONGEST) -> to
         ValueError: the reading is not P finite magnitudes.
         SensorError: the time is over.
     """
-    return validate_magnitudes("pressure of the sensor", _reading(sensor, seconds), points)
+    quantity = quantity_of(sensor)
+    name = f"{quantity.name} of the sensor"
+    return validate_magnitudes(name, _reading(sensor, seconds), points, quantity.unit)
 
 
 def _reading(sensor: Sensor, seconds: float) -> object:
@@ -192,6 +237,28 @@ class SensorConfig(ABC):
     @abstractmethod
     def open(self, setup: Setup) -> AbstractContextManager[AnySensor]:
         """Return a context with the sensor."""
+
+
+@dataclass(frozen=True)
+class InstrumentConfig(SensorConfig):
+    """Base of the configs of instruments that may read another quantity than the pressure.
+
+    Attributes:
+        quantity: of the readings, such as "pressure" or "force".
+        unit: of the readings.
+    """
+
+    quantity: str
+    unit: str
+
+    def check(self, emulated: bool) -> None:
+        """Check the quantity and its unit."""
+        with within("hardware.sensor.quantity"):
+            self.read_quantity()
+
+    def read_quantity(self) -> Quantity:
+        """Return the quantity of the readings."""
+        return Quantity(self.quantity, self.unit)
 
 
 class EmulatedSensor:

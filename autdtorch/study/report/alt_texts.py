@@ -11,7 +11,6 @@ import torch
 
 from autdtorch.methods.calibration.calibration import Calibration
 from autdtorch.methods.catalogue import label_of
-from autdtorch.methods.solution import Solution
 from autdtorch.scene.scene import Scene
 from autdtorch.study.report.findings import MOST_NAMED
 from autdtorch.study.report.tables import competitors, median_score
@@ -104,11 +103,11 @@ def of_costs(scenes: Mapping[str, SceneResult]) -> str:
     return f"Median score against median time of the search. {_by_scene(texts)}"
 
 
-def of_bench(solution: Solution, scale: float, expected: Solution, unit: str) -> str:
-    """Return the text of the convergence on the bench and in the simulation, times the factor `scale`."""
-    ends = float(solution.history[0, -1]), scale * float(expected.history[0, -1])
-    bench, simulation = (f"{end:.4g} {unit}".rstrip() for end in ends)
-    return f"Best score so far against evaluations: the bench ends at {bench}, the simulation at {simulation}"
+def of_bench(histories: Mapping[str, torch.Tensor], unit: str) -> str:
+    """Return the text of the convergence on the bench, and in the simulation."""
+    scores = {name: f"{float(history[0, -1]):.4g} {unit}".rstrip() for name, history in histories.items()}
+    ends = (f"the {name} ends at {score}" for name, score in scores.items())
+    return f"Best score so far against evaluations: {', '.join(ends)}"
 
 
 def _span(values: Mapping[str, float], unit: str = "") -> str:

@@ -1,4 +1,4 @@
-"""The report of a hardware trial: measured pressures beside simulated ones, and a camera's plane."""
+"""The report of a hardware trial: readings, pressures beside simulated ones, and a camera's plane."""
 
 from __future__ import annotations
 
@@ -72,30 +72,34 @@ def write_hardware_report(
 
     The drive of the `solution` on the bench was read `again` (R, P) [Pa]. `expected` is the solution of
     the same method on the `simulated` objective of the `propagator`, without noise and with the phase levels
-    of the device. Both maximised the `goal`. The `calibration` is of the evaluations, or a text says why
-    there is none.
+    of the device. Both maximised the `goal`, or the bench the readings of another quantity, which is not
+    compared with the simulation. The `calibration` is of the evaluations, or a text says why there is none.
     """
     evaluations, scene = log.evaluations, simulated.scene
     working = torch.ones(len(scene.array), **REAL)
     working[preflight.failed] = 0
-    measured = torch.stack([evaluation.pressure for evaluation in evaluations])
-    predicted = simulated(working * torch.stack([evaluation.drive for evaluation in evaluations]))
-    fit = compare(measured, predicted)
-    # A pressure scales with the transducers; a score without unit does not.
-    scale = fit.scale if goal.unit else 1.0
+    names, again_mean = _names(scene.control_points), again.mean(dim=0)
+    readings = {"when found": solution.pressure[0], "again": again_mean}
+    histories, compared = {"bench": solution.history}, {}
+    if goal.of_pressures:
+        measured = torch.stack([evaluation.pressure for evaluation in evaluations])
+        predicted = simulated(working * torch.stack([evaluation.drive for evaluation in evaluations]))
+        fit = compare(measured, predicted)
+        readings["simulated"] = fit.scale * simulated(working * solution.drive)[0]
+        # A pressure scales with the transducers; a score without unit does not.
+        histories["simulation"] = (fit.scale if goal.unit else 1.0) * expected.history
+        fits = _fits(names, measured, predicted)
+        compared = {"scale": fit.scale, "misfit": _percent(fit.misfit), "fits": fits}
+        compared |= measured_plane(folder, propagator, working * solution.drive[0], fit.scale, names)
     convergence = None
     if len(evaluations) > 1:
-        histories = {"bench": solution.history, "simulation": scale * expected.history}
         label = score_label(f"{goal.name}, best so far", goal.unit)
         with naming(folder / _FIGURE):
             plot_convergence({scene.name: histories}, label=label).savefig(folder / _FIGURE)
-        convergence = picture(_FIGURE, alt_texts.of_bench(solution, scale, expected, goal.unit))
+        convergence = picture(_FIGURE, alt_texts.of_bench(histories, goal.unit))
     if isinstance(calibration, Calibration):
         with naming(folder / _CALIBRATION_FIGURE):
             plot_calibration(calibration).savefig(folder / _CALIBRATION_FIGURE)
-    names = _names(scene.control_points)
-    again_mean = again.mean(dim=0)
-    pressures = solution.pressure[0], again_mean, fit.scale * simulated(working * solution.drive)[0]
     times = [datetime.fromisoformat(evaluation.time) for evaluation in evaluations]
     gaps = [(later - earlier).total_seconds() for earlier, later in itertools.pairwise(times)]
     text = rendered(
@@ -110,15 +114,13 @@ def write_hardware_report(
         found=solution,
         convergence=convergence,
         goal=score_label(goal.name),
+        of_pressures=goal.of_pressures,
         unit=goal.unit and f" {goal.unit}",
         score_again=float(goal(again_mean)),
         readings=len(again),
         same=int(torch.isclose(solution.drive, expected.drive, rtol=0, atol=1e-9).sum()),
-        points=_points(names, *pressures),
-        fits=_fits(names, measured, predicted),
-        scale=fit.scale,
-        misfit=_percent(fit.misfit),
-        **measured_plane(folder, propagator, working * solution.drive[0], fit.scale, names),
+        points=_points(names, readings, preflight.unit),
+        **compared,
         **_calibrated(calibration),
         alone=preflight.pressure[preflight.pressure > preflight.threshold],
         preflight=preflight,
@@ -157,13 +159,13 @@ def _as_text(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _points(names: list[str], *pressures: torch.Tensor) -> list[list[str]]:
-    rows = [["control point [mm]", "when found [Pa]", "again [Pa]", "simulated [Pa]", "again / simulated"]]
-    columns = [[*pressure.tolist(), float(pressure.min())] for pressure in pressures]
-    for name, when_found, again, simulated in zip([*names, "weakest"], *columns, strict=True):
-        values = (f"{value:#.4g}" for value in (when_found, again, simulated))
-        rows.append([name, *values, f"{again / simulated:.3f}"])
-    return rows
+def _points(names: list[str], readings: dict[str, torch.Tensor], unit: str) -> list[list[str]]:
+    values = {what: torch.cat([each, each.min()[None]]) for what, each in readings.items()}
+    columns = {f"{what} [{unit}]": [f"{value:#.4g}" for value in each] for what, each in values.items()}
+    if "simulated" in values:
+        columns["again / simulated"] = [f"{ratio:.3f}" for ratio in values["again"] / values["simulated"]]
+    rows = zip([*names, "weakest"], *columns.values(), strict=True)
+    return [["control point [mm]", *columns], *map(list, rows)]
 
 
 def _fits(names: list[str], measured: torch.Tensor, simulated: torch.Tensor) -> list[list[str]]:
