@@ -15,7 +15,7 @@ from torch import Tensor
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
 from autdtorch.fdtd.assembly.neighbours import corners_around, flat_index
-from autdtorch.fdtd.assembly.unions import Union, nearest_normals, rigid_distance, unions_of
+from autdtorch.fdtd.assembly.unions import Union, measured, nearest_normals, rigid_distance, unions_of
 from autdtorch.fdtd.damping import at_time_step, fewest_stable_steps
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.interpolation import (
@@ -169,7 +169,7 @@ class Assembly:
     def _extending(self) -> list[Union]:
         """The bodies without rigid ones along the grid."""
         bodies, _ = unions_of(self.region, self.grid, self.stencil)
-        return [body.measured(self.grid.spacing) for body in bodies if not (body.rigid and body.aligned)]
+        return measured([body for body in bodies if not (body.rigid and body.aligned)], self.grid.spacing)
 
     def is_enclosed(self, points: Tensor) -> NDArray[np.bool_]:
         """Return whether points (N, 3) [m] are nearer to enclosed cells than to others of air.

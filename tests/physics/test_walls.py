@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from small_scenes import AIR, NO_RECEIVERS, NO_SOURCES, relative_error, small_scene
 
 from autdtorch import analytic
-from autdtorch.fdtd.assembly.unions import Thickened, thickened, thin_wall
+from autdtorch.fdtd.assembly.thickened import Thickened, thickened
+from autdtorch.fdtd.assembly.unions import thin_wall
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stepping import assemble
 from autdtorch.propagators import make_propagator
@@ -298,13 +299,14 @@ def test_the_thickness_of_a_wall_is_measured(share, tilt):
     assert wall.signed_distance(torch.from_numpy(place)).abs() < 1e-9
 
 
-def test_a_wall_that_a_later_fluid_leaves_of_a_rigid_body_is_rigid_and_told(caplog):
+@pytest.mark.parametrize("inner", [6.5, 6.9])
+def test_a_wall_that_a_later_fluid_leaves_of_a_rigid_body_is_rigid_and_told(inner, caplog):
     """No sound passes it: the field is that of the whole body."""
     sources = [(26e-3, 14e-3, 12e-3), (13e-3, 27e-3, 16e-3)]
     points = [(-3e-3, 10e-3, 14e-3), (9e-3, -2e-3, 5e-3), (25e-3, 19e-3, 10e-3)]
     whole = Mesh.from_surface(pyvista.Icosphere(radius=7.0, nsub=1), scale=1e-3, offset=CENTER, rigid=True)
     light = {"density": 0.5 * AIR.density, "sound_speed": 1.2 * AIR.sound_speed}
-    inside = Mesh.from_surface(pyvista.Icosphere(radius=6.5, nsub=1), scale=1e-3, offset=CENTER, **light)
+    inside = Mesh.from_surface(pyvista.Icosphere(radius=inner, nsub=1), scale=1e-3, offset=CENTER, **light)
 
     def matrix(*bodies):
         scene = Scene(TransducerArray(sources, (1, 0, 0)), AIR, 40e3, points, bodies)
@@ -314,9 +316,9 @@ def test_a_wall_that_a_later_fluid_leaves_of_a_rigid_body_is_rigid_and_told(capl
     assert "obstacle 0" not in caplog.text
     with pytest.warns(UserWarning, match="overlaps"):
         hollow = matrix(whole, inside)
-    # at such a wall the error is of first order: 2 % here. Through one that leaks 20 % come back
-    assert relative_error(hollow, solid) < 0.05
-    assert "obstacle 0 has a wall of 0.4" in caplog.text
+    # at such a wall the error is of first order: 4 % here. Through one that leaks 20 to 36 % come back
+    assert relative_error(hollow, solid) < 0.08
+    assert "obstacle 0 has a wall of 0" in caplog.text
 
 
 def test_a_lining_that_overlaps_a_body_leaves_no_thin_wall():

@@ -34,6 +34,7 @@ from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, quadratic, rough
 from autdtorch.fdtd.assembly.thin_walls import Side, sides_of
 from autdtorch.fdtd.assembly.unions import (
     Union,
+    measured,
     nearest_normals,
     rigid_distance,
     rigid_level,
@@ -77,7 +78,7 @@ def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
     """Return the material of every element, set by the last body there, and the interface elements."""
     bodies, materials = unions_of(region, grid, stencil)
     blocks = _blocks(bodies, grid)
-    bodies = [body.measured(grid.spacing) for body in bodies]
+    bodies = measured(bodies, grid.spacing)
     material, cut, beside = _measured(bodies, grid)
     material = np.where(beside, material, blocks.over_elements(blocks.at_centers.astype(np.int16)))
     cut = np.where(beside, cut, blocks.over_elements(np.any(blocks.varied, axis=0)))

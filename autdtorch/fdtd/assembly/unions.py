@@ -1,7 +1,7 @@
 """Bodies as the assembly sees them: unions of consecutive bodies of one material, and the materials.
 
 Elements measure bodies on a lattice of points a quarter of a cell apart, so that they would miss a rigid
-sheet between these (`docs/numerics.md` has figures). Rigid sheets oblique to the grid are thickened, and a
+sheet between these (`docs/numerics.md` has figures). Those oblique to the grid are thickened, and a
 warning is logged: errors at such walls are larger than estimated.
 """
 
@@ -19,14 +19,14 @@ import torch
 
 from autdtorch.fdtd.assembly.element import FAR, MaterialLosses, Materials
 from autdtorch.fdtd.assembly.losses import STEP
+from autdtorch.fdtd.assembly.thickened import receding, thickened
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Body, Fluid, Region
 from autdtorch.fdtd.shapes import Shape, Solids, bounds, distance_from, remaining
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.turning import slender_faces, staircase_excess
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.spatial import doubled_normals, extents, mean_thickness, spread_evenly
-from autdtorch.utils.validation import Vector
+from autdtorch.utils.spatial import doubled_normals, extents, spread_evenly
 
 logger = logging.getLogger(__name__)
 
@@ -44,10 +44,6 @@ _ALIKE = 2.0  # Ratio of densities up to which a thin wall of fluid causes only 
 
 _STEP = 2e-5  # Distance [cells] from a cell's centre of the points that tell its nearest face
 _UNDECIDED = 0.5  # Length of a gradient of the distance below which a cell is half-way between faces
-
-_THINNEST = 0.32  # Least thickness of a rigid sheet [cells]
-_OPEN = 1e-9  # Thickness [cells] up to which a surface is open, as of a half-space
-_WIDE = 2.0  # Least extent [cells] of a sheet along two axes: needles would become much thicker than they are
 
 
 @dataclass(frozen=True)
@@ -70,12 +66,6 @@ class Union:
             return np.asarray(distance)
         beyond = np.maximum(np.array(grid.first) - cell, cell - np.array(grid.last) + 1).max(axis=-1) + 0.5
         return np.asarray(np.maximum(distance, beyond))
-
-    def measured(self, spacing: float) -> Union:
-        """Return the union with thin rigid sheets thickened, for the lattices on cells of a spacing [m]."""
-        if not self.rigid:
-            return self
-        return replace(self, shapes=tuple(thickened(shape, spacing) for shape in self.shapes))
 
     def faces(self, grid: Grid) -> list[Array]:
         """Return the places [cells] of its faces along each axis, up to its end on a grid."""
@@ -113,6 +103,20 @@ class Union:
         axes = zip(positions, grid.origin, ends, strict=True)
         ranges = [np.searchsorted(origin + grid.spacing * along, both) for along, origin, both in axes]
         return np.array(ranges, np.int64).T
+
+
+def measured(bodies: Sequence[Union], spacing: float) -> list[Union]:
+    """Return unions with thin rigid sheets and walls thickened, for lattices on cells of a spacing [m]."""
+    thick: list[Union] = []
+    hard: list[Shape] = []
+    for body in bodies:
+        if body.rigid:
+            shapes = tuple(thickened(shape, spacing) for shape in body.shapes)
+            hard += [] if body.aligned else shapes
+        else:
+            shapes = tuple(receding(shape, hard, spacing) for shape in body.shapes)
+        thick.append(replace(body, shapes=shapes))
+    return thick
 
 
 def rigid_level(bodies: Sequence[Union], distances: Iterable[Array]) -> Array:
@@ -278,43 +282,6 @@ def _passive(coupling: complex, mass: complex, stencil: Stencil) -> tuple[comple
             turn = cmath.exp(1j * power / (symbol * coupling.real - stencil.symbol * mass.real))
             coupling, mass = coupling * turn, mass * turn
     return coupling, mass
-
-
-@dataclass(frozen=True, eq=False)
-class Thickened:
-    """A shape whose surface is moved outwards."""
-
-    shape: Shape
-    distance: float  # of the surfaces [m]
-
-    @property
-    def lower(self) -> Vector:
-        """Corner of the bounding box with the smallest coordinates (3,) [m]."""
-        x, y, z = self.shape.lower
-        return x - self.distance, y - self.distance, z - self.distance
-
-    @property
-    def upper(self) -> Vector:
-        """Corner of the bounding box with the largest coordinates (3,) [m]."""
-        x, y, z = self.shape.upper
-        return x + self.distance, y + self.distance, z + self.distance
-
-    def signed_distance(self, points: torch.Tensor, /) -> torch.Tensor:
-        """Return the distance (...) [m] of points (..., 3) to the surface, negative inside."""
-        return self.shape.signed_distance(points) - self.distance
-
-    def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the vertices (V, 3) [m] and triangles (F, 3) of the original shape."""
-        return self.shape.surface()
-
-
-def thickened(shape: Shape, spacing: float) -> Shape:
-    """Return a thinner sheet with the least thickness on cells of a spacing [m], other shapes unchanged."""
-    vertices, triangles = (part.numpy() for part in shape.surface())
-    thickness = mean_thickness(vertices, triangles) / spacing
-    if not _OPEN < thickness < _THINNEST or extents(vertices)[1] < _WIDE * spacing:
-        return shape
-    return Thickened(shape, (_THINNEST - thickness) * spacing / 2)
 
 
 def warn_of_thin_walls(region: Region, spacing: float, grids: Iterable[tuple[Iterable[int], Array]]) -> None:
