@@ -73,16 +73,11 @@ def _in_order(readings: Readings, points: torch.Tensor, scene: Scene | None) -> 
 
 
 def joined(before: Readings | None, more: Readings) -> Readings:
-    """Return all readings of the control points, in order."""
+    """Return all magnitudes of the control points, in order."""
     if before is None:
         return more
-    phase = None
-    if before.phase is not None or more.phase is not None:
-        parts = [torch.full_like(part.pressure, torch.nan) if part.phase is None else part.phase
-                 for part in (before, more)]  # fmt: skip
-        phase = torch.cat(parts)
-    pressure = torch.cat([before.pressure, more.pressure])
-    return Readings(torch.cat([before.drives, more.drives]), pressure, phase=phase)
+    drives = torch.cat([before.drives, more.drives])
+    return Readings(drives, torch.cat([before.pressure, more.pressure]))
 
 
 def answered(asked: torch.Tensor, drives: torch.Tensor) -> list[int | None]:

@@ -30,7 +30,7 @@ from autdtorch.utils.files import path_of, read_arrays, replace_file
 from autdtorch.utils.validation import invalid, require_kind, within
 
 _BEST, _SEARCH, _READINGS, _HEADER = "best.", "search.", "readings.", "header"
-_OF_READINGS = ("drives", "pressure", "phase", "deviation")
+_OF_READINGS = ("drives", "pressure")
 _VERSION = 4  # of the format; a new one where `State`, or the `search` of a method, changes
 _SHOWN = 16  # digits of a digest
 _COLUMNS = tuple(field.name for field in dataclasses.fields(Solution))
@@ -51,9 +51,8 @@ def save_state(path: str | os.PathLike[str], method: Method, state: State) -> No
     require_kind("state", state, State)
     seeds = torch.tensor(state.seeds, dtype=torch.int64, device="cpu")
     tensors = {"seeds": seeds, "trials": state.trials, "drives": state.drives, "pressure": state.pressure}
-    if (readings := state.readings) is not None:
-        parts = {name: getattr(readings, name) for name in _OF_READINGS}
-        tensors |= {f"{_READINGS}{name}": part for name, part in parts.items() if part is not None}
+    if state.readings is not None:
+        tensors |= {f"{_READINGS}{name}": getattr(state.readings, name) for name in _OF_READINGS}
     tensors |= {f"{_BEST}{name}": getattr(state.best, name) for name in _COLUMNS}
     tensors |= {f"{_SEARCH}{name}": tensor for name, tensor in state.search.items()}
     arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in tensors.items()}

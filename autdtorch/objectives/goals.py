@@ -29,7 +29,7 @@ class Goal(ABC):
         name: of the goal in configs, results and figures; of the class where it has none.
         unit: of the scores, "" for numbers.
         absolute: whether `wanted` gives pressures in Pa.
-        of_pressures: whether it scores pressures at control points; a goal of force scores other readings.
+        of_pressures: whether it scores pressures at control points, and no other readings, such as forces.
     """
 
     name: ClassVar[str]

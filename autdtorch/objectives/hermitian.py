@@ -27,16 +27,8 @@ _RANGE = 30.0  # of log z
 _ITERATIONS = 500  # of each order; hundreds of forms take milliseconds in each
 _RANK = 1e-13  # Singular value below which the search leaves a combination of rows out; certificates do not
 _MARGIN = 1e-12
-_SMOOTHING = (
-    1.0,
-    0.3,
-    0.1,
-    0.03,
-    0.01,
-    3e-3,
-    1e-3,
-    3e-4,
-)  # of the least form, relative to the mean size of all
+# of the least form, relative to the mean size of all
+_SMOOTHING = (1.0, 0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4)
 _START = 0.9  # largest amplitude of the start of an ascent
 _TINY = 1e-300
 

@@ -113,9 +113,8 @@ def test_methods_push_by_the_readings_of_a_balance_alone(pushed):
     }
     for name, solution in several.items():
         force = pushed.goal(pushed(solution.drive)).item()
-        assert abs(force - solution.score.item()) < 6 * 0.02 * bound, (
-            name
-        )  # the luckiest of some 300 readings
+        # the luckiest of some 300 readings
+        assert abs(force - solution.score.item()) < 6 * 0.02 * bound, name
         assert force > (0.7 if name == "gabs" else 0.0) * bound, name
     for method in (at.identify, at.phase_stepping, at.gradient_ascent):
         with pytest.raises(ValueError, match="must"):

@@ -119,9 +119,8 @@ def test_a_batch_is_its_sets_one_by_one(random_matrix, algorithm):
 @pytest.mark.parametrize("algorithm", ALGORITHMS[:-1])
 @pytest.mark.parametrize(("points", "transducers"), [(3, 10), (7, 3)])  # many points begin otherwise
 def test_kernels_on_cpus_are_the_definitions(random_matrix, algorithm, free, points, transducers):
-    matrix = torch.stack(
-        [random_matrix(points, transducers, seed) for seed in range(21)]
-    )  # blocks and a part
+    # blocks and a part
+    matrix = torch.stack([random_matrix(points, transducers, seed) for seed in range(21)])
     wanted = torch.rand(21, points, 1, generator=torch.Generator().manual_seed(0)).double() + 0.5
     exact = SOLVERS[algorithm](matrix, wanted, 20, within_largest if free else torch.sgn)
     drive = holography(matrix, wanted[..., 0], algorithm, 20, free)

@@ -258,9 +258,8 @@ def test_phases_are_retrieved_once_for_all_screenings(paper_objective, monkeypat
 
     monkeypatch.setattr("autdtorch.methods.matrix_fit.retrieve", counted)
     at.identify(Faulty(paper_objective, times(3, [11], 1)), 64)
-    assert (
-        "evaluation 11 at control point 1" in caplog.text
-    )  # no gross one: the first fit shows it, and is repeated
+    # no gross one: the first fit shows it, and is repeated
+    assert "evaluation 11 at control point 1" in caplog.text
     assert len(calls) == 1
 
 

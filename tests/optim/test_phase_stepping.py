@@ -26,9 +26,8 @@ def test_steps_determine_the_rows_up_to_a_phase(make_objective, random_matrix, t
         reference = added.sum(dim=-1, keepdim=True)
         exact = added * reference.conj().sgn() / drives[:, :1]
         clear = (added.abs() < 0.99 * (reference - added).abs()).all(dim=-1)  # two cannot be, nor one
-        clear &= reference[..., 0].abs() > 1e-2 * matrix.norm(
-            dim=-1
-        )  # not a dark reference, which has a floor
+        # not a dark reference, which has a floor
+        clear &= reference[..., 0].abs() > 1e-2 * matrix.norm(dim=-1)
         # differences of intensities are solved for: 1e-16 over the least reference squared, 1e-4
         torch.testing.assert_close(rows[clear], exact[clear], rtol=1e-9, atol=1e-9)
         assert clear.any() or transducers <= 2

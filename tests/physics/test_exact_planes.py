@@ -105,9 +105,8 @@ def test_impedance_plane_meets_its_condition(impedance):
 def test_impedance_plane_between_rigid_and_soft():
     points = np.array(PLANE.point) + np.array([[0.05, 0.0, 0.02], [0.0, 0.3, 0.0]]) @ PLANE.axes
     plane = SOURCE, K, PLANE.point, PLANE.normal
-    assert (
-        apart(before_impedance(points, 1e9), analytic.rigid_plane(points, *plane)) < 1e-6
-    )  # k r / impedance
+    # k r / impedance
+    assert apart(before_impedance(points, 1e9), analytic.rigid_plane(points, *plane)) < 1e-6
     soft = analytic.soft_plane(points[:1], *plane)
     assert apart(before_impedance(points[:1], 1e-9), soft) < 1e-7
     # Far away a plane wave at the angle of incidence is reflected by (cos - b) / (cos + b).

@@ -120,9 +120,8 @@ def test_rotations_are_about_fixed_axes_x_first():
     torch.testing.assert_close(rotation_matrix((0, 0, quarter)) @ x, y)
     torch.testing.assert_close(rotation_matrix((quarter, 0, 0)) @ y, z)
     torch.testing.assert_close(rotation_matrix((0, quarter, 0)) @ z, x)
-    torch.testing.assert_close(
-        rotation_matrix((quarter, 0, quarter)) @ y, z
-    )  # y to z about x, and there it stays
+    # y to z about x, and there it stays
+    torch.testing.assert_close(rotation_matrix((quarter, 0, quarter)) @ y, z)
 
 
 @pytest.mark.parametrize("suffix", ["obj", "ply", "STL"])

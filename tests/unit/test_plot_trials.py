@@ -104,10 +104,8 @@ def test_a_calibration_is_drawn_on_the_array_or_by_index() -> None:
     for ax, values in ((gains, calibration.gain), (phases, calibration.phase)):
         (dots,) = ax.collections
         np.testing.assert_array_equal(dots.get_array(), values)
-        assert (ax.get_xlabel(), ax.get_ylabel()) == (
-            "y [mm]",
-            "z [mm]",
-        )  # the array is in the plane of y and z
+        # the array is in the plane of y and z
+        assert (ax.get_xlabel(), ax.get_ylabel()) == ("y [mm]", "z [mm]")
     of_matrix = at.calibrate(matrix, at.Readings(drives, pressure), folds=0)
     figure = at.plot_calibration(of_matrix)
     assert [ax.get_xlabel() for ax in figure.axes] == ["reading [Pa]", "transducer", "transducer"]

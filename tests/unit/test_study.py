@@ -265,9 +265,8 @@ def test_a_study_of_a_force_has_a_score_and_a_bound_and_no_figures_of_foci(goal,
     assert share.startswith("no drive above 0")
     assert share.endswith("(certified)")
     climb = results.scenes["a"].methods["climb"]
-    climb = replace(
-        climb, solution=replace(climb.solution, score=torch.zeros_like(scores[0])[None])
-    )  # silence
+    silent = torch.zeros_like(scores[0])[None]
+    climb = replace(climb, solution=replace(climb.solution, score=silent))
     idle = replace(results.scenes["a"], methods={"climb": climb})
     assert summary_rows(replace(results, scenes={"a": idle}))[1][-1].startswith("none of ")
     (row, *_) = map(json.loads, (tmp_path / TRIALS_FILE).read_text().splitlines())

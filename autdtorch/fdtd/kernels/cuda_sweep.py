@@ -22,10 +22,8 @@ def _plane(p, i, shape, tile, weights, terms_y, terms_z, terms_yz, CELLS: tl.con
     first, k, inside, near_y, in_z, place_z = tile
     center, face, edge, corner = weights
     plane = p + i * (tl.cast(ny, tl.int64) * nz)
-    middle, along = (
-        (),
-        (),
-    )  # a row's pressures, and the sum of their neighbours along z, with the layers' term
+    # a row's pressures, and the sum of their neighbours along z, with the layers' term
+    middle, along = (), ()
     for row in tl.static_range(-1, ROWS + 1):
         j = first + row
         mask = inside & (j >= 0) & (j < ny)

@@ -36,9 +36,8 @@ def _write_waves(
     `EvenWaves.steps` (STEPS, 9). `ends` has ENDS distances, each with the number of steps that suffices from
     there on for all kinds.
     """
-    tiles = tl.cdiv(
-        columns, COLUMNS
-    )  # of a row; only the first axis of a grid has room for millions of sources
+    # of a row; only the first axis of a grid has room for millions of sources
+    tiles = tl.cdiv(columns, COLUMNS)
     row = (tl.program_id(0) // tiles * ROWS + tl.arange(0, ROWS))[:, None]
     column = (tl.program_id(0) % tiles * COLUMNS + tl.arange(0, COLUMNS))[None, :]
     there, here = row < rows, column < columns

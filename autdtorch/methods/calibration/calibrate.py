@@ -108,9 +108,8 @@ def _held_back(calibration: Calibration, folds: int, seed: int) -> HeldBack:
     readings = calibration.readings
     observed, known = readings.pressure, ~readings.pressure.isnan() & ~calibration.fit.read.outliers
     clean = _without(readings, ~known)
-    scored = (
-        known & ~calibration.fit.read.limit
-    )  # a saturated sensor says how far a prediction is off at least
+    # a saturated sensor says how far a prediction is off at least
+    scored = known & ~calibration.fit.read.limit
     simulation = calibration.simulation
     linear = LinearChanges(*calibration.fit.changes, simulation.changes.names)
     here = replace(simulation, changes=linear)

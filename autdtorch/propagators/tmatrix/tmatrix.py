@@ -216,9 +216,8 @@ class TMatrixCluster:
 
     bodies: tuple[TMatrix, ...]
     reflectors: tuple[Reflector, ...]
-    _before: TMatrixCluster | None = field(
-        init=False, repr=False
-    )  # the bodies, at rest, that have moved as one
+    # the bodies, at rest, that have moved as one
+    _before: TMatrixCluster | None = field(init=False, repr=False)
 
     @renamed_keywords(operators="bodies")
     def __init__(self, bodies: Iterable[TMatrix], reflectors: Iterable[Reflector] = ()) -> None:
