@@ -10,14 +10,7 @@ from typing import Any
 
 import torch
 
-from autdtorch.hardware.sensors.sensor import (
-    PRESSURE,
-    InstrumentConfig,
-    Quantity,
-    Sensor,
-    SensorError,
-    Setup,
-)
+from autdtorch.hardware.sensors.sensor import PRESSURE, InstrumentConfig, Quantity, Sensor, SensorError, Setup
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.files import path_of
 from autdtorch.utils.validation import (
