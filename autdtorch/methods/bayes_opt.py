@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -13,6 +12,13 @@ import torch
 from autdtorch.methods.base import Method, State, Step, choice, setting, whole
 from autdtorch.methods.gradient import climbed
 from autdtorch.methods.matrix_fit import posteriors, tensors_of
+from autdtorch.methods.phase_points import (
+    drives_at,
+    fixed_last,
+    points_of,
+    require_transducer,
+    sobol_points,
+)
 from autdtorch.methods.prior import (
     Prior,
     best_simulated_drives,
@@ -28,7 +34,7 @@ from autdtorch.objectives.goals import scores_of
 from autdtorch.objectives.objective import GoalFunction
 from autdtorch.objectives.quiet import SeenPoints
 from autdtorch.objectives.readings import Readings
-from autdtorch.scene.drive import AMPLITUDE_TOLERANCE, drive_from_phases, phases_of
+from autdtorch.scene.drive import AMPLITUDE_TOLERANCE
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.process import device_type, one_library_thread
 from autdtorch.utils.text import counted
@@ -171,7 +177,7 @@ class BayesOpt(Method):
         if self.prior is not None and earlier is None:
             points = self._points(best_simulated_drives(self.prior, problem, generators))[:, None]
         elif count and self.initial_points == "sobol":
-            points = torch.stack([_sobol(count, dimensions, seed) for seed in seeds])
+            points = torch.stack([sobol_points(count, dimensions, seed) for seed in seeds])
         elif count:
             points = torch.stack([uniform(draws, count, dimensions) for draws in generators])
         if (starts := starts_of(problem, len(seeds))) is not None:
@@ -274,14 +280,7 @@ class BayesOpt(Method):
 
     def _points(self, drives: torch.Tensor) -> torch.Tensor:
         """Return points (..., M - 1) in turns with the phases of drives (..., M)."""
-        phases = phases_of(drives)
-        points = (phases - phases[..., [self._fixed(drives.shape[-1])]]) / (2 * math.pi) % 1
-        return points[..., self._others(drives.shape[-1])[:-1]]
-
-    def _others(self, transducers: int) -> list[int]:
-        """Return the indices of all transducers, the fixed one at the end."""
-        fixed = self._fixed(transducers)
-        return [*(index for index in range(transducers) if index != fixed), fixed]
+        return points_of(drives, self._fixed(drives.shape[-1]))
 
     def _fixed(self, transducers: int) -> int:
         """Return the index of the transducer whose phase stays 0."""
@@ -343,7 +342,8 @@ class BayesOpt(Method):
         fit = Hyperparameters(torch.ones_like(share), share / (1 - share))
         seen = scores_of(problem.goal, (drives @ rows.mT).abs()).argmax(dim=1)
         best = climbed(problem.goal, rows, drives[torch.arange(len(seen), device="cpu"), seen], _SAMPLE_STEPS)
-        return fit, MatrixRows(rows[..., self._others(problem.transducers)], spread, self._points(best))
+        order = fixed_last(problem.transducers, self._fixed(problem.transducers))
+        return fit, MatrixRows(rows[..., order], spread, self._points(best))
 
     def _acquisition(
         self,
@@ -381,25 +381,3 @@ def _believed(search: Mapping[str, torch.Tensor]) -> torch.Tensor:
     count = search["outliers"].shape[1]
     known = torch.where(search["outliers"], search["fitted_values"], values[:, :count])
     return torch.cat([known, values[:, count:]], dim=1)
-
-
-def require_transducer(fixed_transducer: int, transducers: int) -> None:
-    """Check that an array has at least two transducers, and that one has the index."""
-    integer_at_least("transducers of the objective's array", transducers, 2)
-    if not 0 <= fixed_transducer < transducers:
-        raise invalid("fixed_transducer", fixed_transducer, f"must be an integer from 0 to {transducers - 1}")
-
-
-def drives_at(points: torch.Tensor, fixed_transducer: int) -> torch.Tensor:
-    """Return drives (..., M) of points (..., M - 1) in turns; the fixed transducer has phase 0."""
-    before, after = points[..., :fixed_transducer], points[..., fixed_transducer:]
-    return drive_from_phases(
-        2 * math.pi * torch.cat([before, torch.zeros_like(points[..., :1]), after], dim=-1)
-    )
-
-
-def _sobol(count: int, dimensions: int, seed: int) -> torch.Tensor:
-    sequence = torch.quasirandom.SobolEngine(dimensions, scramble=True, seed=seed)  # type: ignore[no-untyped-call]
-    points = sequence.draw(count, dtype=torch.float64)
-    points[0] = sequence.shift.double() / 2**sequence.MAXBIT  # the engine rounds it to PyTorch's default
-    return points

@@ -7,7 +7,7 @@ import warnings
 import torch
 from botorch.test_functions.base import BaseTestProblem
 
-from autdtorch.methods.bayes_opt import drives_at, require_transducer
+from autdtorch.methods.phase_points import drives_at, require_transducer
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import GoalFunction, Objective, observe_drives, require_objective
 from autdtorch.objectives.scenarios import observed_goal
