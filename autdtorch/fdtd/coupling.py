@@ -77,7 +77,7 @@ def coupling_of(target: ScatteredField, source: ScatteredField, images: Sequence
 
     Images at similar distances are one matrix: the farther, the fewer degrees of freedom it has.
     """
-    points, surface, k = target.driven, source.surface[0], source.wavenumber
+    points, surface, k = target.driven, source.radiating, source.wavenumber
     kind = np.complex64 if target.assembly.dtype == torch.float32 else np.complex128
     wavelength = 2 * math.pi / abs(k)
     if not len(points):  # obstacles of air

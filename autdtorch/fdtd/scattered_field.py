@@ -1,10 +1,8 @@
 """The scattered field in a box: driven in heterogeneous cells, radiated from a Huygens surface.
 
 The pressure is p_inc + p_scat, with the exact field p_inc in free space. In heterogeneous cells the scheme
-then drives p_scat by the force sum_j (w_ij - w_air) (p_inc,j - p_inc,i), and by the losses of p_inc. Around
-them chi steps from 1 to 0 between two cells of air. The cells there radiate sum_j w_ij (chi_j - chi_i)
-p_scat,j by the exact Green's function: the sources of a field that is p_scat outside and zero inside (a
-discrete Huygens surface).
+then drives p_scat by the force sum_j (w_ij - w_air) (p_inc,j - p_inc,i), and by the losses of p_inc. A
+discrete Huygens surface around them radiates it (`huygens_surface.py`).
 
 Receivers in the box are read by interpolation kernels. Sources there drive by the discrete Green's function
 of the same kernels, so that both ways are each other's transpose.
@@ -19,12 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, vstack
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from autdtorch.fdtd.assembly.neighbours import with_neighbours
 from autdtorch.fdtd.discrete_green import field_of_kernels
 from autdtorch.fdtd.face_nodes import FaceNodes
+from autdtorch.fdtd.huygens_surface import HuygensSurface, row_matrix
 from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.kernels.waves import superposition
@@ -78,7 +77,7 @@ class ScatteredField:
             rows = slice(*ends)
             weight = factor * (assembly.heterogeneous.weight[rows] - assembly.stencil.weights)
             weight[:, 13] -= weight.sum(axis=1)  # they are of differences from the cell itself
-            force[rows] = _rows(weight, around[rows], len(values)) @ values
+            force[rows] = row_matrix(weight, around[rows], len(values)) @ values
 
         spread(add, parts_of_size(len(around), _ROWS))
         total = torch.view_as_complex(torch.from_numpy(force).reshape(len(around), fields.shape[1], 2))
@@ -86,7 +85,7 @@ class ScatteredField:
             place = np.searchsorted(assembly.heterogeneous.index, lossy.numpy())
             change = 1 - np.exp(2j * np.pi / float(assembly.steps_per_period))  # over a step, of a phasor
             loss, ground = assembly.coefficients.loss_weight, assembly.coefficients.loss_ground
-            matrix = _rows(loss.double().numpy(), around[place], len(values))
+            matrix = row_matrix(loss.double().numpy(), around[place], len(values))
             total[place] += change * torch.from_numpy(matrix @ fields.numpy())
             total[place] -= ground.double()[:, None] * fields[around[place, 13]]
         return total
@@ -166,15 +165,14 @@ class ScatteredField:
 
     def near_to_far(self, targets: Apertures) -> NearToFar:
         """Return the transform to P targets, which take the mean over their nodes or discs."""
-        _, surface, outward = self.surface
+        surface = self.surface.cells
         far = ~self._in_box(targets)
         nodes = targets.positions[~far]
         within = self.inside(nodes)
         inner = self.assembly.interpolation(self._on_axes(nodes[within]))
         read = np.concatenate((surface, inner.index.ravel()))
         cells = distinct_cells(read, math.prod(self.assembly.grid.shape))
-        if len(cells) > len(surface):
-            outward = outward @ Interpolation(surface[:, None], np.ones((len(surface), 1))).matrix(cells)
+        outward = slice(None) if len(cells) == len(surface) else np.searchsorted(cells, surface)
         return NearToFar(self, targets, far, within, cells, outward, inner.matrix(cells))
 
     def radiated(
@@ -188,7 +186,7 @@ class ScatteredField:
         far = self._far(points, images)
         field = torch.zeros((len(far), amplitude.shape[1]), **COMPLEX)
         if not far.all():
-            field[~far] = self.waves(_chosen(points, ~far), self.surface[0], amplitude, images=images)
+            field[~far] = self.waves(_chosen(points, ~far), self.radiating, amplitude, images=images)
         if far.any():
             assert self._nodes
             nodes, amplitude = self.places_of(self._nodes), self._nodes.amplitudes(amplitude)
@@ -216,8 +214,8 @@ class ScatteredField:
         """Nodes that radiate like the surface, if they are fewer; None in double precision."""
         if self.assembly.dtype != torch.float32:
             return None
-        nodes = FaceNodes.of(self.assembly.grid, self._radiating, self.wavenumber.real)
-        return nodes if len(nodes.positions) < _FEWER * len(self._radiating) else None
+        nodes = FaceNodes.of(self.assembly.grid, self.surface.cells, self.wavenumber.real)
+        return nodes if len(nodes.positions) < _FEWER * len(self.surface.cells) else None
 
     def inside(self, points: Tensor, margin: Tensor | float = 0.0) -> Tensor:
         """Return the mask of points (..., 3) read from the grid; others are clear of the Huygens surface.
@@ -275,41 +273,16 @@ class ScatteredField:
         return cells, around
 
     @cached_property
-    def _radiating(self) -> Index:
-        """Flat indices (n,) of the cells of the Huygens surface: two and three from the interior's rim."""
-        grid = self.assembly.grid
-        radiating = np.zeros(grid.shape, bool)
-        radiating[grid.deeper(2)], radiating[grid.deeper(4)] = True, False
-        return np.flatnonzero(radiating)
+    def surface(self) -> HuygensSurface:
+        """The Huygens surface."""
+        assembly = self.assembly
+        scale = assembly.coefficients.face / assembly.stencil.face
+        return HuygensSurface.of(assembly.grid, assembly.stencil, scale, float(assembly.steps_per_period))
 
     @cached_property
-    def surface(self) -> tuple[Tensor, Index, csr_array]:
-        """Positions (n, 3) of the Huygens surface, its cells (n,), and the weights (n, n) of their phasors.
-
-        It reads the cells that radiate: those on both sides of the step.
-        """
-        assembly, index = self.assembly, self._radiating
-        grid, stencil = assembly.grid, assembly.stencil
-        chi, place = np.zeros(grid.shape, np.int8), places_among(index, math.prod(grid.shape))
-        chi[grid.deeper(3)] = 1
-        scale = assembly.coefficients.face / stencil.face * grid.spacing
-        factor = scale / stencil.source_factor(float(assembly.steps_per_period))
-
-        def rows(ends: tuple[int, int]) -> csr_array:
-            around = index[slice(*ends), None] + flat_offsets(grid.shape)
-            step = chi.ravel()[around] - chi.ravel()[index[slice(*ends)], None]
-            part = _rows(stencil.weights * step, place[around], len(index))
-            part.eliminate_zeros()
-            return part
-
-        outward = factor * vstack(spread(rows, parts_of_size(len(index), _ROWS)), format="csr")
-        return self.positions(index), index, outward
-
-
-def _rows(weight: Array, place: NDArray[np.int32], count: int) -> csr_array:
-    """Return the matrix (h, count) of stencil rows (h, 27), of cells by their place (h, 27)."""
-    first_of_row = np.arange(0, weight.size + 1, weight.shape[1], dtype=place.dtype)
-    return csr_array((weight.ravel(), place.ravel(), first_of_row), (len(weight), count))
+    def radiating(self) -> Tensor:
+        """Positions (n, 3) [m] of the cells of the Huygens surface."""
+        return self.positions(self.surface.cells)
 
 
 def _chosen(points: Tensor | Discs, mask: Tensor) -> Tensor | Discs:
@@ -326,7 +299,7 @@ class NearToFar:
     far: Tensor  # mask of the targets none of whose nodes is in the box (P,)
     within: Tensor  # mask of the other targets' nodes in the box, where its cells are read (Q, n)
     cells: Index  # flat indices (k,) of the cells whose phasors are needed
-    outward: csr_array  # amplitudes of the Huygens surface from those phasors
+    outward: slice | Index  # the Huygens surface's cells among those
     inward: csr_array  # field at the nodes in the box from those phasors
 
     def field(self, phasors: Tensor) -> Tensor:
@@ -354,7 +327,7 @@ class NearToFar:
 
     def amplitudes(self, phasors: Tensor) -> Tensor:
         """Return amplitudes (n, R) [Pa m] of the Huygens surface, from the cells' phasors (k, R)."""
-        return torch.from_numpy(self.outward @ phasors.numpy())
+        return self.box.surface.of_phasors(phasors[self.outward])
 
     def matrices(self, every: int) -> FieldMatrices:
         """Return the matrices of each `every`-th target."""
@@ -365,7 +338,7 @@ class NearToFar:
         single = self.box.assembly.dtype == torch.float32
         kind = torch.complex64 if single else torch.complex128
         nodes = self.box.nodes_for(self.targets.chosen(chosen).positions.flatten(0, 1))
-        radiating = self.box.surface[0] if nodes is None else self.box.places_of(nodes)
+        radiating = self.box.radiating if nodes is None else self.box.places_of(nodes)
         received = torch.zeros((len(radiating), len(far)), dtype=kind, device="cpu")
         # reciprocity of Green's function
         self._receive(received, radiating, ~far, some, weights * ~within, False, self.box.images)
@@ -379,7 +352,7 @@ class NearToFar:
         place = torch.nonzero(~far)[row, 0].numpy(), np.arange(len(row))
         mean = csr_array((weights[node].numpy(), place), (len(far), len(row)))
         inner = csr_array(mean @ self.inward[read[self.within].numpy()])
-        return FieldMatrices(self.outward, nodes, received, inner)
+        return FieldMatrices(self, nodes, received, inner)
 
     def _receive(
         self,
@@ -411,14 +384,14 @@ class NearToFar:
 class FieldMatrices:
     """The scattered field at P targets, as matrices that are built once for many phasors."""
 
-    outward: csr_array  # amplitudes of the Huygens surface from phasors (n, k)
+    transform: NearToFar
     nodes: FaceNodes | None  # those that stand for the surface, where they reach all targets
     received: Tensor  # waves from the surface, or from its nodes, to the targets (n, P)
     inner: csr_array  # field at the targets in the box from phasors (P, k)
 
     def field(self, phasors: Tensor) -> Tensor:
         """Return the scattered field (P, R) at the targets, from the cells' phasors (k, R)."""
-        amplitude = torch.from_numpy(self.outward @ phasors.numpy())
+        amplitude = self.transform.amplitudes(phasors)
         amplitude = self.nodes.amplitudes(amplitude) if self.nodes else amplitude
         # by NumPy: in single precision PyTorch may take products of a few bits
         outside = self.received.numpy().T @ amplitude.to(self.received.dtype).numpy()

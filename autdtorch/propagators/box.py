@@ -126,7 +126,7 @@ class BoxSimulation(Simulation):
         """Return the Huygens surfaces as monopoles, in runs of drives (R, M)."""
         radiation = self._radiation_of(drive)
         parts = zip(radiation.boxes, radiation.amplitudes, strict=True)
-        return [Radiators(box.surface[0], amplitude, box.mirrors) for box, amplitude in parts]
+        return [Radiators(box.radiating, amplitude, box.mirrors) for box, amplitude in parts]
 
     def _check(self, points: torch.Tensor) -> None:
         require_clear(self.plan.scene.array, "points", points)
@@ -179,7 +179,7 @@ class BoxSimulation(Simulation):
     @cached_property
     def _keeps_surfaces(self) -> bool:
         array = self.plan.scene.array
-        size = _ENTRY_BYTES * len(array) * sum(len(box.surface[0]) for box in self.boxes)
+        size = _ENTRY_BYTES * len(array) * sum(len(box.surface.cells) for box in self.boxes)
         return size <= MOST_BYTES
 
     def _radiation_of_transducers(self) -> Radiation:
@@ -387,7 +387,7 @@ class _Scatterer:
 
 def _images(box: ScatteredField, symmetry: Symmetry) -> Index:
     """Return for each cell of the Huygens surface the place of its image among them."""
-    places = box.surface[0].numpy() - symmetry.center
+    places = box.radiating.numpy() - symmetry.center
     if (symmetry.matrix == np.eye(3)).all():
         return np.arange(len(places))
     return np.asarray(KDTree(places).query(places @ symmetry.matrix.T)[1], np.int64)

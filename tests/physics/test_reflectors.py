@@ -366,7 +366,7 @@ def test_no_corner_of_a_turned_grid_reaches_a_plane_that_it_cannot_hold(turn, wa
     absorbing = at.Reflector((-wall, 0.0, 0.0), (1.0, 0.0, 0.0), 0.5)
     scene = room([body], [FLOOR, absorbing], [[30e-3, 3e-3, 12e-3]], [[25e-3, 20e-3, 10e-3]])
     (box,) = make_propagator(scene, "box", 1.4e-3).simulation.boxes
-    assert (box.surface[0][:, 0] > -wall).all()
+    assert (box.radiating[:, 0] > -wall).all()
 
 
 def test_scenes_that_differ_in_a_reflector_share_no_result(tmp_path):

@@ -32,9 +32,8 @@ def box_named(name):
 def passed_on(name):
     """Amplitudes (n, 1) of a box's surface for a source inside the body."""
     box = box_named(name)
-    _, cells, weights = box.surface
     inside = torch.zeros((1, 3), dtype=torch.float64)
-    return torch.from_numpy(weights @ green(box.positions(cells), inside, box.wavenumber).numpy())
+    return box.surface.of_phasors(green(box.radiating, inside, box.wavenumber))
 
 
 @given(st.sampled_from(list(SIZES)), st.integers(0, 5), st.floats(0.2, 10.0), st.integers(0, 2**32 - 1))
@@ -48,7 +47,7 @@ def test_nodes_radiate_like_the_cells_of_the_surface(name, face, gap, seed):
     apart = gap * 8.6e-3
     places = draw.uniform(lower - apart, upper + apart, (20, 3))
     places[:, face % 3] = (lower - apart, upper + apart)[face // 3][face % 3]
-    points, surface = torch.from_numpy(places @ box.axes), box.surface[0]
+    points, surface = torch.from_numpy(places @ box.axes), box.radiating
     drawn = torch.from_numpy(draw.normal(size=(len(surface), 2)).view(np.complex128))
     for amplitude, tolerance in ((passed_on(name), 2e-5), (drawn, 1e-4)):
         exact = box.waves(points, surface, amplitude)
@@ -57,7 +56,7 @@ def test_nodes_radiate_like_the_cells_of_the_surface(name, face, gap, seed):
 
 def test_large_faces_take_fewer_nodes_and_double_precision_none():
     plate = box_named("plate")
-    assert len(plate._nodes.positions) < len(plate.surface[0]) / 2
+    assert len(plate._nodes.positions) < len(plate.radiating) / 2
     assert box_of((4e-3,) * 3, 1e-3)._nodes is None  # as many as cells
     assert box_of((60e-3, 40e-3, 3e-3), 1e-3, dtype="float64")._nodes is None
 
@@ -72,6 +71,6 @@ def test_images_radiate_through_nodes_too():
     assert len(box.images) == 2
     points = torch.tensor([[0, 0, 0.15], [-0.038, 0, 0.06]], dtype=torch.float64)
     assert box._far(points, box.images).tolist() == [True, False]  # the other is next to body and image
-    amplitude = torch.ones((len(box.surface[0]), 1), dtype=torch.complex128)
-    exact = box.waves(points, box.surface[0], amplitude, images=box.images)
+    amplitude = torch.ones((len(box.radiating), 1), dtype=torch.complex128)
+    exact = box.waves(points, box.radiating, amplitude, images=box.images)
     torch.testing.assert_close(box.radiated(amplitude, points), exact, rtol=1e-4, atol=0)

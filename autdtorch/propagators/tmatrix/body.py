@@ -254,7 +254,7 @@ class BodyWaves:
         periods = math.ceil(count * USUAL_PERIODS * fewest_periods(box.assembly.grid.arrival))
         with show_progress(periods, "simulating the waves of a body") as progress:
             states = run_to_steady_state(
-                box.assembly, kernel, drive, box.surface[1], [plan.tolerance] * count, plan.max_periods,
+                box.assembly, kernel, drive, box.surface.cells, [plan.tolerance] * count, plan.max_periods,
                 lambda phasors, runs: [observed @ phasors.cpu()], progress.advance,
                 torch.zeros((1, count), **REAL),
             )  # fmt: skip
@@ -289,7 +289,8 @@ class BodyWaves:
 
     def _multipoles(self) -> torch.Tensor:
         """Return the map (N, n) from phasors of the Huygens surface to outgoing waves."""
-        positions, _, outward = self._box.surface
+        box = self._box
         place, sign = mirrored(self.degree)
-        conjugate = sign * self._regular(positions)[:, place]  # j_l Y_lm^*, also for a complex wavenumber
-        return 4j * math.pi * self._box.wavenumber * torch.from_numpy((outward.T @ conjugate.numpy()).T)
+        conjugate = sign * self._regular(box.radiating)[:, place]  # j_l Y_lm^*, also for a complex wavenumber
+        factor = 4j * math.pi * box.wavenumber * box.surface.factor
+        return factor * torch.from_numpy((box.surface.weights.T @ conjugate.numpy()).T)
