@@ -232,11 +232,11 @@ class _OpenMPDFirmware:
 
     baud: ClassVar[int | None] = None
 
+    _BEGINNING, _VALUES = re.compile(rb"[\x80-\xff]"), bytes(byte & 127 for byte in range(256))
+
     def __init__(self) -> None:
         self._message = bytearray()
         self._playing = bytes(512)
-
-    _BEGINNING, _VALUES = re.compile(rb"[\x80-\xff]"), bytes(byte & 127 for byte in range(256))
 
     def receive(self, data: bytes) -> None:
         while data:
