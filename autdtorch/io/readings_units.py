@@ -24,24 +24,14 @@ _MOST_LEVELS = 2**16
 # Spellings. The case counts in mPa, which is not MPa.
 _PRESSURE_WORDS = {"pa": "Pa", "kpa": "kPa", "db": "dB", "spl": "dB", "dbspl": "dB"}
 _KIND_WORDS = {"peak": "peak", "pk": "peak", "amplitude": "peak", "rms": "rms", "pp": "peak-to-peak"}
-_ANGLE_WORDS = {
-    "rad": "rad",
-    "radian": "rad",
-    "radians": "rad",
-    "deg": "deg",
-    "degree": "deg",
-    "degrees": "deg",
-}
-_ANGLE_WORDS |= {"°": "deg", "level": "level", "levels": "level"}
+_ANGLE_WORDS = dict.fromkeys(("rad", "radian", "radians"), "rad")
+_ANGLE_WORDS |= dict.fromkeys(("deg", "degree", "degrees", "°"), "deg")
+_ANGLE_WORDS |= dict.fromkeys(("level", "levels"), "level")
 _PEAK_TO_PEAK = re.compile(r"(?<![^\W_])(?:peak[\s_-]*to[\s_-]*peak|pk[-_]?pk|p-p)(?![^\W_])", re.IGNORECASE)
 _RE_20 = re.compile(r"(?:\bre[lf]?\.?)?\s*:?\s*20\s*[uµμ]Pa\b", re.IGNORECASE)  # two letters mu
 
-UNIT_WORDS = {*_PRESSURE_WORDS, *_KIND_WORDS, *_ANGLE_WORDS, *_LENGTHS, "mpa"} - {
-    "amplitude",
-    "spl",
-    "level",
-    "levels",
-}
+UNIT_WORDS = {*_PRESSURE_WORDS, *_KIND_WORDS, *_ANGLE_WORDS, *_LENGTHS, "mpa"}
+UNIT_WORDS -= {"amplitude", "spl", "level", "levels"}
 """UNIT_WORDS: words of a column's name that are units, in lower case."""
 
 _ATMOSPHERE = 101_325.0  # [Pa], which no peak amplitude of sound exceeds
@@ -64,9 +54,8 @@ class Unit(NamedTuple):
 
     def __str__(self) -> str:
         """Return the text that states it."""
-        return " ".join(
-            filter(None, self[::-1] if self.kind == "arg" and self.unit in ("rad", "deg") else self)
-        )
+        parts = self[::-1] if self.kind == "arg" and self.unit in ("rad", "deg") else self
+        return " ".join(filter(None, parts))
 
 
 UNSTATED = Unit()
@@ -236,11 +225,8 @@ def drives_of(phases: Array, amplitudes: Array | None, unit: Unit, of_amplitudes
         raise ValueError(
             f"amplitudes in levels beside phases in {unit}; must be beside phase levels of a device"
         )
-    share = (
-        np.ones_like(phases)
-        if amplitudes is None
-        else amplitudes * (0.01 if of_amplitudes.unit == "%" else 1)
-    )
+    scale = 0.01 if of_amplitudes.unit == "%" else 1
+    share = np.ones_like(phases) if amplitudes is None else amplitudes * scale
     if (count := _levels_of(unit)) is not None:
         return PhaseLevels(count).drive(torch.from_numpy(phases).long(), torch.from_numpy(share))
     argument = radians(phases, unit, "phase") * (1 if unit.kind == "arg" else -1)

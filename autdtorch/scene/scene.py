@@ -88,11 +88,10 @@ class Scene(SceneContents):
         cut at them.
 
         Raises:
-            ValueError: a field of the wrong type or out of range, or a coordinate beyond 1e6 m. Also a point
-                in or on an obstacle, coincident with another or outside the domain, or a medium that absorbs
-                more than 3 dB per wavelength, or an obstacle more than 27; or
-                something behind a reflector, or reflectors that are neither at right angles nor facing each
-                other, a wavelength apart.
+            ValueError: a field of the wrong type or out of range, or a coordinate beyond 1e6 m; a point in or
+                on an obstacle, coincident with another or outside the domain; a medium that absorbs more than
+                3 dB per wavelength, or an obstacle more than 27; something behind a reflector; or reflectors
+                that are neither at right angles nor facing each other, a wavelength apart.
 
         Warns:
             OverlapWarning: two obstacles of different materials overlap.
