@@ -43,7 +43,7 @@ paper: $(INSTALLED)
 	$(BIN)/autdtorch experiment=paper $(OVERRIDES)
 
 # Once for all processes of the tests, which would each take 30 s
-$(VENV)/.kernels: $(wildcard autdtorch/fdtd/kernels/*.py autdtorch/methods/holography/*.py) | $(INSTALLED)-dev
+$(VENV)/.kernels: $(wildcard autdtorch/fdtd/kernels/*.py autdtorch/methods/holography/*.py autdtorch/scene/obstacles/*.py) | $(INSTALLED)-dev
 	for dtype in float32 float64; do $(BIN)/python tests/compile_kernels.py $$dtype & done; wait
 	@touch $@
 

@@ -20,6 +20,7 @@ def main(dtype: str) -> None:
     at.make_propagator(small_scene(()), "free_space", cache=False).transfer_matrix(points)
     for algorithm in ("naive", "gs"):
         at.holography(matrix.to(getattr(torch, dtype).to_complex()), algorithm=algorithm)
+    at.Mesh.from_surface(CUBE.surface(), rigid=True).contains(CUBE.center)
     sphere = at.TMatrix.of(at.Sphere((0, 0, 0.05), 2e-3, rigid=True), scene.medium, scene.frequency)
     pair = at.TMatrixCluster([sphere, sphere.moved((5e-3, 0, 0))])
     at.radiation_force(pair, drive, array=scene.array, medium=scene.medium)

@@ -13,7 +13,7 @@ from small_scenes import CUBE, small_scene
 from torch.utils.data import DataLoader
 
 import autdtorch as at
-from autdtorch.fdtd.kernels.compiled import _entries
+from autdtorch.utils.compiled import _entries
 
 
 def numbers(seed: int) -> list[float]:

@@ -16,7 +16,7 @@ from autdtorch.fdtd.assembly.edges import edges_of
 from autdtorch.fdtd.assembly.element import LATTICE
 from autdtorch.fdtd.assembly.elements import HALF_DIAGONAL, lattice_distances, near_surface
 from autdtorch.scene.obstacles import Box, Mesh, Sphere, VoxelMask
-from autdtorch.scene.obstacles.mesh import MeshDistance
+from autdtorch.scene.obstacles.mesh_distance import MeshDistance
 
 
 def solid(lower, upper):

@@ -18,7 +18,8 @@ import torch
 from small_scenes import CUBE, small_scene
 
 import autdtorch as at
-from autdtorch.fdtd.kernels import compiled, cpu, cpu_waves
+from autdtorch.fdtd.kernels import cpu, cpu_waves
+from autdtorch.utils import compiled
 from autdtorch.utils.process import one_library_thread, spread
 
 
@@ -35,17 +36,17 @@ def test_any_change_of_the_kernels_changes_the_digest(tmp_path):
 
 SOURCE = """
 from pathlib import Path
-from autdtorch.fdtd.kernels.compiled import entry
+from autdtorch.utils.compiled import entry
 
-@entry(Path(__file__).parent)
+@entry(Path(__file__).parent / "others")
 def doubled(x):
     return 2 * x
 
-@entry(Path(__file__).parent)
+@entry()
 def tripled(x):
     return 3 * x
 
-@entry(Path(__file__).parent)
+@entry()
 def halved(x):
     return x / 2
 """
@@ -92,16 +93,14 @@ def test_what_is_damaged_is_compiled_again(kernel, suffix, caplog):
         assert hits(after) == 1
 
 
-def test_kernels_of_other_folders_are_compiled_again_after_a_change_of_those_they_call(
-    kernel, monkeypatch, tmp_path
-):
+def test_kernels_of_other_folders_are_compiled_again_after_a_change_of_those_they_call(kernel, tmp_path):
     made, _ = kernel
     made()(3)
-    (tmp_path / "kernels").mkdir()
-    (tmp_path / "kernels" / "intrinsics.py").write_text("a = 1\n", "utf-8")
     same = made()
     assert (same(3), hits(same)) == (6, 1)
-    monkeypatch.setattr(compiled, "_HERE", tmp_path / "kernels")
+    (tmp_path / "others").mkdir()
+    (tmp_path / "others" / "intrinsics.py").write_text("a = 1\n", "utf-8")
+    compiled._digest.cache_clear()
     changed = made()
     assert (changed(3), hits(changed)) == (6, 0)
 

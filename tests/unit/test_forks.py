@@ -17,8 +17,9 @@ from tqdm import tqdm
 from tqdm.std import TqdmDefaultWriteLock
 
 import autdtorch.utils.progress  # noqa: F401 - what this and the kernels name to `os.register_at_fork`
-from autdtorch.fdtd.kernels import compiled as compiled_kernels
+from autdtorch.fdtd import assembly, kernels
 from autdtorch.utils import process
+from autdtorch.utils.compiled import _digest
 from autdtorch.utils.process import cached_property
 
 pytestmark = [
@@ -196,7 +197,6 @@ def test_processes_of_all_kinds_get_the_results_of_the_one_that_compiled_the_ker
     compiled, *different = run.stdout.splitlines()
     assert int(compiled.removeprefix("compiled ")) > 0
     assert different == [f"{kind} 0" for kind in KINDS]
-    kernels = [path.name for path in tmp_path.rglob("*.nbi")]
-    here = Path(compiled_kernels.__file__).parent
-    digests = {compiled_kernels._digest(here), compiled_kernels._digest(here.parent / "assembly", here)}
-    assert {name.split("-")[0].rpartition("_")[2] for name in kernels} == digests
+    names = [path.name for path in tmp_path.rglob("*.nbi")]
+    digests = {_digest(Path(folder.__file__).parent) for folder in (assembly, kernels)}
+    assert {name.split("-")[0].rpartition("_")[2] for name in names} == digests

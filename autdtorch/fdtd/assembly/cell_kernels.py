@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
-from autdtorch.fdtd.kernels.compiled import entry
+from autdtorch.utils.compiled import entry
 
 
-@entry(Path(__file__).parent)
+@entry()
 def add_elements(first, last, cells, kind, tables, numbers, hard, coupling, sums):  # type: ignore[no-untyped-def]
     """Write rows `first` to `last` of the coupling (n, 27) of cells (n,), and sums over their elements.
 
@@ -49,7 +47,7 @@ def add_elements(first, last, cells, kind, tables, numbers, hard, coupling, sums
         sums[0, row], sums[1, row], sums[2, row] = values[0], values[1], magnitude
 
 
-@entry(Path(__file__).parent)
+@entry()
 def join_cells(cells, coupling, least, place, free, number, neighbours, region):  # type: ignore[no-untyped-def]
     """Join the regions of cells between which sound passes: write the least that each is joined to.
 

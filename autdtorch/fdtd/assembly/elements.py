@@ -349,14 +349,20 @@ def _parts(places: Index, size: int, step: int, upper: Index) -> Index:
 
 
 def _at_lattice(measure: Measure, first: Index, lattice: Array) -> Array:
-    """Return the distances (n, L) at the lattice (L, 3) of elements; neighbours share places."""
+    """Return the distances (n, L) at the lattice (L, 3) of elements; neighbours share places.
+
+    Places in a cell are measured one after the other, as meshes find near places more quickly.
+    """
     if len(first) == 0:
         return np.zeros((0, len(lattice)))
     quarters = SUBCELLS * (first - first.min(axis=0))[:, None] + (SUBCELLS * lattice).astype(np.int64)
-    shape = quarters.reshape(-1, 3).max(axis=0) + 1
-    index = np.ravel_multi_index(tuple(np.moveaxis(quarters, -1, 0)), tuple(shape))
+    axes = np.moveaxis(quarters, -1, 0)
+    cells, within = axes // SUBCELLS, axes % SUBCELLS
+    shape = *(cells.max(axis=(1, 2)) + 1).tolist(), *3 * [SUBCELLS]
+    index = np.ravel_multi_index((*cells, *within), shape)
     used, place = np.unique(index, return_inverse=True)
-    places = places_of(used, shape) / SUBCELLS + first.min(axis=0)
+    cell, quarter = np.split(places_of(used, shape), 2, axis=1)
+    places = cell + quarter / SUBCELLS + first.min(axis=0)
     return np.asarray(measure(places)[place.reshape(index.shape)])
 
 

@@ -24,7 +24,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from autdtorch.fdtd.kernels.blocks import BLOCK, Blocks
-from autdtorch.fdtd.kernels.compiled import INNER, entry, meanwhile
 from autdtorch.fdtd.kernels.contract import (
     CPU,
     Coefficients,
@@ -45,6 +44,7 @@ from autdtorch.fdtd.kernels.cpu_sweep import planes_at_once, strips_of, sweep_pl
 from autdtorch.fdtd.kernels.cpu_waves import superposition
 from autdtorch.fdtd.stencil import OFFSETS, flat_offsets
 from autdtorch.utils.array_types import COMPLEX, REAL, AnyArray, Index
+from autdtorch.utils.compiled import INNER, entry, meanwhile
 from autdtorch.utils.process import spread, thread_count
 
 # Fewest cells and planes of a chunk, for which a second thread and the sums at its ends pay

@@ -8,7 +8,6 @@ import numpy as np
 from numba import njit
 from torch import Tensor
 
-from autdtorch.fdtd.kernels.compiled import INNER
 from autdtorch.utils.apertures import (
     RIM_DIGITS,
     RIM_LEAST,
@@ -19,6 +18,7 @@ from autdtorch.utils.apertures import (
     even_waves,
 )
 from autdtorch.utils.array_types import AnyArray
+from autdtorch.utils.compiled import INNER
 
 LANES = 64
 """Places in a block; their waves stay in the first-level cache."""

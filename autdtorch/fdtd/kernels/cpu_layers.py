@@ -18,10 +18,10 @@ import numpy as np
 import torch
 from numba import njit
 
-from autdtorch.fdtd.kernels.compiled import INNER
 from autdtorch.fdtd.kernels.contract import Coefficients, Memory
 from autdtorch.fdtd.kernels.cpu_intrinsics import add_four
 from autdtorch.utils.array_types import AnyArray
+from autdtorch.utils.compiled import INNER
 
 # b and a of the half cells, then b and a of the cells, repeated as `stretch` reads them
 Profile = tuple[AnyArray, AnyArray, AnyArray, AnyArray]

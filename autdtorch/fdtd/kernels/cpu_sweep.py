@@ -29,10 +29,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from autdtorch.fdtd.kernels.blocks import BLOCK
-from autdtorch.fdtd.kernels.compiled import INNER
 from autdtorch.fdtd.kernels.cpu_intrinsics import step_around
 from autdtorch.fdtd.kernels.cpu_layers import absorb_x, add_terms, stretch_planes
 from autdtorch.utils.array_types import Index
+from autdtorch.utils.compiled import INNER
 
 _GROUP_CELLS = 3000  # Cells of the layers across an axis that are computed at once
 _STRIP_CELLS = 50_000  # Cells of a strip of a plane of at least twice as many, for the cache

@@ -17,7 +17,6 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from autdtorch.fdtd.kernels.compiled import INNER, entry
 from autdtorch.fdtd.kernels.cpu_disc_waves import (
     ALSO,
     APART,
@@ -36,6 +35,7 @@ from autdtorch.fdtd.kernels.cpu_disc_waves import (
 )
 from autdtorch.utils.apertures import Discs
 from autdtorch.utils.array_types import AnyArray
+from autdtorch.utils.compiled import INNER, entry
 from autdtorch.utils.process import even_parts, spread
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 

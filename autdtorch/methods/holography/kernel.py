@@ -15,16 +15,17 @@ import numpy as np
 import torch
 from numba import njit
 
-from autdtorch.fdtd.kernels.compiled import INNER, entry
+from autdtorch.fdtd.kernels import cpu_intrinsics
 from autdtorch.fdtd.kernels.cpu_intrinsics import VECTOR, add_conjugate_products, add_products
 from autdtorch.methods.holography.algorithms import GOLDEN, TINY, UNREACHED, weight_change
+from autdtorch.utils.compiled import INNER, entry
 from autdtorch.utils.process import even_parts, spread, thread_count
 
 _GROUP = np.uint64(4)  # Transducers whose entries are read twice while they are in the nearest cache
 _TASKS = 4  # Tasks a thread, so that none waits long for another
 _NAMES = ("gs", "wgs", "gs_pat")
 _GS, _WGS, _GS_PAT = range(3)  # places in `_NAMES`
-_HERE = Path(__file__).parent
+_INTRINSICS = Path(cpu_intrinsics.__file__).parent
 
 _weight_change = njit(**INNER)(weight_change)
 
@@ -47,7 +48,7 @@ def solved(
     return torch.view_as_complex(torch.from_numpy(drive))
 
 
-@entry(_HERE)
+@entry(_INTRINSICS)
 def _back_propagate(matrix, wanted, first, last, free, drive):  # type: ignore[no-untyped-def]
     """Write the drives (B, M, 2) of the sets `first` to `last` of matrices (B, P, M, 2)."""
     points, transducers = matrix.shape[1:3]
@@ -236,7 +237,7 @@ def _products(a, b, c, d, points, transducers, lanes):  # type: ignore[no-untype
                 c[mirrored], d[mirrored] = c[k], d[k] if p == q else -d[k]
 
 
-@entry(_HERE)
+@entry(_INTRINSICS)
 def _solve(matrix, wanted, first, last, algorithm, iterations, free, drive):  # type: ignore[no-untyped-def]
     """Write the drives (B, M, 2) of the blocks `first` to `last` of matrices (B, P, M, 2).
 

@@ -11,17 +11,19 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
-from autdtorch.fdtd.kernels.compiled import INNER, entry
+from autdtorch.fdtd.kernels import cpu_intrinsics
 from autdtorch.fdtd.kernels.cpu_intrinsics import add_conjugate_products, add_products, set_to_multiples
+from autdtorch.utils.compiled import INNER, entry
 
 LANES = 8
 """Poses in a vector; see `VECTOR`."""
 
 _LANES, _PAIR = np.uint64(LANES), np.uint64(2 * LANES)
+_INTRINSICS = Path(cpu_intrinsics.__file__).parent
 _ZERO, _ONE, _TWO = np.uint64(0), np.uint64(1), np.uint64(2)
 
 
-@entry(Path(__file__).parent)
+@entry(_INTRINSICS)
 def translate(waves, turns, shifts, quarters, out):  # type: ignore[no-untyped-def]
     """Write regular waves (N, B, R, 2) of outgoing ones (K, B, R, 2), of real and imaginary parts.
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import atexit
 import logging
 from dataclasses import InitVar, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
-from weakref import WeakSet
 
 import numpy as np
 import torch
 
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.base import Obstacle
+from autdtorch.scene.obstacles.mesh_distance import MeshDistance
 from autdtorch.scene.obstacles.mesh_file import read_mesh
 from autdtorch.scene.obstacles.mesh_repair import repaired
 from autdtorch.scene.obstacles.mesh_solid import Triangles, outer_parts, solid_of
@@ -22,17 +21,12 @@ from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import replacing
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.process import cached_property
-from autdtorch.utils.spatial import doubled_normals
 from autdtorch.utils.units import angles
 from autdtorch.utils.validation import Vector, boolean, finite_vector, invalid, positive, real_tensor, within
 
 logger = logging.getLogger(__name__)
 
 _MOST = 2**53  # largest whole number that is exact in double precision
-_ON_SIDE = 1e-9  # barycentric coordinate of a nearest point that lies on a side of its triangle
-_ALONG_NORMAL = 1 - 1e-9  # least share of a distance along a normal with which it is a distance along it
-_FINE = 2.0  # accuracy of winding numbers as libigl counts it: errors are below 0.05
-_alive: WeakSet[MeshDistance] = WeakSet()
 
 
 class _Source(str):
@@ -227,79 +221,3 @@ def _triangles(surface: Any) -> Triangles:
     if (triangles != np.trunc(triangles)).any():
         raise ValueError("triangles that are not whole numbers; must be indices of vertices, counted from 0")
     return vertices, triangles.clip(-1, _MOST).astype(np.int64)  # an index beyond is refused
-
-
-@atexit.register
-def _drop_all() -> None:
-    """Drop the search structures: libigl warns of any that outlive the interpreter."""
-    for each in tuple(_alive):
-        vars(each).clear()
-
-
-class MeshDistance:
-    """The distance to a closed surface, negative inside.
-
-    A point is outside if the normal at the nearest point of the surface points towards it. At an edge, this
-    normal is the mean of two triangles, at a vertex the mean weighted by angles (Baerentzen and Aanaes 2005,
-    doi:10.1109/TVCG.2005.49). Where more than two triangles meet at an edge, or parts at a vertex, the
-    winding number decides.
-    """
-
-    def __init__(self, vertices: Array, faces: Index) -> None:
-        """Build the structures for vertices (V, 3) and outward triangles (F, 3)."""
-        import igl
-
-        _alive.add(self)
-        self._vertices, self._faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces)
-        self._tree = igl.AABB()
-        self._tree.init(self._vertices, self._faces)
-        self._winding = None
-        if igl.is_edge_manifold(self._faces)[0] and igl.is_vertex_manifold(self._faces).all():
-            by_angle = igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE
-            uniform = igl.PER_EDGE_NORMALS_WEIGHTING_TYPE_UNIFORM
-            normals = doubled_normals(self._vertices[self._faces])
-            length = np.linalg.norm(normals, axis=1, keepdims=True)
-            self._face_normals = normals / np.where(length > 0, length, 1)
-            self._vertex_normals = igl.per_vertex_normals(self._vertices, self._faces, by_angle)
-            self._edge_normals, _, self._edge = igl.per_edge_normals(self._vertices, self._faces, uniform)
-        else:
-            lower, upper = self._vertices.min(axis=0), self._vertices.max(axis=0)
-            self._middle, self._extent = (lower + upper) / 2, float((upper - lower).max())
-            self._winding = igl.FastWindingNumberBVH()  # in single precision
-            self._winding.init((self._vertices - self._middle) / self._extent, self._faces)
-
-    def __call__(self, points: Array) -> Array:
-        """Return the signed distances (N,) of points (N, 3)."""
-        points = np.ascontiguousarray(points)
-        if len(points) == 0:
-            return np.zeros(0)
-        square, face, nearest = self._tree.squared_distance(self._vertices, self._faces, points)
-        distance = np.sqrt(square)
-        if self._winding is None:
-            away = points - nearest
-            above = (away * self._face_normals[face]).sum(axis=1)
-            beside = np.flatnonzero(np.abs(above) < _ALONG_NORMAL * distance)  # nearest to a side or a corner
-            normals = self._normals(face[beside], nearest[beside])
-            above[beside] = (away[beside] * normals).sum(axis=1)
-            inside = above < 0
-        else:
-            inside = self._winding.winding_number((points - self._middle) / self._extent, _FINE) > 0.5
-        return np.asarray(np.where(inside, -distance, distance))
-
-    def _normals(self, face: Index, nearest: Array) -> Array:
-        """Return the normals (N, 3) of the surface at points on triangles `face` (N,)."""
-        normal = self._face_normals[face]
-        first, second, third = (self._vertices[corner] for corner in self._faces[face].T)
-        opposite = zip((second, third, first), (third, first, second), strict=True)
-        whole = np.linalg.norm(np.cross(second - first, third - first), axis=1)
-        # the share of the triangle opposite each corner, zero for a point on the side opposite it
-        area = [(np.cross(b - nearest, c - nearest) * normal).sum(axis=1) for b, c in opposite]
-        share = np.stack(area, axis=1) / np.where(whole > 0, whole, 1)[:, None]
-        on_side = np.abs(share) < _ON_SIDE
-        at_edge = np.flatnonzero(on_side.sum(axis=1) == 1)
-        side = on_side[at_edge].argmax(axis=1)
-        normal[at_edge] = self._edge_normals[self._edge[face[at_edge] + len(self._faces) * side]]
-        at_vertex = np.flatnonzero(on_side.sum(axis=1) > 1)
-        corner = share[at_vertex].argmax(axis=1)
-        normal[at_vertex] = self._vertex_normals[self._faces[face[at_vertex], corner]]
-        return np.asarray(normal)

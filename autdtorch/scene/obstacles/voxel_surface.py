@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
-from autdtorch.scene.obstacles.mesh import MeshDistance
+from autdtorch.scene.obstacles.mesh_distance import MeshDistance
 from autdtorch.scene.obstacles.primitives import BOX_TRIANGLES
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.process import cached_property

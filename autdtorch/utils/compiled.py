@@ -32,7 +32,6 @@ from autdtorch.utils.process import hold_at_fork, thread_count
 
 logger = logging.getLogger(__name__)
 
-_HERE = Path(__file__).parent
 _entries: set[Any] = set()
 # See `meanwhile`; of all threads, because a thread of `spread` may be the first to compile
 _ahead: list[_Ahead] = []
@@ -272,15 +271,15 @@ def _is_whole(path: Path) -> bool:
     return whole
 
 
-def entry(folder: Path = _HERE, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+def entry(*others: Path, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function that Python calls, and cache its machine code on disk.
 
     Numba checks the file of the function for changes, but not the files of the functions that it calls. The
-    digest in the name covers its folder and the one here, which must hold them.
+    digest in the name covers its folder and `others`, which must hold them.
     """
 
     def compiled(function: Callable[..., Any]) -> Any:
-        function.__qualname__ += f"_{_digest(*dict.fromkeys((folder, _HERE)))}"
+        function.__qualname__ += f"_{_digest(Path(function.__code__.co_filename).parent, *others)}"
         try:
             dispatcher = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
             dispatcher._cache.__class__ = _Cache
@@ -301,7 +300,7 @@ def _log_once(message: str) -> None:
 
 @functools.cache
 def _digest(*folders: Path) -> str:
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(Path(__file__).read_bytes())
     for source in (source for folder in folders for source in sorted(folder.glob("*.py"))):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]

@@ -1,0 +1,61 @@
+"""Distances from meshes are exact, whatever the triangles and the order of the points."""
+
+import numpy as np
+import pytest
+import pyvista
+import torch
+
+import autdtorch as at
+from autdtorch.scene.obstacles.mesh_distance import MeshDistance
+
+ROUNDING = 1e-13  # of coordinates of size 1, a hundred times what is measured
+SLENDER = {"cube": (1.0, 1.0, 1.0), "sheet": (1.0, 1.0, 1e-5), "needle": (1e-5, 1e-5, 1.0)}
+
+
+def points_around(extents: tuple[float, float, float], count: int = 500) -> torch.Tensor:
+    """Return points of all distances from a cuboid: in and around it, next to its faces and its edges."""
+    random = np.random.default_rng(0)
+    whole = random.uniform(-1, 1, (count, 3))
+    beside = random.uniform(-0.5, 0.5, (count, 3))
+    for axis in (0, 1):
+        beside[axis * count // 2 :, axis] = random.choice((-0.5, 0.5), count - axis * count // 2)
+    beside = beside * extents + random.choice((1e-9, 1e-6, 1e-3), (count, 1)) * random.normal(size=(count, 3))
+    return torch.from_numpy(np.concatenate((whole, beside)))
+
+
+@pytest.mark.parametrize("extents", SLENDER.values(), ids=SLENDER)
+def test_distances_from_cuboids_are_exact(extents):
+    box = at.Box((0, 0, 0), extents, rigid=True)
+    vertices, faces = (part.numpy() for part in box.surface())
+    points = points_around(extents)
+    distance = MeshDistance(vertices, faces)(points.numpy())
+    np.testing.assert_allclose(distance, box.signed_distance(points), rtol=0, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("offset", [(1.0, 1.0, 0.0), (1.0, 1.0, 1.0)], ids=["edge", "corner"])
+def test_bodies_that_touch_have_the_distance_of_the_nearer_one(offset):
+    boxes = at.Box((0, 0, 0), (1, 1, 1), rigid=True), at.Box(offset, (1, 1, 1), rigid=True)
+    surfaces = [[part.numpy() for part in box.surface()] for box in boxes]
+    vertices = np.concatenate([vertices for vertices, _ in surfaces])
+    mesh = at.Mesh.from_surface((vertices, np.concatenate([surfaces[0][1], 8 + surfaces[1][1]])), rigid=True)
+    points = points_around((1.0, 1.0, 1.0)) + torch.tensor(offset) / 2
+    nearer = torch.minimum(*(box.signed_distance(points) for box in boxes))
+    torch.testing.assert_close(mesh.signed_distance(points), nearer, rtol=0, atol=ROUNDING)
+
+
+def test_the_order_of_the_points_does_not_matter():
+    mesh = pyvista.Icosphere(nsub=4)
+    mesh.points = mesh.points * (1 + 0.5 * np.sin(5 * mesh.points[:, :1]))
+    distance = MeshDistance(np.asarray(mesh.points, np.float64), mesh.regular_faces.astype(np.int64))
+    along = np.linspace(-1.5, 1.5, 20)
+    points = np.stack(np.meshgrid(along, along, along, indexing="ij"), axis=-1).reshape(-1, 3)
+    order = np.random.default_rng(0).permutation(len(points))
+    alone = np.concatenate([distance(point[None]) for point in points[:50]])
+    together = distance(points)
+    np.testing.assert_allclose(distance(points[order]), together[order], rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(alone, together[:50], rtol=0, atol=ROUNDING)
+
+
+def test_no_points_have_no_distances():
+    box = at.Box((0, 0, 0), (1, 1, 1), rigid=True)
+    assert MeshDistance(*(part.numpy() for part in box.surface()))(np.zeros((0, 3))).shape == (0,)
