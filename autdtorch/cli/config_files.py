@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from hydra._internal.core_plugins import file_config_source
+from hydra._internal.hydra import Hydra
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.plugins.config_source import ConfigResult
 
@@ -62,8 +63,22 @@ class FileConfigSource(file_config_source.FileConfigSource):
 
 
 def register() -> None:
-    """Have Hydra read files through `FileConfigSource` in this process."""
+    """Have Hydra read files through `FileConfigSource` in this process, and find the mode by `_mode`."""
     SourcesRegistry.instance().types["file"] = FileConfigSource
+    Hydra.get_mode = _mode  # type: ignore[assignment, method-assign]
+
+
+_mode_of_settings = Hydra.get_mode
+
+
+def _mode(hydra: Hydra, config_name: str | None, overrides: list[str]) -> Any:
+    """Return the value of hydra.mode, for which Hydra would compose all settings once more.
+
+    It is None unless an override sets it, or adds a trusted folder that may.
+    """
+    if any("hydra" in override for override in overrides):
+        return _mode_of_settings(hydra, config_name, overrides)
+    return None
 
 
 def _begin_paths(config: Any, folder: str) -> None:

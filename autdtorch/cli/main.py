@@ -6,6 +6,7 @@ so that help is quick.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import gc
 import hashlib
@@ -72,6 +73,7 @@ class SweepCallback(Callback):
 
 def main() -> None:
     """Run the command line; `errors.stop` has the statuses where it fails."""
+    atexit.register(gc.freeze)  # the system frees memory faster than a last collection
     prepare_streams()
     sys.argv[1:] = map(quoted, sys.argv[1:])
     wanted = os.environ.get(FULL_ERROR)

@@ -16,7 +16,7 @@ from autdtorch.io.yaml_file import load_yaml
 
 @pytest.fixture(autouse=True, scope="session")
 def configs_parsed_once():
-    """Keep our parsed configs, which Hydra composes twice in each run."""
+    """Keep our parsed configs, which Hydra reads in each run."""
     parsed = functools.cache(load_yaml)
 
     def load(path):

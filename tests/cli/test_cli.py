@@ -6,10 +6,12 @@ import json
 import re
 import signal
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra._internal.hydra import Hydra
 from omegaconf import OmegaConf
 
 import autdtorch.cli.arguments
@@ -42,6 +44,13 @@ def composed(*overrides):
     # `output` refers to Hydra's settings, which compose() leaves out.
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
         return OmegaConf.to_container(compose("config", [*overrides, "output=x"]), resolve=True)
+
+
+def test_a_run_composes_its_settings_once(run, monkeypatch):
+    composing = mock.Mock(wraps=Hydra.compose_config)
+    monkeypatch.setattr(Hydra, "compose_config", lambda *some, **named: composing(*some, **named))
+    assert run("method=lssg", "plane_spacing=0.02") == 0
+    composing.assert_called_once()
 
 
 def test_every_scene_builds_and_has_the_name_of_its_file():

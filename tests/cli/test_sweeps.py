@@ -76,6 +76,13 @@ def test_jobs_in_one_scene_share_its_matrices(run, tmp_path):
     assert matrix.suffix == ".matrix"
 
 
+def test_a_trusted_folder_may_ask_for_a_sweep(run, write, tmp_path):
+    sweep = "hydra: {mode: MULTIRUN, sweeper: {params: {method: 'lss,lssg'}}}"
+    write("lab/experiment/both.yaml", f"# @package _global_\n{sweep}\n")
+    assert run("experiment=both", "hydra.searchpath=[lab]", "plane_spacing=0.02") == 0
+    assert len(jobs(tmp_path)) == 2
+
+
 @pytest.mark.skipif(os.name != "posix", reason="SIGKILL is of POSIX")
 def test_a_killed_sweep_goes_on_with_the_same_command(run, tmp_path):
     command = ("-m", *QUICK, "method=gabs,identify", "trials=2")
