@@ -72,7 +72,8 @@ class BoxSimulation(Simulation):
         for grid in plan.grouping.grids:
             if is_tilted(grid.axes):
                 logger.debug("the grid around obstacles %s is turned along their faces", list(grid.group))
-            assembly = assembled_box(grid.part, grid.axes, plan.spacing, plan.dtype, plan.time_step)
+            with self._kernels_compiled(plan.dtype):
+                assembly = assembled_box(grid.part, grid.axes, plan.spacing, plan.dtype, plan.time_step)
             images = plan.region.other_images(grid.mirrors, plan.scene.images)
             settings = grid.axes, images, grid.mirrors, plan.device
             boxes.append(ScatteredField(assembly, wavenumber, *settings))
@@ -264,7 +265,7 @@ class BoxSimulation(Simulation):
         some = receivers.chosen(slice(None, None, every))
         transforms = [box.near_to_far(receivers) for box in self.boxes]
         sizes = [len(transform.cells) for transform in transforms]
-        with self._kernels_compiled():
+        with self._kernels_compiled(self.assemblies[0].dtype):
             readings = [transform.matrices(every) for transform in transforms]
             incident = self._incident(sources, strength, some)
         audible = (~self.silent(some.positions)).to(incident.dtype)[:, None]
@@ -295,13 +296,13 @@ class BoxSimulation(Simulation):
         runs = [Run.of(state, seconds) for state in states]
         return Solved(transforms, torch.split(phasors, sizes), runs), runs
 
-    def _kernels_compiled(self) -> AbstractContextManager[None]:
+    def _kernels_compiled(self, dtype: torch.dtype) -> AbstractContextManager[None]:
         """Compile all kernels of a simulation as soon as one is missing."""
         if self.plan.kernel != "cpu":
             return contextlib.nullcontext()
         from autdtorch.fdtd.kernels.cpu import CpuKernel  # loads numba
 
-        return CpuKernel().compiled_ahead(self.assemblies[0].coefficients)
+        return CpuKernel().compiled_ahead(dtype)
 
     @cached_property
     def _in_one_box(self) -> BoxSimulation:

@@ -164,7 +164,10 @@ def meanwhile(kernel: Any, call: Callable[[], object], *others: Callable[[], obj
 
 
 def _fork(ahead: _Ahead) -> bool:
-    """Return whether another process compiles a kernel."""
+    """Return whether another process compiles a kernel, also one that began before."""
+    index = ahead.kernel._cache._cache_file._index_path
+    if index in _children.values():
+        return True
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of other threads: see utils/process.py
         try:
@@ -172,7 +175,7 @@ def _fork(ahead: _Ahead) -> bool:
         except OSError:  # too many processes, or too little memory: this one compiles
             return False
     if child:
-        _children[child] = ahead.kernel._cache._cache_file._index_path
+        _children[child] = index
         return True
     try:
         _ahead.clear()

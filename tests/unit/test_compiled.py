@@ -142,6 +142,28 @@ def test_another_process_compiles_what_is_needed_next(kernel):
 
 
 @needs_fork
+def test_a_kernel_is_compiled_by_one_other_process(kernel, tmp_path):
+    made, _ = kernel
+    ahead, go, begun = made("tripled"), tmp_path / "go", tmp_path / "begun"
+
+    def compile_later():
+        with begun.open("a", encoding="utf-8") as file:
+            file.write("once\n")
+        end = time.monotonic() + 60
+        while not go.exists() and time.monotonic() < end:
+            time.sleep(0.01)
+        ahead(3)
+
+    for name in ("doubled", "halved"):
+        with threads(2), compiled.meanwhile(ahead, compile_later):
+            made(name)(3)
+    go.touch()
+    assert ahead(3) == 9
+    assert hits(ahead) == 1
+    assert begun.read_text("utf-8") == "once\n"
+
+
+@needs_fork
 def test_what_no_other_process_can_compile_is_compiled_here(kernel, monkeypatch):
     made, _ = kernel
     forks = mock.Mock(side_effect=BlockingIOError("Resource temporarily unavailable"))

@@ -95,6 +95,15 @@ class Coefficients:
     # past the last (g, 2) int64, ascending; none of them ends in another row or is in a layer
     idle: Tensor = field(default_factory=lambda: _empty(0, 2, dtype=torch.int64))
 
+    @classmethod
+    def of_air(cls, dtype: torch.dtype) -> Coefficients:
+        """Return coefficients without heterogeneous cells and layers, for air in which nothing moves."""
+        none, numbers, columns = _empty(0, dtype=torch.int64), _empty(1, dtype=dtype), Columns.none(0, dtype)
+        return cls(
+            0.0, 0.0, 0.0, 0.0, 0.0, none, _empty(0, 27, dtype=dtype), none, numbers, numbers,
+            none, numbers[:0], columns, columns, columns.index,
+        )  # fmt: skip
+
     @property
     def layer_cells(self) -> int:
         """Thickness of the absorbing layers."""

@@ -409,12 +409,13 @@ class CpuKernel:
         self._work(lambda: _advance(*arguments), len(cuts) - 1)
         memory.give_back()
 
-    def compiled_ahead(self, c: Coefficients) -> AbstractContextManager[None]:
+    def compiled_ahead(self, dtype: torch.dtype) -> AbstractContextManager[None]:
         """Compile `advance` in another process while the sums of waves are compiled here."""
         none = torch.zeros((0, 1), dtype=torch.int64, device="cpu")
-        silent = torch.zeros((0, 1), dtype=c.layer_decay.dtype, device="cpu")
+        silent = torch.zeros((0, 1), dtype=dtype, device="cpu")
 
         def step() -> None:
+            c = Coefficients.of_air(dtype)
             state = uniform_state((3, 3, 3), c, 0.0)  # no steps: of any shape
             self.advance(state, c, Sources(none[:, 0], silent[None]), Receivers(none, silent), silent)
 
