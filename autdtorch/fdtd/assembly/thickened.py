@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from autdtorch.fdtd.shapes import Shape
+from autdtorch.utils.array_types import REAL
 from autdtorch.utils.spatial import extents, mean_thickness
 from autdtorch.utils.validation import Vector
 
@@ -93,7 +94,8 @@ class _Receding:
     def _is_parallel(self, points: torch.Tensor) -> torch.Tensor:
         """Return at which points (n, 3) the nearest faces of both shapes look the same way."""
         step = _STEP * self.spacing
-        around = points + step * torch.cat((torch.eye(3), -torch.eye(3))).to(points)[:, None]
+        axes = torch.eye(3, **REAL).to(points)
+        around = points + step * torch.cat((axes, -axes))[:, None]
         ahead, behind = (
             torch.stack([each.signed_distance(part) for each in (self.shape, self.rigid)])
             for part in torch.split(around, 3)
