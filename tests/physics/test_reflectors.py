@@ -247,7 +247,8 @@ def test_tilted_bodies_that_touch_or_cross_a_plane(depth):
     """Box and full agree within what they claim."""
     tilted = at.Box((0.0, 0.0, 0.0), (10e-3, 12e-3, 5e-3), (0.3, 0.4, 0.2), rigid=True)
     body = at.Box((0.0, 0.0, -tilted.lower[2] - depth), tilted.size, tilted.rotation, rigid=True)
-    scene = room([body], [FLOOR])
+    near = [[-18e-3, 3e-3, 12e-3], [-15e-3, -14e-3, 20e-3]], [[18e-3, 5e-3, 10e-3], [14e-3, -16e-3, 18e-3]]
+    scene = room([body], [FLOOR], *near)
     (box, claimed), (full, other) = (
         make_propagator(scene, method, 1e-3).transfer_matrix(return_error=True) for method in ("box", "full")
     )
