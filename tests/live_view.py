@@ -9,7 +9,7 @@ from PIL import Image
 
 import autdtorch as at
 
-SPACING = 2e-3  # cells of the fine calculation here
+SPACING = 4e-3  # cells of the fine calculation here, at 20 kHz: a view of 6 wavelengths
 PATIENCE = 120  # s; the first simulation may compile kernels, and the machine may be busy
 IDLE = "document.querySelector('section.picture[aria-busy=false]') !== null"
 

@@ -14,11 +14,11 @@ def scene():
     foci = at.circle_points((80e-3, 50e-3, 50e-3), 25e-3, 3, (1, 0, 0))
     obstacles = (
         at.Box((40e-3, 45e-3, 50e-3), (14e-3,) * 3, rigid=True),
-        at.Sphere((30e-3, 70e-3, 60e-3), 3e-3, rigid=True),
+        at.Sphere((30e-3, 70e-3, 60e-3), 4e-3, rigid=True),
     )
     plane = at.Plane((80e-3, 50e-3, 50e-3), (1, 0, 0), (100e-3, 100e-3))
-    domain = [[0, 0, 0], [0.1, 0.1, 0.1]]
-    return at.Scene(array, at.Medium.air(), 40e3, foci, obstacles, plane, domain, name="cube and sphere")
+    air, domain = at.Medium.air(frequency=20e3), [[0, 0, 0], [0.1, 0.1, 0.1]]
+    return at.Scene(array, air, 20e3, foci, obstacles, plane, domain, name="cube and sphere")
 
 
 @pytest.fixture(scope="session")
