@@ -6,6 +6,7 @@ Cells of notebooks run in test_pages.py.
 """
 
 import contextlib
+import functools
 import importlib
 import io
 import itertools
@@ -34,6 +35,7 @@ from doc_pages import (
 )
 from packaging.requirements import Requirement
 
+import autdtorch
 from autdtorch import hardware
 from autdtorch.cli import main as command_line
 
@@ -272,6 +274,8 @@ def program(page, folder):
     with here(folder) as patch, matplotlib.rc_context({"backend": "Agg"}):
         for name in ("open_link", "open_scope", "FileSensor"):  # to be undone
             patch.setattr(hardware, name, getattr(hardware, name))
+        for name in ("explore", "make_propagator"):  # as coarse as commands, unless the page says otherwise
+            patch.setattr(autdtorch, name, functools.partial(getattr(autdtorch, name), spacing=2e-3))
         names = {"__name__": "__main__"}
         exec(compile(code, f"{page} as Python", "exec"), names)
         if "live" in names:

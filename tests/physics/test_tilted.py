@@ -85,15 +85,18 @@ def tilted(rotation, material):
     points = np.array([[1e-3, 2e-3, 14e-3], [7e-3, -3e-3, 13e-3], [-9e-3, 5e-3, 8e-3]])
     array = TransducerArray(transducers @ turn.T, turn @ [0.0, 0.0, 1.0])
     box = Box((0, 0, 0), (8e-3,) * 3, rotation, **material)
-    return Scene(array, AIR, 40e3, points @ turn.T, [box], domain=((-26e-3,) * 3, (26e-3,) * 3))
+    return Scene(array, AIR, 40e3, points @ turn.T, [box], domain=((-22e-3,) * 3, (22e-3,) * 3))
+
+
+@functools.cache
+def upright():
+    return make_propagator(tilted((0.0, 0.0, 0.0), RIGID), "box", 1e-3).transfer_matrix()
 
 
 @pytest.mark.parametrize("rotation", TILTS)
 def test_a_box_turns_with_a_tilted_cube(rotation):
-    matrices = [
-        make_propagator(tilted(each, RIGID), "box", 1e-3).transfer_matrix() for each in (rotation, (0, 0, 0))
-    ]
-    assert relative_error(*matrices) < 1e-4  # rounding in float32: measured 2e-6
+    turned = make_propagator(tilted(rotation, RIGID), "box", 1e-3).transfer_matrix()
+    assert relative_error(turned, upright()) < 1e-4  # rounding in float32: measured 2e-6
 
 
 @functools.cache

@@ -20,7 +20,7 @@ from autdtorch.scene.geometry import plane_basis
 
 CALLS = public_calls()
 
-#: The call that sees all wrong values of a parameter; others of this name and annotation see a third of them.
+#: The call that sees all wrong values of a parameter; others of this name and annotation see a sixth of them.
 FIRST = {key: call.name for call in reversed(CALLS.values()) for key in call.parameters.items()}
 
 EXPECTED = {
@@ -118,7 +118,7 @@ def test_a_value_of_a_wrong_kind_is_refused_in_a_line_that_names_the_field(call,
         valid = call.argument(parameter, tmp_path)
         values = [*wrong_values(), *spoiled(valid)]
         if FIRST[parameter, annotation] != call.name:
-            values = values[len(call.name) % 3 :: 3]
+            values = values[len(call.name) % 6 :: 6]
         for wrong in values:
             if annotation == "Any" or (callable(valid) and callable(wrong.value)):
                 continue  # errors of a function show where it is called
