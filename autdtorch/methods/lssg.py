@@ -11,7 +11,8 @@ from typing import Any, ClassVar, Literal
 import torch
 
 from autdtorch.methods.base import Method, State, Step, first_of_best, setting, whole
-from autdtorch.methods.problem import FOR_FORCE, Problem, scores_pressures
+from autdtorch.methods.problem import FOR_FORCE, Problem
+from autdtorch.objectives.goals import scores_pressures
 from autdtorch.objectives.over_scenes import OverScenes
 from autdtorch.scene.arrays import phase_offsets_of
 from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise, phases_of
@@ -142,7 +143,7 @@ class LSSG(Method):
 
     def check(self, problem: Problem) -> None:
         """Check the order against the number of foci, and that offsets of these change a force."""
-        if _foci(problem) == 1 and not scores_pressures(problem):
+        if _foci(problem) == 1 and not scores_pressures(problem.goal):
             accepted = f"must be 2 or more, whose foci lssg superposes; else {FOR_FORCE}"
             raise invalid("number of control points", 1, accepted)
         require_all(self.order, _foci(problem))
@@ -176,7 +177,7 @@ class LSSG(Method):
 def _foci(problem: Problem) -> int:
     """Return the number of foci, in one scene if there are several: for a force, the control points."""
     goal = problem.goal
-    if problem.scene is not None and not scores_pressures(problem):
+    if problem.scene is not None and not scores_pressures(problem.goal):
         return len(problem.scene.control_points)
     return problem.foci // goal.scenes if isinstance(goal, OverScenes) else problem.foci
 

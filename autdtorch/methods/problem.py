@@ -9,7 +9,7 @@ from functools import partial
 import torch
 
 from autdtorch.methods.further_readings import fitting
-from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal, goal_of
+from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal, goal_of, scores_pressures
 from autdtorch.objectives.objective import (
     GoalFunction,
     Objective,
@@ -131,14 +131,9 @@ def starts_of(problem: Problem, trials: int) -> torch.Tensor | None:
     return start
 
 
-def scores_pressures(problem: Problem) -> bool:
-    """Return whether the goal of a problem scores pressures at control points, and no force."""
-    return not isinstance(problem.goal, Goal) or problem.goal.of_pressures
-
-
 def require_pressures(problem: Problem, method: str) -> None:
     """Refuse a goal of force, for a method that fits the pressures of control points."""
-    if not scores_pressures(problem):
+    if not scores_pressures(problem.goal):
         accepted = f"must be of pressures at control points, which {method} fits; for a force {FOR_FORCE}"
         raise invalid("goal", getattr(problem.goal, "name", problem.goal), accepted)
 

@@ -224,6 +224,11 @@ def goal_of(function: GoalFunction) -> GoalFunction:
     return WEAKEST_FOCUS if inspect.unwrap(function) is inspect.unwrap(weakest_focus) else function
 
 
+def scores_pressures(goal: GoalFunction) -> bool:
+    """Return whether a goal scores pressures at control points, as functions do, and no other readings."""
+    return not isinstance(goal, Goal) or goal.of_pressures
+
+
 def scores_of(goal: GoalFunction, pressure: torch.Tensor) -> torch.Tensor:
     """Return the scores (...) of a goal or any function for magnitudes (..., P), after checking them.
 

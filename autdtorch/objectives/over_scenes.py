@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from autdtorch.objectives.bound import checked_matrix
-from autdtorch.objectives.goals import Goal, slope_of
+from autdtorch.objectives.goals import Goal, scores_pressures, slope_of
 from autdtorch.objectives.objective import GoalFunction
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import (
@@ -64,7 +64,7 @@ class OverScenes(Goal):
     @property
     def of_pressures(self) -> bool:  # type: ignore[override]
         """False if the goal scores other readings."""
-        return not isinstance(self.goal, Goal) or self.goal.of_pressures
+        return scores_pressures(self.goal)
 
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:
         """Return the score (...) of pressures (..., S P) [Pa]."""
