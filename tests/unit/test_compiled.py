@@ -18,7 +18,7 @@ import torch
 from small_scenes import CUBE, small_scene
 
 import autdtorch as at
-from autdtorch.fdtd.kernels import cpu, cpu_waves
+from autdtorch.fdtd.kernels import cpu, cpu_steps, cpu_waves
 from autdtorch.utils import compiled
 from autdtorch.utils.process import one_library_thread, spread
 
@@ -180,13 +180,13 @@ def test_kernels_are_compiled_ahead_for_the_types_of_a_simulation(monkeypatch):
     calls = []
 
     def noted(kernel, *some):
-        assert kernel is cpu._advance
+        assert kernel is cpu_steps.advance
         calls.extend(some)
         return contextlib.nullcontext()
 
     monkeypatch.setattr(cpu, "meanwhile", noted)
     at.make_propagator(small_scene((CUBE,)), "box", 2e-3, cache=False).transfer_matrix()
-    kernels = cpu._advance, cpu_waves._sum_at_points, cpu_waves._sum_over_sources
+    kernels = cpu_steps.advance, cpu_waves._sum_at_points, cpu_waves._sum_over_sources
     before = [set(kernel.signatures) for kernel in kernels]
     for call in calls:
         call()
