@@ -162,9 +162,9 @@ def make_grid(region: Region, spacing: float) -> Grid:
     return _covering(region, spacing, domain_extent(region, spacing))
 
 
-def make_box(region: Region, spacing: float) -> Grid:
-    """Return a grid over the region's bodies and `AROUND` cells of air around them, whatever its domain."""
-    return _covering(region.unbounded, spacing, bodies_extent(region))
+def make_box(region: Region, spacing: float, extent: Extent | None = None) -> Grid:
+    """Return a grid over an extent, by default of the region's bodies, whatever its domain."""
+    return _covering(region.unbounded, spacing, extent or bodies_extent(region))
 
 
 def _covering(region: Region, spacing: float, extent: Extent) -> Grid:

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations, permutations
+from typing import Self
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.coupling import usual_numbers
 from autdtorch.fdtd.grid import Extent, bodies_extent, domain_extent
+from autdtorch.fdtd.perfectly_matched_layer import Thickness
 from autdtorch.fdtd.region import CLEARANCE, MAX_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH, Region
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
@@ -182,6 +184,11 @@ class Grouping:
     def coupled_pairs(self) -> int:
         """Pairs of a radiating cell of one box and a scattering cell of another."""
         return sum(one.radiating * other.scattering for one, other in permutations(self.grids, 2))
+
+    def with_layer(self, layer: Thickness) -> Self:
+        """Return the same grids with other absorbing layers."""
+        grids = [replace(grid, extent=replace(grid.extent, layer=layer)) for grid in self.grids]
+        return replace(self, grids=tuple(grids))
 
     def box_cost(self, runs: int) -> float:
         """Return the time of runs in boxes, in steps of a cell; boxes are coupled for all runs at once."""

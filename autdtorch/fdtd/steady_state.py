@@ -125,8 +125,18 @@ def run_to_steady_state(
                 places = torch.arange(len(runs), device="cpu")
         return [states[run] for run in range(*bounds)]
 
-    count, threads = len(limit), kernel.at_once(assembly.grid.shape)
-    most = kernel.together(assembly.grid.shape, len(cells))
+    return in_batches(together, len(limit), kernel, assembly.grid.shape, len(cells))
+
+
+def in_batches(
+    together: Callable[[tuple[int, int]], list[SteadyState]],
+    count: int,
+    kernel: Kernel,
+    shape: tuple[int, int, int],
+    cells: int,
+) -> list[SteadyState]:
+    """Return the states of runs, so many as a kernel steps at once on grids of a shape, by their bounds."""
+    threads, most = kernel.at_once(shape), kernel.together(shape, cells)
     batches = even_parts(count, max(math.ceil(count / most), min(threads, count))) if count else []
     return [state for states in spread(together, batches, threads) for state in states]
 

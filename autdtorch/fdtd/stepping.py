@@ -312,12 +312,14 @@ def _wanted_steps(fewest: float, time_step: float | None, frequency: float) -> f
     return 1 / (frequency * time_step)
 
 
-def drive_signal(steps_per_period: Fraction, first: int, count: int) -> Tensor:
+def drive_signal(
+    steps_per_period: Fraction, first: int, count: int, ramp_periods: int = RAMP_PERIODS
+) -> Tensor:
     """Return cos(w t) and sin(w t) under the switch-on envelope, (count, 2), from step `first` on."""
     step = torch.arange(first, first + count, device="cpu")
     block, turns = steps_per_period.numerator, steps_per_period.denominator
     phase = 2 * math.pi / block * torch.remainder(step * turns, block).double()
-    ramp = (step.double() / float(RAMP_PERIODS * steps_per_period)).clamp(max=1)
+    ramp = (step.double() / float(ramp_periods * steps_per_period)).clamp(max=1)
     envelope = ramp**4 * (35 - 84 * ramp + 70 * ramp**2 - 20 * ramp**3)
     return torch.stack((envelope * torch.cos(phase), envelope * torch.sin(phase)), dim=1)
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from autdtorch.fdtd.grid import Grid, make_box
+from autdtorch.fdtd.grouping import PlannedGrid
 from autdtorch.fdtd.region import Body, Region
 from autdtorch.fdtd.stepping import Assembly, assemble_on
 from autdtorch.propagators.store import BODIES, key_of
@@ -33,15 +34,14 @@ class _AssembledBox:
         return _CELL_BYTES * math.prod(self.assembly.grid.shape)
 
 
-def assembled_box(
-    region: Region, axes: Array, spacing: float, dtype: torch.dtype, time_step: float | None
-) -> Assembly:
-    """Assemble the box of a region on a grid along `axes`, one a row (3, 3); see `stepping.assemble_on`.
+def assembled_box(planned: PlannedGrid, dtype: torch.dtype, time_step: float | None) -> Assembly:
+    """Assemble the box of a planned grid; see `stepping.assemble_on`.
 
     It is assembled with its first cell at the origin: for a body that moves it is the same, to the last bit.
     """
+    region, axes = planned.part, planned.axes
     part = region.turned(axes)
-    grid = make_box(part, spacing)
+    grid = make_box(part, planned.spacing, planned.extent)
     if not all(isinstance(shape, Obstacle) and is_movable(shape) for shape in region.shapes):
         return assemble_on(grid, part, dtype, time_step)
     bodies = tuple(_shifted(body, grid, axes) for body in region.bodies)

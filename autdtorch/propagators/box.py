@@ -24,6 +24,7 @@ from autdtorch.fdtd.coupling import Coupling, coupling_of
 from autdtorch.fdtd.grouping import one_box
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
+from autdtorch.fdtd.short_runs import short_runs
 from autdtorch.fdtd.steady_state import MOST_JUDGED, Observe, SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_array, orbits_of_transducers
@@ -31,6 +32,7 @@ from autdtorch.fdtd.turning import is_tilted
 from autdtorch.propagators.absorbed_power import Radiators, absorption
 from autdtorch.propagators.assembled_box import assembled_box
 from autdtorch.propagators.multiple_scattering import iterated
+from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.radiation import Judged, Radiation, Solved, spread_runs
 from autdtorch.propagators.simulation import (
     AbsorbingCells,
@@ -40,11 +42,12 @@ from autdtorch.propagators.simulation import (
     Stepped,
     mean_of_images,
 )
-from autdtorch.propagators.store import MOST_BYTES
+from autdtorch.propagators.store import MOST_BYTES, Store
 from autdtorch.scene.checks import require_clear
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.obstacles.moving import circumscribed
 from autdtorch.scene.reflectors import require_in_front
+from autdtorch.scene.scene import Scene
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL, Index
 from autdtorch.utils.digest import digest_of
@@ -63,17 +66,33 @@ class BoxSimulation(Simulation):
     that their distance costs no grid.
     """
 
+    def __init__(self, plan: Plan, store: Store, boxes: Sequence[ScatteredField] = ()) -> None:
+        """Make the simulation of a plan; see `Simulation`. `boxes` are those of its grids, if known."""
+        super().__init__(plan, store)
+        self._boxes = boxes
+
+    def around(self, scene: Scene) -> BoxSimulation:
+        """Return the simulation of a scene with these obstacles on the same grids; see `Plan.around`."""
+        plan = self.plan.around(scene)
+        return BoxSimulation(plan, self._store, self.boxes if plan.grouping is self.plan.grouping else ())
+
+    def short(self, spacing: float, periods: int) -> BoxSimulation:
+        """Return the simulation by short runs of so many periods at another spacing [m]."""
+        return BoxSimulation(self.plan.short(spacing, periods), self._store)
+
     @cached_property
     @one_library_thread()
-    def boxes(self) -> list[ScatteredField]:
+    def boxes(self) -> Sequence[ScatteredField]:
         """The assembled boxes."""
+        if self._boxes:
+            return self._boxes
         plan = self.plan
         boxes, wavenumber = [], plan.scene.complex_wavenumber
         for grid in plan.grouping.grids:
             if is_tilted(grid.axes):
                 logger.debug("the grid around obstacles %s is turned along their faces", list(grid.group))
             with self._kernels_compiled(plan.dtype):
-                assembly = assembled_box(grid.part, grid.axes, plan.spacing, plan.dtype, plan.time_step)
+                assembly = assembled_box(grid, plan.dtype, plan.time_step)
             images = plan.region.other_images(grid.mirrors, plan.scene.images)
             settings = grid.axes, images, grid.mirrors, plan.device
             boxes.append(ScatteredField(assembly, wavenumber, *settings))
@@ -260,10 +279,43 @@ class BoxSimulation(Simulation):
         self, sources: Sequence[Apertures], strength: torch.Tensor, judged: Judged, stepped: Stepped
     ) -> tuple[Solved, list[Run]]:
         """Simulate R runs until the pressure at the judged receivers has converged; see `_run`."""
+        drives = [self.imaged(*drive) for drive in zip(sources, strength, strict=True)]
+        transforms = [box.near_to_far(judged.receivers) for box in self.boxes]
+        bodies = [
+            _Scatterer(self, transform, stepped, self.coupling(box, box, box.echoes) if box.echoes else None)
+            for box, transform in zip(self.boxes, transforms, strict=True)
+        ]
+        single = len(bodies) == 1 and not bodies[0].comes_back_later
+        observed = None  # of a short run, nothing
+        if not (single and self.plan.is_short):
+            observed = self._observed(sources, strength, judged, transforms)
+        begin, count, tolerance = time.perf_counter(), len(drives), self.plan.tolerance
+        driving = [box.driving(drives) for box in self.boxes]
+        if single:
+            states = bodies[0].answers(driving[0], [tolerance] * count, *(observed or ()))
+        else:
+            assert observed
+            states, settled = iterated(bodies, driving, *observed, tolerance)
+            if not settled and len(bodies) > 1:
+                logger.debug("the iteration between %d boxes does not converge: one box instead", len(bodies))
+                return self._in_one_box._solved(sources, strength, judged, stepped)
+        seconds = (time.perf_counter() - begin) / count
+        phasors = torch.stack([state.pressure for state in states]).mT
+        runs = [Run.of(state, seconds) for state in states]
+        sizes = [len(transform.cells) for transform in transforms]
+        return Solved(transforms, torch.split(phasors, sizes), runs), runs
+
+    def _observed(
+        self,
+        sources: Sequence[Apertures],
+        strength: torch.Tensor,
+        judged: Judged,
+        transforms: Sequence[NearToFar],
+    ) -> tuple[Observe, torch.Tensor]:
+        """Return what is observed of R runs, and the norms (Q, R) below which it counts as silence."""
         receivers, every, groups = judged
         drives = [self.imaged(*drive) for drive in zip(sources, strength, strict=True)]
         some = receivers.chosen(slice(None, None, every))
-        transforms = [box.near_to_far(receivers) for box in self.boxes]
         sizes = [len(transform.cells) for transform in transforms]
         with self._kernels_compiled(self.assemblies[0].dtype):
             readings = [transform.matrices(every) for transform in transforms]
@@ -278,23 +330,7 @@ class BoxSimulation(Simulation):
             pressure = audible * (incident[:, runs] + torch.stack(scattered).sum(dim=0))
             return [pressure[group] for group in groups]
 
-        bodies = [
-            _Scatterer(self, transform, stepped, self.coupling(box, box, box.echoes) if box.echoes else None)
-            for box, transform in zip(self.boxes, transforms, strict=True)
-        ]
-        begin, count, tolerance = time.perf_counter(), len(drives), self.plan.tolerance
-        driving = [box.driving(drives) for box in self.boxes]
-        if len(bodies) == 1 and not bodies[0].comes_back_later:
-            states = bodies[0].answers(driving[0], [tolerance] * count, observed, least)
-        else:
-            states, settled = iterated(bodies, driving, observed, least, tolerance)
-            if not settled and len(bodies) > 1:
-                logger.debug("the iteration between %d boxes does not converge: one box instead", len(bodies))
-                return self._in_one_box._solved(sources, strength, judged, stepped)
-        seconds = (time.perf_counter() - begin) / count
-        phasors = torch.stack([state.pressure for state in states]).mT
-        runs = [Run.of(state, seconds) for state in states]
-        return Solved(transforms, torch.split(phasors, sizes), runs), runs
+        return observed, least
 
     def _kernels_compiled(self, dtype: torch.dtype) -> AbstractContextManager[None]:
         """Compile all kernels of a simulation as soon as one is missing."""
@@ -354,12 +390,15 @@ class _Scatterer:
         def observed(phasors: torch.Tensor, runs: Index) -> Sequence[torch.Tensor]:
             return observe(phasors, loud[runs]) if observe else [self.outgoing(phasors.cpu())]
 
-        states = run_to_steady_state(
-            box.assembly, self.simulation._kernel, drive, cells, [tolerances[run] for run in loud],
-            plan.max_periods, observed, self.stepped,
-            torch.zeros((1, len(loud)), **REAL) if floors is None else floors[:, loud],
-            echoed if self.echo and not self.comes_back_later else None,
-        )  # fmt: skip
+        course = box.assembly, self.simulation._kernel, drive, cells
+        if plan.is_short:
+            states = short_runs(*course, len(loud), plan.max_periods, self.stepped)
+        else:
+            states = run_to_steady_state(
+                *course, [tolerances[run] for run in loud], plan.max_periods, observed, self.stepped,
+                torch.zeros((1, len(loud)), **REAL) if floors is None else floors[:, loud],
+                echoed if self.echo and not self.comes_back_later else None,
+            )  # fmt: skip
         silent = SteadyState(torch.zeros(len(cells), **COMPLEX), 0, 0.0, True)
         answers = [silent] * len(tolerances)
         for run, state in zip(loud, states, strict=True):

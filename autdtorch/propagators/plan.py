@@ -18,6 +18,7 @@ from autdtorch.fdtd.kernels import available_kernel, precision_of
 from autdtorch.fdtd.placement import fitting_spacing
 from autdtorch.fdtd.region import Body, Fluid, Region
 from autdtorch.fdtd.shapes import Shape
+from autdtorch.fdtd.short_runs import THIN_LAYER
 from autdtorch.propagators.free_space import PAIR_BYTES
 from autdtorch.propagators.store import key_of
 from autdtorch.propagators.tmatrix.bodies import waves_to_simulate
@@ -67,6 +68,7 @@ class Plan:
         grouping: the grids, and the obstacles on each; no grids in free space.
         runs: number of simulations of the control points' transfer matrix, or of the T-matrices;
             `plan` neglects symmetries.
+        is_short: whether runs are of `max_periods`, steady or not; see `short_runs`.
     """
 
     scene: Scene
@@ -80,10 +82,13 @@ class Plan:
     time_step: float | None
     grouping: Grouping
     runs: int
+    is_short: bool = False
 
     def at(self, spacing: float, tolerance: float, time_step: float | None = None) -> Self:
         """Return a plan of the same method with another spacing [m], tolerance and time step [s]."""
         _, grouping = choose_grids(self.region, self.method, spacing, tolerance, self.runs)
+        if self.is_short:
+            grouping = grouping.with_layer(THIN_LAYER)
         return replace(self, spacing=spacing, tolerance=tolerance, time_step=time_step, grouping=grouping)
 
     def fitted(self, spacing: float, tolerance: float, coarsest: float = math.inf) -> Self:
@@ -96,6 +101,24 @@ class Plan:
         rigid = _SLACK * max((body.rigid_error for body in self.region.bodies), default=0.0)
         plan = replace(self, scene=scene, region=with_rigid(region_of(scene), rigid))
         return plan.at(self.spacing, self.tolerance, self.time_step)
+
+    def around(self, scene: Scene) -> Self:
+        """Return the plan of a scene with these obstacles, and another array, on the same grids.
+
+        Reflectors, which such a scene may have at other places, need other grids.
+        """
+        if self.region.mirrors:
+            return self.of(scene)
+        region = replace(self.region, domain=scene.domain, sources=scene.array.positions.numpy())
+        return replace(self, scene=scene, region=region)
+
+    def short(self, spacing: float, periods: int) -> Self:
+        """Return the plan of short runs of so many periods at another spacing [m].
+
+        With reflectors, which send sound back later, runs go on to the steady state.
+        """
+        short = self if self.region.mirrors else replace(self, max_periods=periods, is_short=True)
+        return short.at(spacing, self.tolerance)
 
     @property
     def with_materials(self) -> Self:

@@ -65,10 +65,9 @@ class SimulatedPropagator(ScenePropagator):
         """Return the propagator of a changed scene, with these settings."""
         return SimulatedPropagator(self.plan.of(scene), self._store)
 
-    def coarser(self, factor: float, looser: float = 1.0) -> SimulatedPropagator:
-        """Return the propagator of the same scene with cells, and a tolerance, larger by factors."""
-        tolerance = looser * self.tolerance
-        return SimulatedPropagator(self.plan.at(factor * self.spacing, tolerance), self._store)
+    def coarser(self, factor: float) -> SimulatedPropagator:
+        """Return the propagator of the same scene with cells larger by a factor."""
+        return SimulatedPropagator(self.plan.at(factor * self.spacing, self.tolerance), self._store)
 
     @cached_property
     def simulation(self) -> Simulation:

@@ -15,6 +15,11 @@ from autdtorch.scene.reflectors import Reflector
 BALL = Sphere((12e-3, 14e-3, 14e-3), 2.5e-3, rigid=True)
 ROD = Cylinder((13e-3, 8e-3, 12e-3), 2e-3, 6e-3, axis=(1, 2, 1), rigid=True)
 SCENE = small_scene((BALL, ROD), radius=3e-3)
+BODIES = {
+    "block": (Box((12e-3, 12e-3, 13e-3), (4e-3, 5e-3, 6e-3), rigid=True),),
+    "plates": tuple(Box((x, 12e-3, 12e-3), (2e-3, 12e-3, 8e-3), rigid=True) for x in (9e-3, 15e-3)),
+    "light ball": (Sphere((12e-3, 12e-3, 12e-3), 4e-3, density=1.5, sound_speed=300.0),),
+}
 SHIFT, TURN = (0.4e-3, -0.3e-3, 0.2e-3), (0.03, -0.02, 0.05)
 
 
@@ -46,6 +51,37 @@ def test_poses_are_those_simulated_afresh_to_the_error_told():
     assert error < relative_error(coarse, fresh)
     assert told / 3 < error < 3 * told
     assert torch.equal(NearbyPoses(propagator).transfer_matrix(SHIFT, TURN), matrix)
+
+
+@pytest.mark.parametrize("bodies", BODIES.values(), ids=BODIES)
+def test_errors_of_small_moves_are_claimed_within_a_factor_of_three(bodies):
+    scene, random = replace(SCENE, obstacles=bodies), torch.Generator().manual_seed(1)
+    nearby = NearbyPoses(make_propagator(scene, "box", 1e-3, 2e-3, cache=False))
+    start = nearby.propagator.transfer_matrix()
+    for size in (0.2, 1.0):
+        shift, turn = size * torch.tensor([[1e-3], [0.05]]) * torch.randn((2, 3), generator=random)
+        matrix, told = nearby.transfer_matrix(shift, turn, return_error=True)
+        fresh = make_propagator(scene.moved(shift, turn), "box", 1e-3, 2e-3, cache=False).transfer_matrix()
+        error = relative_error(matrix, fresh)  # of a grid that does not turn with a ball or along a block
+        assert told / 3 < error < 3 * told
+        assert error < 0.5 * relative_error(start, fresh)
+
+
+def test_reflectors_that_move_with_the_array_leave_long_runs():
+    scene = replace(SCENE, obstacles=(BALL,), reflectors=(Reflector((-5e-3, 0, 0), (1, 0, 0), 0.8),))
+    nearby = NearbyPoses(make_propagator(scene, "box", 1e-3, 5e-3, cache=False))
+    matrix, told = nearby.transfer_matrix(SHIFT, return_error=True)
+    fresh = make_propagator(scene.moved(SHIFT), "box", 1e-3, 5e-3, cache=False).transfer_matrix()
+    assert relative_error(matrix, fresh) < max(told, 5e-3)
+
+
+def test_poses_of_bodies_with_flat_faces_keep_their_grid():
+    """A new simulation may place its grid otherwise, where an array beside a body is no longer symmetric."""
+    block = Box((12e-3, 12e-3, 12e-3), (6e-3, 6e-3, 6e-3), rigid=True)
+    scene = replace(SCENE, obstacles=(block,))
+    simulation = make_propagator(scene, "box", 1e-3, 5e-3, cache=False).simulation
+    array = replace(scene.array, positions=scene.array.positions + torch.tensor([0, 0.3e-3, 0.2e-3]))
+    assert simulation.around(replace(scene, array=array)).boxes is simulation.boxes
 
 
 def test_poses_at_the_edge_of_the_domain_are_those_of_any_domain():

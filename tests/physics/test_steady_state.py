@@ -13,6 +13,7 @@ from small_scenes import CUBE, assembled_parts, relative_error, small_scene
 from autdtorch import Box, Reflector, make_propagator
 from autdtorch.fdtd.kernels.contract import CPU, Layer, Memory, Sources, WaveState
 from autdtorch.fdtd.kernels.cpu import CpuKernel
+from autdtorch.fdtd.short_runs import short_runs
 from autdtorch.fdtd.steady_state import Extrapolation, run_to_steady_state
 from autdtorch.propagators.store import BODIES
 
@@ -99,6 +100,32 @@ def test_runs_together_end_each_at_its_time(most_periods):
     assert sum(together.stepped) <= 2 * sum(alone.stepped)  # at most half of those stepped have converged
     if most_periods == 200:
         assert together.stepped[-1] < 5
+
+
+@pytest.mark.parametrize("spacing", [2e-3, 1.7e-3])
+def test_short_runs_approach_the_steady_state(spacing):
+    """Also where the last two periods are no whole number of steps."""
+    assembly, sources, receivers = assembled_parts(small_scene((CUBE,)), spacing, torch.float64)
+    assert (2 * assembly.steps_per_period).denominator > 1
+    cells, kernel, stepped = np.unique(receivers.index), Kernel(1), []
+    forces = torch.stack([sources.force[0], -2 * sources.force[0]])
+
+    def drive(runs):
+        return Sources(sources.index, forces[runs])
+
+    (steady,) = run_to_steady_state(
+        assembly, kernel, lambda _: drive([0]), cells, [1e-9], 200,
+        lambda phasors, runs: [phasors], stepped.append, torch.zeros((1, 1)),
+    )  # fmt: skip
+    errors = []
+    for periods in (1, 12, 100):
+        one, other = short_runs(assembly, kernel, drive, cells, 2, periods, stepped.append)
+        assert stepped[-2:] == [max(periods, 5)] * 2  # there is a switch-on, and a record
+        assert relative_error(other.pressure, -2 * one.pressure) < 1e-12  # rounding, as a run is linear
+        errors.append(relative_error(one.pressure, steady.pressure))
+    # a cube of air's sound speed has no long resonances; the record leaves some of the switch-on
+    assert errors[0] > 0.1 > errors[1] > errors[2]
+    assert errors[2] < 1e-3
 
 
 def test_a_faint_run_does_not_depend_on_loud_ones_beside_it():
