@@ -225,13 +225,11 @@ def nearest_triangles(points, boxes, triangles, features, normals, distance, abo
             place = points[min(begin + lane, end - _ONE)]
             lanes[_X + lane], lanes[_Y + lane], lanes[_Z + lane] = place[0], place[1], place[2]
             lanes[_SQUARE + lane] = np.inf
-        node = home
-        bound = _search(node, np.inf, boxes, triangles, around, lanes, waiting, gaps)
-        while node > _ONE:
-            beside = node ^ _ONE
+        node, beside, bound = home, home, np.inf
+        while node > _NOWHERE:
             if _square_gap(boxes, beside, around) < bound:
                 bound = _search(beside, bound, boxes, triangles, around, lanes, waiting, gaps)
-            node >>= _ONE
+            node, beside = node >> _ONE, node ^ _ONE
         for lane in range(_ZERO, end - begin):
             nearest = np.uint64(lanes[_TRIANGLE + lane])
             x, y, z = lanes[_X + lane], lanes[_Y + lane], lanes[_Z + lane]
