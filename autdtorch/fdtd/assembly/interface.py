@@ -92,8 +92,8 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
     if finite.any():
         coupling[finite], mass[finite] = _finite_elements(bodies.chosen(finite), materials, stencil)
     for axis in range(3):
-        flat = np.flatnonzero(~finite & (layered == axis))
-        coupling[flat], mass[flat] = flat_elements(axis, distance[:, flat], material, materials, stencil)
+        if len(flat := np.flatnonzero(~finite & (layered == axis))):
+            coupling[flat], mass[flat] = flat_elements(axis, distance[:, flat], material, materials, stencil)
     if len(other := np.flatnonzero(~finite & (layered < 0))):
         coupling[other], mass[other] = _oblique_elements(
             vertex[other], bodies.chosen(other), materials, stencil
