@@ -64,6 +64,14 @@ def sides_of(triangles: Index) -> Index:
     return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 
+def numbered_edges(triangles: Index) -> tuple[Index, Index]:
+    """Return the edges (n, 2) of triangles (T, 3), ascending, and the edge (3 T,) of each of `sides_of`."""
+    ends = sides_of(triangles).astype(np.int64, copy=False)
+    count = ends.max(initial=0) + 1
+    numbers, edge = np.unique(ends.min(axis=1) * count + ends.max(axis=1), return_inverse=True)
+    return np.column_stack(np.divmod(numbers, count)), edge
+
+
 def areas_of(corners: Array) -> Array:
     """Return the areas (T,) of triangles with `corners` (T, 3, 3)."""
     return np.asarray(np.linalg.norm(doubled_normals(corners), axis=1) / 2)
@@ -104,9 +112,8 @@ def parts_of(vertices: Array, triangles: Index) -> list[Array]:
 
 def paired_sides(triangles: Index) -> Index:
     """Return the numbers (n, 2), in `sides_of`, of the sides that just two triangles share."""
-    sides = np.sort(sides_of(triangles), axis=1)
-    _, edge, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(edge.reshape(-1), kind="stable")
+    _, edge = numbered_edges(triangles)
+    order, count = np.argsort(edge, kind="stable"), np.bincount(edge)
     return np.asarray(order[np.repeat(count == 2, count)].reshape(-1, 2))
 
 

@@ -25,7 +25,7 @@ from autdtorch.scene.obstacles.mesh_solid import (
 )
 from autdtorch.scene.obstacles.polygons import Polygons, triangulated
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.spatial import areas_of, connected_parts, paired_sides, sides_of
+from autdtorch.utils.spatial import areas_of, connected_parts, numbered_edges, paired_sides, sides_of
 
 _FARTHEST = 1.0001e-3  # distance between vertices that are taken as one, relative to the extent
 _STRAY = 1e-3  # share of all area below which an open piece is no part of the body
@@ -186,6 +186,6 @@ def _anew(vertices: Array, faces: Index, done: list[str], reason: str) -> Triang
 
 def _pieces(faces: Index) -> Index:
     """Return the number of the piece, joined by edges, of each face (F,)."""
-    edges, edge = np.unique(np.sort(sides_of(faces), axis=1), axis=0, return_inverse=True)
+    edges, edge = numbered_edges(faces)
     owner = np.tile(np.arange(len(faces)), 3)
-    return connected_parts((owner, len(faces) + edge.reshape(-1)), len(faces) + len(edges))[: len(faces)]
+    return connected_parts((owner, len(faces) + edge), len(faces) + len(edges))[: len(faces)]

@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.spatial import areas_of, connected_parts, doubled_normals, paired_sides, sides_of
+from autdtorch.utils.spatial import (
+    areas_of,
+    connected_parts,
+    doubled_normals,
+    numbered_edges,
+    paired_sides,
+    sides_of,
+)
 
 Triangles: TypeAlias = tuple[Array, Index]
 """Vertices (V, 3) and the indices of each triangle's vertices (F, 3)."""
@@ -111,10 +118,9 @@ def joined(corners: Array, triangles: Index, farthest: float = _ROUNDED) -> Tria
 
 def open_edges(faces: Index) -> Index:
     """Return the edges (n, 2) at which as many triangles do not meet from either side, and not twice."""
-    ends = sides_of(faces)
-    edges, edge = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)
+    ends, (edges, edge) = sides_of(faces), numbered_edges(faces)
     up = np.where(ends[:, 0] < ends[:, 1], 1, -1)
-    return np.asarray(edges[np.bincount(edge.reshape(-1), weights=up, minlength=len(edges)) != 0])
+    return np.asarray(edges[np.bincount(edge, weights=up, minlength=len(edges)) != 0])
 
 
 def _cleaned(faces: Index) -> Index:
@@ -193,13 +199,12 @@ def _labels(vertices: Array, faces: Index) -> Index:
     Every side of a triangle meets one of the opposite direction. Of several on an edge, the first ones of
     each direction meet, because files list one part after the other.
     """
-    ends = sides_of(faces)
+    ends, (edges, edge) = sides_of(faces), numbered_edges(faces)
     upwards = ends[:, 0] < ends[:, 1]
-    edges, edge = np.unique(ends.min(axis=1) * len(vertices) + ends.max(axis=1), return_inverse=True)
     up, down = (np.bincount(edge[chosen], minlength=len(edges)) for chosen in (upwards, ~upwards))
     if len(wrong := np.flatnonzero(up != down)):
         first = wrong[0]
-        place = " to ".join(map(place_of, vertices[list(divmod(edges[first], len(vertices)))]))
+        place = " to ".join(map(place_of, vertices[edges[first]]))
         open_sides = f"{len(wrong)} of its {len(edges)} edges do not join two triangles of one orientation"
         where = f"the first, {place}, has {up[first]} of one and {down[first]} of the other"
         turned = (up + down == 2).all()
