@@ -108,7 +108,7 @@ class _Window:
         self._fixed, self._free = self.present & ~inside.ravel(), self.present & inside.ravel()
         self._fields = (fields.values[:, :, 1:] * importance(fields.order[1:])).reshape(len(self.present), -1)
         self._matrix = _known_stiffness(section, materials, stencil)[self._free]
-        self.columns = [_columns(section, place) for place in varied]
+        self.columns = [columns_of(section, place) for place in varied]
         judged = self._free.copy()
         judged[np.concatenate(self.columns)] = False
         self._judged = judged[self._free]
@@ -142,7 +142,7 @@ class _Window:
         return solution, np.asarray(inverse)
 
 
-def _columns(section: Section, place: Sequence[int]) -> Index:
+def columns_of(section: Section, place: Sequence[int]) -> Index:
     """Return the flat indices (4,) of the columns of an element among the vertices of the window."""
     return np.asarray((COLUMNS + place + RING) @ (section.size[1] + 2 * RING + 1, 1))
 
@@ -161,7 +161,7 @@ def _known_stiffness(section: Section, materials: MaterialKey, stencil: Stencil)
     for x, y in itertools.product(range(-RING, wide + RING), range(-RING, tall + RING)):
         element = alike[min(max(x, -1), wide), min(max(y, -1), tall)]
         if element is not None:
-            pairs.append(_columns(section, (x, y))[COLUMN_PAIRS])
+            pairs.append(columns_of(section, (x, y))[COLUMN_PAIRS])
             values.append(element.coupling)
     one, other = np.concatenate(pairs).T
     value, cells = np.concatenate(values), (wide + 2 * RING + 1) * (tall + 2 * RING + 1)

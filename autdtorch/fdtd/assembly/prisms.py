@@ -4,7 +4,7 @@ The field at an edge is singular. In a plane across it, the couplings of the ele
 the scheme must reproduce the smoothest fields of long waves in the window of cells around them, given their
 pressure at its rim. Edges closer than a cell, as of a thin plate or at the mouth of a slit, are fitted
 together. Without the fit the error of a cuboid depends on where its faces fall, and is up to twenty times as
-large.
+large. Single edges of rigid bodies are then fitted to waves of the drive's frequency (`edge_waves.py`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from autdtorch.fdtd.assembly.edge_fit import fitted_couplings, importance
+from autdtorch.fdtd.assembly.edge_waves import at_the_drive, rigid_corner
 from autdtorch.fdtd.assembly.element import PAIRS, coupling_by_edges, stiffness_matrix
 from autdtorch.fdtd.assembly.sections import (
     COLUMN_PAIRS,
@@ -168,8 +169,8 @@ def _fitted(section: Section, materials: MaterialKey, stencil: Stencil) -> Prism
         return fit
     fields = plane_fields(section, materials.mobility, min(_FIELDS + 2 * (len(varied) - 1), _MOST_FIELDS))
     couplings = fitted_couplings(section, varied, fields, materials, stencil)
+    corner = rigid_corner(section, materials)
     for (x, y), coupling in zip(varied, couplings, strict=True):
-        fit.coupling[x, y] = _by_columns(coupling / uniform)
         reached = np.bincount(COLUMN_PAIRS.ravel(), np.repeat(coupling, 2), 4) / (2 * uniform.sum() / 4)
         values = fields.values[RING + x : RING + x + 2, RING + y : RING + y + 2].reshape(4, -1)
         for part, weight in ((fit.mass, materials.masses), (fit.mobility, materials.mobility)):
@@ -177,6 +178,12 @@ def _fitted(section: Section, materials: MaterialKey, stencil: Stencil) -> Prism
             most = np.maximum(at_columns, _REACHED * reached) / 4
             most = np.where(at_columns < weight.max(), most, np.inf)
             part[x, y] = _lumped(values, fields.over_element(weight, x, y), fields.order, most)
+        if corner is not None:
+            coupling, mass = at_the_drive(
+                section, corner, coupling, fit.mass[x, y].ravel(), materials, stencil
+            )
+            fit.mass[x, y] = fit.mobility[x, y] = mass.reshape(2, 2)  # in air, both are volumes
+        fit.coupling[x, y] = _by_columns(coupling / uniform)
     return fit
 
 

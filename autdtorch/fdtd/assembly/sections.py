@@ -18,7 +18,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.linalg import splu
 
 from autdtorch.fdtd.assembly.element import coupling_by_edges
-from autdtorch.fdtd.assembly.layers import long_wave_port, long_wave_shares
+from autdtorch.fdtd.assembly.layers import long_wave_port, long_wave_shares, two_port
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 
@@ -97,9 +97,12 @@ def uniform_columns(stencil: Stencil) -> Array:
 
 
 def layered_element(
-    section: Section, x: int, y: int, materials: MaterialKey, stencil: Stencil
+    section: Section, x: int, y: int, materials: MaterialKey, stencil: Stencil, air: float | None = None
 ) -> Layered | None:
-    """Return an element for long waves, or None if it varies along both axes."""
+    """Return an element, or None if it varies along both axes.
+
+    It is for long waves, or for a wavenumber `air` [rad/cell] if its materials are air or rigid.
+    """
     *ends, part = section.element(x, y)
     varied = [bool((np.diff(part, axis=axis) != 0).any()) for axis in (0, 1)]
     if all(varied):
@@ -108,12 +111,16 @@ def layered_element(
     layers = part[:, 0] if axis == 0 else part[0]
     width, density = np.diff(ends[axis])[None], np.array(materials.density)[None, layers]
     port, uniform = long_wave_port(width, density, np.ones_like(width)), uniform_columns(stencil)
+    shares = long_wave_shares(width, density)[0]
+    mass, mobility = shares @ materials.masses[layers], shares @ materials.mobility[layers]
+    if air is not None:
+        port = two_port(width, density, np.full_like(width, air), air)
+        mass = port.thickness[0] * materials.masses[layers[[0, -1]]]
     one, other = COLUMNS[COLUMN_PAIRS.T, axis]
     along = port.mobility[0, one] * (uniform[0] + uniform[2]) - port.link[0] * uniform[2]
-    shares = np.expand_dims(long_wave_shares(width, density)[0], 1 - axis) / 2
-    shares = np.repeat(shares, 2, axis=1 - axis)
     coupling = np.where(one != other, uniform * port.link[0], along)
-    return Layered(coupling, shares @ materials.masses[layers], shares @ materials.mobility[layers])
+    of_columns = [np.expand_dims(part, 1 - axis).repeat(2, axis=1 - axis) / 2 for part in (mass, mobility)]
+    return Layered(coupling, *of_columns)
 
 
 def mean_densities(section: Section, x: int, y: int, materials: MaterialKey) -> Array:

@@ -1,0 +1,57 @@
+"""Elements at edges of rigid bodies, fitted at the drive's frequency."""
+
+import numpy as np
+import pytest
+
+from autdtorch.fdtd.assembly.edge_fit import fitted_couplings
+from autdtorch.fdtd.assembly.edge_waves import _Window, at_the_drive, rigid_corner
+from autdtorch.fdtd.assembly.prisms import prisms
+from autdtorch.fdtd.assembly.sections import COLUMN_PAIRS, MaterialKey, Section, plane_fields
+from autdtorch.fdtd.stencil import tuned_stencil
+
+RIGID = MaterialKey((1.0, 1e12), (1.0, 1e-12), (False, True))
+
+
+def corner(x, y, rigid=(0, 0)):
+    """A section whose block at `rigid` is rigid, with faces at x and y."""
+    blocks = np.zeros((2, 2), int)
+    blocks[rigid] = 1
+    return Section((1, 1), ((x,), (y,)), tuple(map(tuple, blocks.tolist())))
+
+
+@pytest.mark.parametrize("place", [(0.5, 0.5), (0.6, 0.5), (0.3, 0.6)])
+def test_waves_around_an_edge_miss_less_than_those_of_elements_for_long_waves(place):
+    """Half as far at most, at 9 cells per wavelength; half-way between cells a quarter."""
+    section, stencil = corner(*place), tuned_stencil(0.7)
+    coupling = fitted_couplings(section, [(0, 0)], plane_fields(section, RIGID.mobility, 8), RIGID, stencil)[
+        0
+    ]
+    window, missed = _Window(section, (0, 0), RIGID, stencil), []
+    mass = np.append(0.0, np.full(3, (1 - place[0] * place[1]) / 3))
+    for values in ((coupling, mass), at_the_drive(section, (0, 0), coupling, mass, RIGID, stencil)):
+        operator = window._operator.copy()
+        window._add(operator, window.columns, *values)
+        missed.append(np.linalg.norm(window._missed(operator)[0]))
+    assert missed[1] < 0.5 * missed[0] < 0.05 * np.linalg.norm(window._waves)
+
+
+@pytest.mark.parametrize("rigid", [(0, 0), (0, 1), (1, 0), (1, 1)])
+def test_the_corner_may_be_any_block(rigid):
+    section, turned = corner(0.3, 0.6), corner(abs(rigid[0] - 0.3), abs(rigid[1] - 0.6), rigid)
+    assert rigid_corner(turned, RIGID) == rigid
+    first, other = (prisms(each, RIGID, tuned_stencil(0.7)) for each in (section, turned))
+    axes = [axis for axis in (0, 1) if rigid[axis]]
+    np.testing.assert_allclose(np.flip(other.mass[0, 0], axes), first.mass[0, 0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("place", np.random.default_rng(0).uniform(0.02, 0.98, (6, 2)).tolist())
+def test_elements_have_a_positive_energy_and_the_mass_of_their_volume(place):
+    element = prisms(corner(*place), RIGID, tuned_stencil(1.0))
+    assert element.mass.sum() == pytest.approx(1 - place[0] * place[1], rel=1e-3)
+    assert (element.mass >= 0).all()
+    matrix = np.zeros((4, 4))
+    for one, other in COLUMN_PAIRS:
+        value = element.coupling[0, 0].reshape(4, 4)[one, other]
+        matrix[[one, other], [one, other]] += value
+        matrix[[one, other], [other, one]] -= value
+    assert np.linalg.eigvalsh(matrix).min() > -1e-9
