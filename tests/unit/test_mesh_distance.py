@@ -59,3 +59,27 @@ def test_the_order_of_the_points_does_not_matter():
 def test_no_points_have_no_distances():
     box = at.Box((0, 0, 0), (1, 1, 1), rigid=True)
     assert MeshDistance(*(part.numpy() for part in box.surface()))(np.zeros((0, 3))).shape == (0,)
+
+
+WEDGE = [[0, 1, 2], [3, 5, 4], [0, 3, 4], [0, 4, 1], [0, 2, 5], [1, 4, 5], [1, 5, 2]]  # without triangle 0, 5, 3
+
+
+@pytest.mark.parametrize("height", [0.0, 1e-13, 1e-9])
+def test_slivers_that_rounding_has_turned_over_leave_points_outside(height):
+    corners = [(x, y, z) for z in (0.0, 1.0) for x, y in ((0.0, 0.0), (1.0, 0.05), (1.0, -0.05))]
+    vertices = np.array([*corners, (-height, 0.3 * height, 0.4)])  # one at the edge, for the lower face alone
+    wedge = MeshDistance(vertices[:6], np.array([*WEDGE, [0, 5, 3]]))
+    divided = MeshDistance(vertices, np.array([*WEDGE, [3, 6, 5], [6, 0, 5], [3, 0, 6]]))
+    points = np.random.default_rng(0).uniform(-0.3, 1.3, (2000, 3)) * (1.0, 0.3, 1.0)
+    np.testing.assert_allclose(divided(points), wedge(points), rtol=0, atol=2 * height + ROUNDING)
+
+
+@pytest.mark.parametrize("height", [1e-15, 1e-12, 1e-9, 1e-6])
+def test_points_on_slivers_are_as_near_as_their_sides(height):
+    random = np.random.default_rng(0)
+    first, second, aside = random.normal(size=(3, 50, 3))
+    third = first + random.uniform(size=(50, 1)) * (second - first) + height * aside
+    corners = np.stack((first, second, third), axis=1)
+    points = (random.dirichlet((1, 1, 1), 50)[:, :, None] * corners).sum(axis=1)
+    distance = MeshDistance(corners.reshape(-1, 3), np.arange(150).reshape(-1, 3))(points)
+    assert np.abs(distance).max() < height + ROUNDING

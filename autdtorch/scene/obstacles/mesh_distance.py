@@ -13,6 +13,7 @@ from autdtorch.utils.spatial import doubled_normals
 
 _IN_LEAF = 5  # Triangles of a leaf of the tree, at most
 _TOGETHER = 4096  # Points in a task: one or two milliseconds
+_SLIVER = 1e-6  # height of a triangle, relative to the extent, below which rounding may have turned it over
 
 
 class MeshDistance:
@@ -20,8 +21,8 @@ class MeshDistance:
 
     A point is outside if the normal at the nearest point of the surface points towards it. At an edge, this
     normal is the mean of two triangles, at a vertex the mean weighted by angles (Baerentzen and Aanaes 2005,
-    doi:10.1109/TVCG.2005.49). At edges of more than two triangles, and vertices where parts meet, the winding
-    number decides.
+    doi:10.1109/TVCG.2005.49). At edges of more than two triangles, vertices where parts meet, and slivers, which
+    rounding may turn over, the winding number decides.
     """
 
     def __init__(self, vertices: Array, faces: Index) -> None:
@@ -81,17 +82,22 @@ def _tree(corners: Array) -> tuple[Array, Index]:
 def _normals(vertices: Array, faces: Index) -> tuple[Array, Index]:
     """Return the normals (n, 3) of faces, edges and vertices, and their rows (F, 7); see `nearest_triangles`.
 
-    They are NaN where more than two triangles meet at an edge, or parts at a vertex.
+    They are NaN where more than two triangles meet at an edge, or parts at a vertex, and at slivers.
     """
     import igl
 
-    normals = doubled_normals(vertices[faces])
+    corners = vertices[faces]
+    normals = doubled_normals(corners)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = normals / np.where(length > 0, length, 1)
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    sliver = length[:, 0] < _SLIVER * np.ptp(vertices, axis=0).max() * longest
+    normals = np.divide(normals, length, out=np.full_like(normals, np.nan), where=~sliver[:, None])
     at_edge, _, edge = igl.per_edge_normals(vertices, faces, igl.PER_EDGE_NORMALS_WEIGHTING_TYPE_UNIFORM)
     at_edge[np.bincount(edge, minlength=len(at_edge)) != 2] = np.nan
+    at_edge[edge.reshape(3, -1)[:, sliver]] = np.nan
     at_vertex = igl.per_vertex_normals(vertices, faces, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE)
     at_vertex[~igl.is_vertex_manifold(faces)] = np.nan
+    at_vertex[faces[sliver]] = np.nan
     count = len(faces)
     rows = np.column_stack((np.arange(count), count + edge.reshape(3, -1).T, count + len(at_edge) + faces))
     return np.concatenate((normals, at_edge, at_vertex)), rows

@@ -111,7 +111,8 @@ def _measure(triangles, number, lanes):  # type: ignore[no-untyped-def]
         one, other, last = _square(first), _square(second), _square(third)
         square = one if one < other else other
         square = square if square < last else last
-        square = _square(plane) if plane[0] > 0.0 else square
+        # shares of slivers are inaccurate, and a place of theirs in the plane may be far from the nearest one
+        square = _square(plane) if plane[0] > 0.0 and _square(plane) < square else square
         before = lanes[_SQUARE + lane]
         lanes[_TRIANGLE + lane] = name if square < before else lanes[_TRIANGLE + lane]
         lanes[_SQUARE + lane] = square if square < before else before
@@ -188,7 +189,7 @@ def _side_of(x, y, z, triangle, features, normals):  # type: ignore[no-untyped-d
         place = 4 + begin
     elif way[0] > 1.0 - _AT_CORNER:
         place = 4 + end
-    if plane[0] > 0.0:
+    if plane[0] > 0.0 and _square(plane) < _square(way):
         way = plane
         if plane[0] > _ON_SIDE:
             place = 0
