@@ -61,7 +61,7 @@ def test_no_points_have_no_distances():
     assert MeshDistance(*(part.numpy() for part in box.surface()))(np.zeros((0, 3))).shape == (0,)
 
 
-WEDGE = [[0, 1, 2], [3, 5, 4], [0, 3, 4], [0, 4, 1], [0, 2, 5], [1, 4, 5], [1, 5, 2]]  # without triangle 0, 5, 3
+WEDGE = [[0, 1, 2], [3, 5, 4], [0, 3, 4], [0, 4, 1], [0, 2, 5], [1, 4, 5], [1, 5, 2]]  # and 0, 5, 3
 
 
 @pytest.mark.parametrize("height", [0.0, 1e-13, 1e-9])
