@@ -21,8 +21,8 @@ class MeshDistance:
 
     A point is outside if the normal at the nearest point of the surface points towards it. At an edge, this
     normal is the mean of two triangles, at a vertex the mean weighted by angles (Baerentzen and Aanaes 2005,
-    doi:10.1109/TVCG.2005.49). The winding number decides at edges of more than two triangles, at vertices where
-    parts meet, and at slivers, which rounding may turn over.
+    doi:10.1109/TVCG.2005.49). The winding number decides at edges of more than two triangles, at vertices
+    where parts meet, and at slivers, which rounding may turn over.
     """
 
     def __init__(self, vertices: Array, faces: Index) -> None:
