@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 _entries: set[Any] = set()
 # See `meanwhile`; of all threads, because a thread of `spread` may be the first to compile
 _ahead: list[_Ahead] = []
-_children: dict[int, str] = {}  # processes that compile a kernel, and the index of its files
+_children: dict[int, Any] = {}  # processes that compile, and the kernel
 _PATIENCE = 30.0  # [s] without processor time after which processes that compile are taken to hang
 _POLL = 0.01  # [s] between looks at them
 
@@ -109,7 +109,7 @@ class _Ahead(NamedTuple):
 
 
 class _Compilation(event.Listener):
-    """Logs that a kernel is compiled, which takes seconds; loading one from disk takes none.
+    """Logs that a kernel is compiled here, which takes seconds; loading one from disk takes none.
 
     Garbage collection is paused, an eighth of the time.
     """
@@ -121,7 +121,7 @@ class _Compilation(event.Listener):
     def on_start(self, event: Any) -> None:
         function = event.data["dispatcher"]
         if function in _entries:
-            logger.info("compiling %s (once per machine)", function.__name__)
+            _log_compilation(function)
             self._paused = gc.isenabled()
             gc.disable()
             with contextlib.suppress(IndexError):  # no more
@@ -165,8 +165,7 @@ def meanwhile(kernel: Any, call: Callable[[], object], *others: Callable[[], obj
 
 def _fork(ahead: _Ahead) -> bool:
     """Return whether another process compiles a kernel, also one that began before."""
-    index = ahead.kernel._cache._cache_file._index_path
-    if index in _children.values():
+    if _compiling(_index_of(ahead.kernel)):
         return True
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of other threads: see utils/process.py
@@ -175,7 +174,7 @@ def _fork(ahead: _Ahead) -> bool:
         except OSError:  # too many processes, or too little memory: this one compiles
             return False
     if child:
-        _children[child] = index
+        _children[child] = ahead.kernel
         return True
     try:
         _ahead.clear()
@@ -187,10 +186,12 @@ def _fork(ahead: _Ahead) -> bool:
 
 
 def _wait_for_children(index: str) -> None:
-    """Wait until no other process compiles the kernel with these files for this one."""
+    """Wait until no other process compiles the kernel with these files, and log that one does."""
     worked, end = -1.0, math.inf
     _forget_ended()
-    while children := [child for child, theirs in tuple(_children.items()) if theirs == index]:
+    for kernel in _compiling(index).values():
+        _log_compilation(kernel)
+    while children := _compiling(index):
         time.sleep(_POLL)
         if (seconds := sum(map(_processor_seconds, children))) != worked:
             worked, end = seconds, time.monotonic() + _PATIENCE
@@ -199,6 +200,19 @@ def _wait_for_children(index: str) -> None:
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(child, signal.SIGKILL)
         _forget_ended()
+
+
+def _compiling(index: str) -> dict[int, Any]:
+    """Return the processes that compile the kernel with these files, and the kernel."""
+    return {child: kernel for child, kernel in tuple(_children.items()) if _index_of(kernel) == index}
+
+
+def _index_of(kernel: Any) -> str:
+    return str(kernel._cache._cache_file._index_path)
+
+
+def _log_compilation(kernel: Any) -> None:
+    logger.info("compiling %s (once per machine)", kernel.__name__)
 
 
 def _processor_seconds(child: int) -> float:

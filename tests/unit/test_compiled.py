@@ -207,7 +207,8 @@ def test_a_process_that_hangs_is_not_waited_for(kernel, monkeypatch):
 
 
 @needs_fork
-def test_a_process_that_works_is_waited_for_however_slow_it_is(kernel, monkeypatch, tmp_path):
+def test_a_process_that_works_is_waited_for_however_slow_it_is(kernel, monkeypatch, tmp_path, caplog):
+    caplog.set_level("INFO", compiled.__name__)
     made, _ = kernel
     monkeypatch.setattr(compiled, "thread_count", lambda: 2)
     monkeypatch.setattr(compiled, "_PATIENCE", 0.01)
@@ -225,9 +226,11 @@ def test_a_process_that_works_is_waited_for_however_slow_it_is(kernel, monkeypat
         made()(3)
     assert made("halved")(3) == 1.5
     assert not ended.exists()  # other kernels do not wait for it
+    caplog.clear()
     go.touch()
     made("tripled")(3)
     assert ended.exists()
+    assert caplog.messages[0] == "compiling tripled (once per machine)"  # a user waits, and sees for what
 
 
 @needs_fork
