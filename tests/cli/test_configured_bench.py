@@ -166,6 +166,7 @@ def test_readings_of_another_quantity_have_its_name_and_unit_and_are_not_compare
     assert "- force: **" in report
     assert "| control point [mm] | when found [mN] | again [mN] |" in report
     assert "simulated pressures" not in report
+    assert "failed transducers: not tested" in report
     assert " Pa" not in report.split("## Settings")[0]
     assert json.loads(trial_log.read_text().splitlines()[0])["origin"]["quantity"] == "force [mN]"
     with pytest.raises(ValueError, match=r"readings of force \[mN\]; must be pressures"):
