@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import torch
 
 from autdtorch.methods.base import Method, State, Step, choice, setting, whole
-from autdtorch.methods.gradient import climbed
-from autdtorch.methods.matrix_fit import posteriors, tensors_of
+from autdtorch.methods.gradient import climbed, highest_drive
+from autdtorch.methods.matrix_fit import least_readings, posteriors, tensors_of
 from autdtorch.methods.phase_points import (
     drives_at,
     fixed_last,
@@ -98,8 +98,9 @@ class BayesOpt(Method):
             changes no magnitude; None for 6, the paper's 7th, or the last one of fewer.
         model: "weakest": one process models the score, as in the paper. "foci": each focus has a process, and
             the improvement of the score is averaged over samples of all. The score must then be
-            differentiable by PyTorch. From 3 M - 1 evaluations on, or with a prior, the processes begin at a
-            sample of the transfer matrix that `MatrixPosterior` fits to all readings.
+            differentiable by PyTorch. From 3 M - 1 readings on, or with a prior, the processes begin at a
+            sample of the transfer matrix that `MatrixPosterior` fits to all readings. With fewer evaluations
+            they do so from 2.3 M on, and the search for the matrix takes long if there is noise.
         kernel: of the model "weakest": "phases", as in the paper, measures distances between phases from 0 to
             2 pi; "circle" between their points (cos, sin), which makes the process periodic; both are Matern
             5/2. Of the model "foci": "phasor", the covariance of intensities |g . q|^2; see `PhasorKernel`.
@@ -301,8 +302,10 @@ class BayesOpt(Method):
         """Return hyperparameters and rows; `search` gets the tensors that the next fit begins with."""
         from autdtorch.methods.bayes.gaussian_process import Hyperparameters, fitted
 
-        count = search["values"].shape[1]
-        if self.model == "foci" and (self.prior is not None or count >= 3 * problem.transducers - 1):
+        count, needed = search["values"].shape[1], 3 * problem.transducers - 1
+        if count + left <= needed:  # the last drive would come too soon: a long search then needs fewer
+            needed = least_readings(problem.transducers)
+        if self.model == "foci" and (self.prior is not None or count >= needed):
             return self._with_rows(problem, search, generators, left)
         # The hyperparameters are fitted again where the observations grew by a fifth.
         if "fitted" not in search or count >= _REFIT_GROWTH * int(search["fitted"]):
@@ -340,8 +343,13 @@ class BayesOpt(Method):
         rows = mean if left <= 1 else sampled
         share = (2 * search["variance"] / power).clamp_max(0.5)
         fit = Hyperparameters(torch.ones_like(share), share / (1 - share))
-        seen = scores_of(problem.goal, (drives @ rows.mT).abs()).argmax(dim=1)
-        best = climbed(problem.goal, rows, drives[torch.arange(len(seen), device="cpu"), seen], _SAMPLE_STEPS)
+        if left == 1:
+            fitted = zip(mean, generators, drives, strict=True)
+            best = torch.stack([highest_drive(problem.goal, *trial) for trial in fitted])
+        else:
+            seen = scores_of(problem.goal, (drives @ rows.mT).abs()).argmax(dim=1)
+            start = drives[torch.arange(len(seen), device="cpu"), seen]
+            best = climbed(problem.goal, rows, start, _SAMPLE_STEPS)
         order = fixed_last(problem.transducers, self._fixed(problem.transducers))
         return fit, MatrixRows(rows[..., order], spread, self._points(best))
 

@@ -27,6 +27,11 @@ _STEP = (0.5, 0.005)
 _MOMENTUM = 0.9
 _TINY = 1e-300
 
+STARTS = 16
+"""Number of random drives from which `highest_drive` climbs."""
+
+_STEPS_FROM_ANYWHERE = 300
+
 
 @dataclass(frozen=True)
 class GradientAscent(Method):
@@ -97,6 +102,20 @@ def climbed(goal: GoalFunction, matrix: torch.Tensor, drive: torch.Tensor, steps
         drive = drive + step * velocity
         drive = drive / drive.abs().clamp_min(1)
     return drive
+
+
+def highest_drive(
+    goal: GoalFunction, matrix: torch.Tensor, generator: torch.Generator, seen: torch.Tensor | None = None
+) -> torch.Tensor:
+    """Return the best drive (M,) of a matrix (P, M) by climbs from random drives.
+
+    Another climb begins at the best of the drives `seen` (N, M), if there are any.
+    """
+    starts = random_drives(STARTS, matrix.shape[1], generator)
+    if seen is not None:
+        best = scores_of(goal, (seen @ matrix.T).abs()).argmax()
+        starts = torch.cat([seen[best][None], starts])
+    return climb(goal, matrix, starts, _STEPS_FROM_ANYWHERE)
 
 
 def _pressure(matrix: torch.Tensor, drive: torch.Tensor) -> torch.Tensor:

@@ -5,7 +5,6 @@ Enough magnitudes determine each row of the matrix up to a phase (docs/decisions
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -15,8 +14,8 @@ import torch
 from autdtorch.methods.base import Method, State, Step, setting, whole
 from autdtorch.methods.doubtful_readings import Magnitudes, reading_doubts, sensor_doubts
 from autdtorch.methods.further_readings import independent_readings
-from autdtorch.methods.gradient import climb, climbed, random_drives
-from autdtorch.methods.matrix_fit import MatrixFit, posteriors, tensors_of
+from autdtorch.methods.gradient import climbed, highest_drive, random_drives
+from autdtorch.methods.matrix_fit import MatrixFit, least_readings, posteriors, tensors_of
 from autdtorch.methods.prior import (
     Prior,
     best_simulated_drives,
@@ -35,9 +34,6 @@ from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import invalid
 
 _LEAST = 64  # evaluations without the setting; more where transducers need them
-_LEAST_READINGS = 2.3  # for each transducer, to find a row by its magnitudes
-_STARTS = 16  # drives from which the fitted matrix is climbed
-_CLIMB_STEPS = 300
 _SAMPLE_STEPS = 60  # of the climb on a sample of the matrix, from the best drive
 _GROWTH = 24  # a round observes one drive for so many that were observed
 _WORSE = 9.0  # The last drive is not the solution if so many median deviations (6 sigma) below another one,
@@ -79,9 +75,7 @@ class Identify(Method):
         if self.prior is not None:
             prior_mean(self.prior, problem)
             return
-        transducers = problem.transducers
-        least = min(3 * transducers - 1, math.ceil(_LEAST_READINGS * transducers) + 1)
-        least = max(2, least - _independent(problem))
+        least = max(2, least_readings(problem.transducers) + 1 - _independent(problem))
         if self.most_evaluations(problem) < least:
             accepted = f"must be an integer >= {least}, to identify {problem.transducers} transducers"
             raise invalid("evaluations", self.evaluations, accepted)
@@ -149,7 +143,9 @@ class Identify(Method):
         fits = posteriors(prior, search, drives, observed, generators, deviation=deviation)
         copies = [played.clone() for played in drives]  # products must not round by the place in memory
         trials = list(zip(fits, copies, generators, strict=True))
-        best = torch.stack([_highest(problem.goal, *trial) for trial in trials])
+        best = torch.stack(
+            [highest_drive(problem.goal, fit.posterior.matrix, draws, seen) for fit, seen, draws in trials]
+        )
         search = {**search, **tensors_of(fits)}
         if left == 0:
             last = problem.quantise(best)[:, None]
@@ -238,15 +234,6 @@ def _added(
 
 def _name(number: int) -> str:
     return f"evaluation {number}" if number >= 0 else f"earlier reading {-1 - number}"
-
-
-def _highest(
-    goal: GoalFunction, fit: MatrixFit, drives: torch.Tensor, generator: torch.Generator
-) -> torch.Tensor:
-    """Return the best drive (M,) of a fitted matrix, which was fitted to drives (N, M)."""
-    seen = drives[scores_of(goal, (drives @ fit.posterior.matrix.T).abs()).argmax()]
-    starts = random_drives(_STARTS, len(seen), generator)
-    return climb(goal, fit.posterior.matrix, torch.cat([seen[None], starts]), _CLIMB_STEPS)
 
 
 def _sampled(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -18,6 +19,7 @@ _SCREENINGS = 8  # fits, each without the outliers that the one before shows
 _BETTER = 0.5  # largest ratio of the deviations with and without limits at which limits are believed
 
 _GUESSES = 16  # rows from which the search for each row begins
+_LEAST_READINGS = 2.3  # for each transducer, so that a long search finds the row
 _APART = 0.5  # random part of these rows, relative to the common part
 _RELAXATION = 0.7  # of the splitting; 1 takes half as many steps again
 _SEARCH_STEPS = 300
@@ -73,6 +75,11 @@ def posteriors(
         errors = None if deviation is None else deviation[trial].clone()
         fits.append(TrialReadings(scaled, before, played, seen, generator, noise, deviation=errors).fit())
     return fits
+
+
+def least_readings(transducers: int) -> int:
+    """Return the number of readings at a point by which a row of the matrix is found without a prior."""
+    return min(3 * transducers - 2, math.ceil(_LEAST_READINGS * transducers))
 
 
 def tensors_of(fits: Sequence[MatrixFit]) -> dict[str, torch.Tensor]:

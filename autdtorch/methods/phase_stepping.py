@@ -14,15 +14,13 @@ from typing import ClassVar
 import torch
 
 from autdtorch.methods.base import Method, State, Step, whole
-from autdtorch.methods.gradient import climb, random_drives
+from autdtorch.methods.gradient import STARTS, highest_drive, random_drives
 from autdtorch.methods.problem import Problem, require_pressures, starts_of
 from autdtorch.methods.seeds import generators_of, restored, states_of
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.validation import invalid
 
 _TURNS = (-1 / 3, 1 / 3)  # steps of a phase
-_STARTS = 16  # drives from which the matrix is climbed
-_CLIMB_STEPS = 300
 _MEAN = ("matrix", "weight")  # tensors of a search, as `_averaged` makes them
 _DARK = 1e-3  # least pressure that a reference counts with, relative to the rms of the point
 _LEAST_AREA = 1e-6  # of the triangle of three phases; 0 if the device has only two phases
@@ -65,7 +63,7 @@ class PhaseStepping(Method):
 
     def numbers_kept(self, problem: Problem) -> float:
         """Add the numbers of a climb."""
-        return super().numbers_kept(problem) + 2.0 * _STARTS * (4 * problem.transducers + 2 * problem.foci)
+        return super().numbers_kept(problem) + 2.0 * STARTS * (4 * problem.transducers + 2 * problem.foci)
 
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Observe the steps around the first reference."""
@@ -86,7 +84,8 @@ class PhaseStepping(Method):
             before = {name: state.search[name][trial].clone() for name in _MEAN if name in state.search}
             played, observed = state.drives[trial].clone(), pressure[trial].clone()
             searches.append(_averaged(before, _matrix(played, observed), observed[0]))
-            drives.append(_highest(problem, searches[-1]["matrix"], state.best.drive[trial], generator))
+            matrix, seen = searches[-1]["matrix"], state.best.drive[trial, None]
+            drives.append(highest_drive(problem.goal, matrix, generator, seen))
         highest = torch.stack(drives)
         search = {name: torch.stack([each[name] for each in searches]) for name in _MEAN}
         last = done == self.rounds * _in_round(problem)
@@ -172,11 +171,3 @@ def _averaged(
     turned = matrix * (matrix.conj() * mean).sum(dim=-1, keepdim=True).sgn()
     share = weight / (before + weight).clamp_min(torch.finfo(weight.dtype).tiny)
     return {"matrix": mean + share * (turned - mean), "weight": before + weight}
-
-
-def _highest(
-    problem: Problem, matrix: torch.Tensor, seen: torch.Tensor, generator: torch.Generator
-) -> torch.Tensor:
-    """Return the best drive (M,) of a matrix (P, M), from a drive that was observed and from random ones."""
-    starts = random_drives(_STARTS, problem.transducers, generator)
-    return climb(problem.goal, matrix, torch.cat([seen[None], starts]), _CLIMB_STEPS)

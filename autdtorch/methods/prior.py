@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields
 
 import torch
 
-from autdtorch.methods.gradient import climb, random_drives
+from autdtorch.methods.gradient import highest_drive
 from autdtorch.methods.linearised_readings import NUMBERS_AT_ONCE
 from autdtorch.methods.matrix_posterior import MatrixPrior
 from autdtorch.methods.problem import Problem
@@ -22,8 +22,6 @@ from autdtorch.utils.validation import (
     require_known,
     within,
 )
-
-_STARTS, _CLIMB_STEPS = 16, 300  # of the climbs to the best drive of a simulation
 
 _LEAST_WIDTH = 1e-6  # of gain, phase and rest
 _DARK = 1e-2  # least rms entry of a row, relative to the strongest row's: simulated shadows are deep
@@ -160,5 +158,4 @@ def best_simulated_drives(
 ) -> torch.Tensor:
     """Return drives (T, M) that focus best in the simulation, one for each generator of random starts."""
     matrix = prior_mean(prior, problem)
-    starts = [random_drives(_STARTS, problem.transducers, draws) for draws in generators]
-    return torch.stack([climb(problem.goal, matrix, start, _CLIMB_STEPS) for start in starts])
+    return torch.stack([highest_drive(problem.goal, matrix, draws) for draws in generators])

@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 
 import torch
 from botorch.utils.probability.utils import log_phi, ndtr, phi
-from botorch.utils.safe_math import fatmin, log1mexp, log_fatplus, logmeanexp
+from botorch.utils.safe_math import log1mexp, log_fatplus
 
 from autdtorch.methods.bayes.gaussian_process import Processes
 from autdtorch.methods.seeds import uniform
@@ -122,16 +122,14 @@ class FocusAcquisition:
         mean, deviation = self._processes.at(points)
         samples = mean[..., None, :] + deviation[..., None, :] * self._normal
         gain = log_fatplus(self._scored(samples) - self._highest, tau=_SMOOTH_IMPROVEMENT)
-        mean_gain: torch.Tensor = logmeanexp(gain, dim=-1)
-        return mean_gain
+        return gain.logsumexp(dim=-1) - math.log(_SAMPLES)
 
     def _scored(self, intensity: torch.Tensor) -> torch.Tensor:
         """Return the goal (T, ...) of intensities (T, ..., P), in units of pressure."""
         unit = self._unit.reshape(-1, *(1,) * (intensity.ndim - 1))
         pressure = (intensity / unit.square()).clamp_min(_LEAST_INTENSITY).sqrt()
         if isinstance(self._goal, WeakestFocus):
-            minimum: torch.Tensor = fatmin(self._goal.levels(pressure), dim=-1, tau=_SMOOTH_MINIMUM)
-            return minimum
+            return -_SMOOTH_MINIMUM * (self._goal.levels(pressure) / -_SMOOTH_MINIMUM).logsumexp(dim=-1)
         pressure = unit * pressure
         lost = ~pressure.isfinite()  # where a search left the range of the process
         score = differentiable_scores(self._goal, pressure.masked_fill(lost, 0)) / unit[..., 0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import torch
@@ -239,6 +240,9 @@ class Processes:
         standard, self.mean, self.scale = standardised(kernel, values, fit.noise)
         self._shared = rows is None
         self._kernel = _kernel(kernel, fit, rows, self.scale[:, 0])
+        # For the kernels "phases" and "circle", GPyTorch's Matern kernel written out takes half the time
+        matern = partial(_matern, length_scale=fit.length_scale)
+        self._covariance: Any = self._kernel.forward if kernel == "phasor" else matern
         excess = self._excess(observed)
         variance = fit.noise[:, None]
         if kernel == "phasor":
@@ -263,12 +267,12 @@ class Processes:
         """
         features = self._features(points)
         there = self._by_output(features)
-        covariance = self._kernel.forward(there, self._observed)  # as the model calls it, without its checks
+        covariance = self._covariance(there, self._observed)
         variance: torch.Tensor | float = 1.0
         if self._shared:
             covariance = covariance[:, None]
         else:
-            variance = self._kernel.forward(there, there, diag=True)
+            variance = self._covariance(there, there, diag=True)
         mean = self._excess(features) + (covariance @ self._weights)[..., 0].mT
         unexplained = (variance - (covariance @ self._whitening).square().sum(dim=-1)).mT
         deviation = unexplained.clamp_min(_LEAST_VARIANCE).sqrt()
@@ -371,6 +375,12 @@ def _kernel(kernel: KernelName, fit: Hyperparameters, rows: MatrixRows | None, u
     if rows is None:
         return PhasorKernel("drives")
     return PhasorKernel("drives", rows.mean / unit[..., None].sqrt(), rows.variance / unit)
+
+
+def _matern(x1: torch.Tensor, x2: torch.Tensor, length_scale: torch.Tensor) -> torch.Tensor:
+    """Return Matern 5/2 covariances (T, N1, N2) of inputs (T, N1, D) and (T, N2, D)."""
+    distance = math.sqrt(5) * torch.cdist(x1, x2) / length_scale[..., None]
+    return (1 + distance + distance.square() / 3) * (-distance).exp()
 
 
 def _reach(kernel: KernelName, fit: Hyperparameters) -> torch.Tensor:
