@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -41,6 +42,8 @@ class FileConfigSource(file_config_source.FileConfigSource):
         config = load_yaml(shown)
         with open(path, encoding="utf-8") as file:
             header = self._get_header_dict(file.read(512))
+        if self.path == str(CONFIGS):
+            _require_no_mode(shown, config)
         if not self._is_trusted():
             _require_harmless(shown, header["package"], unresolved(config, shown))
         if PurePosixPath(config_path).parts[:1] == ("scene",):
@@ -74,7 +77,7 @@ _mode_of_settings = Hydra.get_mode
 def _mode(hydra: Hydra, config_name: str | None, overrides: list[str]) -> Any:
     """Return the value of hydra.mode, for which Hydra would compose all settings once more.
 
-    It is None unless an override sets it, or adds a trusted folder that may.
+    It is None unless an override sets it, or adds a trusted folder that may. Our files may not.
     """
     if any("hydra" in override for override in overrides):
         return _mode_of_settings(hydra, config_name, overrides)
@@ -93,6 +96,12 @@ def _begin_paths(config: Any, folder: str) -> None:
             config[key] = os.path.join(folder, config[key])
         elif OmegaConf.is_config(config[key]):
             _begin_paths(config[key], folder)
+
+
+def _require_no_mode(where: str, config: Any) -> None:
+    """Refuse a mode of Hydra, which `_mode` would not see."""
+    if isinstance(config, Mapping) and "mode" in (config.get("hydra") or {}):
+        raise ValueError(f"{where}: hydra.mode; must be set on the command line, as hydra.mode=MULTIRUN")
 
 
 def _require_harmless(where: str, package: str | None, content: Any) -> None:

@@ -14,6 +14,7 @@ import torch
 from checks.kills import Subject, of_studies, wait
 from hydra import compose, initialize_config_dir
 
+from autdtorch.cli import config_files
 from autdtorch.cli.config_files import CONFIGS
 from autdtorch.study.report.tables import save_summary
 from autdtorch.study.results_file import load_results
@@ -81,6 +82,14 @@ def test_a_trusted_folder_may_ask_for_a_sweep(run, write, tmp_path):
     write("lab/experiment/both.yaml", f"# @package _global_\n{sweep}\n")
     assert run("experiment=both", "hydra.searchpath=[lab]", "plane_spacing=0.02") == 0
     assert len(jobs(tmp_path)) == 2
+
+
+def test_a_file_of_ours_that_asks_for_a_sweep_is_refused(write, tmp_path, monkeypatch):
+    write("experiment/both.yaml", "# @package _global_\nhydra: {mode: MULTIRUN}\n")
+    monkeypatch.setattr(config_files, "CONFIGS", tmp_path)
+    source = config_files.FileConfigSource("main", f"file://{tmp_path}")
+    with pytest.raises(ValueError, match=r"hydra\.mode; must be set on the command line"):
+        source.load_config("experiment/both.yaml")
 
 
 @pytest.mark.skipif(os.name != "posix", reason="SIGKILL is of POSIX")
