@@ -118,12 +118,19 @@ def test_a_file_is_read_once_it_has_changed_and_is_whole(tmp_path, monkeypatch):
     assert FileSensor(path, 2, settle=0.1).read().tolist() == [1.5, 2.5]
 
 
+def test_a_tared_balance_may_read_below_zero_in_silence_where_a_pressure_may_not(tmp_path, monkeypatch):
+    path, force = tmp_path / "reading.txt", Quantity("force", "mN")
+    running(monkeypatch, path, None, "-0.01 0.3\n")
+    assert FileSensor(path, 2, quantity=force).read().tolist() == [0.0, 0.3]
+    assert ManualSensor(POINTS[:1], lambda _: "-0.02", force).read().tolist() == [0.0]
+
+
 @pytest.mark.parametrize(
     ("contents", "message"),
     [
         ([], "reading.txt did not change, within 5 s"),
-        ([None, "1 2 3\n"], "holds no reading: pressure: .*must be 2 numbers, within 5 s"),
-        ([None, "1 -2\n"], "holds no reading: pressure: -2.0 Pa"),
+        ([None, "1 2 3\n"], "holds no reading: pressure: .*must be 2 numbers >= 0, within 5 s"),
+        ([None, "1 -2\n"], r"holds no reading: pressure: \(1\.0, -2\.0\) Pa"),
     ],
 )
 def test_a_file_that_does_not_change_or_holds_something_else_is_an_error_in_time(

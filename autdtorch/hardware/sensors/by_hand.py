@@ -19,11 +19,12 @@ from autdtorch.hardware.sensors.sensor import (
     SensorError,
     Setup,
     checked_reading,
+    magnitudes_of,
     quantity_of,
 )
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.progress import is_terminal
-from autdtorch.utils.validation import ArrayLike, not_negative, points_tensor, require_callable, require_kind
+from autdtorch.utils.validation import ArrayLike, points_tensor, require_callable, require_kind
 
 _SIGNAL_PERIOD = 0.2  # [s] between looks for a signal
 
@@ -75,7 +76,7 @@ class ManualSensor:
         while True:
             text = _asked(self._ask, hint + question)
             try:
-                return not_negative(self.quantity.name, float(text), self.quantity.unit)
+                return magnitudes_of(self.quantity, self.quantity.name, [float(text)], 1).item()
             except ValueError:
                 hint = f"{text!r}: must be a number >= 0 with a decimal point, as 1.5\n"
 

@@ -10,13 +10,19 @@ from typing import Any
 
 import torch
 
-from autdtorch.hardware.sensors.sensor import PRESSURE, InstrumentConfig, Quantity, Sensor, SensorError, Setup
-from autdtorch.utils.array_types import REAL
+from autdtorch.hardware.sensors.sensor import (
+    PRESSURE,
+    InstrumentConfig,
+    Quantity,
+    Sensor,
+    SensorError,
+    Setup,
+    magnitudes_of,
+)
 from autdtorch.utils.files import path_of
 from autdtorch.utils.validation import (
     integer_at_least,
     invalid,
-    not_negative,
     number_between,
     positive,
     require_kind,
@@ -63,7 +69,7 @@ class FileSensor:
     def read(self) -> torch.Tensor:
         """Return the magnitudes (P,), once the file has changed.
 
-        `SensorError` if it does not change in time, or then holds anything but P numbers >= 0.
+        `SensorError` if it does not change in time, or then holds anything but P magnitudes; see `Quantity`.
         """
         time.sleep(self._settle)
         before, deadline = self._stamp(), time.monotonic() + self._timeout
@@ -89,11 +95,8 @@ class FileSensor:
         text = self._path.read_text(encoding="utf-8")
         if not text.endswith("\n"):
             raise ValueError("no line end after the last number")
-        name, unit = self.quantity.name, self.quantity.unit
-        numbers = [not_negative(name, float(word), unit) for word in text.replace(",", " ").split()]
-        if len(numbers) != self._points:
-            raise invalid(name, numbers, f"must be {self._points} numbers", unit)
-        return torch.tensor(numbers, **REAL)
+        numbers = [float(word) for word in text.replace(",", " ").split()]
+        return magnitudes_of(self.quantity, self.quantity.name, numbers, self._points)
 
 
 @dataclass(frozen=True)

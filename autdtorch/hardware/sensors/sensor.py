@@ -24,6 +24,7 @@ from autdtorch.utils.validation import (
     integer_at_least,
     invalid,
     number_between,
+    real_tensor,
     require_kind,
     within,
 )
@@ -51,7 +52,8 @@ class Quantity:
     """A quantity that a sensor reads.
 
     A sensor of another quantity than the pressure has an attribute `quantity`. Methods then maximise its
-    least reading, and nothing compares readings with simulated pressures.
+    least reading, and nothing compares readings with simulated pressures. Readings below 0, as a balance has
+    of noise once it is tared, count as 0.
 
     Attributes:
         name: such as "force".
@@ -72,6 +74,13 @@ class Quantity:
 
 PRESSURE = Quantity("pressure", "Pa")
 """PRESSURE: the quantity of a sensor that states none."""
+
+
+def magnitudes_of(quantity: Quantity, name: str, value: object, points: int) -> torch.Tensor:
+    """Return readings (P,) of `points` control points as float64, after checking them."""
+    if quantity != PRESSURE:
+        value = real_tensor(name, value, quantity.unit).clamp(min=0)
+    return validate_magnitudes(name, value, points, quantity.unit)
 
 
 @runtime_checkable
@@ -133,8 +142,7 @@ def checked_reading(sensor: Sensor, points: int, seconds: float = LONGEST) -> to
         SensorError: the time is over.
     """
     quantity = quantity_of(sensor)
-    name = f"{quantity.name} of the sensor"
-    return validate_magnitudes(name, _reading(sensor, seconds), points, quantity.unit)
+    return magnitudes_of(quantity, f"{quantity.name} of the sensor", _reading(sensor, seconds), points)
 
 
 def _reading(sensor: Sensor, seconds: float) -> object:
