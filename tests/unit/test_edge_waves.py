@@ -5,8 +5,9 @@ import pytest
 
 from autdtorch.fdtd.assembly.edge_fit import fitted_couplings
 from autdtorch.fdtd.assembly.edge_waves import _Window, at_the_drive, rigid_corner
+from autdtorch.fdtd.assembly.element import stiffness_matrix
 from autdtorch.fdtd.assembly.prisms import prisms
-from autdtorch.fdtd.assembly.sections import COLUMN_PAIRS, MaterialKey, Section, plane_fields
+from autdtorch.fdtd.assembly.sections import COLUMN_PAIRS, MaterialKey, Section, plane_fields, uniform_columns
 from autdtorch.fdtd.stencil import tuned_stencil
 
 RIGID = MaterialKey((1.0, 1e12), (1.0, 1e-12), (False, True))
@@ -44,14 +45,17 @@ def test_the_corner_may_be_any_block(rigid):
     np.testing.assert_allclose(np.flip(other.mass[0, 0], axes), first.mass[0, 0], rtol=1e-6)
 
 
-@pytest.mark.parametrize("place", np.random.default_rng(0).uniform(0.02, 0.98, (6, 2)).tolist())
-def test_elements_have_a_positive_energy_and_the_mass_of_their_volume(place):
-    element = prisms(corner(*place), RIGID, tuned_stencil(1.0))
-    assert element.mass.sum() == pytest.approx(1 - place[0] * place[1], rel=1e-3)
+SLIVERS = [(0.98, 0.98), (0.9, 0.95), (0.02, 0.97), (0.03, 0.02)]
+
+
+@pytest.mark.parametrize("cells", [3.0, 6.0, 40.0])
+@pytest.mark.parametrize("place", SLIVERS + np.random.default_rng(0).uniform(0.02, 0.98, (4, 2)).tolist())
+def test_elements_have_a_positive_energy_and_the_mass_of_their_volume(place, cells):
+    """Also slivers of air, at few and at many cells per wavelength; rounding."""
+    stencil = tuned_stencil(2 * np.pi / cells)
+    element = prisms(corner(*place), RIGID, stencil)
+    assert element.mass.sum() == pytest.approx(1 - place[0] * place[1], abs=1e-3)
     assert (element.mass >= 0).all()
-    matrix = np.zeros((4, 4))
-    for one, other in COLUMN_PAIRS:
-        value = element.coupling[0, 0].reshape(4, 4)[one, other]
-        matrix[[one, other], [one, other]] += value
-        matrix[[one, other], [other, one]] -= value
-    assert np.linalg.eigvalsh(matrix).min() > -1e-9
+    relative = element.coupling[0, 0].reshape(4, 4)[tuple(COLUMN_PAIRS.T)]
+    eigenvalues = np.linalg.eigvalsh(stiffness_matrix(relative * uniform_columns(stencil), COLUMN_PAIRS))
+    assert eigenvalues.min() > -1e-12 * eigenvalues.max()

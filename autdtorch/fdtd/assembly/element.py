@@ -110,6 +110,13 @@ def stiffness_matrix(coupling: Array, pairs: Index = PAIRS) -> Array:
     return matrix
 
 
+def without_negative(matrices: Array) -> Array:
+    """Return symmetric matrices (..., m, m) without their negative eigenvalues."""
+    value, vector = np.linalg.eigh(matrices)
+    positive = (vector * np.maximum(value, 0)[..., None, :]) @ vector.mT
+    return np.where(value[..., :1, None] < 0, positive, matrices)
+
+
 # Eigenvalues below this share of the largest are rounding in a condensed stiffness matrix. A higher value
 # would remove energy from nearly constant pressures.
 _NULL_EIGENVALUE = 1e-10

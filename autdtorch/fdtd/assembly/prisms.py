@@ -18,7 +18,7 @@ from scipy.optimize import lsq_linear
 
 from autdtorch.fdtd.assembly.edge_fit import fitted_couplings, importance
 from autdtorch.fdtd.assembly.edge_waves import at_the_drive, rigid_corner
-from autdtorch.fdtd.assembly.element import PAIRS, coupling_by_edges, stiffness_matrix
+from autdtorch.fdtd.assembly.element import PAIRS, coupling_by_edges, stiffness_matrix, without_negative
 from autdtorch.fdtd.assembly.sections import (
     COLUMN_PAIRS,
     COLUMNS,
@@ -130,16 +130,9 @@ def stacked(width: Array, slices: Prisms, axis: int, stencil: Stencil) -> tuple[
         conductance = np.eye(4) * (1 / resistance[:, layer].reshape(-1, 1, 4))
         lengthwise = conductance + thick / 12 * across + beyond / thick
         between = thick * at_middle.mT @ across @ at_middle
-        matrix += between + along.mT @ _without_negative(lengthwise) @ along
+        matrix += between + along.mT @ without_negative(lengthwise) @ along
         masses[:, number] += thick * np.stack(((1 - place) * part, place * part), axis=1)[..., 0]
     return -matrix[:, PAIRS[:, 0], PAIRS[:, 1]], masses
-
-
-def _without_negative(matrices: Array) -> Array:
-    """Return symmetric matrices (n, m, m) without their negative eigenvalues."""
-    value, vector = np.linalg.eigh(matrices)
-    positive = (vector * np.maximum(value, 0)[:, None]) @ vector.mT
-    return np.where(value[:, :1, None] < 0, positive, matrices)
 
 
 def _stiffness(coupling: Array) -> Array:
