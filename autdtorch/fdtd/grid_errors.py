@@ -22,6 +22,7 @@ _WEIGHT = 0.2  # of the logarithm of the usual error: grids may agree by chance
 _MOST_APART = 10.0  # Largest ratio of the two errors: a usual error farther away is moved to this ratio
 _LEAST = 0.37  # Least error that is claimed, relative to the usual one
 _COMPARED = 2  # Last other grids that count: earlier ones may be too coarse for the scene
+_BESIDE = 0.6  # Width of the strip along an edge that its errors are relative to [wavelengths]
 _ORDERS = 2.0, 4.0  # Least and largest order that three grids may show: those of the scheme's parts
 _TINY = torch.finfo(torch.float64).tiny
 
@@ -38,6 +39,7 @@ class Law:
     aligned: bool  # whether all faces are parallel to their grids
     air: float = math.inf  # wavelength around bodies [m]
     thickness: float = math.inf  # their mean thickness [m]
+    edges: float = math.inf  # length of their edges over their area [1/m], for aligned faces alone
 
     @property
     def _equal(self) -> float:
@@ -48,11 +50,22 @@ class Law:
         """
         return 0.12 if self.aligned else 0.4
 
+    @property
+    def at_edges(self) -> float:
+        """Share of the scattered field that edges diffract, about; 1 where their length is not known.
+
+        Faces parallel to the grid are all but exact, edges are not. In deep shadow their field is the only
+        one. Errors of 28 random scenes of rigid plates, slits, corners, cubes and boxes of 1 to 47
+        wavelengths are 0.2 to 1.8 times the usual ones; without this share they were 0.05 to 1.8 times.
+        """
+        return min(_BESIDE * self.wavelength * self.edges, 1.0)
+
     def usual(self, spacing: float) -> float:
         """Return the median error of these scenes on cells of a spacing [m], relative to the scattered field.
 
-        Faces that cut cells are off by a share of a cell, which counts relative to the size of a body: rigid
-        spheres of 1 to 7 mm err in proportion to 1 / radius, as fluid ones do. Cells see nothing thinner.
+        Of aligned faces it is relative to the part that edges diffract. Faces that cut cells are off by a
+        share of a cell, which counts relative to the size of a body: rigid spheres of 1 to 7 mm err in
+        proportion to 1 / radius, as fluid ones do. Cells see nothing thinner.
         """
         if self.aligned:
             return 0.36 * self.growth(spacing)
@@ -84,7 +97,7 @@ def grid_errors(
     spacings [m]; the last ones count.
     """
     by_grids = errors_by_grids(matrix, free, spacing, others, law)
-    usual = law.usual(spacing) * _scattered(matrix, free)
+    usual = law.usual(spacing) * _scattered(matrix, free, law.at_edges)
     near = torch.minimum(torch.maximum(usual, by_grids / _MOST_APART), by_grids * _MOST_APART)
     return torch.maximum(by_grids ** (1 - _WEIGHT) * near**_WEIGHT, _LEAST * usual)
 
@@ -133,11 +146,11 @@ def rigid_errors(matrix: Tensor, free: Tensor, region: Region) -> Tensor:
     return errors
 
 
-def _scattered(matrix: Tensor, free: Tensor) -> Tensor:
-    """Return the share (P,) of the scattered field in rows of a matrix (P, M), at most 1.
+def _scattered(matrix: Tensor, free: Tensor, part: float = 1.0) -> Tensor:
+    """Return the share (P,) of a part of the scattered field in rows of a matrix (P, M), at most 1.
 
     In a shadow the rest of it cancels the field in free space (P, M), wherever the surface is.
     """
-    scattered = torch.minimum((matrix - free).norm(dim=1), matrix.norm(dim=1))
+    scattered = torch.minimum(part * (matrix - free).norm(dim=1), matrix.norm(dim=1))
     share: Tensor = scattered / sizes(matrix, free)
     return share

@@ -18,10 +18,10 @@ import torch
 
 from autdtorch.fdtd.shapes import Bounded, Shape, Solids, Turned, is_turned, turned_shape
 from autdtorch.fdtd.turning import FlatFaces, flat_faces, slender_faces
-from autdtorch.utils.array_types import Array
+from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.images import Image, Mirror, images_of
 from autdtorch.utils.process import cached_property
-from autdtorch.utils.spatial import volume_and_area
+from autdtorch.utils.spatial import edge_length, volume_and_area
 from autdtorch.utils.validation import LENGTH_TOLERANCE, Vector, invalid, positive
 
 logger = logging.getLogger(__name__)
@@ -125,10 +125,21 @@ class Region:
     @cached_property
     def mean_thickness(self) -> float:
         """Twice the volume of all bodies that end over their area [m]; infinite without such bodies."""
-        surfaces = [body.shape.surface() for body in self.bodies if not body.continued]
-        parts = [volume_and_area(vertices.numpy(), triangles.numpy()) for vertices, triangles in surfaces]
+        parts = [volume_and_area(*surface) for surface in self._surfaces]
         volume, area = np.array(parts).reshape(-1, 2).sum(axis=0).tolist()
         return 2 * volume / area if area else math.inf
+
+    @cached_property
+    def edges_per_area(self) -> float:
+        """Length of all edges of bodies that end over their area [1/m]; infinite without such bodies."""
+        area = sum(volume_and_area(*surface)[1] for surface in self._surfaces)
+        return sum(edge_length(*surface) for surface in self._surfaces) / area if area else math.inf
+
+    @property
+    def _surfaces(self) -> list[tuple[Array, Index]]:
+        """Vertices (V, 3) [m] and triangles (T, 3) of the bodies that end."""
+        surfaces = [body.shape.surface() for body in self.bodies if not body.continued]
+        return [(vertices.numpy(), triangles.numpy()) for vertices, triangles in surfaces]
 
     @property
     def unbounded(self) -> Self:

@@ -157,9 +157,9 @@ class Plan:
     @property
     def law(self) -> Law:
         """The growth of its errors with the spacing."""
-        region = self.region
-        aligned = self.grouping.aligned
-        return Law(region.shortest_wavelength, aligned, region.wavelength, region.mean_thickness)
+        region, aligned = self.region, self.grouping.aligned
+        edges = region.edges_per_area if aligned else math.inf
+        return Law(region.shortest_wavelength, aligned, region.wavelength, region.mean_thickness, edges)
 
     @property
     def on_grids(self) -> Self:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from autdtorch.utils.array_types import AnyArray, Array, Index
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
+_FLAT = 1 - 1e-9  # Cosine of the angle between the normals of triangles in a plane, at least
 _LATTICE = 0.7548776662466927, 0.5698402909980532
 """Steps of a plane lattice of low discrepancy: powers of the root of x^3 + x^2 = 1 (Roberts 2018)."""
 
@@ -127,6 +128,16 @@ def mean_thickness(vertices: Array, triangles: Index) -> float:
     """Return twice the volume over the area of a closed surface, vertices (V, 3), triangles (T, 3)."""
     volume, area = volume_and_area(vertices, triangles)
     return 2 * volume / area
+
+
+def edge_length(vertices: Array, triangles: Index) -> float:
+    """Return the length of the edges between faces of a surface, vertices (V, 3) [m], triangles (T, 3)."""
+    joined = distinct_rows(np.round(vertices / LENGTH_TOLERANCE).astype(np.int64))[1][triangles]
+    pairs, normals = paired_sides(joined), doubled_normals(vertices[triangles])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), np.finfo(float).tiny)[:, None]
+    one, other = normals[pairs.T % len(triangles)]
+    ends = vertices[sides_of(triangles)[pairs[np.einsum("ij,ij->i", one, other) < _FLAT, 0]]]
+    return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum())
 
 
 def extents(vertices: Array) -> Array:
