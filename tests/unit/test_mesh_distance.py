@@ -74,6 +74,21 @@ def test_slivers_that_rounding_has_turned_over_leave_points_outside(height):
     np.testing.assert_allclose(divided(points), wedge(points), rtol=0, atol=2 * height + ROUNDING)
 
 
+def test_slivers_that_single_precision_has_turned_over_far_from_the_origin_leave_points_outside():
+    corners = [(x, y, z) for z in (0.0, 1.0) for x, y in ((0.0, 0.0), (1.0, 0.05), (1.0, -0.05))]
+    wedge = MeshDistance(np.array(corners), np.array([*WEDGE, [0, 5, 3]]))
+    random = np.random.default_rng(0)
+    points = random.uniform(-0.3, 1.3, (500, 3)) * (1.0, 0.3, 1.0)
+    for share in random.uniform(0.1, 0.9, 20):
+        turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
+        turn *= np.linalg.det(turn)
+        vertices = np.array([*corners, (0.0, 0.0, share)]) @ turn.T + 100
+        rounded = vertices.astype(np.float32).astype(np.float64)
+        divided = MeshDistance(rounded, np.array([*WEDGE, [3, 6, 5], [6, 0, 5], [3, 0, 6]]))
+        # vertices are off by up to 4e-6 along each axis
+        np.testing.assert_allclose(divided(points @ turn.T + 100), wedge(points), rtol=0, atol=2e-5)
+
+
 @pytest.mark.parametrize("height", [1e-15, 1e-12, 1e-9, 1e-6])
 def test_points_on_slivers_are_as_near_as_their_sides(height):
     random = np.random.default_rng(0)

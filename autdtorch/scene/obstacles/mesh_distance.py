@@ -13,7 +13,9 @@ from autdtorch.utils.spatial import doubled_normals
 
 _IN_LEAF = 5  # Triangles of a leaf of the tree, at most
 _TOGETHER = 4096  # Points in a task: one or two milliseconds
-_SLIVER = 1e-6  # height of a triangle, relative to the extent, below which rounding may have turned it over
+# Heights of triangles below which rounding may have turned them over, relative to the extent, and to the
+# largest coordinate: four roundings in single precision, as of STL
+_SLIVER, _ROUNDED = 1e-6, 2.0**-22
 
 
 class MeshDistance:
@@ -90,7 +92,8 @@ def _normals(vertices: Array, faces: Index) -> tuple[Array, Index]:
     normals = doubled_normals(corners)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    sliver = length[:, 0] < _SLIVER * np.ptp(vertices, axis=0).max() * longest
+    least = max(_SLIVER * np.ptp(vertices, axis=0).max(), _ROUNDED * np.abs(vertices).max())
+    sliver = length[:, 0] < least * longest
     normals = np.divide(normals, length, out=np.full_like(normals, np.nan), where=~sliver[:, None])
     at_edge, _, edge = igl.per_edge_normals(vertices, faces, igl.PER_EDGE_NORMALS_WEIGHTING_TYPE_UNIFORM)
     at_edge[np.bincount(edge, minlength=len(at_edge)) != 2] = np.nan
