@@ -27,6 +27,7 @@ _PATIENCE = 3.0  # time after which the bar or the first forecast in the log app
 _MOST_POINTS = 1000  # times of earlier steps
 # without tqdm's forecast, which is of means
 _BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
+_SOON = 0.5  # [s] left, of which nothing is said
 _UNSURE = 1.5  # ratio of two forecasts, from which both are shown
 _asked: ContextVar[Callable[[], bool]] = ContextVar("asked to stop", default=lambda: False)
 
@@ -103,7 +104,7 @@ class Progress:
                 self._next = 4 * spent  # ever fewer lines
 
     def _forecast(self) -> str:
-        """Return the time left as text; nothing before it is known.
+        """Return the time left as text; nothing before it is known, and when the work ends soon.
 
         The remaining steps take as long as those of the later half so far, or become slower along the line
         through both halves; where the two differ much, both are shown.
@@ -115,12 +116,14 @@ class Progress:
         if done == first:  # the time before the first may include compiling kernels
             return ""
         middle, half = min(self._points, key=lambda point: abs(point[1] - (first + done) / 2))
-        if not first < half < done:
-            return f"about {left * (now - begun) / (done - first):.0f} s left"
-        early, late = (middle - begun) / (half - first), (now - middle) / (done - half)
-        growth = max(0.0, late - early) / ((done - first) / 2)  # of the time of a step, by each step
-        least = left * late
-        most = least + left * growth * (done - half + left) / 2
+        least = most = left * (now - begun) / (done - first)
+        if first < half < done:
+            early, late = (middle - begun) / (half - first), (now - middle) / (done - half)
+            growth = max(0.0, late - early) / ((done - first) / 2)  # of the time of a step, by each step
+            least = left * late
+            most = least + left * growth * (done - half + left) / 2
+        if most < _SOON:
+            return ""
         if most < _UNSURE * least:
             return f"about {(least + most) / 2:.0f} s left"
         return f"about {least:.0f} to {most:.0f} s left"

@@ -53,6 +53,11 @@ def test_the_forecast_goes_by_what_the_last_steps_took(clock, caplog):
     assert lines_of(clock, caplog, 11, [(20, 1), (4, 2)]) == ["simulating: 24 s so far, about 16 s left"]
 
 
+def test_work_that_ends_soon_has_no_forecast(clock, caplog):
+    # after a compilation of 20 s, steps of a millisecond
+    assert lines_of(clock, caplog, 100, [(20, 1), *[(1e-3, 1)] * 98]) == []
+
+
 def test_short_work_says_nothing_and_long_work_ever_less(clock, caplog):
     assert lines_of(clock, caplog, 10, [(0.2, 1)] * 10) == []
     # after 3 s, and whenever it has taken four times as long
