@@ -61,6 +61,8 @@ def at_the_drive(
     result = -matrix[tuple(COLUMN_PAIRS.T)]
     masses = mass.copy()
     masses[window.air] += change[: len(window.air)]
+    if (masses < 0).any():  # in slivers, and where the fit diverges: the element for long waves remains
+        return coupling, mass
     return result, masses
 
 
@@ -105,6 +107,7 @@ class _Window:
         count = len(self.air)
         total = np.zeros(count + len(self.pairs))
         least = np.concatenate((_RIDGE * np.eye(len(total)), _SUM * (np.arange(len(total)) < count)[None]))
+        first = np.linalg.norm(self._missed(operator)[0])
         for _ in range(_STEPS):
             missed, slopes = self._missed(operator)
             both = np.concatenate((slopes, least)), np.concatenate((-missed, -least @ total))
@@ -113,7 +116,7 @@ class _Window:
             change, masses = np.zeros(6), np.zeros(4)
             change[self.pairs], masses[self.air] = self._kappa**2 * step[count:], step[:count]
             self._add(operator, self.columns, change, masses)
-        return total
+        return total if np.linalg.norm(self._missed(operator)[0]) < first else np.zeros_like(total)
 
     def _add(self, operator: Array, columns: Index, coupling: Array, mass: Array) -> None:
         """Add an element with a coupling (6,) and masses (4,) to an operator: stiffness less inertia."""
