@@ -258,6 +258,36 @@ def test_points_in_a_cavity_that_a_fluid_cuts_read_no_cells_beyond_its_wall(tilt
     assert not (tube.signed_distance(torch.from_numpy(grid.grid.centers_of(read))) > 0).any()
 
 
+@pytest.mark.filterwarnings("ignore::autdtorch.OverlapWarning")
+def test_a_bore_that_a_later_fluid_cuts_is_that_of_a_mesh():
+    """Without finite elements in the bore, modes of the wall's cells rang for 600 periods."""
+    outer, inner, long = 3.39e-3, 2.48e-3, 9.5e-3
+    tube = Cylinder(CENTER, outer, long, (0, 0, 1), rigid=True)
+    bore = Cylinder(CENTER, inner, long + 1e-3, (0, 0, 1), density=AIR.density, sound_speed=AIR.sound_speed)
+    around = 2 * np.pi * np.arange(120) / 120
+    circle = np.column_stack((np.cos(around), np.sin(around), 0 * around))
+    rims = [(inner, -1), (outer, -1), (outer, 1), (inner, 1)]
+    rings = [radius * circle + (0, 0, side * long / 2) for radius, side in rims]
+    here = np.arange(480).reshape(4, 120)
+    quads = [here, np.roll(here, -1, 1), np.roll(here, (-1, -1), (0, 1)), np.roll(here, -1, 0)]
+    faces = np.concatenate(
+        [np.stack([quads[0], *pair], -1).reshape(-1, 3) for pair in (quads[1:3], quads[2:4])]
+    )
+    mesh = Mesh.from_surface((np.concatenate(rings) + CENTER, faces), rigid=True)
+    sources = [(26e-3, 14e-3, 22e-3), (13e-3, 27e-3, 16e-3)]
+    within = [(0, 0, 1e-3), (1.2e-3, 0, 1e-3), (0, -1.5e-3, 2e-3)]
+
+    def matrix(*bodies):
+        scene = Scene(TransducerArray(sources, (1, 0, 0)), AIR, 40e3, np.array(CENTER) + within, bodies)
+        propagator = make_propagator(scene, "box", 0.77e-3, 5e-3)
+        pressure = propagator.transfer_matrix()
+        assert max(run.periods for run in propagator.runs) < 100
+        return pressure
+
+    # meshes also have the edges of the inner rim
+    assert relative_error(matrix(tube, bore), matrix(mesh)) < 0.1
+
+
 @pytest.mark.parametrize(
     ("method", "material"),
     [("box", {"rigid": True}), ("full", {"rigid": True}), ("box", {"density": 50.0, "sound_speed": 600.0})],

@@ -28,7 +28,7 @@ from autdtorch.fdtd.assembly.element import (
     InterfaceElements,
     Materials,
 )
-from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
+from autdtorch.fdtd.assembly.interface import Bodies, interface_elements, left_by_fluids
 from autdtorch.fdtd.assembly.losses import with_losses
 from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, quadratic, roughness
 from autdtorch.fdtd.assembly.thin_walls import Side, sides_of
@@ -176,10 +176,11 @@ def _finite(
     These are rigid bodies, and edges of fluids without a rigid body along the grid beside them. Where such a
     body crosses an element, no body is: sound would pass. `whole` as in `_thick`.
     """
-    near = np.asarray((np.abs(distance) < FAR).any(axis=2))
+    hard = np.array([body.rigid for body in bodies])
+    near, left = np.asarray((np.abs(distance) < FAR).any(axis=2)), left_by_fluids(distance, hard)
     finite, thin, crossed = near.copy(), np.zeros(len(first), bool), np.zeros(len(first), bool)
     walls = np.zeros(len(first), bool)
-    for body, mask, level, here in zip(bodies, finite, distance, near, strict=True):
+    for body, mask, level, here in zip(bodies, finite, left, near, strict=True):
         if body.rigid and body.finite:
             walls[mask] |= ~_thick(bodies, level[mask], first[mask], whole, grid)
         elif body.rigid:
@@ -189,7 +190,6 @@ def _finite(
             mask &= near_edge & body.finite
             mask[mask] = roughness(level[mask]) > _ROUGH
         mask &= body.finite
-    hard = np.array([body.rigid for body in bodies])
     finite &= (hard[:, None] | ~thin) & ~crossed
     return finite, np.asarray(walls & finite.any(axis=0))
 

@@ -84,7 +84,7 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
     bodies = bodies._replace(distance=distance)
     vertex = _vertex_materials(distance, material)
     layered = layered_axis(distance)
-    near = (np.abs(distance) < FAR).any(axis=2)
+    near = (np.abs(left_by_fluids(distance, materials.rigid[material])) < FAR).any(axis=2)
     # a surface with an impedance needs pressures on both sides
     allowed = bodies.finite & ((layered < 0) | materials.reacting[material, None])
     finite = np.asarray((near & allowed).any(axis=0))
@@ -99,6 +99,15 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
             vertex[other], bodies.chosen(other), materials, stencil
         )
     return InterfaceElements(coupling, mass, vertex, finite, np.zeros((len(vertex), 0)))
+
+
+def left_by_fluids(distance: Array, rigid: NDArray[np.bool_]) -> Array:
+    """Return signed distances (K, n, L) of bodies; of `rigid` ones (K,), those of what later fluids leave."""
+    left = distance.copy()
+    for number in np.flatnonzero(rigid):
+        for later in number + 1 + np.flatnonzero(~rigid[number + 1 :]):
+            left[number] = np.maximum(left[number], -distance[later])
+    return left
 
 
 class _Cut(NamedTuple):
@@ -160,10 +169,15 @@ def _set_smooth(
 
 
 def _finite_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -> tuple[Array, Array]:
-    """Return coupling (n, 28) and mass (n, 8) of finite elements, the bodies grown by the added thickness."""
+    """Return coupling (n, 28) and mass (n, 8) of finite elements, the bodies grown by the added thickness.
+
+    A fluid that later cuts into a rigid body is shrunk by it.
+    """
     contrast = np.where(materials.rigid, 1, (materials.density - 1) / (materials.density + 1))
-    contrast = contrast[bodies.material, None, None] * bodies.finite[:, :, None]
-    grown = bodies.distance - _added_thickness(stencil.kappa) * contrast
+    hard = bodies.finite & materials.rigid[bodies.material, None]
+    cutting = ~bodies.finite & (np.cumsum(hard, axis=0) > 0)
+    grown = np.where(cutting, -1, contrast[bodies.material, None] * bodies.finite)[:, :, None]
+    grown = bodies.distance - _added_thickness(stencil.kappa) * grown
     volumes = shares(volume_coverage, grown, bodies.material, len(materials.density))
     coupling, mass = np.zeros((len(volumes), 28)), np.zeros((len(volumes), 8))
     for side in bodies.sides:
