@@ -16,12 +16,19 @@ from typing import NamedTuple, Self
 import numpy as np
 import torch
 
-from autdtorch.fdtd.shapes import Bounded, Shape, Solids, Turned, is_turned, turned_shape
+from autdtorch.fdtd.shapes import Bounded, Shape, Solids, Turned, bounds, is_turned, turned_shape
 from autdtorch.fdtd.turning import FlatFaces, flat_faces, slender_faces
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.images import Image, Mirror, images_of
 from autdtorch.utils.process import cached_property
-from autdtorch.utils.spatial import edge_length, volume_and_area
+from autdtorch.utils.spatial import (
+    areas_of,
+    doubled_normals,
+    edge_length,
+    places_on,
+    spread_evenly,
+    volume_and_area,
+)
 from autdtorch.utils.validation import LENGTH_TOLERANCE, Vector, invalid, positive
 
 logger = logging.getLogger(__name__)
@@ -32,6 +39,9 @@ The Huygens surface is up to 4 cells from the bodies, and must not meet its own 
 
 _AS_HEAVY = 1.1
 """Ratio of densities up to which cells on both sides of a surface interpolate better than those on one."""
+
+_PLACES = 400  # Places of a surface where bodies of air may cut it
+_SKIN = 1e-6  # Distance [m] in front of and behind a surface where air is looked for
 
 MIN_CELLS_PER_WAVELENGTH = 3.0  # Fewest cells per wavelength; coarser grids are refused
 # Fewest cells per wavelength without a warning. On coarser grids points would need interpolation over more
@@ -124,9 +134,14 @@ class Region:
 
     @cached_property
     def mean_thickness(self) -> float:
-        """Twice the volume of all bodies that end over their area [m]; infinite without such bodies."""
-        parts = [volume_and_area(*surface) for surface in self._surfaces]
-        volume, area = np.array(parts).reshape(-1, 2).sum(axis=0).tolist()
+        """Twice the volume of all bodies that end over their area [m]; infinite without such bodies.
+
+        Later bodies of air cut into those before.
+        """
+        numbers = [number for number, body in enumerate(self.bodies) if not body.continued]
+        carved = any(body.fluid == self.fluid for body in self.bodies)
+        measure = self._remaining_volume_and_area if carved else self._volume_and_area
+        volume, area = np.array([measure(number) for number in numbers]).reshape(-1, 2).sum(axis=0).tolist()
         return 2 * volume / area if area else math.inf
 
     @cached_property
@@ -140,6 +155,32 @@ class Region:
         """Vertices (V, 3) [m] and triangles (T, 3) of the bodies that end."""
         surfaces = [body.shape.surface() for body in self.bodies if not body.continued]
         return [(vertices.numpy(), triangles.numpy()) for vertices, triangles in surfaces]
+
+    def _volume_and_area(self, number: int) -> tuple[float, float]:
+        """Return volume [m^3] and area [m^2] of a body."""
+        vertices, triangles = self.bodies[number].shape.surface()
+        return volume_and_area(vertices.numpy(), triangles.numpy())
+
+    def _remaining_volume_and_area(self, number: int) -> tuple[float, float]:
+        """Return the part of a body's surface in volume [m^3] and area [m^2] of what bodies of air leave.
+
+        Places on the surface count where one side is air. Where that is inside, the volume is negative.
+        """
+        shape = self.bodies[number].shape
+        vertices, triangles = (part.numpy() for part in shape.surface())
+        corners = vertices[triangles]
+        normals = doubled_normals(corners)[spread_evenly(areas_of(corners), _PLACES)]
+        normals /= np.linalg.norm(normals, axis=1)[:, None]
+        places = places_on(corners, _PLACES)
+        # triangles are chords of curved faces
+        places -= shape.signed_distance(torch.from_numpy(places)).numpy()[:, None] * normals
+        solids = Solids(self.shapes, [body.fluid != self.fluid for body in self.bodies])
+        inside, outside = (solids.distance(places + side * _SKIN * normals) < 0 for side in (-1, 1))
+        facing = inside.astype(np.float64) - outside
+        middle = 0.5 * (bounds(self.shapes)[0] + bounds(self.shapes)[1])
+        height = ((places - middle) * normals).sum(axis=1)
+        share = float(areas_of(corners).sum()) / _PLACES
+        return share * float(facing @ height) / 3, share * float(np.abs(facing).sum())
 
     @property
     def unbounded(self) -> Self:
