@@ -1,7 +1,7 @@
 """Convex edges of rigid bodies at the drive's frequency.
 
-Elements that are fitted to long waves (`edge_fit.py`) leave an error of second order at an edge. Behind large
-plates, where all that is heard has passed their edges, it is 1 to 3 % at 6 to 9 cells per wavelength. Around
+Elements that are fitted to long waves (`edge_fit.py`) leave an error of second order at an edge: behind large
+plates, whose shadow is lit by their edges alone, 1 to 3 % at 6 to 9 cells per wavelength. Around
 a rigid right angle, waves of wavenumber k are J_n(k r) cos(n phi), n = 0, 2/3, 4/3, ... The masses of the
 element at the edge, and a change of its couplings, are fitted to them.
 """

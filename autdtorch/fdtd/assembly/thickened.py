@@ -1,7 +1,7 @@
 """Rigid sheets and walls with the least thickness that elements see.
 
-Sheets are thickened on both sides. Where a later fluid leaves a thin wall of a rigid body, the fluid recedes:
-the field outside remains that of the body.
+Sheets are thickened on both sides. Where a later fluid leaves a thin wall of a rigid body, the fluid
+recedes, so that the outer surface of the body stays.
 """
 
 from __future__ import annotations

@@ -205,9 +205,9 @@ def nearest_triangles(points, boxes, triangles, features, normals, distance, abo
         points: neighbours should follow each other.
         boxes: of the nodes (2 L, 6), lower and upper corners. Node i has the children 2 i and 2 i + 1, the
             root is 1, and the L leaves are last.
-        triangles: first corner, both sides from it, the vectors whose products with a way from it are the
-            shares of both sides, and the inverse squares of the sides, third one last (F, 18). All leaves
-            have as many.
+        triangles: rows (F, 18) of the first corner, both sides from it, two vectors, and the inverse squares
+            of the three sides. The product of such a vector and a way from the corner is the share of a side.
+            All leaves have as many triangles.
         features: rows in `normals` of the face, its sides opposite each corner, and its corners (F, 7).
         normals: of the faces, edges and vertices (n, 3).
         distance: of the points, to be written.
