@@ -91,9 +91,9 @@ class Assembly:
     def read_at(self, points: Tensor) -> Tensor:
         """Return the places (P, 3) [m] that are read for points (P, 3) [m]; they differ in narrow slits.
 
-        A single layer of cells between two walls does not tell the slope of the pressure across. The
-        slope is small there, but a box adds the incident field, whose slope is not. So points in such a slit are
-        moved into the layer.
+        A single layer of cells between two walls does not tell the slope of the pressure across. The slope is
+        small there, but a box adds the incident field, whose slope is not. So points in such a slit are moved
+        into the layer.
         """
         grid, cells = self.grid, self.grid.to_cells(points)
         around = self.region.kinked.distance(points.numpy())
