@@ -48,7 +48,7 @@ $(VENV)/.kernels: $(wildcard autdtorch/fdtd/kernels/*.py autdtorch/methods/holog
 	@touch $@
 
 test: $(INSTALLED)-dev $(VENV)/.kernels
-	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadscope --no-loadscope-reorder $(ARGS)
+	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist worksteal $(ARGS)
 
 lint: $(INSTALLED)-dev
 	$(BIN)/ruff check .

@@ -78,20 +78,6 @@ def pytest_xdist_auto_num_workers() -> int:
     return (os.cpu_count() or 1) + 1
 
 
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Have one process run a file, so that what its tests share is made once."""
-    from xdist.scheduler import LoadScopeScheduling
-
-    class ByFile(LoadScopeScheduling):
-        def _split_scope(self, nodeid: str) -> str:
-            if "/test_explore" in nodeid and "/browser/" in nodeid:
-                return "live view"  # which four files share
-            each_page = "/test_commands.py::" in nodeid or "::test_the_cells_of_a_notebook_run[" in nodeid
-            return nodeid if each_page else nodeid.partition("::")[0]
-
-    return ByFile(config, log) if config.getoption("dist") == "loadscope" else None
-
-
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         item.add_marker(item.path.relative_to(TESTS).parts[0])

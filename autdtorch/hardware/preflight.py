@@ -33,11 +33,11 @@ class Preflight:
     """The pressure of each transducer alone, and of silence, or what else a sensor reads.
 
     Attributes:
-        pressure: of each transducer (M,), rms over readings and control points; (0,) where a sensor does not
-            see a transducer alone.
-        silence: reading with the outputs off.
-        threshold: reading that a working transducer exceeds.
-        unit: of the three.
+        pressure: of each transducer (M,) [Pa], or in `unit`, rms over readings and control points; (0,) where
+            a sensor does not see a transducer alone.
+        silence: reading with the outputs off [Pa], or in `unit`.
+        threshold: reading that a working transducer exceeds [Pa], or in `unit`.
+        unit: of the readings.
     """
 
     pressure: torch.Tensor

@@ -20,7 +20,7 @@ SETTLED = 1e-5  # Tolerance of runs
 SAME = 2e-3
 ASIDE = replace(CUBE, center=(12e-3, 12.7e-3, 11.6e-3))  # no transducer is the image of another
 PLANE = torch.cartesian_prod(*(1e-3 * torch.arange(5).double() for _ in range(2)))
-PLANE = torch.cat((torch.full((25, 1), 20e-3, dtype=torch.float64), 10e-3 + PLANE), dim=1)
+PLANE = torch.cat((torch.full((25, 1), 21e-3, dtype=torch.float64), 10e-3 + PLANE), dim=1)
 DRIVE = torch.polar(torch.ones(4, dtype=torch.float64), torch.arange(4, dtype=torch.float64))
 DRIVES = torch.stack([DRIVE**power for power in range(1, 6)])
 BESIDE = torch.tensor([[12e-3, 12e-3, 14.4e-3]], dtype=torch.float64)  # in the box, where the grid is read
