@@ -288,7 +288,7 @@ class BoxSimulation(Simulation):
         single = len(bodies) == 1 and not bodies[0].comes_back_later
         observed = None  # of a short run, nothing
         if not (single and self.plan.is_short):
-            observed = self._observed(sources, strength, judged, transforms)
+            observed = self._observed(sources, strength, drives, judged, transforms)
         begin, count, tolerance = time.perf_counter(), len(drives), self.plan.tolerance
         driving = [box.driving(drives) for box in self.boxes]
         if single:
@@ -309,12 +309,15 @@ class BoxSimulation(Simulation):
         self,
         sources: Sequence[Apertures],
         strength: torch.Tensor,
+        drives: Sequence[tuple[Apertures, torch.Tensor]],
         judged: Judged,
         transforms: Sequence[NearToFar],
     ) -> tuple[Observe, torch.Tensor]:
-        """Return what is observed of R runs, and the norms (Q, R) below which it counts as silence."""
+        """Return what is observed of R runs, and the norms (Q, R) below which it counts as silence.
+
+        `drives` are the sources and strengths of the runs with those of their images.
+        """
         receivers, every, groups = judged
-        drives = [self.imaged(*drive) for drive in zip(sources, strength, strict=True)]
         some = receivers.chosen(slice(None, None, every))
         sizes = [len(transform.cells) for transform in transforms]
         with self._kernels_compiled(self.assemblies[0].dtype):

@@ -131,15 +131,19 @@ class _Window:
 
     def _solved(self, coupling: Array) -> tuple[Array, Array]:
         """Return the fields with the scheme's pressures inside the rim, and the inverse of the stiffness."""
-        flat, whole = coupling.ravel(), np.zeros((len(self.present),) * 2)
-        one, other = self._one, self._other
-        for rows, columns, sign in ((one, other, -1), (other, one, -1), (one, one, 1), (other, other, 1)):
-            np.add.at(whole, (rows, columns), sign * flat)
+        whole = np.zeros((len(self.present),) * 2)
+        add_couplings(whole, self._one, self._other, coupling.ravel())
         matrix = self._matrix + whole[self._free]
         inverse = np.linalg.inv(matrix[:, self._free] + _GROUND * np.eye(len(matrix)))
         solution = self._fields.copy()
         solution[self._free] = -inverse @ (matrix[:, self._fixed] @ self._fields[self._fixed])
         return solution, np.asarray(inverse)
+
+
+def add_couplings(stiffness: Array, one: Index, other: Index, coupling: Array) -> None:
+    """Add couplings (n,) between vertices `one` (n,) and `other` (n,) to a stiffness matrix."""
+    for rows, columns, sign in ((one, other, -1), (other, one, -1), (one, one, 1), (other, other, 1)):
+        np.add.at(stiffness, (rows, columns), sign * coupling)
 
 
 def columns_of(section: Section, place: Sequence[int]) -> Index:

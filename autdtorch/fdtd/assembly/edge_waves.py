@@ -13,7 +13,7 @@ import itertools
 import numpy as np
 from scipy.special import jv
 
-from autdtorch.fdtd.assembly.edge_fit import columns_of, importance
+from autdtorch.fdtd.assembly.edge_fit import add_couplings, columns_of, importance
 from autdtorch.fdtd.assembly.element import stiffness_matrix, without_negative
 from autdtorch.fdtd.assembly.sections import COLUMN_PAIRS, RING, MaterialKey, Section, layered_element
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
@@ -121,8 +121,7 @@ class _Window:
     def _add(self, operator: Array, columns: Index, coupling: Array, mass: Array) -> None:
         """Add an element with a coupling (6,) and masses (4,) to an operator: stiffness less inertia."""
         one, other = columns[COLUMN_PAIRS].T
-        for rows, others, sign in ((one, other, -1), (other, one, -1), (one, one, 1), (other, other, 1)):
-            np.add.at(operator, (rows, others), sign * coupling)
+        add_couplings(operator, one, other, coupling)
         operator[columns, columns] -= self._symbol * mass
 
     def _missed(self, operator: Array) -> tuple[Array, Array]:
