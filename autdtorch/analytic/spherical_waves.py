@@ -90,6 +90,17 @@ def harmonics(degree: int, directions: torch.Tensor) -> torch.Tensor:
     return torch.cat([upper, upper.conj()], dim=-1)[..., table.place] * table.sign
 
 
+@functools.lru_cache(8)
+def sphere_rule(rings: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return nodes (S, 3) on the unit sphere and weights (S,) that integrate waves up to 2 * rings - 1."""
+    z, weight = np.polynomial.legendre.leggauss(rings)
+    angle = math.pi / rings * np.arange(2 * rings)
+    across = np.sqrt(1 - z**2)[:, None]
+    nodes = np.stack(np.broadcast_arrays(across * np.cos(angle), across * np.sin(angle), z[:, None]), axis=-1)
+    weights = np.repeat(weight * math.pi / rings, 2 * rings)
+    return torch.from_numpy(nodes.reshape(-1, 3)), torch.from_numpy(weights)
+
+
 class _Recurrence(NamedTuple):
     """Factors of P_lm / sin^m, and the places of the harmonics of all m among those of m >= 0."""
 

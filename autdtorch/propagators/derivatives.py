@@ -12,11 +12,10 @@ import functools
 import math
 from typing import NamedTuple
 
-import numpy as np
 import torch
 
 from autdtorch.analytic.momentum import linear_momentum
-from autdtorch.analytic.spherical_waves import harmonics, regular_radial
+from autdtorch.analytic.spherical_waves import harmonics, regular_radial, sphere_rule
 from autdtorch.propagators.propagator import Propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX
@@ -65,7 +64,7 @@ def nodes_around(scene: Scene, points: torch.Tensor) -> torch.Tensor:
             index = int(wrong.nonzero()[0])
             accepted = f"must be at least {1e3 * radius:.2f} mm from {name}, as its derivatives are needed"
             raise invalid(f"points[{index}]", tuple(places[index].tolist()), accepted, "m")
-    return points[:, None] + radius * _sphere()[0].to(points.device)
+    return points[:, None] + radius * sphere_rule(_RINGS)[0].to(points.device)
 
 
 def regular_coefficients(pressure: torch.Tensor, wavenumber: complex, degree: int) -> torch.Tensor:
@@ -90,21 +89,10 @@ def field_derivatives(propagator: Propagator, drive: torch.Tensor, nodes: torch.
     return derivatives(pressure, propagator.scene.complex_wavenumber)
 
 
-@functools.lru_cache(1)
-def _sphere() -> tuple[torch.Tensor, torch.Tensor]:
-    """Return nodes (S, 3) on the unit sphere and weights (S,), exact up to the degree 2 * rings - 1."""
-    z, weight = np.polynomial.legendre.leggauss(_RINGS)
-    angle = math.pi / _RINGS * np.arange(2 * _RINGS)
-    across = np.sqrt(1 - z**2)[:, None]
-    nodes = np.stack(np.broadcast_arrays(across * np.cos(angle), across * np.sin(angle), z[:, None]), axis=-1)
-    weights = np.repeat(weight * math.pi / _RINGS, 2 * _RINGS)
-    return torch.from_numpy(nodes.reshape(-1, 3)), torch.from_numpy(weights)
-
-
 @functools.lru_cache(8)
 def _to_waves(wavenumber: complex, degree: int) -> torch.Tensor:
     """Return the map (S, N) from pressures at nodes to coefficients of regular waves."""
-    nodes, weights = _sphere()
+    nodes, weights = sphere_rule(_RINGS)
     size = torch.tensor([[wavenumber * SIZE / wavenumber.real]], **COMPLEX)
     return weights[:, None] * harmonics(degree, nodes).conj() / regular_radial(degree, size)
 

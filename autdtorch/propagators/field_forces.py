@@ -15,7 +15,7 @@ import torch
 from scipy.special import spherical_jn, spherical_yn
 
 from autdtorch.analytic.momentum import linear_momentum
-from autdtorch.analytic.spherical_waves import degrees, harmonics
+from autdtorch.analytic.spherical_waves import degrees, harmonics, sphere_rule
 from autdtorch.propagators.derivatives import field_derivatives, nodes_around
 from autdtorch.propagators.propagator import Propagator
 from autdtorch.propagators.tmatrix.bodies import ObstacleGroup, bodies_of
@@ -89,14 +89,8 @@ def _force_on(propagator: Propagator, drive: torch.Tensor, body: ObstacleGroup) 
 @functools.lru_cache(4)
 def _sphere(degree: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Return nodes (S, 3) on the unit sphere, and the map (S, N) from values there to those of harmonics."""
-    rings = degree + 1
-    z, weight = np.polynomial.legendre.leggauss(rings)
-    angle = math.pi / rings * np.arange(2 * rings)
-    across = np.sqrt(1 - z**2)[:, None]
-    nodes = np.stack(np.broadcast_arrays(across * np.cos(angle), across * np.sin(angle), z[:, None]), axis=-1)
-    places = torch.from_numpy(nodes.reshape(-1, 3))
-    weights = torch.from_numpy(np.repeat(weight * math.pi / rings, 2 * rings))
-    return places, weights[:, None] * harmonics(degree, places).conj()
+    nodes, weights = sphere_rule(degree + 1)
+    return nodes, weights[:, None] * harmonics(degree, nodes).conj()
 
 
 def radiation_stress(

@@ -1,6 +1,6 @@
 """Run time against error of transfer matrices: exact solutions, and the paper's cubes.
 
-Writes accuracy.json, accuracy.png and a block of the documentation. Errors are complex relative L2 errors of
+Writes accuracy.png and a block of the documentation. Errors are complex relative L2 errors of
 the transfer matrix, for the total field and for its scattered part. Run times include the assembly of the
 scene. The paper's domain is cut to array, obstacles and first focus; symmetry makes the other three foci
 equal. Exits with 1 if an error is above its required limit.
@@ -8,7 +8,7 @@ equal. Exits with 1 if an error is above its required limit.
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
@@ -192,11 +192,10 @@ def figure(rows: Sequence[Row]) -> Figure:
 
 
 def write_report(rows: Sequence[Row], page: Page) -> list[str]:
-    """Write the block, accuracy.json and accuracy.png; return the exceeded limits."""
+    """Write the block and accuracy.png; return the exceeded limits."""
     count, failed = exceeded(rows)
     limits = "\n".join(failed) if failed else f"All {count} required limits hold."
     legend = "Total error by spacing; scattered error and run time at 1 mm; observed order."
     page.write("![Error over run time](accuracy.png)", f"{legend} {limits}", error_table(rows))
-    page.write_rows("accuracy.json", map(asdict, rows))
     page.save("accuracy.png", figure(rows))
     return failed

@@ -15,6 +15,7 @@ from shared.scenes import relative_error
 from shared.timing import timed
 
 import autdtorch as at
+from autdtorch.analytic.spherical_waves import sphere_rule
 from autdtorch.propagators import Propagator
 from autdtorch.utils.process import one_library_thread
 
@@ -131,14 +132,9 @@ def stress_around(
     propagator: Propagator, drive: torch.Tensor, center: tuple[float, ...], radius: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return force and torque about the centre by the stress on a sphere."""
-    rings = 18
-    heights, weights = np.polynomial.legendre.leggauss(rings)
-    turns, across = math.pi * np.arange(2 * rings) / rings, np.sqrt(1 - heights**2)[:, None]
-    parts = np.broadcast_arrays(across * np.cos(turns), across * np.sin(turns), heights[:, None])
-    normals = torch.from_numpy(np.stack(parts, axis=-1).reshape(-1, 3))
-    areas = torch.from_numpy(np.repeat(weights, 2 * rings)) * math.pi / rings * radius**2
+    normals, angles = sphere_rule(18)
     points = torch.tensor(center, dtype=torch.float64) + radius * normals
-    force = areas[:, None] * at.radiation_stress(propagator, drive, points, normals)
+    force = radius**2 * angles[:, None] * at.radiation_stress(propagator, drive, points, normals)
     return force.sum(dim=0), radius * torch.linalg.cross(normals, force).sum(dim=0)
 
 

@@ -1,6 +1,6 @@
 """Run time against error of Deepwave, Devito, j-Wave and k-wave-python beside ours.
 
-Makes a virtual environment for each peer in `--venvs`, then writes peers.json, peers.png and a block of the
+Makes a virtual environment for each peer in `--venvs`, then writes peers.png and a block of the
 documentation. Scenes, receivers and errors are those of `benchmark.py accuracy`: the transfer matrix of one
 focus, simulated from the focus by reciprocity. `--coarse` is a trial.
 """
@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
@@ -256,7 +256,7 @@ def measure(settings: Sequence[Setting], venvs: Path) -> Iterator[Point | Refusa
 
 
 def write_report(points: Sequence[Point], refusals: Sequence[Refusal], page: Page) -> None:
-    """Write the block, peers.json and peers.png."""
+    """Write the block and peers.png."""
     steady = list(settled(points))
     parts = [
         "![Error over run time](peers.png)",
@@ -268,7 +268,6 @@ def write_report(points: Sequence[Point], refusals: Sequence[Refusal], page: Pag
         lines = [[r.case, NAMES[r.program], r.setting, r.reason] for r in refusals]
         parts.append(table(["scene", "program", "setting", "did not run"], lines))
     page.write(*parts)
-    page.write_rows("peers.json", map(asdict, (*points, *refusals)))
     page.save("peers.png", figure(points))
 
 

@@ -9,9 +9,9 @@ import functools
 import itertools
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import torch
-from benchmarks.bo import FOCI
 from benchmarks.pictures import SHIFT, Bench
 from shared.document import printed, quartiles, table
 from shared.scenes import autd3_array, paper_scene, weakest, with_array
@@ -21,6 +21,7 @@ import autdtorch as at
 from autdtorch.objectives.perturbations import random_rms
 
 BUDGETS = (16, 32, 64)
+FOCI: dict[str, Any] = {"model": "foci", "kernel": "phasor", "noise": "inferred"}
 best_drive = functools.partial(at.gradient_ascent, steps=1000)
 
 OPTIONS = {

@@ -1,31 +1,21 @@
 """Registration of a camera by marks and by foci."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
+from shared.heated_screen import pinhole
 
 from autdtorch.hardware import CallableFrames, ThermalCamera
 from autdtorch.hardware.camera.registration import Registration, hot_spot
 from autdtorch.scene.geometry import Plane
 
 PLANE = Plane((0.01, 0.0, 0.15), (0.0, 0.0, 1.0), (0.1, 0.08))
-
-
-def camera(plane: Plane = PLANE, tilt: float = 0.0, pitch: float = 0.8e-3) -> Registration:
-    """Return the registration of a pinhole camera, 1000 pixels of focal length, tilted about its row axis."""
-    cos, sin, turn = math.cos(tilt), math.sin(tilt), 0.1
-    tilted = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
-    turned = np.array([[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]])
-    lens = np.array([[1000.0, 0, 79.8], [0, 1000.0, 74.3], [0, 0, 1]])
-    pose = np.column_stack([(tilted @ turned)[:, :2], [0, 0, 1000.0 * pitch]])
-    return Registration(plane, lens @ pose)
+IMAGE = (150, 160)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.6])
 def test_four_corners_register_a_camera(tilt: float) -> None:
-    truth = camera(tilt=tilt)
+    truth = pinhole(PLANE, IMAGE, tilt)
     half = np.array(PLANE.size) / 2
     corners = truth.to_pixels(half * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]))
     registration = Registration.of(PLANE, corners, PLANE.corners)
@@ -36,7 +26,7 @@ def test_four_corners_register_a_camera(tilt: float) -> None:
 
 
 def test_the_residual_tells_the_error_of_the_marks() -> None:
-    generator, truth = np.random.default_rng(1), camera(tilt=0.5)
+    generator, truth = np.random.default_rng(1), pinhole(PLANE, IMAGE, 0.5)
     places = np.stack(np.meshgrid([-0.04, -0.01, 0.02, 0.05], [-0.03, 0.0, 0.03]), -1).reshape(-1, 2) * 0.9
     marks = torch.tensor(np.column_stack([places + np.array(PLANE.center[:2]), np.full(12, 0.15)]))
     pixels = truth.to_pixels(places) + generator.normal(0, 0.1, (12, 2))
@@ -75,7 +65,7 @@ def test_pixels_in_an_order_that_no_camera_sees_are_refused() -> None:
 
 
 def test_an_image_is_sampled_on_the_plane() -> None:
-    truth = camera(tilt=0.4)
+    truth = pinhole(PLANE, IMAGE, 0.4)
     rows, columns = np.mgrid[:150, :160]
     places = truth.to_plane(np.stack([columns, rows], -1).astype(float))
     image = 20 + 100 * places[..., 0] - 50 * places[..., 1]

@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from benchmarks.force import series
 from scipy.special import sph_harm_y, spherical_jn, spherical_yn
 from small_scenes import assert_slopes, relative_error
 
 import autdtorch as at
+from autdtorch.analytic.spherical_waves import sphere_rule
 from autdtorch.propagators.tmatrix.scattering import scattered_waves, waves_at
 from autdtorch.utils.images import NO_MIRRORS
 
@@ -43,15 +45,6 @@ def with_slopes(
     return values.detach(), torch.complex(*parts)
 
 
-def around(rings: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Directions (n, 3), and solid angles (n,) with which products of waves up to the degree are exact."""
-    heights, weights = np.polynomial.legendre.leggauss(rings)
-    turns, across = math.pi * np.arange(2 * rings) / rings, np.sqrt(1 - heights**2)[:, None]
-    parts = [across * np.cos(turns), across * np.sin(turns), heights[:, None] + 0 * turns]
-    directions = torch.from_numpy(np.stack(parts, axis=-1).reshape(-1, 3))
-    return directions, torch.from_numpy(np.repeat(weights, 2 * rings)) * math.pi / rings
-
-
 def by_surface(
     bodies: at.TMatrix | at.TMatrixCluster,
     drive: torch.Tensor,
@@ -60,7 +53,7 @@ def by_surface(
     array: at.TransducerArray = ARRAY,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Force and torque about the centre, from the field and its gradient on a sphere around it."""
-    normals, areas = around(20)
+    normals, areas = sphere_rule(20)
     pressure, slopes = with_slopes(
         lambda points: bodies.transfer_matrix(array, points) @ drive, center + radius * normals
     )
@@ -95,11 +88,7 @@ def test_the_force_of_plane_and_standing_waves_is_the_series(material):
         radius = size / WAVENUMBER
         body = sphere((0.0, 0.0, 0.0), radius, material)
         coefficient = body.matrix.diagonal().numpy()[[n * n for n in range(body.degree + 1)]]
-        real, imag, n = coefficient.real, coefficient.imag, np.arange(body.degree)
-        products = real[:-1] * real[1:] + imag[:-1] * imag[1:]
-        plane = -4 / size**2 * ((n + 1) * (real[:-1] + real[1:] + 2 * products)).sum()
-        pairs = imag[:-1] * (1 + 2 * real[1:]) - imag[1:] * (1 + 2 * real[:-1])
-        standing = 2 / size**2 * ((n + 1) * (-1) ** (n + 1) * pairs).sum()
+        plane, standing = series(coefficient, size)
         scale, setting = math.pi * radius**2 * energy_density(), {"medium": AIR}
         # so far that the fall of 1 / r, whose force is of a lower power of ka, does not count
         one = at.radiation_force(body, torch.ones(1) + 0j, array=far_away(ALONG_Z, distance=1e10), **setting)
@@ -122,7 +111,7 @@ def test_the_force_of_a_focused_wave_is_the_series(material, size):
     body, setting = sphere(center, radius, material), {"array": array, "medium": AIR}
     degree = np.arange(math.ceil(size) + 12)
     scattered = by_mie(degree, size, material)
-    normals, areas = around(40)
+    normals, areas = sphere_rule(40)
     radii = np.array([1.0, 1.25]) * max(radius, 2 / WAVENUMBER)
     inner = spherical_jn(degree[:, None], WAVENUMBER * radii)
     expected = []
@@ -255,7 +244,7 @@ def test_all_momentum_is_that_of_the_far_field():
         _, slope = with_slopes(regular, place[None])
         omega = 2 * math.pi * FREQUENCY
         on_sources += 2 * math.pi / (AIR.density * omega**2) * (strength[index] * slope[0].conj()).real
-    normals, areas = around(40)
+    normals, areas = sphere_rule(40)
     field = far * cluster.transfer_matrix(ARRAY, far * normals) @ DRIVE
     flux = (areas * field.abs().square()) @ normals * energy_density()
     assert relative_error(on_bodies + on_sources, -flux) < 1e-6
@@ -329,7 +318,7 @@ def test_the_stress_on_a_surface_around_a_body_is_the_force_on_it():
         at.make_propagator(scene, "tmatrix", tolerance=1e-7),
         torch.stack([DRIVE, -1j * DRIVE]),
     )
-    normals, areas = around(12)
+    normals, areas = sphere_rule(12)
     points = torch.tensor(body.center).double() + 6.2e-3 * normals
     stress = at.radiation_stress(propagator, drives, points, 2 * normals)
     force = at.radiation_force(propagator, DRIVE)
