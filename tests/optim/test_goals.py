@@ -1,6 +1,5 @@
-"""Goals: scores, slopes and bounds; one that is new. Functions of methods: stub, old keywords, settings."""
+"""Goals: scores, slopes and bounds; one that is new. Functions of methods: defaults, old keywords."""
 
-import ast
 import inspect
 import math
 from dataclasses import dataclass
@@ -15,7 +14,6 @@ from hypothesis import strategies as st
 
 import autdtorch as at
 from autdtorch.io.goal_section import GOALS, goal_section, load_goal
-from autdtorch.methods import functions
 from autdtorch.methods.catalogue import METHODS, VARIANTS
 from autdtorch.methods.gradient import climb, random_drives
 from autdtorch.objectives.goals import derivative, goal_of
@@ -235,25 +233,20 @@ def test_bad_goals_are_named(make, message):
         make()
 
 
-STUB = Path(functions.__file__).with_suffix(".pyi")
 CONFIGS = Path(__file__).parents[2] / "configs/method"
-FUNCTIONS = {
-    node.name: node for node in ast.parse(STUB.read_text()).body if isinstance(node, ast.FunctionDef)
-}
+FUNCTIONS = sorted(METHODS.keys() - {"holography"} | {"bo_foci"})
 
 
-def test_the_stub_has_the_parameters_of_the_functions():
-    assert set(FUNCTIONS) == set(METHODS) - {"holography"} | {"bo_foci"}
-    for name, node in FUNCTIONS.items():
-        parameters = inspect.signature(getattr(functions, name)).parameters.values()
-        by_position = [one.name for one in parameters if one.kind is inspect.Parameter.POSITIONAL_OR_KEYWORD]
-        assert [one.arg for one in node.args.args] == by_position
-        listed = {one.arg: ast.unparse(one.annotation) for one in node.args.args + node.args.kwonlyargs}
-        assert listed == {one.name: one.annotation for one in parameters}
-        defaults = [*node.args.defaults, *(one for one in node.args.kw_defaults if one)]
-        shown = [ast.literal_eval(one) for one in defaults]
-        expected = [... if one.name == "goal" else one.default for one in parameters]
-        assert shown == expected[len(expected) - len(shown) :]
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_function_has_the_settings_of_its_method_and_parameters_of_run_with_their_defaults(name):
+    method = VARIANTS[name] if name in VARIANTS else METHODS[name]()
+    parameters = dict(inspect.signature(getattr(at, name)).parameters)
+    assert next(iter(parameters)) == "objective"
+    of_run = inspect.signature(at.run).parameters
+    for each in [*parameters.values()][1:]:
+        default = of_run[each.name].default if each.name in of_run else getattr(method, each.name)
+        assert each.default == default
+    assert parameters.keys() >= vars(method).keys() | ({"trials", "seed"} if method.random else set())
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
