@@ -8,10 +8,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
 from autdtorch import hardware as hw
+from autdtorch.hardware import safety
 from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.propagators import make_propagator
 from autdtorch.scene.arrays import TransducerArray
@@ -57,6 +59,24 @@ class Trial:
     ) -> hw.HardwareObjective:
         limited = hw.LimitedLink(link, hw.Limits(1.0)) if isinstance(link, hw.Link) else link
         return hw.HardwareObjective(self.scene, limited, sensor, self.log, settings)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """The clock of limits: `now` [s] goes on in sleeps alone, and timers of many seconds do not go off."""
+    clock = SimpleNamespace(now=0.0, monotonic=lambda: clock.now)
+    clock.sleep = lambda seconds: setattr(clock, "now", clock.now + seconds)
+    monkeypatch.setattr(safety, "time", clock)
+    return clock
+
+
+@pytest.fixture
+def kit() -> ModuleType:
+    """The kit of AUTD3."""
+    reason = "the kit of AUTD3: install autdtorch[autd3]"
+    for part in ("autd3_pattern", "autd3_modulation"):
+        pytest.importorskip(part, reason=reason)
+    return pytest.importorskip("autd3", reason=reason)
 
 
 @pytest.fixture

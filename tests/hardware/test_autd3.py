@@ -64,12 +64,8 @@ class Mute:
         await asyncio.Event().wait()
 
 
+@pytest.mark.usefixtures("kit")
 class TestWithTheKit:
-    @pytest.fixture(autouse=True)
-    def kit(self):
-        pytest.importorskip("autd3_pattern", reason="the kit of AUTD3: install autdtorch[autd3]")
-        return pytest.importorskip("autd3", reason="the kit of AUTD3: install autdtorch[autd3]")
-
     def test_boards_on_the_network_take_the_drives_and_are_off_in_the_end(self, kit, monkeypatch):
         from autd3.commands import Clear, Pattern
 

@@ -17,16 +17,22 @@ from autdtorch.hardware.devices import autd3
 from autdtorch.scene.sequence import Sequence, modulated
 
 
+def deviation(held, drives):
+    """The largest difference of what held levels emit, frame by frame, from drives (T, N)."""
+    levels = held.frames.reshape(len(held.frames), 2, -1).astype(float)
+    patterns = levels[:, 1] / 255 * np.exp(2j * math.pi * levels[:, 0] / 256)
+    number = np.arange(len(drives))
+    factors = held.modulation[number % len(held.modulation), None] / 255
+    return np.abs(patterns[number % len(patterns)] * factors - drives.numpy()).max()
+
+
+LEVEL = math.pi / 256 + 1 / 255  # half a level of phase, and of both amplitudes
+
+
 @given(st.lists(st.sampled_from([0.0, 1e-12, 0.3, 1.0, -1.0, 1j]), min_size=1, max_size=6), st.integers(0, 9))
 def test_what_is_held_emits_the_frames(factors, seed):
     drives = torch.tensor(factors, dtype=torch.complex128)[:, None] * random_frames(1, 249, seed)
-    held = hw.AUTD3.held(drives, 4000.0, True)
-    levels = held.frames.reshape(len(held.frames), 2, 249).astype(float)
-    patterns = levels[:, 1] / 255 * np.exp(2j * math.pi * levels[:, 0] / 256)
-    number = np.arange(len(factors))
-    emitted = patterns[number % len(patterns)] * (held.modulation[number % len(held.modulation), None] / 255)
-    # Half a level of phase, and of both amplitudes.
-    assert np.abs(emitted - drives.numpy()).max() <= math.pi / 256 + 1 / 255
+    assert deviation(hw.AUTD3.held(drives, 4000.0, True), drives) <= LEVEL
 
 
 @given(st.integers(3, 40), st.integers(1200, 3000), st.integers(0, 9))
@@ -36,14 +42,9 @@ def test_a_loop_of_moving_frames_times_factors_is_held(laps, rest, seed):
     number = torch.arange(count)
     factors = (0.6 + 0.4 * torch.cos(2 * math.pi * number.double() / count))[:, None]
     drives = factors * lap[number % len(lap)]
-    device = replace(hw.AUTD3, board=16)
-    held = device.held(drives, 4000.0, True)
+    held = replace(hw.AUTD3, board=16).held(drives, 4000.0, True)
     assert len(held.frames) <= max(len(lap), 2)
-    levels = held.frames.reshape(len(held.frames), 2, 16).astype(float)
-    patterns = levels[:, 1] / 255 * np.exp(2j * math.pi * levels[:, 0] / 256)
-    emitted = patterns[number % len(patterns)] * (held.modulation[number % len(held.modulation), None] / 255)
-    # Half a level of phase, and of both amplitudes.
-    assert np.abs(emitted - drives.numpy()).max() <= math.pi / 256 + 1 / 255
+    assert deviation(held, drives) <= LEVEL
 
 
 def test_a_drive_and_its_opposite_are_two_patterns():
@@ -59,13 +60,9 @@ def test_a_modulation_longer_than_the_memory_is_refused():
         hw.AUTD3.held(drives, 4000.0, True)
 
 
+@pytest.mark.usefixtures("kit")
 class TestWithTheKit:
     """Against its emulators of the network and of the boards."""
-
-    @pytest.fixture(autouse=True)
-    def kit(self):
-        pytest.importorskip("autd3_modulation", reason="the kit of AUTD3: install autdtorch[autd3]")
-        return pytest.importorskip("autd3", reason="the kit of AUTD3: install autdtorch[autd3]")
 
     def test_limits_are_those_of_the_kit(self, kit):
         assert kit.params.EMISSION_MAX_INDICES == autd3._MOST_PATTERNS

@@ -7,7 +7,6 @@ import torch
 
 import autdtorch as at
 from autdtorch import hardware as hw
-from autdtorch.hardware import safety
 
 FULL = torch.ones(16, dtype=torch.complex128)
 
@@ -27,15 +26,6 @@ class Heat:
         assert not self._bench.drive().any()
         self.pulses += 1
         return pressure
-
-
-@pytest.fixture
-def clock(monkeypatch):
-    """The clock of limits, which goes on in sleeps alone."""
-    clock = type("Clock", (), {"now": 0.0, "monotonic": lambda: clock.now})
-    clock.sleep = lambda seconds: setattr(clock, "now", clock.now + seconds)
-    monkeypatch.setattr(safety, "time", clock)
-    return clock
 
 
 def test_a_pulse_is_read_for_each_evaluation_as_a_steady_sound_is(trial):

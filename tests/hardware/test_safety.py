@@ -7,7 +7,6 @@ import sys
 import threading
 import time
 import weakref
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,7 +15,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autdtorch import hardware as hw
-from autdtorch.hardware import safety
 from autdtorch.hardware.sensors.sensor import checked_reading
 from autdtorch.methods.run import observed
 
@@ -76,15 +74,6 @@ def test_no_wait_is_longer_than_a_trial(value):
         elif not value <= DAY:
             with pytest.raises(ValueError, match=name.strip()):
                 make()
-
-
-@pytest.fixture
-def clock(monkeypatch):
-    """The clock of limits: `now` [s] goes on in sleeps alone, and timers of many seconds do not go off."""
-    clock = SimpleNamespace(now=0.0, monotonic=lambda: clock.now)
-    clock.sleep = lambda seconds: setattr(clock, "now", clock.now + seconds)
-    monkeypatch.setattr(safety, "time", clock)
-    return clock
 
 
 def test_the_outputs_rest_as_the_duty_cycle_asks(trial, clock):

@@ -6,6 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,10 +15,12 @@ import torch
 from faulty_bus import FAULTS, FaultyBus
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from public_values import board_file
 from small_scenes import random_frames
 
 from autdtorch import hardware as hw
 from autdtorch.hardware import streaming
+from autdtorch.hardware.devices.openmpd import OpenMPDBoard
 from autdtorch.scene.sequence import Sequence
 
 COUNT = 16  # transducers of the bench
@@ -153,8 +156,8 @@ def test_every_frame_is_sent_in_order_and_the_outputs_are_off_in_the_end(trial, 
 
 
 def test_boards_of_openmpd_share_every_transfer(tmp_path):
-    boards = [_board(tmp_path, name) for name in ("left", "right")]
-    device = hw.openmpd_boards(boards)
+    board = OpenMPDBoard.load(board_file(tmp_path))
+    device = hw.openmpd_boards([replace(board, name=name) for name in ("left", "right")])
     bench = hw.EmulatedBench(device, torch.ones(1, 512).cdouble())
     sequence = Sequence(random_frames(40, 512), 9000.0, loop=False)
     with hw.open_link(device, backend=bench.bus) as link:
@@ -165,15 +168,6 @@ def test_boards_of_openmpd_share_every_transfer(tmp_path):
         frames = device.frames(sequence.drives).reshape(40, 2, 512)
     for number, data in enumerate(received):
         assert bytes(data[: 40 * 512]) == frames[:, number].tobytes()
-
-
-def _board(folder, name):
-    import autdtorch as at
-
-    lines = [name, "256", "128", "(0,0,0)" * 256, ",".join(map(str, range(256))), ",".join("0" * 256)]
-    path = folder / f"{name}.pat"
-    path.write_text("\n".join([*lines, ",".join("1" * 256)]), encoding="utf-8")
-    return at.OpenMPDBoard.load(path)
 
 
 @pytest.mark.parametrize("how", ["off", "another drive", "another sequence", "close"])
@@ -327,57 +321,33 @@ def test_the_timer_of_a_limited_link_ends_a_loop_and_its_off_is_no_error(trial):
 
 CLOSED, LIMITED = "closed", "limited"
 SMALL = random_frames(4, COUNT)
+SHORT, OTHERS = Sequence(SMALL, 10.0), Sequence(SMALL[:, :10], 10.0)
 MISTAKES = [
-    (hw.OPENMPD, lambda: SMALL, {}, "sequence: .*must be a Sequence"),
-    (hw.OPENMPD, lambda: None, {}, "sequence: None; must be a Sequence"),
-    (hw.OPENMPD, lambda: Sequence(SMALL[:, :10], 10.0), {}, "sequence: 10 transducers; must be 16"),
-    (hw.OPENMPD, lambda: Sequence(SMALL, 10.0), {"seconds": 0}, "seconds: 0 s; must be finite and > 0"),
-    (hw.OPENMPD, lambda: Sequence(SMALL, 10.0), {"seconds": -1.0}, "seconds: -1.0 s; must be finite and > 0"),
-    (hw.OPENMPD, lambda: Sequence(SMALL, 10.0), {"seconds": math.nan}, "seconds: nan s"),
-    (
-        hw.OPENMPD,
-        lambda: Sequence(SMALL, 0.1),
-        {"seconds": 1.0},
-        "seconds: 1.0 s; must be at least 10, one frame",
-    ),
-    (hw.OPENMPD, lambda: Sequence(SMALL, 10.0), {"seconds": "5"}, "seconds: '5'"),
-    (
-        hw.OPENMPD,
-        lambda: Sequence(SMALL, 10.0, loop=False),
-        {"seconds": 0.5},
-        "seconds: 0.5 s; must be at most 0.4",
-    ),
-    (hw.OPENMPD, lambda: Sequence(SMALL, 12e3), {}, "rate: 12000.0 Hz; must be at most 1e.04 for OpenMPD"),
-    (
-        hw.SONICSURFACE,
-        lambda: Sequence(SMALL, 100.0),
-        {},
-        "rate: 100.0 Hz; must be at most 89.3 for SonicSurface",
-    ),
-    (hw.ULTRAINO, lambda: Sequence(SMALL, 60.0), {}, "rate: 60.0 Hz; must be at most 54.86 for Ultraino"),
-    (
-        hw.ultraino_boards(2),
-        lambda: Sequence(SMALL, 50.0),
-        {},
-        "rate: 50.0 Hz; must be at most 28.1 for Ultraino",
-    ),
-    (hw.AUTD3, lambda: Sequence(SMALL, 50e3), {}, "rate: 50000.0 Hz; must be at most 4e.04 for AUTD3"),
-    (hw.AUTD3, lambda: Sequence(SMALL, 3e3), {}, "rate: 3000.0 Hz; .* such as 2857.143 or 3076.923"),
-    (hw.AUTD3, lambda: Sequence(SMALL, 0.5), {}, "rate: 0.5 Hz; must be at least 0.61 for AUTD3"),
-    (
-        hw.AUTD3,
-        lambda: Sequence(random_frames(1025, COUNT), 1e3),
-        {},
-        "sequence: 1025 frames; must be at most 1024",
-    ),
-    (LIMITED, lambda: SMALL, {}, "sequence: .*must be a Sequence"),
-    (LIMITED, lambda: Sequence(SMALL[:, :3], 10.0), {}, "sequence: 3 transducers; must be 16"),
-    (CLOSED, lambda: Sequence(SMALL, 10.0), {}, "OpenMPD is closed; open it again"),
+    (hw.OPENMPD, SMALL, {}, "sequence: .*must be a Sequence"),
+    (hw.OPENMPD, None, {}, "sequence: None; must be a Sequence"),
+    (hw.OPENMPD, OTHERS, {}, "sequence: 10 transducers; must be 16"),
+    (hw.OPENMPD, SHORT, {"seconds": 0}, "seconds: 0 s; must be finite and > 0"),
+    (hw.OPENMPD, SHORT, {"seconds": -1.0}, "seconds: -1.0 s; must be finite and > 0"),
+    (hw.OPENMPD, SHORT, {"seconds": math.nan}, "seconds: nan s"),
+    (hw.OPENMPD, SHORT, {"seconds": "5"}, "seconds: '5'"),
+    (hw.OPENMPD, Sequence(SMALL, 0.1), {"seconds": 1.0}, "seconds: 1.0 s; must be at least 10, one frame"),
+    (hw.OPENMPD, Sequence(SMALL, 10.0, False), {"seconds": 0.5}, "seconds: 0.5 s; must be at most 0.4"),
+    (hw.OPENMPD, Sequence(SMALL, 12e3), {}, "rate: 12000.0 Hz; must be at most 1e.04 for OpenMPD"),
+    (hw.SONICSURFACE, Sequence(SMALL, 100.0), {}, "rate: 100.0 Hz; must be at most 89.3 for SonicSurface"),
+    (hw.ULTRAINO, Sequence(SMALL, 60.0), {}, "rate: 60.0 Hz; must be at most 54.86 for Ultraino"),
+    (hw.ultraino_boards(2), Sequence(SMALL, 50.0), {}, "rate: 50.0 Hz; must be at most 28.1 for Ultraino"),
+    (hw.AUTD3, Sequence(SMALL, 50e3), {}, "rate: 50000.0 Hz; must be at most 4e.04 for AUTD3"),
+    (hw.AUTD3, Sequence(SMALL, 3e3), {}, "rate: 3000.0 Hz; .* such as 2857.143 or 3076.923"),
+    (hw.AUTD3, Sequence(SMALL, 0.5), {}, "rate: 0.5 Hz; must be at least 0.61 for AUTD3"),
+    (hw.AUTD3, Sequence(random_frames(1025, COUNT), 1e3), {}, "sequence: 1025 frames; must be at most 1024"),
+    (LIMITED, SMALL, {}, "sequence: .*must be a Sequence"),
+    (LIMITED, OTHERS, {}, "sequence: 10 transducers; must be 16"),
+    (CLOSED, SHORT, {}, "OpenMPD is closed; open it again"),
 ]
 
 
-@pytest.mark.parametrize(("device", "make", "arguments", "message"), MISTAKES)
-def test_a_mistake_is_refused_in_one_line_and_nothing_plays(trial, device, make, arguments, message):
+@pytest.mark.parametrize(("device", "sequence", "arguments", "message"), MISTAKES)
+def test_a_mistake_is_refused_in_one_line_and_nothing_plays(trial, device, sequence, arguments, message):
     kind = hw.OPENMPD if isinstance(device, str) else device
     bench = hw.EmulatedBench(kind, trial.simulated.transfer_matrix, range(COUNT))
     port = kind.emulated_port(bench) if kind.adapters else bench.port()
@@ -387,7 +357,7 @@ def test_a_mistake_is_refused_in_one_line_and_nothing_plays(trial, device, make,
         player = hw.LimitedLink(link, hw.Limits(1.0)) if device == LIMITED else link
         drives = played(bench)
         with pytest.raises((ValueError, hw.LinkError), match=message) as raised:
-            player.play_sequence(make(), **arguments)
+            player.play_sequence(sequence, **arguments)
         assert "\n" not in str(raised.value)
         assert not any(drive.any() for drive in drives)
 
