@@ -338,7 +338,6 @@ class Link(contextlib.AbstractContextManager["Link"]):
         self._sleep(self.device.wire_time(frame))
 
     def __exit__(self, *_: object) -> None:
-        """Switch all outputs off and release the device."""
         self.close()
 
 

@@ -150,11 +150,8 @@ def _above_noise(power: float, numbers: int) -> float:
 
 def _silent(sensor: AnySensor, points: int) -> Callable[[], torch.Tensor]:
     """Return a function that reads (P,) and leaves the outputs off."""
-    silent = Pulse(sensor, _nothing, _nothing) if isinstance(sensor, PulsedSensor) else sensor
+    silent = Pulse(sensor, lambda: None, lambda: None) if isinstance(sensor, PulsedSensor) else sensor
     return partial(checked_reading, silent, points)
-
-
-def _nothing() -> None: ...
 
 
 def _power(read: Callable[[], torch.Tensor], readings: int) -> float:

@@ -140,7 +140,6 @@ class Limits:
     duty_cycle: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
         integer_at_least("evaluations", self.evaluations, 1)
         number_between("amplitude", positive("amplitude", self.amplitude), 0.0, 1.0)
         for name in ("seconds", "seconds_in_a_row"):

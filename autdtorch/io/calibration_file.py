@@ -42,7 +42,7 @@ _OF_READINGS = ("drives", "pressure", "points", "phase", "deviation")
 _OF_PRIOR = ("rows", "spread", "widths", "changes")
 _OF_POSTERIOR = ("factors", "entries", "variance")
 _OF_MAGNITUDES = ("value", "limit", "phase", "deviation")
-_OF_PREDICTIONS = ("predicted", "simulated")
+_OF_PREDICTIONS, _OF_ERRORS = ("predicted", "simulated"), ("error", "before", "coverage", "readings")
 _NUMBERS = ("gain", "phase", "rest")  # of a prior
 
 
@@ -89,7 +89,7 @@ def save_calibration(path: str | os.PathLike[str], calibration: Calibration) -> 
         "names": simulation.changes.names,
         "unit": fit.unit,
         "converged": fit.converged,
-        "held_back": None if held is None else {n: getattr(held, n) for n in _numbers_of_held_back()},
+        "held_back": None if held is None else {name: getattr(held, name) for name in _OF_ERRORS},
         "doubts": calibration.doubts,
         "digest": _digest(arrays),
     }
@@ -117,9 +117,12 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
         scene = _scene_of(files) if files else None
         propagator = None if scene is None else make_propagator(scene, **header["propagator"])
-        simulation = CalibrationStart(
-            propagator, _changes(propagator, header, tensors), tensors["widths"], tensors.get("points")
-        )
+        points, names = tensors.get("points"), tuple(header["names"])
+        if "steps" in tensors or propagator is None:
+            changes: Changes = LinearChanges(tensors["simulated"], tensors["steps"], names)
+        else:
+            changes = SceneChanges(propagator, names, points)
+        simulation = CalibrationStart(propagator, changes, tensors["widths"], points)
         readings = Readings(**_group("readings", tensors))
         prior = Prior(variants=header["variants"] or tensors.get("variants"), **header["prior"])
         matrix_prior = MatrixPrior(**_group("prior", tensors))
@@ -147,10 +150,6 @@ def _group(group: str, tensors: Mapping[str, torch.Tensor]) -> dict[str, Any]:
     return {name.removeprefix(start): tensor for name, tensor in tensors.items() if name.startswith(start)}
 
 
-def _numbers_of_held_back() -> tuple[str, ...]:
-    return tuple(name for name in HeldBack._fields if name not in _OF_PREDICTIONS)
-
-
 def _settings_of(propagator: Propagator | None) -> dict[str, Any] | None:
     """Return the arguments of `make_propagator`, without device and kernel; None for a matrix alone."""
     if propagator is None:
@@ -162,14 +161,6 @@ def _settings_of(propagator: Propagator | None) -> dict[str, Any] | None:
         raise invalid("calibration.simulation.propagator", type(propagator).__name__, accepted)
     plan = propagator.plan
     return {name: getattr(plan, name) for name in _SETTINGS} | {"dtype": str(plan.dtype).partition(".")[2]}
-
-
-def _changes(
-    propagator: Propagator | None, header: Mapping[str, Any], tensors: Mapping[str, torch.Tensor]
-) -> Changes:
-    if "steps" in tensors or propagator is None:
-        return LinearChanges(tensors["simulated"], tensors["steps"], tuple(header["names"]))
-    return SceneChanges(propagator, header["names"], tensors.get("points"))
 
 
 def _checked_header(arrays: dict[str, AnyArray]) -> dict[str, Any]:

@@ -168,11 +168,8 @@ def _titled(place: str, header: list[str] | None, named: Named) -> Iterator[Read
                 raise ValueError(f"columns: {titles[min(twice)]!r} in {place} twice; {accepted}")
             taken |= {*matching}
             with within(place):
-                yield from _by_number([_titled_column(index, titles[index], what) for index in matching])
-
-
-def _titled_column(index: int, title: str, what: str) -> ReadingColumn:
-    return _column(index, title, what) or ReadingColumn(index, title, what)
+                named_columns = (_column(index, titles[index], what) for index in matching)
+                yield from _by_number([column for column in named_columns if column is not None])
 
 
 def _by_number(columns: list[ReadingColumn]) -> list[ReadingColumn]:

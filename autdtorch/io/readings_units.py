@@ -53,7 +53,6 @@ class Unit(NamedTuple):
     kind: str | None = None
 
     def __str__(self) -> str:
-        """Return the text that states it."""
         parts = self[::-1] if self.kind == "arg" and self.unit in ("rad", "deg") else self
         return " ".join(filter(None, parts))
 

@@ -92,17 +92,12 @@ def whole(default: int | None, least: int) -> Any:
 
 def choice(default: str, *others: str) -> Any:
     """Return the field of a setting that is one of these texts, the default first."""
-    return setting(default, partial(_one_of, accepted=(default, *others)))
+    return setting(default, partial(require_one_of, accepted=(default, *others)))
 
 
 def setting(default: object, check: Callable[[str, Any], object]) -> Any:
     """Return the field of a setting that a function of its name and value checks, and may convert."""
     return field(default=default, metadata={"check": check})
-
-
-def _one_of(name: str, value: object, accepted: Sequence[str]) -> object:
-    require_one_of(name, value, accepted)
-    return value
 
 
 @dataclass(frozen=True)

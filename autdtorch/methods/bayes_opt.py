@@ -72,8 +72,7 @@ def _defaults_of_processes() -> Iterator[None]:
 
 def _checked_noise(name: str, value: object) -> object:
     if isinstance(value, str):
-        require_one_of(name, value, ("inferred",))
-        return value
+        return require_one_of(name, value, ("inferred",))
     return number_between(name, value, 1e-6, 1)
 
 

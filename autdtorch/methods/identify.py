@@ -151,10 +151,12 @@ class Identify(Method):
             last = problem.quantise(best)[:, None]
             return Step(last, {**search, "fitted": _magnitudes(fits, torch.cat([drives, last], dim=1))})
         count = min(left, max(1, drives.shape[1] // _GROWTH))
-        pairs = zip(trials, best, strict=True)
-        chosen = torch.stack([_sampled(problem.goal, *trial, start, count) for trial, start in pairs])
+        chosen = []  # the best drives of samples of the matrix, near the best of the fitted one
+        for (fit, played, draws), start in zip(trials, best, strict=True):
+            samples = fit.posterior.samples(played, fit.read, draws, count)
+            chosen.append(climbed(problem.goal, samples, start.expand(count, -1), _SAMPLE_STEPS))
         search |= {"fitted": _magnitudes(fits, drives), "generators": states_of(generators)}
-        return Step(problem.quantise(chosen), search)
+        return Step(problem.quantise(torch.stack(chosen)), search)
 
     def best(self, state: State) -> Solution:
         """Return the solution of each trial; before the last evaluation, the best one that is no outlier."""
@@ -234,19 +236,6 @@ def _added(
 
 def _name(number: int) -> str:
     return f"evaluation {number}" if number >= 0 else f"earlier reading {-1 - number}"
-
-
-def _sampled(
-    goal: GoalFunction,
-    fit: MatrixFit,
-    drives: torch.Tensor,
-    generator: torch.Generator,
-    best: torch.Tensor,
-    count: int,
-) -> torch.Tensor:
-    """Return the best drives (count, M) of samples of the matrix, near the best of the fitted one."""
-    samples = fit.posterior.samples(drives, fit.read, generator, count)
-    return climbed(goal, samples, best.expand(count, -1), _SAMPLE_STEPS)
 
 
 def _magnitudes(fits: Sequence[MatrixFit], drives: torch.Tensor) -> torch.Tensor:

@@ -9,7 +9,7 @@ import torch
 
 from autdtorch.methods.doubtful_readings import Magnitudes
 from autdtorch.methods.linearised_readings import LinearisedReadings
-from autdtorch.utils.array_types import COMPLEX
+from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.process import one_library_thread
 
 _STEPS = 10  # of the Gauss-Newton search
@@ -77,11 +77,15 @@ class MatrixPrior:
         """Return the prior of another unit."""
         return replace(self, **{name: unit * getattr(self, name) for name in ("rows", "spread", "changes")})
 
+    def parts(self, factors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return a_m, b_m, s, c and t_k of factors (2 M + 2 + K,)."""
+        transducers = self.rows.shape[1]
+        return torch.split(factors, [transducers, transducers, 1, 1, len(self.changes)])
+
     def errors(self, drives: torch.Tensor) -> torch.Tensor:
         """Return the standard deviations (N, P) [Pa] of the pressures of drives (N, M), without scale."""
-        transducers, power = self.rows.shape[1], drives.abs().square()
-        parts = [transducers, transducers, 2, len(self.changes)]
-        gain, phase, _, amounts = torch.split(self.widths, parts)
+        power = drives.abs().square()
+        gain, phase, _, _, amounts = self.parts(self.widths)
         of_factors = (power * (gain.square() + phase.square())) @ self.rows.abs().square().T
         by_amounts = torch.einsum("nm,kpm->knp", drives, self.changes).abs() * amounts[:, None, None]
         of_entries = power.sum(dim=1, keepdim=True) * self.spread.square()
@@ -177,9 +181,9 @@ class MatrixPosterior:
 
     def _sample(self, line: LinearisedReadings, generator: torch.Generator) -> torch.Tensor:
         widths = self.prior.widths
-        factors = _normal(generator, *self.factors.shape)
-        entries = _circular(generator, *self.entries.shape)
-        noise = line.noise.sqrt() * _normal(generator, *line.left.shape)
+        factors = torch.randn(self.factors.shape, **REAL, generator=generator)
+        entries = torch.randn(self.entries.shape, **COMPLEX, generator=generator)
+        noise = line.noise.sqrt() * torch.randn(line.left.shape, **REAL, generator=generator)
         correction = line.explained(line.change(factors, entries) + noise)
         drawn = replace(
             self,
@@ -237,9 +241,7 @@ class MatrixPosterior:
         rows, changes = self.prior.rows, self.prior.changes
         if not len(self.factors):
             return rows, changes
-        transducers = rows.shape[1]
-        parts = [transducers, transducers, 1, 1, len(changes)]
-        gain, phase, scale, turn, amounts = torch.split(self.factors, parts)
+        gain, phase, scale, turn, amounts = self.prior.parts(self.factors)
         factor = torch.polar((gain + scale).exp(), phase + turn)
         return factor * (rows + (amounts[:, None, None] * changes).sum(dim=0)), factor * changes
 
@@ -286,11 +288,3 @@ class MatrixPosterior:
         readings = (line.left.square() / line.noise).sum()
         factors = (self.factors / self.prior.widths).square().sum()
         return readings + factors + 2 * self.entries.abs().square().sum()
-
-
-def _normal(generator: torch.Generator, *shape: int) -> torch.Tensor:
-    return torch.randn(shape, dtype=torch.float64, generator=generator, device="cpu")
-
-
-def _circular(generator: torch.Generator, *shape: int) -> torch.Tensor:
-    return torch.randn(shape, dtype=torch.complex128, generator=generator, device="cpu")

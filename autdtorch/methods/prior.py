@@ -63,7 +63,6 @@ class Prior:
     rest: float = 0.15
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if self.transfer_matrix is not None:
             matrix = complex_tensor("transfer_matrix", self.transfer_matrix).detach().cpu()
             if matrix.ndim != 2:

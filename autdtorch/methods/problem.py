@@ -67,7 +67,6 @@ class Problem:
     deviation: Callable[[torch.Tensor], torch.Tensor] | None = None
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         for name in ("transducers", "foci"):
             object.__setattr__(self, name, integer_at_least(name, getattr(self, name), 1))
         require_callable("goal", self.goal)

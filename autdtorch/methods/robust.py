@@ -40,7 +40,6 @@ class RobustDrive:
     scenarios: Scenarios
 
     def __repr__(self) -> str:
-        """Return the pressures."""
         least, places = self.certificate.least, counted(len(self.scenarios), "place")
         pressures = f"at least {least:.4g} of at most {self.bound:.4g} Pa, nominal {self.nominal:.4g} Pa"
         return f"RobustDrive({pressures}, {places})"

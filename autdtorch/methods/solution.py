@@ -41,7 +41,6 @@ class Solution:
         return amplitudes_of(self.drive)
 
     def __repr__(self) -> str:
-        """Return counts and scores, with units."""
         return f"Solution({', '.join(f'{name} {value}' for name, value in self._facts())})"
 
     def _repr_html_(self) -> str:

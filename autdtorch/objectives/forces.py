@@ -94,7 +94,6 @@ class LeastForm(GoalOfForce):
         return self.of == other.of and np.array_equal(self.weights, other.weights)
 
     def __hash__(self) -> int:
-        """Return the hash of the trap, lift or push."""
         return hash(self.of)
 
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:
@@ -161,7 +160,6 @@ class _ParticleGoal(ForceGoal):
     displacement: float = 2e-4
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         if self.points is not None:
             points = points_tensor("points", self.points)
             object.__setattr__(self, "points", tuple(tuple(point) for point in points.tolist()))
@@ -285,7 +283,6 @@ class Levitate(_ParticleGoal):
     up: Vector = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         super().__post_init__()
         object.__setattr__(self, "reach", positive("reach", self.reach, "m"))
         object.__setattr__(self, "up", unit_vector("up", self.up))
@@ -314,7 +311,6 @@ class Push(ForceGoal):
     direction: Vector
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         object.__setattr__(self, "body", integer_at_least("body", self.body, 0))
         object.__setattr__(self, "direction", unit_vector("direction", self.direction))
 

@@ -100,7 +100,6 @@ class WeakestFocus(Goal):
     weights: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
-        """Check the weights."""
         if self.weights is not None:
             object.__setattr__(self, "weights", _positive("weights", self.weights))
 
@@ -178,7 +177,6 @@ class TargetPressures(Goal):
     targets: Sequence[float]
 
     def __post_init__(self) -> None:
-        """Check the targets."""
         object.__setattr__(self, "targets", _positive("targets", self.targets, "Pa"))
 
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:

@@ -66,7 +66,6 @@ class HapticMetrics:
         return (largest - smallest) / (largest + smallest).clamp_min(torch.finfo(torch.float64).tiny)
 
     def __repr__(self) -> str:
-        """Return the largest values, with units."""
         parts = [
             f"{counted(len(self.times), 'frame')}, {counted(self.pressure.shape[1], 'point')}",
             f"up to {self.pressure.max():.4g} Pa, radiation pressure {self.radiation.max():.4g} Pa",

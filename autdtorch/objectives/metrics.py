@@ -29,7 +29,6 @@ class FocusMetrics:
     area: torch.Tensor | None
 
     def __repr__(self) -> str:
-        """Return the medians, with units."""
         area = "none" if self.area is None else f"{1e6 * _median(self.area):.4g} mm²"
         return (
             f"FocusMetrics(mean {_median(self.mean):.4g} Pa, min {_median(self.min):.4g} Pa, "

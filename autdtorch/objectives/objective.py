@@ -186,7 +186,6 @@ class SimulatedObjective:
         return objective
 
     def __repr__(self) -> str:
-        """Return scene, mode and number of evaluations."""
         mode = "replay" if self.transfer_matrix is None else "transfer"
         evaluations = counted(self.evaluations, "evaluation")
         return f"SimulatedObjective(scene {self.scene.name!r}, mode {mode!r}, {evaluations})"

@@ -46,7 +46,6 @@ class OverScenes(Goal):
     by: By = "worst"
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         require_callable("goal", self.goal)
         object.__setattr__(self, "scenes", integer_at_least("scenes", self.scenes, 1))
         object.__setattr__(self, "by", checked_by(self.by))
@@ -142,8 +141,7 @@ _ROUNDING = 1e-12  # of the product of quantile and scenes: 7 % of 100 scenes ar
 def checked_by(by: object) -> By:
     """Return how the scores of scenes are joined, after checking it."""
     if isinstance(by, str):
-        require_one_of("by", by, ("worst", "mean"))
-        return by  # type: ignore[return-value]
+        return require_one_of("by", by, ("worst", "mean"))  # type: ignore[return-value]
     quantile = finite_number("by", by)
     if not 0 < quantile < 1:
         raise invalid("by", by, 'must be "worst", "mean", or a quantile above 0 and below 1')

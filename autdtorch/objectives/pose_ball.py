@@ -92,7 +92,6 @@ class PoseBall:
         self.tolerance = number_between("tolerance", tolerance, 1e-8, 1e-2)
 
     def __repr__(self) -> str:
-        """Return scene and radius."""
         return f"PoseBall(scene {self.propagator.scene.name!r}, radius {1e3 * self.radius:.4g} mm)"
 
     def transfer_matrix(self, offset: ArrayLike) -> torch.Tensor:

@@ -29,7 +29,6 @@ class _BesideOthers(Goal):
     points: Sequence[int]
 
     def __post_init__(self) -> None:
-        """Check the indices."""
         accepted = "must be indices of control points, each once, at least one"
         checked = tuple(integers("points", self.points, 0, accepted))
         if not checked or len(set(checked)) < len(checked):
@@ -80,7 +79,6 @@ class _GoalBesideOthers(_BesideOthers):
     goal: Goal
 
     def __post_init__(self) -> None:
-        """Check goal and indices."""
         require_kind("goal", self.goal, Goal)
         if isinstance(self.goal, _BesideOthers) and not self._takes(self.goal):
             raise invalid("goal", self.goal, "must be a goal without quiet or seen points")
@@ -167,7 +165,6 @@ class QuietPoints(_GoalBesideOthers):
     ratio: float
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         super().__post_init__()
         object.__setattr__(self, "ratio", positive("ratio", self.ratio))
 

@@ -124,7 +124,6 @@ class Readings:
         return int((~self.pressure.isnan()).sum())
 
     def __len__(self) -> int:
-        """Return the number of drives."""
         return len(self.drives)
 
     def __getitem__(self, rows: Any) -> Readings:
@@ -134,7 +133,6 @@ class Readings:
         return Readings(self.drives[chosen], self.pressure[chosen], self.points, phase, deviation)
 
     def __repr__(self) -> str:
-        """Return the sizes."""
         (drives, transducers), points = self.drives.shape, self.pressure.shape[1]
         gaps = self.pressure.numel() - self.count
         parts = [

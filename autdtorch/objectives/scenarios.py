@@ -161,11 +161,9 @@ class Scenarios:
         return cls(objectives, by)
 
     def __len__(self) -> int:
-        """Return the number of scenes S."""
         return len(self.objectives)
 
     def __repr__(self) -> str:
-        """Return the numbers of scenes and evaluations."""
         scenes, evaluations = counted(len(self), "scene"), counted(self.evaluations, "evaluation")
         return f"Scenarios({scenes}, by {self.by!r}, {evaluations})"
 

@@ -50,10 +50,11 @@ def within(place: object) -> Iterator[None]:
         raise ValueError(f"{place}: {error}") from error
 
 
-def require_one_of(name: str, value: object, accepted: Collection[str]) -> None:
-    """Check that `value` is one of the accepted texts."""
+def require_one_of(name: str, value: object, accepted: Collection[str]) -> str:
+    """Return `value`, one of the accepted texts."""
     if not isinstance(value, str) or value not in accepted:
         raise invalid(name, value, f"must be one of {', '.join(accepted)}{did_you_mean(value, accepted)}")
+    return value
 
 
 def require_known(where: str, keys: Iterable[Any], allowed: Collection[str], what: str = "key") -> None:

@@ -260,7 +260,7 @@ def test_the_settings_of_an_oscilloscope_reach_it(tmp_path, monkeypatch, moved):
     instrument = mock.MagicMock(spec=Oscilloscope)
     instrument.__enter__.return_value = instrument
     opened = mock.Mock(return_value=instrument)
-    monkeypatch.setattr("autdtorch.hardware.sensors.scope_config.open_scope", opened)
+    monkeypatch.setattr("autdtorch.hardware.sensors.scope_microphones.open_scope", opened)
     with Bench(section, load_scene(tmp_path / "ours/scene/two.yaml"), 0).sensor() as found:
         assert isinstance(found, MovedMicrophone if moved else ScopeSensor)
     assert opened.call_args.args[0] == (0x2A8D, 0x1770)

@@ -57,7 +57,6 @@ class Frame:
     image: Degrees
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
         object.__setattr__(self, "time", finite_number("time", self.time, "s"))
         image = gappy_tensor("image", self.image, "degrees C").detach().cpu().numpy()
         if image.ndim != 2 or image.size == 0:
@@ -160,7 +159,8 @@ class FolderFrames:
         except OSError as error:
             accepted = "must be the folder into which the camera's program writes"
             raise SensorError(f"{self._folder}: {error.strerror or error}; {accepted}") from error
-        return sorted((name for name in names if not name.startswith(".")), key=_by_numbers)
+        visible = (name for name in names if not name.startswith("."))
+        return sorted(visible, key=lambda name: ([*map(int, re.findall(r"\d+", name))], name))
 
     def _new_frames(self) -> list[Frame]:
         frames = []
@@ -208,10 +208,6 @@ class FolderFrames:
         if self._first is None:
             self._first = number, changed
         return self._first[1] + (number - self._first[0]) / self._rate
-
-
-def _by_numbers(name: str) -> tuple[list[int], str]:
-    return [int(digits) for digits in re.findall(r"\d+", name)], name
 
 
 def _read_image(path: Path, scale: float, zero: float) -> Degrees:

@@ -178,7 +178,8 @@ class HeatInversion:
 
     def _checked(self, times: ArrayLike, images: ArrayLike, saturation: float | None) -> tuple[Array, Array]:
         """Return times (T,) and the values (T, N) of the pixels around the plane, NaN without one."""
-        moments, frames = _numbers(real_tensor("times", times, "s")), _numbers(gappy_tensor("images", images))
+        moments: Array = real_tensor("times", times, "s").detach().cpu().numpy()
+        frames: Array = gappy_tensor("images", images).detach().cpu().numpy()
         if moments.ndim != 1 or frames.shape != (len(moments), *self.shape):
             accepted = f"must be {('T', *self.shape)}, and times (T,)"
             raise ValueError(f"images: shape {frames.shape}, times: shape {moments.shape}; {accepted}")
@@ -188,7 +189,3 @@ class HeatInversion:
         if saturation is not None:
             values = np.where(values < finite_number("saturation", saturation), values, np.nan)
         return moments, values
-
-
-def _numbers(tensor: torch.Tensor) -> Array:
-    return np.asarray(tensor.detach().cpu().numpy(), dtype=np.float64)

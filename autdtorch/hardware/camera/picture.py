@@ -68,7 +68,6 @@ class Picture:
     doubts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
         require_kind("plane", self.plane, Plane)
         for name in ("pressure", "deviation"):
             values = real_tensor(name, getattr(self, name), "Pa").detach().cpu()
@@ -86,7 +85,6 @@ class Picture:
         finite_number("latency", self.latency, "s")
 
     def __repr__(self) -> str:
-        """Return the size and the largest pressure."""
         counts = " x ".join(map(str, self.pressure.shape))
         unit = "of an unknown unit" if self.relative else "Pa"
         return f"Picture({counts} cells, up to {self.pressure.max():.4g} {unit}, {self.frames} frames)"

@@ -157,7 +157,8 @@ def hot_spot(rise: Array) -> Array:
     height = smooth[row, column] - level
     if not height > 4 * spread / 3:  # smoothing leaves about a fifth of the noise
         raise invalid("rises", float(height), f"must have a spot above their noise of {spread:.2g}", "K")
-    rows, columns = np.nonzero(_connected(smooth > level + height / 2, row, column) & valid)
+    spots, _ = label(smooth > level + height / 2)
+    rows, columns = np.nonzero((spots == spots[row, column]) & valid)
     offset = np.stack([columns - column, rows - row])
 
     def misfit(unknowns: Array) -> Array:
@@ -172,14 +173,9 @@ def hot_spot(rise: Array) -> Array:
     return np.array([column + fitted[0], row + fitted[1]])
 
 
-def _connected(mask: Array, row: int, column: int) -> Array:
-    """Return the part of a mask (H, W) that is connected to a pixel."""
-    labels, _ = label(mask)
-    return np.asarray(labels == labels[row, column])
-
-
 def _array(name: str, value: object) -> Array:
-    return np.asarray(real_tensor(name, value).detach().cpu().numpy(), dtype=np.float64)
+    array: Array = real_tensor(name, value).detach().cpu().numpy()
+    return array
 
 
 def _pairs(name: str, value: object) -> Array:

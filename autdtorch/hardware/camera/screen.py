@@ -62,7 +62,6 @@ class Screen:
     heating: float | None = None
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
         for name, unit in (("diffusivity", "m^2/s"), ("loss_time", "s"), ("heating", "K/(s Pa^2)")):
             if (value := getattr(self, name)) is not None or name != "heating":
                 object.__setattr__(self, name, positive(f"Screen.{name}", value, unit))

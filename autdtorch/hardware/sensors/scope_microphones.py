@@ -1,26 +1,40 @@
-"""Microphones at an oscilloscope: pressures by a lock-in at the drive frequency."""
+"""Microphones at an oscilloscope: pressures by a lock-in at the drive frequency; their config."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
-from autdtorch.hardware.sensors.scpi_scope import COARSEST, FINEST, Oscilloscope, Waveform
-from autdtorch.hardware.sensors.sensor import SensorError
+from autdtorch.hardware.sensors.by_hand import MovedMicrophone
+from autdtorch.hardware.sensors.scpi_scope import (
+    COARSEST,
+    FINEST,
+    KEYSIGHT,
+    RIGOL,
+    Oscilloscope,
+    Waveform,
+    open_scope,
+)
+from autdtorch.hardware.sensors.sensor import Sensor, SensorConfig, SensorError, Setup
+from autdtorch.objectives.perturbations import random_rms
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import (
+    boolean,
     integer_at_least,
     invalid,
     members,
     number_between,
     positive,
     require_kind,
+    require_one_of,
 )
 
 logger = logging.getLogger(__name__)
@@ -36,6 +50,9 @@ _DIVISIONS = 3.5  # of a full screen, above and below the middle; there are 4 or
 _SMALL = 0.25  # share of the screen below which a waveform gets a finer scale
 _TARGET = 0.5  # share that it then fills
 _COARSER = 4.0  # a waveform that clips fills at least a quarter of a scale so much coarser
+
+_MAKERS = {"keysight": KEYSIGHT, "rigol": RIGOL}
+_EMULATED_CHIP = "2a8d:1770"
 
 
 class SineFit(NamedTuple):
@@ -101,7 +118,6 @@ class Microphone:
     gain: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
         integer_at_least("input", self.input, 1)
         positive("sensitivity", self.sensitivity, "V/Pa")
         positive("loudest", self.loudest, "Pa")
@@ -235,3 +251,76 @@ def _fitted(scale: float, waveform: Waveform, noise: float) -> float:
     if peak < _SMALL * _DIVISIONS * scale and noise < waveform.resolution:
         return peak / (_TARGET * _DIVISIONS)
     return scale
+
+
+@dataclass(frozen=True)
+class ScopeConfig(SensorConfig):
+    """The config of a `ScopeSensor`; configs/hardware/sensor/scope.yaml describes the keys."""
+
+    chip: Any
+    maker: Any
+    sensitivity: float
+    loudest: float
+    captures: int
+    moved: bool
+    snr: float | None
+
+    @property
+    def by_hand(self) -> bool:
+        """True if a person moves the microphone."""
+        return self.moved
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Sensitivity and number of captures."""
+        return {"sensitivity [V/Pa]": self.sensitivity, "captures": self.captures}
+
+    def check(self, emulated: bool) -> None:
+        """Check the values for a real or an `emulated` bench."""
+        super().check(emulated)
+        require_one_of("hardware.sensor.maker", self.maker, _MAKERS)
+        if boolean("hardware.sensor.moved", self.moved) and emulated:
+            raise invalid("hardware.sensor.moved", True, "must be false: it is for a real device")
+        if self.chip is None and not emulated:
+            accepted = "the oscilloscope's VID:PID, as lsusb shows it; or hardware/sensor=file or manual"
+            raise invalid("hardware.sensor.chip", None, f"must be {accepted}")
+
+    @contextlib.contextmanager
+    def open(self, setup: Setup) -> Iterator[Sensor]:
+        """Open the oscilloscope, on an emulated bench an emulated one, and set it up."""
+        points = setup.control_points
+        inputs = range(1, 2 if self.moved else len(points) + 1)
+        microphones = [Microphone(number, self.sensitivity, self.loudest) for number in inputs]
+        with self._scope(setup) as scope:
+            sensor = ScopeSensor(scope, setup.frequency, microphones, self.captures)
+            yield MovedMicrophone(sensor, points, setup.ask) if self.moved else sensor
+
+    def _scope(self, setup: Setup) -> Oscilloscope:
+        dialect, chip = _MAKERS[self.maker], _chip(self.chip or _EMULATED_CHIP)
+        bench = setup.bench
+        if bench is None:
+            return open_scope(chip, dialect)
+        from autdtorch.hardware.emulator.emulated_scope import EmulatedScope  # needs pyusb
+
+        noise = 0.0
+        if self.snr is not None:
+            noise = self.sensitivity * random_rms(bench.transfer_matrix) * 10 ** (-self.snr / 20)
+        emulated = EmulatedScope(
+            bench.pressure,
+            setup.frequency,
+            self.sensitivity,
+            range(len(setup.control_points)),
+            dialect.name.partition(" ")[0],
+            noise=noise,
+            seed=setup.seed,
+        )
+        emulated.plug_into(bench, chip)
+        return open_scope(chip, dialect, backend=bench.bus)
+
+
+def _chip(text: object) -> tuple[int, int]:
+    """Return idVendor and idProduct of text such as "2a8d:1770", as lsusb shows them."""
+    match = re.fullmatch(r"(?:0x)?([0-9a-f]{1,4}):(?:0x)?([0-9a-f]{1,4})", str(text), re.IGNORECASE)
+    if match is None:
+        raise invalid("hardware.sensor.chip", text, "must be VID:PID with four digits each, as 2a8d:1770")
+    return int(match[1], 16), int(match[2], 16)

@@ -176,7 +176,6 @@ class Oscilloscope(contextlib.AbstractContextManager["Oscilloscope"]):
         self._port.close()
 
     def __exit__(self, *_: object) -> None:
-        """Release the oscilloscope."""
         self.close()
 
     def _capture(self, scales: Mapping[int, float]) -> list[Waveform]:

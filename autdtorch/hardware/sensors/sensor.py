@@ -64,7 +64,6 @@ class Quantity:
     unit: str
 
     def __post_init__(self) -> None:
-        """Check name and unit."""
         require_name("name", self.name)
         if self.name == "pressure" and self.unit != "Pa":
             raise invalid("unit", self.unit, "must be Pa for the quantity pressure")

@@ -232,17 +232,12 @@ class Calibration:
 
     @property
     def _factors(self) -> tuple[torch.Tensor, ...]:
-        return self._split(self.fit.posterior.factors)
+        """Gains, phases, scale, common phase and amounts."""
+        return self.fit.posterior.prior.parts(self.fit.posterior.factors)
 
     @property
     def _deviations(self) -> tuple[torch.Tensor, ...]:
-        return self._split(self.fit.deviations)
-
-    def _split(self, factors: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return gains, phases, scale, common phase and amounts of factors."""
-        transducers = self.readings.drives.shape[1]
-        sizes = [transducers, transducers, 1, 1, len(factors) - 2 * transducers - 2]
-        return torch.split(factors, sizes)
+        return self.fit.posterior.prior.parts(self.fit.deviations)
 
     def summary(self) -> str:
         """Return the facts as lines of text."""
@@ -250,7 +245,6 @@ class Calibration:
         return "\n".join(f"{name:{width}}  {value}" for name, value in self._facts())
 
     def __repr__(self) -> str:
-        """Return the facts in a line."""
         return f"Calibration({', '.join(f'{name} {value}' for name, value in self._facts())})"
 
     def _repr_html_(self) -> str:

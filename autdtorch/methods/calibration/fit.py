@@ -64,7 +64,7 @@ class CalibrationFit:
     @property
     def amounts(self) -> torch.Tensor:
         """The fitted amounts of the changes (K,)."""
-        return self.posterior.factors[2 * self.drives.shape[1] + 2 :]
+        return self.posterior.prior.parts(self.posterior.factors)[-1]
 
     @property
     def changes(self) -> tuple[torch.Tensor, torch.Tensor]:
