@@ -52,21 +52,13 @@ class SteppedCells(NamedTuple):
     ground: Tensor  # their stiffness against silence (l,)
 
 
-def damping_of(cells: HeterogeneousCells) -> Damping | None:
-    """Return the damping of cells, None if nothing absorbs."""
-    if cells.losses is None:
-        return None
-    losses = cells.losses
-    return Damping(*map(torch.from_numpy, (losses.place, losses.coupling, losses.mass, losses.ground)))
-
-
 def at_time_step(
     cells: HeterogeneousCells, stencil: Stencil, steps_per_period: float
 ) -> tuple[HeterogeneousCells, Tensor, Tensor]:
     """Return the cells with rows and masses at a time step, and `loss` and `ground` of `SteppedCells`."""
-    damping = damping_of(cells)
-    if damping is None:
+    if (losses := cells.losses) is None:
         return cells, torch.zeros((0, 27), **REAL), torch.zeros(0, **REAL)
+    damping = Damping(*map(torch.from_numpy, (losses.place, losses.coupling, losses.mass, losses.ground)))
     rows = torch.from_numpy(cells.weight), torch.from_numpy(cells.mass)
     weight, mass, loss, ground = stepped_cells(*rows, damping, stencil, steps_per_period)
     return replace(cells, weight=weight.numpy(), mass=mass.numpy()), loss, ground

@@ -29,7 +29,6 @@ from autdtorch.utils.array_types import REAL, Array, Index
 from autdtorch.utils.fluids import fluid
 
 _STEP = 1e-4  # Relative step of the central differences: truncation and rounding are about 1e-8
-_LEAST_ABSORPTION = 1.0  # Absorption [Np/m] from which its step is relative
 _RIM = 2  # Cells of air around the maps: the first depends on them, the second is its neighbour
 
 
@@ -74,19 +73,15 @@ class DifferentiableCells:
 
 
 def cells_of_obstacles(
-    region: Region,
-    grid: Grid,
-    density: Tensor | None = None,
-    sound_speed: Tensor | None = None,
-    absorption: Tensor | None = None,
+    region: Region, grid: Grid, density: Tensor | None = None, sound_speed: Tensor | None = None
 ) -> DifferentiableCells:
-    """Return the cells of K bodies, differentiable by density, sound speed and absorption [Np/m] (K,).
+    """Return the cells of K bodies, differentiable by density and sound speed (K,).
 
-    Rigid bodies are not. Of a lossy fluid these are the real part of the density, the phase speed, and the
-    attenuation of its waves; the imaginary part of the density stays.
+    Rigid bodies are not. Of a lossy fluid these are the real part of the density and the phase speed; the
+    imaginary part of the density and the attenuation of its waves stay.
     """
     stencil = air_stencil(grid, region)
-    materials = {"density": density, "sound_speed": sound_speed, "absorption": absorption}
+    materials = {"density": density, "sound_speed": sound_speed}
     base = _assembled(region, grid, stencil, materials)
     differences = list(_differences(region, grid, stencil, materials))
     every = [base.index, *(cells.index for _, _, sides in differences for cells in sides)]
@@ -120,8 +115,7 @@ def _differences(
             continue
         for number in (number for number, body in enumerate(region.bodies) if body.fluid is not None):
             here, sides = float(values.detach()[number]), []
-            step = _STEP * max(here, _LEAST_ABSORPTION if name == "absorption" else 0.0)
-            ends = here + step, max(here - step, 0.0)
+            ends = here + _STEP * here, here - _STEP * here
             for end in ends:
                 moved = values.detach().clone()
                 moved[number] = end
@@ -132,20 +126,17 @@ def _differences(
 def _assembled(
     region: Region, grid: Grid, stencil: Stencil, materials: dict[str, Tensor | None]
 ) -> HeterogeneousCells:
-    """Assemble a region whose K bodies have other densities, sound speeds and absorptions (K,)."""
-    bodies, angular = list(region.bodies), 2 * math.pi * region.frequency
+    """Assemble a region whose K bodies have other densities and sound speeds (K,)."""
+    bodies = list(region.bodies)
     for number, body in enumerate(bodies):
         if body.fluid is not None and any(values is not None for values in materials.values()):
             usual = body.fluid
-            parts = usual.density.real, usual.phase_speed, angular * (1 / usual.sound_speed).imag
-            density, sound_speed, absorption = (
-                part if values is None else values[number].item()
-                for part, values in zip(parts, materials.values(), strict=True)
-            )
+            parts = zip((usual.density.real, usual.phase_speed), materials.values(), strict=True)
+            density, sound_speed = (part if each is None else each[number].item() for part, each in parts)
             density, sound_speed = fluid(f"obstacles[{number}]", density, sound_speed)
             changed_fluid = Fluid(density, sound_speed)
-            if absorption or usual.density.imag:
-                slowness = complex(1 / sound_speed, absorption / angular)
+            if usual.is_lossy:
+                slowness = complex(1 / sound_speed, (1 / usual.sound_speed).imag)
                 changed_fluid = Fluid(complex(density, usual.density.imag), 1 / slowness)
             bodies[number] = replace(body, fluid=changed_fluid)
     changed = replace(region, bodies=tuple(bodies))

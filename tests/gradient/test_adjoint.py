@@ -179,7 +179,7 @@ def test_gradients_by_the_materials_of_a_lossy_body():
     scene = small_scene(LOSSY, extent=9e-3)
     region, generator = region_of(scene), torch.Generator().manual_seed(0)
     grid = make_grid(region, 1.4e-3)
-    start = torch.tensor([[20.0, 1.0], [300.0, 340.0], [30.0, 0.0]], dtype=torch.float64)
+    start = torch.tensor([[20.0, 1.0], [300.0, 340.0]], dtype=torch.float64)
     slope = torch.randn((STEPS, 3), generator=generator, dtype=torch.float64)
 
     def loss(values):
@@ -193,7 +193,7 @@ def test_gradients_by_the_materials_of_a_lossy_body():
 
     values = start.clone().requires_grad_()
     loss(values).backward()
-    for row in range(3):
+    for row in range(2):
         step = torch.zeros_like(start)
         step[row, 0] = 1e-4 * start[row, 0]
         change = float(loss(start + step) - loss(start - step)) / float(2 * step[row, 0])

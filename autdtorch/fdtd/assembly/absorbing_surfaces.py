@@ -43,9 +43,12 @@ from autdtorch.fdtd.assembly.element import (
     PAIR_OF,
     PAIRS,
     SUBCELLS,
+    SUBCENTERS,
     VERTICES,
     InterfaceElements,
     Materials,
+    hat_slopes,
+    hats,
     shares,
     subcell_gradients,
     subcell_means,
@@ -55,7 +58,6 @@ from autdtorch.fdtd.stencil import Stencil, flat_strides
 from autdtorch.utils.array_types import Array, ComplexArray, Index
 
 _GROWTH = 1e-3  # Distance [cells] by which a body grows and shrinks for the area of its surface
-_CENTERS = (np.array(list(np.ndindex((SUBCELLS,) * 3))) + 0.5) / SUBCELLS  # of the sub-cells (64, 3)
 _LARGEST_PHASE = 1.2  # Largest phase between a vertex and a surface [rad]
 _LEAST_WIDTH = 4e-3  # Least change of a distance over a sub-cell [cells]: cubes of it are not rounding
 # Shares of the square of the slope along a surface [cells^2], and of the square of the wavenumber: with both,
@@ -96,7 +98,7 @@ def _facets(distance: Array, material: Index, number: int, materials: Materials)
     level = np.where(same, distance, FAR).min(axis=0)
     gradient = subcell_gradients(level)
     steep = np.maximum(np.linalg.norm(gradient, axis=2, keepdims=True), _LEAST_GRADIENT)
-    place = _CENTERS - subcell_means(level)[..., None] * gradient / steep**2
+    place = SUBCENTERS - subcell_means(level)[..., None] * gradient / steep**2
     return _Facets(np.maximum(area, 0), np.clip(place, 0, 1), gradient / steep)
 
 
@@ -154,15 +156,15 @@ def _consistent(
     Linear interpolation underestimates the power of a pressure that varies along the surface: the squares of
     slopes along it are added. Vertices `out` (n, 8) have no share.
     """
-    hats = _hats(surface.place) * ~out[:, None]
-    whole = hats.sum(axis=2, keepdims=True)
+    shares = hats(surface.place) * ~out[:, None]
+    whole = shares.sum(axis=2, keepdims=True)
     whole[whole == 0] = np.inf
-    area, hats = surface.area[:, :, None], hats / whole
-    both = (1 - _EXCESS * kappa**2) * (area * hats).transpose(0, 2, 1) @ hats
-    total, across = both.sum(axis=2), np.zeros_like(hats)
+    area, shares = surface.area[:, :, None], shares / whole
+    both = (1 - _EXCESS * kappa**2) * (area * shares).transpose(0, 2, 1) @ shares
+    total, across = both.sum(axis=2), np.zeros_like(shares)
     for axis in range(3):
-        slope = _slopes(surface.place, axis) * ~out[:, None] / whole
-        slope -= hats * slope.sum(axis=2, keepdims=True)
+        slope = hat_slopes(surface.place, axis) * ~out[:, None] / whole
+        slope -= shares * slope.sum(axis=2, keepdims=True)
         both += _ALONG * (area * slope).transpose(0, 2, 1) @ slope
         across += surface.normal[:, :, axis, None] * slope
     both -= _ALONG * (area * across).transpose(0, 2, 1) @ across
@@ -178,10 +180,10 @@ def _lumped(
     The air between a vertex and the surface, a distance d away, is in the element's mass. With t = tan(k d),
     the admittance Y behind it acts as Y (1 + t^2) / (1 - i Y t).
     """
-    depth, hats = _outer_side(surface, out)
+    depth, share = _outer_side(surface, out)
     slope = np.tan(np.minimum(kappa * depth, _LARGEST_PHASE))
     behind = admittance * (1 + slope**2) / (1 - 1j * admittance * slope)
-    return np.zeros((len(hats), 28), complex), (surface.area[:, :, None] * hats * behind).sum(axis=1)
+    return np.zeros((len(share), 28), complex), (surface.area[:, :, None] * share * behind).sum(axis=1)
 
 
 def _outer_side(surface: _Facets, solid: NDArray[np.bool_]) -> tuple[Array, Array]:
@@ -190,23 +192,9 @@ def _outer_side(surface: _Facets, solid: NDArray[np.bool_]) -> tuple[Array, Arra
     `solid` (n, 8) is the mask of the vertices in rigid bodies. These, and vertices behind, have no share.
     """
     depth = ((VERTICES - surface.place[:, :, None]) * surface.normal[:, :, None]).sum(axis=3)
-    hats = _hats(surface.place) * (~solid[:, None] & (depth > 0))
-    whole = hats.sum(axis=2, keepdims=True)
-    return depth, np.divide(hats, whole, out=np.zeros_like(hats), where=whole > 0)
-
-
-def _hats(place: Array) -> Array:
-    """Return the trilinear functions (n, q, 8) of the vertices at places (n, q, 3)."""
-    place = place[:, :, None]
-    return np.asarray(np.where(VERTICES == 1, place, 1 - place).prod(axis=3))
-
-
-def _slopes(place: Array, axis: int) -> Array:
-    """Return the derivatives (n, q, 8) of these functions along an axis."""
-    place = place[:, :, None]
-    factors = np.where(VERTICES == 1, place, 1 - place)
-    factors[..., axis] = 2 * VERTICES[:, axis] - 1
-    return np.asarray(factors.prod(axis=3))
+    share = hats(surface.place) * (~solid[:, None] & (depth > 0))
+    whole = share.sum(axis=2, keepdims=True)
+    return depth, np.divide(share, whole, out=np.zeros_like(share), where=whole > 0)
 
 
 class _Faces(NamedTuple):

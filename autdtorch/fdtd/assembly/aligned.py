@@ -207,15 +207,9 @@ def _prismatic(
     axis: int, kinds: Index, blocks: Blocks, materials: Materials, stencil: Stencil
 ) -> tuple[Array, Array]:
     """Return coupling (n, 28) and mass (n, 8) of kinds of elements (n, 3) that do not vary along an axis."""
-    key, slices = _key(materials), []
     planes = blocks.planes[axis]
-    levels = planes.centers[planes.begin[kinds[:, axis]]]
-    across = [other for other in range(3) if other != axis]
-    sections = {level: _Sections(blocks, axis, level) for level in np.unique(levels).tolist()}
-    for level, kind in zip(levels.tolist(), kinds[:, across], strict=True):
-        section, place = sections[level].around(kind)
-        slices.append([Prisms(*(part[place] for part in prisms(section, key, stencil)))])
-    return _stacked([np.ones(1)] * len(kinds), slices, axis, stencil)
+    levels = planes.centers[planes.begin[kinds[:, axis]]][:, None].tolist()
+    return _stacked(axis, kinds, levels, [np.ones(1)] * len(kinds), blocks, materials, stencil)
 
 
 def _densities(materials: Materials) -> Array:
@@ -238,39 +232,47 @@ def _cornered(kinds: Index, blocks: Blocks, materials: Materials, stencil: Stenc
     Along each axis an element is a stack of slices that do not vary along it. The element is the mean of the
     three stacks.
     """
-    key = _key(materials)
     coupling, mass = np.zeros((len(kinds), 28)), np.zeros((len(kinds), 8))
-    sections = {}
     for axis, planes in enumerate(blocks.planes):
-        across = [other for other in range(3) if other != axis]
-        widths, stacks = [], []
-        for kind in kinds:
-            slices = []
-            for level in range(planes.first[kind[axis]], planes.last[kind[axis]] + 1):
-                if (axis, level) not in sections:
-                    sections[axis, level] = _Sections(blocks, axis, level)
-                section, place = sections[axis, level].around(kind[across])
-                slices.append(Prisms(*(part[place] for part in prisms(section, key, stencil))))
-            stacks.append(slices)
-            widths.append(np.diff(np.concatenate(([0.0], planes.cuts(kind[axis]), [1.0]))))
-        for total, part in zip((coupling, mass), _stacked(widths, stacks, axis, stencil), strict=True):
+        levels = [range(planes.first[kind], planes.last[kind] + 1) for kind in kinds[:, axis]]
+        widths = [np.diff(np.concatenate(([0.0], planes.cuts(kind), [1.0]))) for kind in kinds[:, axis]]
+        stacks = _stacked(axis, kinds, levels, widths, blocks, materials, stencil)
+        for total, part in zip((coupling, mass), stacks, strict=True):
             total += part / 3
     missing = 1 - coupling.sum(axis=1) / uniform_coupling(stencil).sum()
     return coupling * (1 + _STIFFER * np.maximum(missing, 0))[:, None], mass
 
 
 def _stacked(
-    widths: Sequence[Array], stacks: Sequence[Sequence[Prisms]], axis: int, stencil: Stencil
+    axis: int,
+    kinds: Index,
+    levels: Sequence[Sequence[int]],
+    widths: Sequence[Array],
+    blocks: Blocks,
+    materials: Materials,
+    stencil: Stencil,
 ) -> tuple[Array, Array]:
-    """Return coupling (n, 28) and mass (n, 8) of stacks of slices; see `stacked`."""
+    """Return coupling (n, 28) and mass (n, 8) of kinds of elements (n, 3), stacks of slices along an axis.
+
+    A slice is that of an element at a level, and has a width [cells]; see `stacked`.
+    """
+    across = [other for other in range(3) if other != axis]
+    key, sections, stacks = _key(materials), dict[int, _Sections](), list[list[Prisms]]()
+    for kind, of_kind in zip(kinds[:, across], levels, strict=True):
+        slices = []
+        for level in of_kind:
+            if level not in sections:
+                sections[level] = _Sections(blocks, axis, level)
+            section, place = sections[level].around(kind)
+            slices.append(Prisms(*(part[place] for part in prisms(section, key, stencil))))
+        stacks.append(slices)
     coupling, mass = np.zeros((len(stacks), 28)), np.zeros((len(stacks), 8))
     layers = np.array([len(slices) for slices in stacks], np.int64)
     for count in np.unique(layers):
         rows = np.flatnonzero(layers == count).tolist()
         parts = zip(*(zip(*stacks[row], strict=True) for row in rows), strict=True)
-        slices = Prisms(*(np.array(part) for part in parts))
         width = np.array([widths[row] for row in rows])
-        coupling[rows], mass[rows] = stacked(width, slices, axis, stencil)
+        coupling[rows], mass[rows] = stacked(width, Prisms(*map(np.array, parts)), axis, stencil)
     return coupling, mass
 
 

@@ -28,6 +28,7 @@ PAIR_OF[PAIRS[:, 0], PAIRS[:, 1]] = PAIR_OF[PAIRS[:, 1], PAIRS[:, 0]] = np.arang
 EDGES_BETWEEN = np.abs(VERTICES[PAIRS[:, 0]] - VERTICES[PAIRS[:, 1]])
 # Points of an element at which signed distances are measured (125, 3), from its first vertex [cells]
 LATTICE = np.array(list(itertools.product(range(SUBCELLS + 1), repeat=3))) / SUBCELLS
+SUBCENTERS = (np.array(list(np.ndindex((SUBCELLS,) * 3))) + 0.5) / SUBCELLS  # Centres of sub-cells (64, 3)
 # Indices of the vertices in `LATTICE`
 CORNERS = np.ravel_multi_index((VERTICES * SUBCELLS).T, (SUBCELLS + 1,) * 3)
 
@@ -88,6 +89,22 @@ class InterfaceElements(NamedTuple):
             finite=self.finite[some],
             loss=self.loss[some],
         )
+
+
+def hats(places: Array) -> Array:
+    """Return the trilinear functions (..., 8) of the vertices at places (..., 3) from the first [cells]."""
+    return np.asarray(_factors(places).prod(axis=-1))
+
+
+def hat_slopes(places: Array, axis: int) -> Array:
+    """Return the derivatives (..., 8) of these functions along an axis."""
+    factors = _factors(places)
+    factors[..., axis] = 2 * VERTICES[:, axis] - 1
+    return np.asarray(factors.prod(axis=-1))
+
+
+def _factors(places: Array) -> Array:
+    return np.where(VERTICES == 1, places[..., None, :], 1 - places[..., None, :])
 
 
 def coupling_by_edges(stencil: Stencil) -> Array:

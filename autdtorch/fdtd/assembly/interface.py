@@ -31,10 +31,12 @@ from autdtorch.fdtd.assembly.element import (
     FAR,
     PAIRS,
     SUBCELLS,
-    VERTICES,
+    SUBCENTERS,
     InterfaceElements,
     Materials,
     distance_to_material,
+    hat_slopes,
+    hats,
     line_coverage,
     shares,
     stiffness_matrix,
@@ -269,15 +271,8 @@ def _balanced_mass(surface: Surface, whole_cell: Array, mass: Array) -> Array:
     return np.asarray(mass * (1 + change * np.minimum(1, _MOST_TAKEN / np.maximum(-least, 1e-12))))
 
 
-_SUBCENTRES = (np.array(list(np.ndindex((SUBCELLS,) * 3))) + 0.5) / SUBCELLS
-# Linear factors of the trilinear functions of the vertices at the centres of the sub-cells (64, 8, 3)
-_FACTORS = np.where(VERTICES == 1, _SUBCENTRES[:, None], 1 - _SUBCENTRES[:, None])
-_HATS = _FACTORS.prod(axis=2)  # Trilinear functions of the vertices at the centres of the sub-cells (64, 8)
-# Their gradients (64, 8, 3)
-_SLOPES = np.stack(
-    [(2 * VERTICES[:, axis] - 1) * np.delete(_FACTORS, axis, axis=2).prod(axis=2) for axis in range(3)],
-    axis=2,
-)
+_HATS = hats(SUBCENTERS)  # Trilinear functions of the vertices at the centres of the sub-cells (64, 8)
+_SLOPES = np.stack([hat_slopes(SUBCENTERS, axis) for axis in range(3)], axis=2)  # Their gradients (64, 8, 3)
 _PRODUCTS = np.einsum("qix,qjx->qij", _SLOPES, _SLOPES)
 
 
