@@ -254,6 +254,16 @@ def regular_radial(degree: int, x: torch.Tensor) -> torch.Tensor:
     return torch.from_numpy(spherical_jn(np.arange(degree + 1), x.numpy()))[:, degrees(degree)]
 
 
+def outgoing_radial(degree: int, x: torch.Tensor) -> torch.Tensor:
+    """Return h_l(x) (L + 1, B) of the first kind."""
+    inverse = 1 / x.to(torch.complex128)
+    rows = [torch.exp(1j * x) * inverse / 1j]
+    rows.append(rows[0] * (inverse - 1j))
+    for n in range(1, degree):
+        rows.append((2 * n + 1) * inverse * rows[-1] - rows[-2])
+    return torch.stack(rows[: degree + 1])
+
+
 def sphere_coefficients(
     degree: int,
     size: complex,

@@ -48,6 +48,7 @@ RAMP_PERIODS = 8
 # Initial uniform pressure, relative to the largest force. From exact zeros the wave's precursors would decay
 # into subnormal numbers, on which processors are slow (2.4 times, measured at 120^3 in float32).
 _BACKGROUND = 1e-20
+_CELL_BYTES = 20  # Memory of an assembled cell
 _FEWEST_IDLE = 32  # Cells of a row from which it is quicker to skip them than to step them
 _LOOKING = 512  # Points whose kernels are looked at together
 _TOGETHER = 16_384  # Receivers whose records in double precision stay in the CPU's cache
@@ -72,6 +73,11 @@ class Assembly:
     def dtype(self) -> torch.dtype:
         """Precision of the fields."""
         return self.coefficients.heterogeneous_weight.dtype
+
+    @property
+    def nbytes(self) -> int:
+        """Memory [bytes], about."""
+        return _CELL_BYTES * math.prod(self.grid.shape)
 
     def silence(self, sources: Sources, device: torch.device = CPU) -> WaveState:
         """Return the state of all runs, on a device, before the drive is switched on."""

@@ -12,25 +12,24 @@ import itertools
 import logging
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import torch
 from scipy.spatial import KDTree
 
-from autdtorch.fdtd.coupling import Coupling, coupling_of
-from autdtorch.fdtd.grouping import one_box
-from autdtorch.fdtd.kernels.contract import Sources
+from autdtorch.fdtd.grid import make_box
+from autdtorch.fdtd.grouping import PlannedGrid, one_box
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
-from autdtorch.fdtd.short_runs import short_runs
-from autdtorch.fdtd.steady_state import MOST_JUDGED, Observe, SteadyState, run_to_steady_state
-from autdtorch.fdtd.stepping import Assembly
+from autdtorch.fdtd.steady_state import MOST_JUDGED, Observe
+from autdtorch.fdtd.stepping import Assembly, assemble_on
 from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_array, orbits_of_transducers
 from autdtorch.fdtd.turning import is_tilted
 from autdtorch.propagators.absorbed_power import Radiators, absorption
-from autdtorch.propagators.assembled_box import assembled_box
+from autdtorch.propagators.box_scatterer import BoxScatterer, Couplings
 from autdtorch.propagators.multiple_scattering import iterated
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.radiation import Judged, Radiation, Solved, spread_runs
@@ -42,16 +41,17 @@ from autdtorch.propagators.simulation import (
     Stepped,
     mean_of_images,
 )
-from autdtorch.propagators.store import MOST_BYTES, Store
+from autdtorch.propagators.store import BODIES, MOST_BYTES, Store, key_of
 from autdtorch.scene.checks import require_clear
 from autdtorch.scene.geometry import sphere_points
-from autdtorch.scene.obstacles.moving import circumscribed
+from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.obstacles.moving import circumscribed, is_movable, shifted
 from autdtorch.scene.reflectors import require_in_front
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL, Index
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.images import Image, Mirror
+from autdtorch.utils.images import Mirror
 from autdtorch.utils.process import cached_property, one_library_thread
 
 logger = logging.getLogger(__name__)
@@ -98,31 +98,6 @@ class BoxSimulation(Simulation):
             boxes.append(ScatteredField(assembly, wavenumber, *settings))
         return boxes
 
-    def _mirrors(self, numbers: Iterable[int]) -> list[Mirror]:
-        return [self.plan.region.mirrors[number] for number in numbers]
-
-    def coupling(self, target: ScatteredField, source: ScatteredField, images: Sequence[Image]) -> Coupling:
-        """Return the coupling from a box to another or to itself; see `coupling_of`."""
-        key = target, source
-        if key not in self._couplings:
-            self._couplings[key] = coupling_of(target, source, images)
-        return self._couplings[key]
-
-    def images_towards(self, target: ScatteredField, source: ScatteredField) -> Sequence[Image]:
-        """Return the images of a box that drive another: as for receivers, both sides of mirrors count alike.
-
-        A mirror that both hold is left out: the other drives its own image. See `seen_twice`.
-        """
-        images = source.images
-        for mirror in self._mirrors(sorted(set(source.mirrors) - set(target.mirrors))):
-            half = [image._replace(weight=image.weight / 2) for image in images]
-            images = (*half, *(image.after(mirror.image) for image in half))
-        return images
-
-    @cached_property
-    def _couplings(self) -> dict[tuple[ScatteredField, ScatteredField], Coupling]:
-        return {}
-
     @property
     def assemblies(self) -> Sequence[Assembly]:
         """The assembled grids of the boxes."""
@@ -131,7 +106,12 @@ class BoxSimulation(Simulation):
     @property
     def held_mirrors(self) -> Sequence[Mirror]:
         """The mirrors next to bodies."""
-        return self._mirrors(sorted({number for grid in self.plan.grouping.grids for number in grid.mirrors}))
+        held = sorted({number for grid in self.plan.grouping.grids for number in grid.mirrors})
+        return [self.plan.region.mirrors[number] for number in held]
+
+    @cached_property
+    def _couplings(self) -> Couplings:
+        return Couplings(self.plan.region.mirrors)
 
     @cached_property
     def absorptions(self) -> Sequence[AbsorbingCells]:
@@ -281,10 +261,8 @@ class BoxSimulation(Simulation):
         """Simulate R runs until the pressure at the judged receivers has converged; see `_run`."""
         drives = [self.imaged(*drive) for drive in zip(sources, strength, strict=True)]
         transforms = [box.near_to_far(judged.receivers) for box in self.boxes]
-        bodies = [
-            _Scatterer(self, transform, stepped, self.coupling(box, box, box.echoes) if box.echoes else None)
-            for box, transform in zip(self.boxes, transforms, strict=True)
-        ]
+        settings = self.plan, self._kernel, self._couplings, stepped
+        bodies = [BoxScatterer(*settings, transform) for transform in transforms]
         single = len(bodies) == 1 and not bodies[0].comes_back_later
         observed = None  # of a short run, nothing
         if not (single and self.plan.is_short):
@@ -349,88 +327,30 @@ class BoxSimulation(Simulation):
         return BoxSimulation(replace(self.plan, grouping=grouping), self._store)
 
 
-@dataclass(frozen=True, eq=False)
-class _Scatterer:
-    """The obstacles of a box, whose answers to incident fields are simulated.
-
-    The `echo` is what mirrors send back, None without mirrors. It drives the run itself, or where some waves
-    are summed one by one, it is a further incident field.
-    """
-
-    simulation: BoxSimulation
-    transform: NearToFar
-    stepped: Stepped
-    echo: Coupling | None
-
-    @property
-    def comes_back_later(self) -> bool:
-        """True if mirrors send back an incident field of a further run."""
-        return self.echo is not None and bool(self.echo.rest)
-
-    def answers(
-        self,
-        incoming: torch.Tensor,
-        tolerances: Sequence[float],
-        observe: Observe | None = None,
-        floors: torch.Tensor | None = None,
-    ) -> list[SteadyState]:
-        """Simulate the answers to forces (h, R) until all that is observed has converged.
-
-        By default, these are the amplitudes of the Huygens surface.
-        """
-        box, cells, plan = self.transform.box, self.transform.cells, self.simulation.plan
-        # without those of obstacles of air, and of drives that cancel
-        loud = box.sources(incoming).force.any(dim=(1, 2)).nonzero()[:, 0].numpy()
-
-        def drive(runs: Index) -> Sources:
-            return box.sources(incoming[:, loud[runs]])
-
-        def echoed(phasors: torch.Tensor, runs: Index) -> Sources:
-            assert self.echo
-            back = self.echo.field(self.outgoing(phasors))
-            return box.sources(incoming[:, loud[runs]] + box.forces(back))
-
-        def observed(phasors: torch.Tensor, runs: Index) -> Sequence[torch.Tensor]:
-            return observe(phasors, loud[runs]) if observe else [self.outgoing(phasors.cpu())]
-
-        course = box.assembly, self.simulation._kernel, drive, cells
-        if plan.is_short:
-            states = short_runs(*course, len(loud), plan.max_periods, self.stepped)
-        else:
-            states = run_to_steady_state(
-                *course, [tolerances[run] for run in loud], plan.max_periods, observed, self.stepped,
-                torch.zeros((1, len(loud)), **REAL) if floors is None else floors[:, loud],
-                echoed if self.echo and not self.comes_back_later else None,
-            )  # fmt: skip
-        silent = SteadyState(torch.zeros(len(cells), **COMPLEX), 0, 0.0, True)
-        answers = [silent] * len(tolerances)
-        for run, state in zip(loud, states, strict=True):
-            answers[run] = state
-        return answers
-
-    def outgoing(self, phasors: torch.Tensor) -> torch.Tensor:
-        """Return the amplitudes of the Huygens surface."""
-        return self.transform.amplitudes(phasors)
-
-    def incoming(self, other: _Scatterer, outgoing: torch.Tensor) -> torch.Tensor | None:
-        """Return the forces (h, R) of what a Huygens surface radiates to this box, its own by mirrors."""
-        box, here = other.transform.box, self.transform.box
-        if other is self and not self.comes_back_later:
-            return None
-        images = box.echoes if other is self else self.simulation.images_towards(here, box)
-        coupling = self.simulation.coupling(here, box, images)
-        if not coupling.pairs:
-            field = box.radiated(outgoing, here.driven, coupling.rest)
-        else:
-            field = coupling.field(outgoing)
-            if coupling.rest:
-                field = field + box.radiated(outgoing, here.driven, coupling.rest)
-        return here.forces(field)
-
-
 def _images(box: ScatteredField, symmetry: Symmetry) -> Index:
     """Return for each cell of the Huygens surface the place of its image among them."""
     places = box.radiating.numpy() - symmetry.center
     if (symmetry.matrix == np.eye(3)).all():
         return np.arange(len(places))
     return np.asarray(KDTree(places).query(places @ symmetry.matrix.T)[1], np.int64)
+
+
+def assembled_box(planned: PlannedGrid, dtype: torch.dtype, time_step: float | None) -> Assembly:
+    """Assemble the box of a planned grid; see `stepping.assemble_on`.
+
+    It is assembled with its first cell at the origin: for a body that moves it is the same, to the last bit.
+    """
+    axes, part = planned.axes, planned.part.turned(planned.axes)
+    grid = make_box(part, planned.spacing, planned.extent)
+    if not all(isinstance(shape, Obstacle) and is_movable(shape) for shape in planned.part.shapes):
+        return assemble_on(grid, part, dtype, time_step)
+    offset = torch.from_numpy(-np.array(grid.origin) @ axes)
+    bodies = tuple(
+        replace(body, shape=shifted(cast(Obstacle, body.shape), offset)) for body in planned.part.bodies
+    )
+    here = replace(grid, origin=(0.0, 0.0, 0.0))
+    still = replace(planned.part.unbounded, bodies=bodies, sources=np.zeros((0, 3)), mirrors=())
+    medium = still.fluid, still.attenuation, still.frequency
+    key = key_of("box", bodies, axes, here, *medium, str(dtype), time_step)
+    assembly = BODIES.get(key, lambda: assemble_on(here, still.turned(axes), dtype, time_step))
+    return replace(assembly, grid=grid, region=part)

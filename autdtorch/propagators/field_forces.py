@@ -10,12 +10,16 @@ from __future__ import annotations
 import functools
 import math
 
-import numpy as np
 import torch
-from scipy.special import spherical_jn, spherical_yn
 
-from autdtorch.analytic.momentum import linear_momentum
-from autdtorch.analytic.spherical_waves import degrees, harmonics, sphere_rule
+from autdtorch.analytic.momentum import linear_momentum, taken_up
+from autdtorch.analytic.spherical_waves import (
+    degrees,
+    harmonics,
+    outgoing_radial,
+    regular_radial,
+    sphere_rule,
+)
 from autdtorch.propagators.derivatives import field_derivatives, nodes_around
 from autdtorch.propagators.propagator import Propagator
 from autdtorch.propagators.tmatrix.bodies import ObstacleGroup, bodies_of
@@ -65,32 +69,27 @@ def _is_alone(scene: Scene, bodies: list[ObstacleGroup], body: ObstacleGroup) ->
 def _force_on(propagator: Propagator, drive: torch.Tensor, body: ObstacleGroup) -> torch.Tensor:
     """Return the force (3,) [N] on a body by the pressures on two spheres around it."""
     scene = propagator.scene
-    k, radii = scene.complex_wavenumber, [body.radius + share * scene.wavelength for share in _APART]
-    degree = math.ceil(scene.wavenumber * radii[1]) + _MORE_DEGREES
-    nodes, to_waves = _sphere(degree)
-    points = torch.cat([body.center + radius * nodes for radius in radii])
+    radii = torch.tensor([body.radius + share * scene.wavelength for share in _APART], **REAL)
+    degree = math.ceil(scene.wavenumber * float(radii[1])) + _MORE_DEGREES
+    points = body.center + radii[:, None, None] * sphere_rule(degree + 1)[0]
     # a grid, which may be near obstacles without a warning
-    on_spheres = propagator.field(drive, points[None]).reshape(2, -1) @ to_waves  # (2, N)
-    orders = np.arange(degree + 1)
-    regular = np.array([spherical_jn(orders, k * radius) for radius in radii])
-    radial = np.stack(
-        [regular, regular + 1j * np.array([spherical_yn(orders, k * r) for r in radii])], axis=1
-    )
-    columns = torch.from_numpy(radial)[..., degrees(degree)].movedim(-1, 0)  # (N, spheres, kinds)
+    on_spheres = propagator.field(drive, points) @ _to_harmonics(degree)  # (2, N)
+    size = scene.complex_wavenumber * radii
+    radial = regular_radial(degree, size[:, None]), outgoing_radial(degree, size).mT[:, degrees(degree)]
+    columns = torch.stack(radial, dim=-1).movedim(1, 0)  # (N, spheres, kinds)
     scale = columns.abs().amax(dim=1, keepdim=True)
     solved = torch.linalg.solve(columns / scale, on_spheres.mT[..., None])[..., 0] / scale[:, 0]
     incoming, outgoing = solved[:, :1], solved[:, 1:]
-    momentum = linear_momentum(incoming + outgoing).conj()
     factor = 1 / (2 * scene.medium.density * scene.angular_frequency**2)
-    force: torch.Tensor = -factor * (momentum * outgoing).sum(dim=(-2, -1)).real
+    force: torch.Tensor = factor * taken_up(linear_momentum, incoming, outgoing)[:, 0, 0].real
     return force
 
 
 @functools.lru_cache(4)
-def _sphere(degree: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return nodes (S, 3) on the unit sphere, and the map (S, N) from values there to those of harmonics."""
+def _to_harmonics(degree: int) -> torch.Tensor:
+    """Return the map (S, N) from values at the nodes of a sphere to those of harmonics."""
     nodes, weights = sphere_rule(degree + 1)
-    return nodes, weights[:, None] * harmonics(degree, nodes).conj()
+    return weights[:, None] * harmonics(degree, nodes).conj()
 
 
 def radiation_stress(

@@ -12,7 +12,7 @@ from autdtorch.analytic import rigid_sphere
 from autdtorch.fdtd.grid import make_box
 from autdtorch.fdtd.grouping import box_grid, cheapest_boxes, one_box
 from autdtorch.fdtd.kernels.cpu import CpuKernel
-from autdtorch.propagators import SimulatedPropagator, assembled_box, make_propagator
+from autdtorch.propagators import SimulatedPropagator, box, make_propagator
 from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.propagators.plan import plan, region_of
 from autdtorch.propagators.store import BODIES
@@ -123,10 +123,10 @@ BALL = Sphere((40e-3, 50e-3, 50e-3), 4e-3, rigid=True)
 @pytest.fixture
 def assembled(monkeypatch):
     """A list with an entry for every box that is assembled; none is kept before."""
-    boxes, assemble_on = [], assembled_box.assemble_on
+    boxes, assemble_on = [], box.assemble_on
     BODIES.forget()
     monkeypatch.setattr(
-        assembled_box, "assemble_on", lambda grid, *more: boxes.append(grid) or assemble_on(grid, *more)
+        box, "assemble_on", lambda grid, *more: boxes.append(grid) or assemble_on(grid, *more)
     )
     return boxes
 

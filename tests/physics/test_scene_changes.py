@@ -9,9 +9,9 @@ import pytest
 import torch
 from small_scenes import AIR, relative_error, small_scene
 
-from autdtorch.propagators import TMatrixPropagator, assembled_box, make_propagator
+from autdtorch.propagators import TMatrixPropagator, box, make_propagator
 from autdtorch.propagators.scene_changes import SceneChanges
-from autdtorch.propagators.tmatrix.body import BodyWaves
+from autdtorch.propagators.tmatrix.body import StillBody
 from autdtorch.propagators.tmatrix.tmatrix import TMatrixCluster
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.changes import KINDS
@@ -116,7 +116,7 @@ def test_grids_turn_with_obstacles_that_turn_as_one_body():
         afresh = propagator.transfer_matrix(changes.points(amounts))
         assert relative_error(changes.matrix([0.0, *amounts[1:]]), afresh) > 0.1
         assert relative_error(matrix, afresh) < 0.01  # cells along other axes
-    with mock.patch.object(assembled_box, "assemble_on", wraps=assembled_box.assemble_on) as assembled:
+    with mock.patch.object(box, "assemble_on", wraps=box.assemble_on) as assembled:
         for turn in (0.1, 0.2):
             changes_of(scene, names[0], method="box", spacing=0.9e-3).matrix([turn])
     assert assembled.call_count == 1
@@ -151,7 +151,7 @@ def test_simulated_bodies_move_and_warm_without_further_simulations():
     changes = changes_of(SIMULATED, "obstacles.x", "obstacles[0].turn_y", "temperature", method="tmatrix")
     changes.matrix([0.0, 0.0, 1.0])  # the temperatures around
     amounts = [-0.5e-3, 0.2, 2.5]
-    with mock.patch.object(BodyWaves, "matrix", side_effect=AssertionError):
+    with mock.patch.object(StillBody, "simulated", side_effect=AssertionError):
         matrix = changes.matrix(amounts)
         changes.derivatives(amounts)
     exact = make_propagator(changes.scene(amounts), "tmatrix", **COARSE).transfer_matrix()

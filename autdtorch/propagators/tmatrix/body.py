@@ -83,7 +83,10 @@ class Solver(NamedTuple):
 
 @dataclass(frozen=True)
 class StillBody:
-    """A body at rest around the origin, and all that decides its matrix."""
+    """A body at rest around the origin, all that decides its matrix, and the simulation of that.
+
+    Its waves are those around the centre of the circumscribed sphere.
+    """
 
     obstacles: tuple[Obstacle, ...]
     medium: Medium
@@ -107,18 +110,94 @@ class StillBody:
             warnings.simplefilter("ignore", ScaleWarning)
             return Scene(array, self.medium, self.frequency, center - aside, self.obstacles, name="body")
 
-    @property
+    @cached_property
     def degree(self) -> int:
         """The largest degree of the waves."""
         return max(
             enough_degrees(self.scene.wavenumber * self.sphere[1], self.solver.error), self.fewest_degrees
         )
 
-    @property
-    def waves(self) -> BodyWaves:
-        """The simulation of its waves."""
-        planned = plan(self.scene, "box", *self.solver)
-        return BodyWaves(planned, *self.sphere, self.degree)
+    @cached_property
+    def axes(self) -> torch.Tensor:
+        """The axes of the grid, along which waves are taken: the columns of a matrix (3, 3)."""
+        return torch.from_numpy(self._grouping.grids[0].axes).mT.contiguous()
+
+    @cached_property
+    def runs(self) -> list[list[int]]:
+        """The real waves of each run, at most one of each kind; those of similar degree together."""
+        kinds = self._kinds
+        of_kind = [torch.nonzero(kinds == kind)[:, 0].tolist() for kind in range(int(kinds.max()) + 1)]
+        return [[wave for wave in waves if wave is not None] for waves in zip_longest(*of_kind)]
+
+    @one_library_thread()
+    def simulated(self) -> SimulatedT:
+        """Simulate T."""
+        spacing, size = 1e3 * self.solver.spacing, (self.degree + 1) ** 2
+        logger.debug("simulating a T-matrix: %d waves, cells of %.3g mm", size, spacing)
+        if not len(self._box.assembly.heterogeneous.index):  # obstacles of the medium's own material
+            return SimulatedT(torch.zeros((size, size), **COMPLEX), self.axes, 0.0)
+        box, plan, kernel = self._box, self._plan, make_kernel(self._plan.kernel)
+        mixing = real_waves(self.degree)
+        incoming = self._regular(box.driven) @ mixing
+        strength = incoming.norm(dim=0).clamp_min(torch.finfo(torch.float64).tiny)
+        outgoing = mixing.mH @ self._multipoles()
+        judged = sphere_points((0.0, 0.0, 0.0), self.sphere[1], MOST_JUDGED)
+        observed = outgoing_waves(self.degree, box.wavenumber, judged) @ mixing @ outgoing
+
+        def drive(runs: Index) -> Sources:
+            waves = (self.runs[run] for run in runs)
+            fields = [(incoming[:, some] / strength[some]).sum(dim=1) for some in waves]
+            return box.sources(box.forces(torch.stack(fields, dim=1)))
+
+        count = len(self.runs)
+        periods = math.ceil(count * USUAL_PERIODS * fewest_periods(box.assembly.grid.arrival))
+        with show_progress(periods, "simulating the waves of a body") as progress:
+            states = run_to_steady_state(
+                box.assembly, kernel, drive, box.surface.cells, [plan.tolerance] * count, plan.max_periods,
+                lambda phasors, runs: [observed @ phasors.cpu()], progress.advance,
+                torch.zeros((1, count), **REAL),
+            )  # fmt: skip
+        answers = outgoing @ torch.stack([steady.pressure for steady in states], dim=1)
+        matrix, kinds = torch.zeros_like(mixing), self._kinds
+        for waves, answer in zip(self.runs, answers.mT, strict=True):
+            for wave in waves:
+                matrix[:, wave] = torch.where(kinds == kinds[wave], answer * strength[wave], 0)
+        residual = max(steady.residual for steady in states)
+        return SimulatedT(mixing @ matrix @ mixing.mH, self.axes, residual)
+
+    @cached_property
+    def _plan(self) -> Plan:
+        return plan(self.scene, "box", *self.solver)
+
+    @cached_property
+    def _grouping(self) -> Grouping:
+        return one_box(self._plan.region, self._plan.spacing)
+
+    @cached_property
+    def _box(self) -> ScatteredField:
+        return BoxSimulation(replace(self._plan, grouping=self._grouping), Store()).boxes[0]
+
+    @cached_property
+    def _kinds(self) -> torch.Tensor:
+        """The kind (N,) of each real wave; waves of different kinds do not scatter into one another."""
+        box, odd = self._box, parities(self.degree).numpy()
+        mirrors = symmetries([box.assembly], box.axes, Apertures.of_points(self.sphere[0][None]))
+        turns = [box.axes @ symmetry.matrix @ box.axes.T for symmetry in mirrors]
+        flips = np.stack([np.diag(turn) < 0 for turn in turns if np.allclose(np.abs(turn), np.eye(3))])
+        odd = odd @ flips.T.astype(np.int64) % 2  # by wave and symmetry
+        return torch.from_numpy(np.unique(odd, axis=0, return_inverse=True)[1].reshape(-1))
+
+    def _regular(self, places: torch.Tensor) -> torch.Tensor:
+        """Return regular waves (n, N) at places (n, 3) [m]."""
+        return regular_waves(self.degree, self._box.wavenumber, (places - self.sphere[0]) @ self.axes)
+
+    def _multipoles(self) -> torch.Tensor:
+        """Return the map (N, n) from phasors of the Huygens surface to outgoing waves."""
+        box = self._box
+        place, sign = mirrored(self.degree)
+        conjugate = sign * self._regular(box.radiating)[:, place]  # j_l Y_lm^*, also for a complex wavenumber
+        factor = 4j * math.pi * box.wavenumber * box.surface.factor
+        return factor * torch.from_numpy((box.surface.weights.T @ conjugate.numpy()).T)
 
 
 class Placed(NamedTuple):
@@ -132,7 +211,7 @@ class Placed(NamedTuple):
     def runs(self) -> int:
         """Number of simulations that T takes where it is not there."""
         body = self.body
-        return 0 if has_closed_form(body.obstacles) else len(body.waves.runs)
+        return 0 if has_closed_form(body.obstacles) else len(body.runs)
 
     def matrix(self, store: Store) -> BodyMatrix:
         """Return T and its place, from memory or the store's folder if it is there."""
@@ -145,10 +224,15 @@ class Placed(NamedTuple):
         else:
             settings = tuple(str(entry) if isinstance(entry, torch.dtype) else entry for entry in body.solver)
             key = key_of(body.obstacles, body.medium, body.frequency, settings)
-            simulated = BODIES.get(key, lambda: _loaded(body, key, store) or _simulated(body))
+            simulated = BODIES.get(key, lambda: _loaded(body, key, store) or body.simulated())
             matrix, axes = simulated.matrix.clone(), simulated.axes
             if simulated.residual > body.solver.error:
-                _warn_of_unsettled(body.solver, simulated.residual)
+                warn_user(
+                    f"no steady state of the waves of a body after {body.solver.max_periods} periods: "
+                    f"estimated relative error up to {simulated.residual:.1e}, tolerance "
+                    f"{body.solver.error:g}; raise max_periods or tolerance",
+                    SteadyStateWarning,
+                )
             elif store.folder is not None and store.load(key, tuple(matrix.shape), 1) is None:
                 store.save(key, matrix.numpy(), simulated.residual)
         place = self.turn @ center + self.shift
@@ -188,109 +272,4 @@ def _loaded(body: StillBody, key: str, store: Store) -> SimulatedT | None:
     if saved is None:
         return None
     logger.info("T-matrix of an earlier run, kept in %s", store.folder)
-    return SimulatedT(torch.from_numpy(saved[0]), body.waves.axes, saved[1][0])
-
-
-def _simulated(body: StillBody) -> SimulatedT:
-    spacing = 1e3 * body.solver.spacing
-    logger.debug("simulating a T-matrix: %d waves, cells of %.3g mm", (body.degree + 1) ** 2, spacing)
-    waves = body.waves
-    matrix, residual = waves.matrix()
-    return SimulatedT(matrix, waves.axes, residual)
-
-
-def _warn_of_unsettled(solver: Solver, residual: float) -> None:
-    warn_user(
-        f"no steady state of the waves of a body after {solver.max_periods} periods: estimated relative "
-        f"error up to {residual:.1e}, tolerance {solver.error:g}; raise max_periods or tolerance",
-        SteadyStateWarning,
-    )
-
-
-@dataclass(frozen=True)
-class BodyWaves:
-    """The simulation of a body's answers to regular waves up to a degree.
-
-    Centre (3,) and radius [m] are those of its circumscribed sphere.
-    """
-
-    plan: Plan
-    center: torch.Tensor
-    radius: float
-    degree: int
-
-    @cached_property
-    def axes(self) -> torch.Tensor:
-        """The axes of the grid, along which waves are taken: the columns of a matrix (3, 3)."""
-        return torch.from_numpy(self._grouping.grids[0].axes).mT.contiguous()
-
-    @cached_property
-    def runs(self) -> list[list[int]]:
-        """The real waves of each run, at most one of each kind; those of similar degree together."""
-        kinds = self._kinds
-        of_kind = [torch.nonzero(kinds == kind)[:, 0].tolist() for kind in range(int(kinds.max()) + 1)]
-        return [[wave for wave in waves if wave is not None] for waves in zip_longest(*of_kind)]
-
-    @one_library_thread()
-    def matrix(self) -> tuple[torch.Tensor, float]:
-        """Simulate T (N, N); return also the largest residual of the runs, relative."""
-        if not len(self._box.assembly.heterogeneous.index):  # obstacles of the medium's own material
-            count = (self.degree + 1) ** 2
-            return torch.zeros((count, count), **COMPLEX), 0.0
-        box, plan, kernel = self._box, self.plan, make_kernel(self.plan.kernel)
-        mixing = real_waves(self.degree)
-        incoming = self._regular(box.driven) @ mixing
-        size = incoming.norm(dim=0).clamp_min(torch.finfo(torch.float64).tiny)
-        outgoing = mixing.mH @ self._multipoles()
-        judged = sphere_points((0.0, 0.0, 0.0), self.radius, MOST_JUDGED)
-        observed = outgoing_waves(self.degree, box.wavenumber, judged) @ mixing @ outgoing
-
-        def drive(runs: Index) -> Sources:
-            waves = (self.runs[run] for run in runs)
-            fields = [(incoming[:, some] / size[some]).sum(dim=1) for some in waves]
-            return box.sources(box.forces(torch.stack(fields, dim=1)))
-
-        count = len(self.runs)
-        periods = math.ceil(count * USUAL_PERIODS * fewest_periods(box.assembly.grid.arrival))
-        with show_progress(periods, "simulating the waves of a body") as progress:
-            states = run_to_steady_state(
-                box.assembly, kernel, drive, box.surface.cells, [plan.tolerance] * count, plan.max_periods,
-                lambda phasors, runs: [observed @ phasors.cpu()], progress.advance,
-                torch.zeros((1, count), **REAL),
-            )  # fmt: skip
-        answers = outgoing @ torch.stack([steady.pressure for steady in states], dim=1)
-        matrix, kinds = torch.zeros_like(mixing), self._kinds
-        for waves, answer in zip(self.runs, answers.mT, strict=True):
-            for wave in waves:
-                matrix[:, wave] = torch.where(kinds == kinds[wave], answer * size[wave], 0)
-        return mixing @ matrix @ mixing.mH, max(steady.residual for steady in states)
-
-    @cached_property
-    def _grouping(self) -> Grouping:
-        return one_box(self.plan.region, self.plan.spacing)
-
-    @cached_property
-    def _box(self) -> ScatteredField:
-        return BoxSimulation(replace(self.plan, grouping=self._grouping), Store()).boxes[0]
-
-    @cached_property
-    def _kinds(self) -> torch.Tensor:
-        """The kind (N,) of each real wave; waves of different kinds do not scatter into one another."""
-        box, odd = self._box, parities(self.degree).numpy()
-        mirrors = symmetries([box.assembly], box.axes, Apertures.of_points(self.center[None]))
-        turns = [box.axes @ symmetry.matrix @ box.axes.T for symmetry in mirrors]
-        flips = np.stack([np.diag(turn) < 0 for turn in turns if np.allclose(np.abs(turn), np.eye(3))])
-        odd = odd @ flips.T.astype(np.int64) % 2  # by wave and symmetry
-        return torch.from_numpy(np.unique(odd, axis=0, return_inverse=True)[1].reshape(-1))
-
-    def _regular(self, places: torch.Tensor) -> torch.Tensor:
-        """Return regular waves (n, N) at places (n, 3) [m]."""
-        return regular_waves(self.degree, self._box.wavenumber, (places - self.center) @ self.axes)
-
-    def _multipoles(self) -> torch.Tensor:
-        """Return the map (N, n) from phasors of the Huygens surface to outgoing waves."""
-        box = self._box
-        place, sign = mirrored(self.degree)
-        conjugate = sign * self._regular(box.radiating)[:, place]  # j_l Y_lm^*, also for a complex wavenumber
-        factor = 4j * math.pi * box.wavenumber * box.surface.factor
-        return factor * torch.from_numpy((box.surface.weights.T @ conjugate.numpy()).T)
+    return SimulatedT(torch.from_numpy(saved[0]), body.axes, saved[1][0])

@@ -23,7 +23,7 @@ import torch
 from autdtorch.analytic.momentum import angular_momentum, linear_momentum, taken_up
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.propagators.tmatrix.scattering import waves_of_body
-from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
+from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster, broadcast
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.medium import Medium
@@ -154,11 +154,8 @@ class _Driven:
             taken = -(momentum.of_waves(regular + outgoing).conj() * outgoing).sum(dim=-2).real
             return (self._to_scene(bodies, momentum) @ taken.movedim(0, -2)).mT
 
-        try:
-            every = np.broadcast_shapes(self.cluster.poses, drive.shape[:-1])
-        except ValueError:
-            beside = f"beside poses {self.cluster.poses}; leading dimensions must broadcast"
-            raise ValueError(f"drive: shape {tuple(drive.shape)} {beside}") from None
+        beside = f" beside poses {self.cluster.poses}"
+        every = broadcast("drive", drive, beside, self.cluster.poses, drive.shape[:-1])
         poses = (1,) * (len(every) - len(self.cluster.poses)) + self.cluster.poses
         order = sorted(range(len(every)), key=lambda dimension: poses[dimension] == 1)  # of drives alone last
         drives = drive.expand(*every, -1).permute(*order, -1).reshape(math.prod(poses), -1, len(self.array))

@@ -151,7 +151,7 @@ class TMatrix(BodyMatrix):
             raise ValueError(f"offset: shape {tuple(shift.shape)}; must be (3,), or (..., 3) for many poses")
         before = np.broadcast_shapes(self.center.shape[:-1], self.axes.shape[:-2])
         beside = f" beside a rotation of {tuple(angles.shape)}" + (f" and poses {before}" if before else "")
-        poses = _broadcast("offset", shift, beside, shift.shape[:-1], angles.shape[:-1], before)
+        poses = broadcast("offset", shift, beside, shift.shape[:-1], angles.shape[:-1], before)
         axes = composed_rotation(angles.cos(), angles.sin()) @ self.axes
         return replace(self, center=self.center + shift, axes=axes).in_poses(poses)
 
@@ -192,7 +192,7 @@ class TMatrix(BodyMatrix):
             return cls(matrix, complex(arrays["wavenumber"]), radius, center, axes)
 
 
-def _broadcast(name: str, value: torch.Tensor, beside: str, *shapes: Sequence[int]) -> tuple[int, ...]:
+def broadcast(name: str, value: torch.Tensor, beside: str, *shapes: Sequence[int]) -> tuple[int, ...]:
     """Return what leading dimensions broadcast to; the message names a value and what is beside it."""
     try:
         return np.broadcast_shapes(*map(tuple, shapes))
@@ -231,7 +231,7 @@ class TMatrixCluster:
             for other in bodies[:number]:
                 others = f" beside {tuple(other.center.shape)}"
                 poses = body.center.shape[:-1], other.center.shape[:-1]
-                _broadcast(f"bodies[{number}].center", body.center, others, *poses)
+                broadcast(f"bodies[{number}].center", body.center, others, *poses)
                 least = body.radius + other.radius
                 apart = float((body.center - other.center).detach().norm(dim=-1).min())
                 if apart < least - LENGTH_TOLERANCE:
@@ -309,7 +309,7 @@ class TMatrixCluster:
         require_kind("array", array, TransducerArray)
         places, grid = points_grid("points", points)
         targets, of_points = places.cpu(), places.reshape(*grid, 3)
-        every = _broadcast("points", of_points, f" beside poses {self.poses}", self.poses, grid[:-1])
+        every = broadcast("points", of_points, f" beside poses {self.poses}", self.poses, grid[:-1])
         for name, places in (("points", targets.detach()), ("array.positions", array.positions)):
             require_in_front(self.reflectors, name, places.reshape(-1, 3))
         images = self.images_around(torch.cat([targets.detach(), array.positions]))

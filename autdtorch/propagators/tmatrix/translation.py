@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from autdtorch.analytic.momentum import gradient_by_place, gradient_by_turn
-from autdtorch.analytic.spherical_waves import harmonics, mirrored, turns
+from autdtorch.analytic.spherical_waves import harmonics, mirrored, outgoing_radial, turns
 from autdtorch.utils.array_types import REAL
 
 
@@ -149,7 +149,7 @@ class _Factors(NamedTuple):
         angles[:-1] += math.pi  # a quarter turn back is one between two half turns about z
         degrees = here.degree, there.degree
         every = torch.arange(max(degrees) + 1, **REAL)[:, None] * _padded(angles)[:, None]
-        radial = torch.view_as_real(_outgoing_radial(sum(degrees), translation.wavenumber * distance))
+        radial = torch.view_as_real(outgoing_radial(sum(degrees), translation.wavenumber * distance))
         shifts = _shifts_along_z(*degrees) @ _padded(radial.movedim(-1, 0).contiguous())
         if translation.is_conjugate:
             shifts[1].neg_()
@@ -225,16 +225,6 @@ def _quarters(degree: int) -> torch.Tensor:
         upper[:, 0] /= 2  # as the order 0 is added to itself
         parts.append(torch.cat([upper.flip(1)[:, side::2] for side in (0, 1)], dim=1).flatten())
     return torch.cat(parts)
-
-
-def _outgoing_radial(degree: int, x: torch.Tensor) -> torch.Tensor:
-    """Return h_l(x) (L + 1, B) of the first kind."""
-    inverse = 1 / x.to(torch.complex128)
-    rows = [torch.exp(1j * x) * inverse / 1j]
-    rows.append(rows[0] * (inverse - 1j))
-    for n in range(1, degree):
-        rows.append((2 * n + 1) * inverse * rows[-1] - rows[-2])
-    return torch.stack(rows[: degree + 1])
 
 
 @functools.lru_cache(8)
