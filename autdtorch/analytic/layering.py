@@ -9,7 +9,6 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from scipy.integrate import cumulative_trapezoid
 from scipy.special import hankel1, hankel2, jv
 
 from autdtorch.utils.array_types import Array, ComplexArray
@@ -223,7 +222,8 @@ def _panel_edges(
     clearance = np.maximum(-kappa.imag, kappa.real - singular)
     outer, inner = (np.abs(kappa / vertical_wavenumber(wavenumber, kappa)) for wavenumber in wavenumbers)
     density = 1 / (_PANEL_LENGTH * clearance) + (offset + vertical * (outer + inner)) / _PANEL_PHASE
-    panels = length * cumulative_trapezoid(density, along, initial=0)
+    steps = length * np.diff(along) * (density[:-1] + density[1:]) / 2
+    panels = np.concatenate([[0.0], np.cumsum(steps)])
     return np.interp(np.linspace(0, panels[-1], 1 + int(np.ceil(panels[-1]))), panels, along)
 
 
