@@ -16,12 +16,13 @@ OVERRIDES = $(strip $(foreach name,$(filter-out PYTHON ARGS,$(.VARIABLES)),$(if 
 	$(findstring command line,$(origin $(name))),'$(name)=$($(name))')) $(ARGS))
 
 .DEFAULT_GOAL := help
-.PHONY: help paper test lint docs clean
+.PHONY: help paper test test-pages lint docs clean
 
 help:
 	@echo "make paper   run the paper's experiment and write outputs/paper/report.html"
 	@echo "             (make paper trials=5 changes a setting, as does ARGS='trials=5 seed=1')"
-	@echo "make test    run the tests (ARGS='-m unit' selects)"
+	@echo "make test    test the package (ARGS='-m unit' selects)"
+	@echo "make test-pages   the tests of pages: documentation, its commands and notebooks, live view"
 	@echo "make lint    ruff, mypy, import-linter"
 	@echo "make docs    build the documentation in outputs/docs, executing its notebooks"
 	@echo "make clean   remove .venv and the tools' caches; outputs/ stays"
@@ -47,8 +48,13 @@ $(VENV)/.kernels: $(wildcard autdtorch/fdtd/kernels/*.py autdtorch/methods/holog
 	for dtype in float32 float64; do $(BIN)/python tests/compile_kernels.py $$dtype & done; wait
 	@touch $@
 
+PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 8
+
 test: $(INSTALLED)-dev $(VENV)/.kernels
-	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist worksteal $(ARGS)
+	$(PYTEST) --dist worksteal -m 'not (docs or browser)' $(ARGS)
+
+test-pages: $(INSTALLED)-dev $(VENV)/.kernels
+	$(PYTEST) --dist loadgroup -m 'docs or browser' $(ARGS)
 
 lint: $(INSTALLED)-dev
 	$(BIN)/ruff check .

@@ -155,7 +155,7 @@ def pinned_lines():
 
 
 def makes(command, folder):
-    """`make` knows the target and its variables; CI runs `make test` and `make lint`."""
+    """`make` knows the target and its variables; CI runs those that test and `make lint`."""
     program, *arguments = shlex.split(command.text)
     done = run([program, "-n", *arguments], folder)
     assert done.returncode == 0, done.stderr
