@@ -39,15 +39,9 @@ def send(write, tmp_path, monkeypatch):
     return send_all
 
 
-def bomb(first, line):
-    """Ten levels, each of ten times the one before."""
-    return "".join([first, *(line.format(this=n, all=", ".join([f"*a{n - 1}"] * 10)) for n in range(1, 10))])
-
-
-LAUGHS = bomb("a0: &a0 [lol, lol]\n", "a{this}: &a{this} [{all}]\n")
-MERGES = bomb("a0: &a0 {x: 1}\n", "a{this}: &a{this} {{<<: [{all}]}}\n")
-REFERENCES = "a0: [lol, lol]\n" + "".join(f"a{n}: {[f'${{scene.a{n - 1}}}'] * 10}\n" for n in range(1, 10))
-
+LAUGHS = "a0: &a0 [lol, lol]\n" + "".join(
+    f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 10)
+)
 HYDRA = {
     "callbacks": f"{{x: {CALL}}}",
     "launcher": f"{{x: {CALL}}}",
@@ -83,7 +77,6 @@ ATTACKS = {
         ("_target_: autdtorch.load_results\n", "method._target_"),
         ("_target_: evil.load\nf: evil.pt\n", "method._target_"),
         ("_target_: autdtorch.lssg\nlevels: ${oc.decode:'4'}\n", "levels"),
-        (MERGES, "line"),
     ],
     "scene": [
         (f"{SCENE}extra: {CALL}\n", "scene.extra._target_"),
@@ -97,9 +90,6 @@ ATTACKS = {
         (scene("${scene.dollar}{oc.env:SECRET}\ndollar: $"), "name"),
         ("x: !!python/object/apply:pathlib.Path.touch [canary]\n", "line 1"),
         (SCENE + LAUGHS, "line"),
-        (SCENE + REFERENCES, "settings: scene.a"),
-        ("a: &a [*a]\n", "line 1"),
-        (f"a: {'[' * 10_000}", "line 1"),
     ],
     "solver": [
         (f"spacing: {CALL}\n", "solver.spacing._target_"),

@@ -218,6 +218,12 @@ OUT_OF_RANGE: dict[Callable[..., Any] | str, list[tuple[dict[str, Any], str]]] =
         ({"radius": 5.1e-3}, "TransducerArray.radius: 0.0051 m; must be at most 0.005 m, half the distance"),
     ],
     "circle_points": [({"radius": -0.03}, "radius: -0.03 m; must be finite and > 0")],
+    "polyline_points": [
+        ({"corners": [[0, 0, 0]]}, "corners: shape (1, 3); must be (K, 3) with K >= 2"),
+        ({"corners": [[0, 0, 0]] * 3}, "must not all be in one place"),
+        ({"count": 1, "closed": False}, "count: 1"),
+        ({"closed": "no"}, "closed: 'no'"),
+    ],
     plane_basis: [
         ({"normal": (1, 0, 0, 0)}, "normal: (1, 0, 0, 0); must be 3 real numbers"),
         ({"normal": (1e-12, 0, 0)}, "normal: (1e-12, 0, 0); must be a vector of finite length > 1e-09"),

@@ -358,18 +358,3 @@ def _along(corners: torch.Tensor, way: float) -> torch.Tensor:
             return start + way / length * (end - start)
         way -= length
     return corners[0]
-
-
-@pytest.mark.parametrize(
-    ("corners", "arguments", "message"),
-    [
-        ([[0, 0, 0]], {}, r"corners: shape \(1, 3\); must be \(K, 3\) with K >= 2"),
-        ([[0, 0, 0]] * 3, {}, "corners: .* must not all be in one place"),
-        ([[0, 0, 0], [1, 0, 0]], {"count": 0}, "count: 0"),
-        ([[0, 0, 0], [1, 0, 0]], {"count": 1, "closed": False}, "count: 1"),
-        ([[0, 0, 0], [1, 0, 0]], {"closed": "no"}, "closed: 'no'"),
-    ],
-)
-def test_a_wrong_polyline_is_refused(corners, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        polyline_points(corners, **{"count": 5, **arguments})

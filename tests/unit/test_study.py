@@ -200,15 +200,6 @@ def test_settings_are_checked_before_anything_is_simulated(changes, message, tmp
     assert "\n" not in str(caught.value)
 
 
-def test_another_study_is_kept_and_a_refused_one_moves_nothing(study, tmp_path):
-    for config in ("a: 1", "a: 2", "a: 3"):
-        study(config=config)
-        with pytest.raises(ValueError, match="solver: dtype"):
-            study(solver=FREE_SPACE | {"dtype": "int"}, config="a: 4")
-    kept = [tmp_path / folder for folder in ("previous-1", "previous-2", ".")]
-    assert [at.load_results(folder).provenance.config for folder in kept] == ["a: 1", "a: 2", "a: 3"]
-
-
 def test_the_matrix_of_the_study_is_a_prior(tmp_path):
     methods = {"identify": at.Identify(evaluations=3, prior=at.Prior()), "climb": at.GradientAscent()}
     found = run_study({"a": scene(None)}, methods, tmp_path, solver=FREE_SPACE).scenes["a"].methods
