@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -24,14 +25,17 @@ from checks.autd3 import (
     plane,
     play_focus,
     play_levels,
+    played_sequence,
     random_drive,
     rms,
     scaled,
+    wrong_levels,
 )
 from shared.scenes import relative_error
 
 import autdtorch as at
 from autdtorch.hardware import AUTD3
+from autdtorch.scene.sequence import Sequence, modulated
 
 FLOAT32 = 1e-5
 
@@ -68,3 +72,35 @@ def test_the_waveform_has_our_phases() -> None:
     assert left < 0.5 * (math.pi / FULL_PULSE) ** 2
     # The same for all points: half a turn off would be a sign.
     assert abs(torch.tensor(factor).angle()) < math.pi / 2
+
+
+def swinging(count: int) -> torch.Tensor:
+    """Drives (count, 249) whose phases swing: emulator 0.12.0 smooths wrongly where they wind down twice."""
+    turn = torch.sin(math.pi * torch.arange(count, dtype=torch.float64)[:, None] / 10)
+    return random_drive(249) * torch.polar(torch.ones_like(turn), turn)
+
+
+@pytest.mark.parametrize("rate", [500.0, 4000.0, 40_000.0])
+def test_boards_emit_every_frame_in_order_at_its_time(rate: float) -> None:
+    assert wrong_levels(Sequence(swinging(20), rate)) == 0
+
+
+def test_boards_emit_laps_of_a_path_times_factors() -> None:
+    factor = 0.6 + 0.4 * torch.cos(2 * math.pi * torch.arange(1220) / 61)[:, None]  # 61 frames, in laps of 20
+    sequence = Sequence(factor * swinging(1220), 4000.0)
+    phases, widths = played_sequence(sequence, 1)
+    phase, intensity = (level.T.numpy() for level in AUTD3.levels(sequence.drives))
+    assert np.array_equal(phases[:, 9::10][intensity > 0], phase[intensity > 0])
+    emitted = np.sin(math.pi * widths[:, 9::10] / FULL_PULSE)
+    # Half a level of factor and of intensity, and of 512 pulse widths.
+    wanted = factor.T * random_drive(249).abs()[:, None]
+    assert np.abs(emitted - wanted.numpy()).max() < 1 / 255 + math.pi / FULL_PULSE
+
+
+def test_amplitude_modulation_has_its_frequency_and_depth_within_a_hundredth() -> None:
+    widths = played_sequence(modulated(torch.ones(249).cdouble(), 200.0), 8)[1]
+    ends = (np.sin(math.pi * widths[:, 9::10] / FULL_PULSE) ** 2).mean(axis=0)  # radiation pressure
+    wanted = (1 + np.sin(2 * math.pi * np.arange(160) / 20)) / 2
+    # 8 bits of the factor and of the intensity, 9 bits of the pulse width.
+    assert np.abs(ends - wanted).max() < 0.01
+    assert np.abs(np.fft.rfft(ends - ends.mean())).argmax() * 4000 / 160 == 200.0
