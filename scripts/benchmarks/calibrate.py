@@ -1,15 +1,15 @@
 """Calibration of simulated benches by old readings: the drive that it gives, gains, phases and the pose.
 
-An AUTD3 of discs behind the paper's two cubes and behind a tilted phone. The bench differs in gains, phases,
-the obstacle's pose and the temperature, and its readings have noise. Takes about 20 minutes on 2 idle cores.
+An AUTD3 of discs behind the paper's two cubes. The bench differs in gains, phases, the obstacle's pose and
+the temperature, and its readings of random drives have noise.
 """
 
-import dataclasses
 import math
 import time
+from collections.abc import Iterator, Sequence
 
 import torch
-from shared.document import printed
+from shared.document import printed, table
 from shared.scenes import autd3_array, paper_scene, with_array
 
 import autdtorch as at
@@ -19,17 +19,9 @@ GAIN, PHASE = 0.1, 0.5  # rms of the logarithm of the gain, and [rad]
 SHIFT, TURN = 2e-3, math.radians(2)  # of the obstacle, about any axis
 WARMER = 5.0  # K
 NOISE = 30.0  # dB below the rms pressure of random phases
-OUTLIER = 100.0  # factor of a false reading
+DRIVES = 128  # of random phases, that were read
 
-OPTIONS = {
-    "--scenes": {"default": "two_cubes,phone", "help": "scenes, by commas"},
-    "--drives": {
-        "default": "64 random,128 random,64 trial",
-        "help": "drives that were read: of random phases, or those of a trial of identify",
-    },
-    "--seeds": {"type": int, "default": 20, "help": "benches"},
-    "--outliers": {"default": "0,0.02", "help": "shares of readings a hundred times too large"},
-}
+OPTIONS = {"--seeds": {"type": int, "default": 5, "help": "benches"}}
 
 _POSE = (
     "obstacles.x",
@@ -46,56 +38,35 @@ _PRIOR = {
 }
 
 
-def main(scenes: str, drives: str, seeds: int, outliers: str) -> None:
-    """Measure, and print medians.
-
-    Of each case: share of the optimum, and before; gains within 2 deviations; place off, and as stated; time.
-    """
-    printed(
-        _row(propagator, kind, seeds, float(share))
-        for propagator in map(_propagator, scenes.split(","))
-        for kind in drives.split(",")
-        for share in outliers.split(",")
-    )
-
-
-def scene_of(name: str) -> at.Scene:
-    """Return a scene by its name: "two_cubes", or "phone"."""
-    cubes = with_array(paper_scene("two_cubes"), autd3_array())
-    if name == "two_cubes":
-        return cubes
-    x, y, z = cubes.array.positions.mean(dim=0).tolist()
-    phone = at.Box((x + 0.08, y, z), (0.15, 0.075, 0.008), rigid=True, rotation=(0.0, 1.2, 0.0))
-    behind = torch.tensor([[x + 0.13, y + dy, z + dz] for dy in (-0.02, 0.02) for dz in (-0.02, 0.02)])
-    lower, upper = (x - 0.01, y - 0.1, z - 0.1), (x + 0.16, y + 0.1, z + 0.1)
-    return dataclasses.replace(
-        cubes, name="phone", obstacles=(phone,), control_points=behind, domain=(lower, upper)
-    )
-
-
-def _propagator(name: str) -> at.propagators.Propagator:
-    return at.make_propagator(scene_of(name), method="tmatrix" if name == "two_cubes" else "auto")
-
-
-def _row(propagator: at.propagators.Propagator, drives: str, seeds: int, outliers: float) -> list[str]:
-    count, kind = drives.split()
+def main(seeds: int) -> None:
+    """Measure benches, and print each and the medians."""
+    scene = with_array(paper_scene("two_cubes"), autd3_array())
+    propagator = at.make_propagator(scene, method="tmatrix")
+    header = [
+        "bench",
+        "of the optimum",
+        "before",
+        "gains within 2 deviations",
+        "place off",
+        "as stated",
+        "time",
+    ]
     results = []
-    for seed in range(seeds):
-        results.append(_calibrated(propagator, kind, seed, int(count), outliers))
-        print(
-            propagator.scene.name,
-            kind,
-            outliers,
-            seed,
-            [round(value, 4) for value in results[-1]],
-            flush=True,
-        )
-    share, before, within, off, stated, seconds = torch.tensor(results).quantile(0.5, dim=0).tolist()
-    false = f", {outliers:.0%} outliers" if outliers else ""
-    return [
-        f"{propagator.scene.name}, {count} {kind}{false}", f"{share:.3f}", f"{before:.3f}",
-        f"{within:.0%}", f"{1e3 * off:.2f} mm", f"{1e3 * stated:.2f} mm", f"{seconds:.0f} s",
-    ]  # fmt: skip
+
+    def rows() -> Iterator[list[str]]:
+        for seed in range(seeds):
+            results.append(calibrated(propagator, seed))
+            yield row(str(seed), results[-1])
+        yield row("median", torch.tensor(results).quantile(0.5, dim=0).tolist())
+
+    print("", table(header, printed(rows())), sep="\n")
+
+
+def row(name: str, result: Sequence[float]) -> list[str]:
+    """Return the results of a bench as cells."""
+    share, before, within, off, stated, seconds = result
+    lengths = (f"{1e3 * length:.2f} mm" for length in (off, stated))
+    return [name, f"{share:.3f}", f"{before:.3f}", f"{within:.0%}", *lengths, f"{seconds:.0f} s"]
 
 
 class Bench:
@@ -120,25 +91,12 @@ class Bench:
         noise = torch.complex(self._normal(*pressure.shape), self._normal(*pressure.shape))
         return (pressure + 0.5**0.5 * self._noise * noise).abs()
 
-    def readings(self, kind: str, count: int, outliers: float, seed: int) -> at.Readings:
-        """Return readings of random drives, or of those that `identify` asked for in a trial."""
-        if kind == "random":
-            shape = (count, self.matrix.shape[1])
-            phases = 2 * math.pi * torch.rand(shape, dtype=torch.float64, generator=self.draws)
-            drives = at.drive_from_phases(phases)
-            pressure = self(drives)
-        else:
-            method = at.Identify(count, at.Prior(self.simulated))
-            points, transducers = self.matrix.shape
-            state = method.start(at.Problem(transducers, points), seed)
-            parts = []
-            while not state.done:
-                asked = method.ask(state)
-                parts.append((asked, self(asked)))
-                state = method.tell(state, parts[-1][1])
-            drives, pressure = (torch.cat(part) for part in zip(*parts, strict=True))
-        false = torch.rand(pressure.shape, generator=self.draws) < outliers
-        return at.Readings(drives, torch.where(false, OUTLIER * pressure, pressure))
+    def readings(self) -> at.Readings:
+        """Return readings of random drives."""
+        shape = (DRIVES, self.matrix.shape[1])
+        phases = 2 * math.pi * torch.rand(shape, dtype=torch.float64, generator=self.draws)
+        drives = at.drive_from_phases(phases)
+        return at.Readings(drives, self(drives))
 
     def weakest(self, drive: torch.Tensor) -> float:
         """Return the weakest focus [Pa] of a drive (1, M), without noise."""
@@ -148,12 +106,12 @@ class Bench:
         return torch.randn(*shape, dtype=torch.float64, generator=self.draws)
 
 
-def _calibrated(
-    propagator: at.propagators.Propagator, kind: str, seed: int, count: int, outliers: float
+def calibrated(
+    propagator: at.propagators.Propagator, seed: int
 ) -> tuple[float, float, float, float, float, float]:
     """Return shares of the optimum after and before, share of gains, the pose's error and deviation, time."""
     bench = Bench(propagator, seed)
-    readings = bench.readings(kind, count, outliers, seed)
+    readings = bench.readings()
     prior = at.Prior(variants=_PRIOR, gain=GAIN, phase=PHASE, rest=0.02)
     begin = time.perf_counter()
     model = at.calibrate(propagator, readings, prior, folds=0)

@@ -1,12 +1,10 @@
-"""The live view: memory, and the time from a slider's move to the new field in a browser.
+"""The live view: the time from a slider's move to the new field in a browser.
 
 A headless Chromium on the same machine moves a slider; the time ends with the frame of the new field, or with
-its error. The scenes are the paper's two cubes, and an AUTD3 of discs below a tilted phone. Then an obstacle
-is moved many times more, for the memory of the process. The picture of the page is taken, too. Takes about
-six minutes on 2 idle cores.
+its error. The scenes are the paper's two cubes, and an AUTD3 of discs below a tilted phone. The picture of
+the page is taken, too. Takes about six minutes on 2 idle cores.
 """
 
-import gc
 import itertools
 import shutil
 import statistics
@@ -14,7 +12,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import psutil
 from playwright.sync_api import sync_playwright
 from shared.document import DOCS, table
 from shared.scenes import paper_scene
@@ -24,14 +21,12 @@ import autdtorch as at
 OPTIONS = {
     "--moves": {"type": int, "default": 25, "help": "moves that are timed, dragged and let go"},
     "--picture": {"type": Path, "default": DOCS / "explore.png", "help": "of the page"},
-    "--more": {"type": int, "default": 500, "help": "moves while memory is watched, 1 or more"},
 }
 
 _WINDOW = {"width": 1280, "height": 900}  # pixels
 _SWITCHES = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"]
 _AT_REST = 500  # ms between two moves, so that no calculation is left
 _LONGEST = 120_000  # ms until the first field
-_SOME = 50  # moves between two readings of the memory
 
 # Resolves with the times [ms] until a frame came after the readings of the new field, and until its error.
 _MOVE = """([name, value, letGo]) => new Promise((resolve, reject) => {
@@ -60,10 +55,10 @@ _MOVE = """([name, value, letGo]) => new Promise((resolve, reject) => {
 })"""
 
 
-def main(picture: Path, moves: int, more: int) -> None:
-    """Take the picture of the page, and print times and memory."""
+def main(picture: Path, moves: int) -> None:
+    """Take the picture of the page, and print times."""
     program = shutil.which("chromium") or shutil.which("google-chrome")
-    rows, megabytes = [], []
+    rows = []
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=_SWITCHES)
         for label, scene in (("AUTD3 and phone", phone_scene()), ("two cubes", paper_scene("two_cubes"))):
@@ -79,18 +74,11 @@ def main(picture: Path, moves: int, more: int) -> None:
             place = places(1e3 * explorer.scene.obstacles[0].center[1])
             times(tab, place, 3)  # what is done once
             rows += [[label, kind, *row_of(spent)] for kind, spent in times(tab, place, moves).items()]
-            if scene.name == "two_cubes":
-                megabytes = memory(tab, place, more)
             tab.close()
             explorer.close()
         browser.close()
-    parts = (
-        f"From a slider's move to the frame with the new field, {moves} moves each:",
-        table(("scene", "the slider is", "median", "95 % within"), rows),
-        f"Memory of the process: {megabytes[0]:.0f} MB before {more} more moves of a cube, after every "
-        f"{_SOME} {min(megabytes[1:]):.0f} to {max(megabytes[1:]):.0f} MB, {megabytes[-1]:.0f} MB at last.",
-    )
-    print("\n\n".join(parts))
+    print(f"From a slider's move to the frame with the new field, {moves} moves each:", end="\n\n")
+    print(table(("scene", "the slider is", "median", "95 % within"), rows))
 
 
 def phone_scene() -> at.Scene:
@@ -126,15 +114,3 @@ def times(tab: Any, place: Iterator[str], moves: int) -> dict[str, list[float]]:
             for kind, milliseconds in zip(shown, spent, strict=False):
                 seconds[kind].append(1e-3 * milliseconds)
     return seconds
-
-
-def memory(tab: Any, place: Iterator[str], moves: int) -> list[float]:
-    """Return the memory [MB] of this process, the server: at the beginning, after some moves and at last."""
-    process = psutil.Process()
-    megabytes = [process.memory_info().rss / 1e6]
-    for move in range(1, moves + 1):
-        tab.evaluate(_MOVE, ["body_y", next(place), move % 5 == 0])
-        if move % _SOME == 0 or move == moves:
-            gc.collect()
-            megabytes.append(process.memory_info().rss / 1e6)
-    return megabytes

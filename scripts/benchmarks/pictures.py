@@ -10,9 +10,8 @@ import contextlib
 import dataclasses
 import functools
 import itertools
-import math
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from typing import NamedTuple
 
@@ -41,22 +40,18 @@ CASES = (
     ("microphones", 64, 24),
 )
 """What is read, random drives, and drives of `identify`."""
-UNKNOWN = (320, 384, 768, 1536)
-"""Pictures of random drives where nothing is known but that fields are band-limited."""
 
 OPTIONS = {
     "--trials": {"type": int, "default": 20, "help": "arrays that are measured"},
     "--processes": {"type": int, "default": 1, "help": "that measure arrays side by side"},
-    "--unknown": {"action": "store_true", "help": "nothing is known of array and obstacle"},
     "--noise": {"type": float, "default": 1.0, "help": "factor of the errors of camera and microphones"},
 }
 
 
-def main(trials: int, processes: int, unknown: bool, noise: float) -> None:
+def main(trials: int, processes: int, noise: float) -> None:
     """Print the table."""
-    cases = [("no model", count, 0) for count in UNKNOWN] if unknown else CASES
     header = ["read", "drives", "weakest over optimum", "rms off equal [%]", "largest [%]", "CPU time"]
-    print("", table(header, printed(rows(cases, noise, trials, processes))), sep="\n")
+    print("", table(header, printed(rows(noise, trials, processes))), sep="\n")
 
 
 class Result(NamedTuple):
@@ -68,25 +63,20 @@ class Result(NamedTuple):
     seconds: float
 
 
-def rows(
-    cases: Iterable[tuple[str, int, int]], noise: float, trials: int, processes: int
-) -> Iterator[list[str]]:
+def rows(noise: float, trials: int, processes: int) -> Iterator[list[str]]:
     """Yield a row for each case, with quartiles."""
     two_cubes()  # processes that are forked have it then
     with ProcessPoolExecutor(processes) if processes > 1 else contextlib.nullcontext() as pool:
         side_by_side = map if pool is None else pool.map
-        for case in cases:
+        for case in CASES:
             results = [*side_by_side(functools.partial(trial, case, noise), range(trials))]
             yield [case[0], f"{case[1]} + {case[2]}", *summary(results)]
 
 
 def trial(case: tuple[str, int, int], noise: float, seed: int) -> Result:
     """Return the pressures of a measured array behind the two cubes."""
-    propagator, what, before, more = two_cubes(), *case
-    if what == "no model":
-        return without_model(propagator, before, noise, seed)
     changes = dict.fromkeys((f"obstacles.{axis}" for axis in "xyz"), SHIFT / 3**0.5)
-    return measured(propagator, changes, FOCI, what, before, more, seed, noise)
+    return measured(two_cubes(), changes, FOCI, *case, seed, noise)
 
 
 @functools.cache
@@ -178,56 +168,3 @@ def result_of(matrix: torch.Tensor, drive: torch.Tensor, best: float, seconds: f
     return Result(
         float(true.min()) / best, float(away.square().mean().sqrt()), float(away.abs().max()), seconds
     )
-
-
-def without_model(propagator: Propagator, count: int, noise: float, seed: int, steps: int = 2000) -> Result:
-    """Return the pressures after joint phase retrieval of whole pictures, without any simulation.
-
-    Relaxed Douglas-Rachford splitting seeks phasors (N, P) that have the magnitudes of the pictures, that the
-    drives produce by some matrix, and whose fields are band-limited. Places are a quarter of a wavelength
-    apart, as |p|^2 has twice the band.
-    """
-    fine = fine_points()
-    finer = propagator.for_scene(dataclasses.replace(propagator.scene, control_points=fine))
-    bench = Bench(finer, dict.fromkeys((f"obstacles.{axis}" for axis in "xyz"), SHIFT / 3**0.5), seed)
-    best = float(at.gradient_ascent(bench.matrix[:FOCI]).score[0])
-    sensor = at.CameraNoise(bench, noise * RELATIVE, noise * FLOOR * best, seed)
-    start, where = time.process_time(), "cuda" if torch.cuda.is_available() else "cpu"
-    draws = torch.Generator().manual_seed(seed)
-    played = random_drives(count, bench.matrix.shape[1], draws)
-    read, drives = sensor(played).to(where), played.to(where)
-    basis, inverse = band(finer.scene.wavelength).to(where), torch.linalg.pinv(drives)
-
-    def rows_of(phasors: torch.Tensor) -> torch.Tensor:
-        return (inverse @ phasors) @ basis.conj()
-
-    first = torch.randn(drives.shape[1], basis.shape[1], dtype=drives.dtype, generator=draws).to(where)
-    phasors = drives @ first @ basis.T
-    phasors = phasors * (read.norm() / phasors.norm())
-    for _ in range(steps):
-        right = read * phasors.sgn()
-        phasors = phasors + 0.7 * (drives @ rows_of(2 * right - phasors) @ basis.T - right)
-    for _ in range(100):  # alternating projections take the nearest such phasors
-        phasors = drives @ rows_of(read * phasors.sgn()) @ basis.T
-    matrix = (rows_of(phasors) @ basis.T).T[:FOCI].cpu()
-    drive = at.gradient_ascent(matrix).drive[0]
-    return result_of(bench.matrix[:FOCI], drive, best, time.process_time() - start)
-
-
-def fine_points() -> torch.Tensor:
-    """Return the foci, and places of their plane a quarter of a wavelength apart."""
-    return torch.cat([grid(4, 60e-3), grid(2 * PLACES - 1, SIDE)])
-
-
-@functools.cache
-def band(wavelength: float) -> torch.Tensor:
-    """Return an orthonormal basis (P, R) of fields at the fine points that are sums of plane waves."""
-    ends = fine_points()[:, 1:]
-    waves = 2 * math.ceil(2 * SIDE / wavelength) + 3
-    steps = torch.linspace(-1, 1, waves, dtype=torch.float64) * 2 * math.pi / wavelength
-    numbers = torch.cartesian_prod(steps, steps)
-    numbers = numbers[numbers.norm(dim=1) <= 1.001 * steps[-1]]
-    left, sizes, _ = torch.linalg.svd(
-        torch.exp(1j * ((ends - ends.mean(dim=0)) @ numbers.T)), full_matrices=False
-    )
-    return left[:, sizes > 1e-2 * sizes[0]]

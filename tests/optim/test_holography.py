@@ -93,7 +93,7 @@ def test_weighted_iterations_end_with_their_best_and_above_plain_ones(points, sp
     best = SOLVERS["wgs"](matrix, torch.ones(points, 1).double(), 20, limited)[:, 0]
     assert pressures(matrix, best).min() == pytest.approx(max(levels), rel=1e-12)
     weakest, plain = (pressures(matrix, holography(matrix, None, name)).min() for name in ("wgs", "gs"))
-    assert weakest > 0.99 * plain  # `check.py holography` has the least of 2,000 sets
+    assert weakest > 0.99 * plain
 
 
 @pytest.mark.parametrize(("points", "least"), [(8, 0.89), (16, 0.88), (32, 0.84)])
