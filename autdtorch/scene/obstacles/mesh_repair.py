@@ -12,8 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order
 
 from autdtorch.scene.obstacles.mesh_solid import (
     Triangles,
@@ -25,7 +23,7 @@ from autdtorch.scene.obstacles.mesh_solid import (
 )
 from autdtorch.scene.obstacles.polygons import Polygons, triangulated
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.spatial import areas_of, connected_parts, numbered_edges, paired_sides, sides_of
+from autdtorch.utils.spatial import areas_of, sides_of
 
 _FARTHEST = 1.0001e-3  # distance between vertices that are taken as one, relative to the extent
 _STRAY = 1e-3  # share of all area below which an open piece is no part of the body
@@ -51,6 +49,8 @@ def repaired(corners: Array, triangles: Index) -> Repaired:
         return Repaired(*solid_of(corners, triangles), [])
     done: list[str] = []
     vertices, faces = joined(corners, triangles, _FARTHEST)
+    if not len(faces):
+        raise ValueError("no triangle has an area; must enclose a volume")
     faces = _without_doubles(faces, done)
     faces = _without_strays(vertices, faces, done)
     faces = _oriented(vertices, faces, done)
@@ -72,7 +72,9 @@ def _without_doubles(faces: Index, done: list[str]) -> Index:
 
 def _without_strays(vertices: Array, faces: Index, done: list[str]) -> Index:
     """Leave out small pieces that are open."""
-    label = _pieces(faces)
+    import igl
+
+    _, label = igl.facet_components(faces)
     area = np.bincount(label, weights=areas_of(vertices[faces]))
     is_open = np.zeros(len(area), bool)
     is_open[label[np.isin(faces, open_edges(faces)).any(axis=1)]] = True
@@ -86,23 +88,15 @@ def _without_strays(vertices: Array, faces: Index, done: list[str]) -> Index:
 
 def _oriented(vertices: Array, faces: Index, done: list[str]) -> Index:
     """Turn triangles so that neighbours agree and most of each piece faces outwards."""
-    ends, pairs = sides_of(faces), paired_sides(faces)
-    one, other = pairs.T % len(faces)
-    opposed = (ends[pairs[:, 0]] == ends[pairs[:, 1]]).all(axis=1)  # both run along the edge the same way
-    against = coo_array((np.where(opposed, 2.0, 1.0), (one, other)), shape=(len(faces),) * 2).tocsr()
-    against = against.maximum(against.T)
-    label = connected_parts((one, other), len(faces))
-    turned = np.zeros(len(faces), bool)
-    for root in np.unique(label, return_index=True)[1]:
-        along, before = breadth_first_order(against, root, directed=False)
-        for face in along[1:]:
-            turned[face] = turned[before[face]] ^ (against[before[face], face] == 2)
-    faces = np.where(turned[:, None], faces[:, ::-1], faces)
+    import igl
+
+    before, (faces, label) = faces, igl.bfs_orient(faces)
     for piece in range(label.max() + 1):
         in_piece = label == piece
         corners = vertices[faces[in_piece]]
         if np.linalg.det(corners - corners.mean(axis=(0, 1))).sum() < 0:  # six times the volume
-            faces[in_piece], turned[in_piece] = faces[in_piece, ::-1], ~turned[in_piece]
+            faces[in_piece] = faces[in_piece, ::-1]
+    turned = (faces != before).any(axis=1)
     if turned.any():
         place = place_of(vertices[faces[turned][0]].mean(axis=0))
         done.append(f"turned {turned.sum()} triangles over, the first at {place}")
@@ -182,10 +176,3 @@ def _anew(vertices: Array, faces: Index, done: list[str], reason: str) -> Triang
         )
     done.append(f"made the surface anew on cells of {cell:.3g}, as {reason.split(';')[0]}")
     return solid_of(corners, triangles)
-
-
-def _pieces(faces: Index) -> Index:
-    """Return the number of the piece, joined by edges, of each face (F,)."""
-    edges, edge = numbered_edges(faces)
-    owner = np.tile(np.arange(len(faces)), 3)
-    return connected_parts((owner, len(faces) + edge), len(faces) + len(edges))[: len(faces)]
