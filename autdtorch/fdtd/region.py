@@ -16,7 +16,7 @@ from typing import NamedTuple, Self
 import numpy as np
 import torch
 
-from autdtorch.fdtd.shapes import Bounded, Shape, Solids, Turned, bounds, is_turned, turned_shape
+from autdtorch.fdtd.shapes import Shape, Solids, bounds, is_turned, turned_shape, with_image
 from autdtorch.fdtd.turning import FlatFaces, flat_faces, slender_faces
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.images import Image, Mirror, images_of
@@ -29,7 +29,7 @@ from autdtorch.utils.spatial import (
     spread_evenly,
     volume_and_area,
 )
-from autdtorch.utils.validation import LENGTH_TOLERANCE, Vector, invalid, positive
+from autdtorch.utils.validation import Vector, invalid, positive
 
 logger = logging.getLogger(__name__)
 
@@ -330,78 +330,6 @@ def _with_images(bodies: tuple[Body, ...], mirrors: Sequence[Mirror]) -> tuple[B
     """Return bodies with their images in mirrors; a body on or across a mirror is one with its image."""
     for mirror in mirrors:
         bodies = tuple(
-            replace(body, shape=shape) for body in bodies for shape in _with_image(body.shape, mirror)
+            replace(body, shape=shape) for body in bodies for shape in with_image(body.shape, mirror)
         )
     return bodies
-
-
-@dataclass(frozen=True, eq=False)
-class _Doubled(Bounded):
-    """A shape that touches or crosses a mirror, cut at it and joined with its image."""
-
-    shape: Shape
-    mirror: Mirror
-
-    def signed_distance(self, points: torch.Tensor, /) -> torch.Tensor:
-        """Return the distance (...) [m] of points (..., 3) to the surface, negative inside."""
-        behind = self.mirror.height(points) < 0
-        return self.shape.signed_distance(
-            torch.where(behind[..., None], self.mirror.image.of(points), points)
-        )
-
-    def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return vertices (V, 3) [m] and triangles (F, 3), counter-clockwise as seen from outside."""
-        return self._surface
-
-    @cached_property
-    def _surface(self) -> tuple[torch.Tensor, torch.Tensor]:
-        corners = _cut(*self.shape.surface(), self.mirror)
-        both = torch.cat([corners, self.mirror.image.of(corners).flip(1)])  # an image turns the other way
-        return both.reshape(-1, 3), torch.arange(3 * len(both), device="cpu").reshape(-1, 3)
-
-    @cached_property
-    def _bounds(self) -> tuple[Vector, Vector]:
-        image = _image_of(self.shape, self.mirror)
-        lower = np.minimum(self.shape.lower, image.lower)
-        upper = np.maximum(self.shape.upper, image.upper)
-        normal, vertices = np.abs(np.array(self.mirror.normal)), self.surface()[0].numpy()
-        if np.count_nonzero(normal) == 1:  # the part behind is gone
-            axis = int(normal.argmax())
-            lower[axis], upper[axis] = vertices[:, axis].min(), vertices[:, axis].max()
-        (x, y, z), (u, v, w) = lower.tolist(), upper.tolist()
-        return (x, y, z), (u, v, w)
-
-
-def _with_image(shape: Shape, mirror: Mirror) -> list[Shape]:
-    """Return a shape and its image in a mirror; they are one if it is on or across the mirror."""
-    if float(mirror.height(shape.surface()[0]).min()) < LENGTH_TOLERANCE:
-        return [_Doubled(shape, mirror)]
-    return [shape, _image_of(shape, mirror)]
-
-
-def _image_of(shape: Shape, mirror: Mirror) -> Turned:
-    image = mirror.image
-    return Turned(shape, image.matrix.numpy(), image.offset.numpy())
-
-
-def _cut(vertices: torch.Tensor, triangles: torch.Tensor, mirror: Mirror) -> torch.Tensor:
-    """Return the corners (F, 3, 3) [m] of the part of a surface in front of a mirror."""
-    corners = vertices[triangles]
-    height = mirror.height(corners)
-    height = torch.where(height.abs() < LENGTH_TOLERANCE, 0.0, height)
-    whole = (height >= 0).all(dim=1) & (height > 0).any(dim=1)
-    parts = [corners[whole]]
-    for triangle, above in zip(corners[~whole], height[~whole], strict=True):
-        if (above <= 0).all():
-            continue
-        polygon = []
-        for number in range(3):
-            here, there = above[number - 1], above[number]
-            if here * there < 0:
-                share = here / (here - there)
-                polygon.append(triangle[number - 1] + share * (triangle[number] - triangle[number - 1]))
-            if there >= 0:
-                polygon.append(triangle[number])
-        fan = [torch.stack([polygon[0], *polygon[n : n + 2]]) for n in range(1, len(polygon) - 1)]
-        parts.append(torch.stack(fan))
-    return torch.cat(parts)
