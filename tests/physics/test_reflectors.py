@@ -109,7 +109,7 @@ def test_the_memory_of_waves_that_mirrors_send_back_is_planned(monkeypatch):
     monkeypatch.setattr(grouping, "_CHEAPER", 0.0)
     propagator = make_propagator(plate_above_a_table(), "box", 1.5e-3, cache=False)
     box, grid = propagator.simulation.boxes[0], propagator.plan.grouping.grids[0]
-    pairs = propagator.simulation.coupling(box, box, box.echoes).pairs
+    pairs = coupling.coupling_of(box, box, box.echoes).pairs
     assert 0.5 < sum(pair.left.size + pair.right.size for pair in pairs) / grid.echo_numbers < 2
     assert propagator.plan.memory > sum(pair.left.nbytes + pair.right.nbytes for pair in pairs) / 2
 
