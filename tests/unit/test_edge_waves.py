@@ -20,10 +20,11 @@ def corner(x, y, rigid=(0, 0)):
     return Section((1, 1), ((x,), (y,)), tuple(map(tuple, blocks.tolist())))
 
 
+@pytest.mark.parametrize("kappa", [0.7, 0.85, 1.25])
 @pytest.mark.parametrize("place", [(0.5, 0.5), (0.6, 0.5), (0.3, 0.6)])
-def test_waves_around_an_edge_miss_less_than_those_of_elements_for_long_waves(place):
-    """Half as far at most, at 9 cells per wavelength; half-way between cells a quarter."""
-    section, stencil = corner(*place), tuned_stencil(0.7)
+def test_waves_around_an_edge_miss_less_than_those_of_elements_for_long_waves(place, kappa):
+    """Half as far at most, at 9 to 5 cells per wavelength; half-way between cells a quarter."""
+    section, stencil = corner(*place), tuned_stencil(kappa)
     coupling = fitted_couplings(section, [(0, 0)], plane_fields(section, RIGID.mobility, 8), RIGID, stencil)[
         0
     ]
@@ -33,7 +34,7 @@ def test_waves_around_an_edge_miss_less_than_those_of_elements_for_long_waves(pl
         operator = window._operator.copy()
         window._add(operator, window.columns, *values)
         missed.append(np.linalg.norm(window._missed(operator)[0]))
-    assert missed[1] < 0.5 * missed[0] < 0.05 * np.linalg.norm(window._waves)
+    assert missed[1] < (0.3 if place == (0.5, 0.5) else 0.5) * missed[0]
 
 
 @pytest.mark.parametrize("rigid", [(0, 0), (0, 1), (1, 0), (1, 1)])

@@ -3,7 +3,9 @@
 Elements that are fitted to long waves (`edge_fit.py`) leave an error of second order at an edge: behind large
 plates, whose shadow is lit by their edges alone, 1 to 3 % at 6 to 9 cells per wavelength. Around
 a rigid right angle, waves of wavenumber k are J_n(k r) cos(n phi), n = 0, 2/3, 4/3, ... The masses of the
-element at the edge, and a change of its couplings, are fitted to them.
+element at the edge, and a change of its couplings, are fitted to them in a window of cells. Differences from
+the waves leave the window through an impedance at its rim: with known pressures there it would resonate at 7
+to 9 cells per wavelength.
 """
 
 from __future__ import annotations
@@ -16,14 +18,10 @@ from scipy.special import jv
 from autdtorch.fdtd.assembly.edge_fit import add_couplings, columns_of, importance
 from autdtorch.fdtd.assembly.element import stiffness_matrix, without_negative
 from autdtorch.fdtd.assembly.sections import COLUMN_PAIRS, RING, MaterialKey, Section, layered_element
-from autdtorch.fdtd.stencil import Stencil, tuned_stencil
+from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 
 _ORDERS = np.arange(5) * 2 / 3  # n of the waves
-# Wavenumber of the fit [rad/cell], at the most: the window resonates at 0.8 to 0.9. On coarser grids its
-# change remains: with one that grew as k^2, a cube at 3 to 5 cells per wavelength missed 1.2 to 2.2 times as
-# much.
-_LARGEST = 0.7
 _STEPS = 3  # Linear steps of the fit
 _RIDGE = 1e-3  # Weight of the changes: some combinations hardly matter
 _SUM = 100.0  # Weight of the sum of masses, which is the volume of air
@@ -51,12 +49,11 @@ def at_the_drive(
     stencil: Stencil,
 ) -> tuple[Array, Array]:
     """Return coupling (6,) and masses (4,) of the element at a rigid corner, from those for long waves."""
-    kappa = min(stencil.kappa, _LARGEST)
-    window = _Window(section, corner, materials, tuned_stencil(kappa))
+    window = _Window(section, corner, materials, stencil)
     change = window.fitted(coupling, mass)
     pairs = window.pairs
     result = coupling.copy()
-    result[pairs] += kappa**2 * change[len(window.air) :]
+    result[pairs] += stencil.kappa**2 * change[len(window.air) :]
     matrix = without_negative(stiffness_matrix(result, COLUMN_PAIRS))  # slivers would lose energy otherwise
     result = -matrix[tuple(COLUMN_PAIRS.T)]
     masses = mass.copy()
@@ -78,13 +75,12 @@ class _Window:
         from_edge = (places - np.array(section.cuts)[:, 0]) * np.where(np.array(corner) == 0, 1, -1)
         present = (from_edge > 0).any(axis=1)
         inside = ((places > -RING) & (places < RING + 1)).all(axis=1)
-        self._free, self._fixed = present & inside, present & ~inside
+        self._present, self._rim = present, present & ~inside
         self.columns = columns_of(section, (0, 0))
         self.air = np.flatnonzero(present[self.columns])
         self.pairs = np.flatnonzero(present[self.columns][COLUMN_PAIRS].all(axis=1))
-        judged = self._free.copy()
-        judged[self.columns] = False
-        self._judged = judged[self._free]
+        self._judged = present.copy()
+        self._judged[self.columns] = False
         self._kappa, self._symbol = stencil.kappa, stencil.symbol
         radius, angle = np.hypot(*from_edge.T), np.arctan2(from_edge[:, 1], from_edge[:, 0]) + np.pi / 2
         waves = jv(_ORDERS, stencil.kappa * radius[:, None]) * np.cos(_ORDERS * angle[:, None])
@@ -125,16 +121,20 @@ class _Window:
         operator[columns, columns] -= self._symbol * mass
 
     def _missed(self, operator: Array) -> tuple[Array, Array]:
-        """Return the differences (n,) from the waves at the judged vertices, and their derivatives (n, k)."""
-        free, fixed = self._free, self._fixed
-        inverse = np.linalg.inv(operator[np.ix_(free, free)])
-        solution = self._waves.copy()
-        solution[free] = -inverse @ (operator[np.ix_(free, fixed)] @ self._waves[fixed])
-        padded = np.zeros((int(self._judged.sum()), len(free)))
-        padded[:, free] = inverse[self._judged]
+        """Return the differences (n,) from the waves at the judged vertices, and their derivatives (n, k).
+
+        Real parts come first, then imaginary ones.
+        """
+        some, judged = np.ix_(self._present, self._present), self._judged
+        inverse = np.zeros(operator.shape, np.complex128)
+        inverse[some] = np.linalg.inv((operator - 1j * self._kappa * np.diag(self._rim))[some])
+        missed = -inverse[:, ~self._rim] @ (operator @ self._waves)[~self._rim]
+        solution, response = self._waves + missed, inverse[judged]
         air, (one, other) = self.columns[self.air], self.columns[COLUMN_PAIRS[self.pairs]].T
-        by_mass = self._symbol * padded[:, air, None] * solution[air]
-        response = (padded[:, other] - padded[:, one])[..., None]
-        by_coupling = self._kappa**2 * response * (solution[one] - solution[other])
+        by_mass = self._symbol * response[:, air, None] * solution[air]
+        across = (response[:, other] - response[:, one])[..., None]
+        by_coupling = self._kappa**2 * across * (solution[one] - solution[other])
         slopes = np.concatenate((by_mass, by_coupling), axis=1).transpose(0, 2, 1)
-        return (solution - self._waves)[free][self._judged].ravel(), slopes.reshape(-1, slopes.shape[2])
+        parts = missed[judged].ravel(), slopes.reshape(-1, slopes.shape[2])
+        differences, derivatives = (np.concatenate((part.real, part.imag)) for part in parts)
+        return differences, derivatives
