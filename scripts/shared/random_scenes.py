@@ -216,18 +216,16 @@ class _Draft:
         return middle + rng.uniform(-0.5, 0.5, 3) * extent, "overlapping"
 
 
-def draw_material(
-    rng: np.random.Generator, slowest: float = 0.2, most_dense: float = 1e4
-) -> tuple[dict[str, Any], set[str]]:
-    """Return the material arguments of an obstacle, and labels; limits are relative to air."""
+def draw_material(rng: np.random.Generator) -> tuple[dict[str, Any], set[str]]:
+    """Return the material arguments of an obstacle, and labels."""
     kind = str(rng.choice(list(MATERIALS), p=list(MATERIALS.values())))
     if kind == "rigid":
         return {"rigid": True}, {kind}
     if kind == "impedance":
         turn = cmath.exp(0.5j * math.pi * rng.uniform(-1, 1))
         return {"impedance": log_uniform(rng, 0.03, 1e3) * turn}, {kind}
-    density = AIR.density * log_uniform(rng, 1e-3, most_dense)
-    speed = AIR.sound_speed * log_uniform(rng, slowest, 17.0)
+    density = AIR.density * log_uniform(rng, 1e-3, 1e4)
+    speed = AIR.sound_speed * log_uniform(rng, 0.2, 17.0)
     labels = {"light" if density < AIR.density else "heavy", "slow" if speed < AIR.sound_speed else "fast"}
     material: dict[str, Any] = {"density": density, "sound_speed": speed}
     if kind == "absorbing":  # the phases of the density and of the bulk modulus, up to 80 degrees
