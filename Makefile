@@ -16,13 +16,13 @@ OVERRIDES = $(strip $(foreach name,$(filter-out PYTHON ARGS,$(.VARIABLES)),$(if 
 	$(findstring command line,$(origin $(name))),'$(name)=$($(name))')) $(ARGS))
 
 .DEFAULT_GOAL := help
-.PHONY: help paper test test-pages lint docs clean
+.PHONY: help paper test test-rest lint docs clean
 
 help:
 	@echo "make paper   run the paper's experiment and write outputs/paper/report.html"
 	@echo "             (make paper trials=5 changes a setting, as does ARGS='trials=5 seed=1')"
 	@echo "make test    test the package (ARGS='-m unit' selects)"
-	@echo "make test-pages   the tests of pages: documentation, its commands and notebooks, live view"
+	@echo "make test-rest   test documentation, its commands and notebooks, pages in a browser, launchers and forks"
 	@echo "make lint    ruff, mypy, import-linter"
 	@echo "make docs    build the documentation in outputs/docs, executing its notebooks"
 	@echo "make clean   remove .venv and the tools' caches; outputs/ stays"
@@ -51,10 +51,10 @@ $(VENV)/.kernels: $(wildcard autdtorch/fdtd/kernels/*.py autdtorch/methods/holog
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 8
 
 test: $(INSTALLED)-dev $(VENV)/.kernels
-	$(PYTEST) --dist worksteal -m 'not (docs or browser)' $(ARGS)
+	$(PYTEST) --dist worksteal -m 'not (docs or browser or processes)' $(ARGS)
 
-test-pages: $(INSTALLED)-dev $(VENV)/.kernels
-	$(PYTEST) --dist loadgroup -m 'docs or browser' $(ARGS)
+test-rest: $(INSTALLED)-dev $(VENV)/.kernels
+	$(PYTEST) --dist loadgroup -m 'docs or browser or processes' $(ARGS)
 
 lint: $(INSTALLED)-dev
 	$(BIN)/ruff check .

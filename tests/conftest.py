@@ -1,8 +1,9 @@
 """Settings of all tests, and fixtures that several folders share.
 
-A test has the marker named like its folder, so that ``pytest -m physics`` runs ``tests/physics``. Without a
-GPU, Triton interprets the CUDA kernel on the CPU. Several processes of pytest share the cores: threads that
-wait for each other on busy cores are many times slower.
+A test has the marker named like its folder, so that ``pytest -m physics`` runs ``tests/physics``. `make test`
+leaves out `docs`, `browser` and `processes`; the last is of files in several folders. Without a GPU, Triton
+interprets the CUDA kernel on the CPU. Several processes of pytest share the cores: threads that wait for each
+other on busy cores are many times slower.
 """
 
 import gc

@@ -23,6 +23,8 @@ from autdtorch.study.results_file import load_results
 
 pytest.importorskip("submitit")
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture
 def squeue(tmp_path, monkeypatch):

@@ -20,6 +20,8 @@ from autdtorch.study.report.tables import save_summary
 from autdtorch.study.results_file import load_results
 from autdtorch.study.sweeps import collect_results
 
+pytestmark = pytest.mark.processes
+
 QUICK = ("scene=homogeneous", "plane_spacing=0.02")
 
 
@@ -28,7 +30,9 @@ def jobs(folder):
 
 
 def test_a_sweep_by_submitit_has_a_folder_for_each_job(run, tmp_path):
-    assert run("-m", "hydra/launcher=submitit_local", *QUICK, "method=lssg") == 0
+    status = run("-m", "hydra/launcher=submitit_local", *QUICK, "method=lssg")
+    logs = sorted((tmp_path / "multirun" / ".submitit").glob("*/*.*"))
+    assert status == 0, "\n".join(f"{path.name}: {path.read_bytes()[-2000:]!r}" for path in logs)
     assert jobs(tmp_path) == ["method=lssg,plane_spacing=0.02,scene=homogeneous"]
 
 

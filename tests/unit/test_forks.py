@@ -23,6 +23,7 @@ from autdtorch.utils.compiled import _digest
 from autdtorch.utils.process import cached_property
 
 pytestmark = [
+    pytest.mark.processes,
     pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks here"),
     pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning"),
 ]
