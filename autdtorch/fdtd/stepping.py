@@ -198,9 +198,9 @@ class Assembly:
         nearest = [np.where(kind, far, np.inf).min(axis=1) for kind in (enclosed, open_air)]
         return np.asarray(nearest[0] < nearest[1])
 
-    def receivers(self, points: Tensor, weights: Tensor = _ONE_NODE) -> Receivers:
-        """Return receivers at points (P, 3) [m], or of means over nodes (P, n, 3) with `weights` (n,)."""
-        kernels = self.interpolation(points, weights)
+    def receivers(self, points: Tensor) -> Receivers:
+        """Return receivers at points (P, 3) [m]."""
+        kernels = self.interpolation(points)
         return Receivers(torch.from_numpy(kernels.index), torch.from_numpy(kernels.weight).to(self.dtype))
 
     def sources(self, points: Tensor, strength: Tensor, weights: Tensor = _ONE_NODE) -> Sources:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from autdtorch.fdtd.shapes import Shape
+from autdtorch.fdtd.shapes import Bounded, Shape
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.spatial import extents, mean_thickness
 from autdtorch.utils.validation import Vector
@@ -26,23 +26,16 @@ _STEP = 1e-3  # Distance [cells] of the points that tell the directions of faces
 
 
 @dataclass(frozen=True, eq=False)
-class Thickened:
+class Thickened(Bounded):
     """A shape whose surface is moved outwards."""
 
     shape: Shape
     distance: float  # of the surfaces [m]
 
     @property
-    def lower(self) -> Vector:
-        """Corner of the bounding box with the smallest coordinates (3,) [m]."""
-        x, y, z = self.shape.lower
-        return x - self.distance, y - self.distance, z - self.distance
-
-    @property
-    def upper(self) -> Vector:
-        """Corner of the bounding box with the largest coordinates (3,) [m]."""
-        x, y, z = self.shape.upper
-        return x + self.distance, y + self.distance, z + self.distance
+    def _bounds(self) -> tuple[Vector, Vector]:
+        (x, y, z), (u, v, w), far = self.shape.lower, self.shape.upper, self.distance
+        return (x - far, y - far, z - far), (u + far, v + far, w + far)
 
     def signed_distance(self, points: torch.Tensor, /) -> torch.Tensor:
         """Return the distance (...) [m] of points (..., 3) to the surface, negative inside."""
@@ -63,7 +56,7 @@ def thickened(shape: Shape, spacing: float) -> Shape:
 
 
 @dataclass(frozen=True, eq=False)
-class _Receding:
+class _Receding(Bounded):
     """A fluid shape inside a rigid one, whose surface recedes where the wall between them is thin."""
 
     shape: Shape
@@ -71,14 +64,8 @@ class _Receding:
     spacing: float  # [m]
 
     @property
-    def lower(self) -> Vector:
-        """Corner of the bounding box with the smallest coordinates (3,) [m]."""
-        return self.shape.lower
-
-    @property
-    def upper(self) -> Vector:
-        """Corner of the bounding box with the largest coordinates (3,) [m]."""
-        return self.shape.upper
+    def _bounds(self) -> tuple[Vector, Vector]:
+        return self.shape.lower, self.shape.upper
 
     def signed_distance(self, points: torch.Tensor, /) -> torch.Tensor:
         """Return the distance (...) [m] of points (..., 3) to the surface, negative inside.
