@@ -28,7 +28,7 @@ from autdtorch.utils.validation import invalid, positive
 
 logger = logging.getLogger(__name__)
 
-_FIRST_ERROR = 0.05
+_FIRST_ERROR = 0.1
 """Tolerance relative to the `growth` of the first spacing, whose error is several times as large."""
 
 _FINER_IF_SLOW = 1.6

@@ -12,12 +12,12 @@ from small_scenes import AIR, CUBE, relative_error, small_scene
 
 import autdtorch as at
 from autdtorch import analytic
-from autdtorch.fdtd.grid_errors import Law, errors_by_grids, grid_errors
+from autdtorch.fdtd.grid_errors import Law, errors_by_grids, grid_errors, rigid_errors
 from autdtorch.fdtd.region import RATIO
 from autdtorch.propagators import FreeSpacePropagator, make_propagator
 from autdtorch.propagators import estimate as simulation_estimate
 from autdtorch.propagators.free_space import free_space_matrix
-from autdtorch.propagators.plan import plan, region_of
+from autdtorch.propagators.plan import plan, region_of, with_rigid
 from autdtorch.scene.obstacles import Cylinder, Sphere, VoxelMask
 
 CENTER, RADIUS = (12.2e-3, 11.9e-3, 12.1e-3), 3.3e-3
@@ -45,7 +45,7 @@ def test_the_estimate_is_honest(sphere, method, spacing):
 
 @pytest.mark.parametrize("radius", [1.8e-3, 3e-3, 5e-3])
 def test_the_usual_error_is_that_of_rigid_spheres_of_any_size(radius):
-    """Elsewhere, spheres of 1.4 to 7 mm have 0.8 to 1.5 times this error."""
+    """Elsewhere, spheres of 1.4 to 7 mm have 0.5 to 1.0 times this error."""
     scene = small_scene((Sphere(CENTER, radius, rigid=True),))
     law = plan(scene, "box", 1e-3).law
     where = scene.control_points, scene.array.positions, scene.wavenumber, CENTER, radius
@@ -54,6 +54,23 @@ def test_the_usual_error_is_that_of_rigid_spheres_of_any_size(radius):
     error = (make_propagator(scene, "box", 1e-3, tolerance=1e-4).transfer_matrix() - series).norm()
     share = float(error / (series - free).norm())
     assert 1 / 3 < share / law.usual(1e-3) < 3
+
+
+@pytest.mark.parametrize("radius", [0.5e-3, 2e-3, 4e-3])
+def test_what_heavy_balls_differ_from_rigid_ones_is_claimed(radius):
+    """Required: a third to 12 times it; 40 random balls had 0.7 to 8 times, once up to 10,000 times."""
+    ratios = 300.0, 5.0
+    density, speed = ratios[0] * AIR.density, ratios[1] * AIR.sound_speed
+    ball = Sphere(CENTER, radius, density=density, sound_speed=speed)
+    region = with_rigid(region_of(small_scene((ball,))), 0.2)
+    where = EMPTY.control_points, EMPTY.array.positions, EMPTY.wavenumber, CENTER, radius
+    strength = 4 * math.pi * EMPTY.array.source_strength
+    rigid, fluid = strength * analytic.rigid_sphere(*where), strength * analytic.fluid_sphere(*where, *ratios)
+    true = (rigid - fluid).norm(dim=1) / rigid.norm(dim=1)
+    free = free_space_matrix(EMPTY.control_points, EMPTY.array, EMPTY.wavenumber)
+    claimed = rigid_errors(rigid, free, region)
+    assert (claimed > true / 3).all()
+    assert (claimed < 12 * true).all()
 
 
 def test_the_estimate_of_a_cube_of_many_wavelengths_is_no_larger_than_its_edges_leave():
@@ -163,37 +180,28 @@ def test_a_spacing_is_chosen_where_nothing_scatters_and_none_without_an_estimate
         make_propagator(small_scene((RIGID,)), "box", None, tolerance=0.1, max_periods=1)
 
 
-@given(st.floats(1.25, 3.0), st.floats(1e-5, 5e-3), st.floats(0.02, 0.3))
-def test_errors_are_known_from_either_grid(ratio, error, spacing):
-    one = torch.ones(2, 3, dtype=torch.complex128)
-    other = error * LAW.growth(ratio * spacing) / LAW.growth(spacing)
+@given(st.floats(1.25, 3.0), st.floats(1e-5, 5e-3), st.floats(0.02, 0.3), st.floats(0.1, 1.0))
+def test_errors_are_known_from_either_grid(ratio, error, spacing, edges):
+    one, law = torch.ones(2, 3, dtype=torch.complex128), Law(1.0, aligned=True, edges=edges)
+    other = error * law.growth(ratio * spacing) / law.growth(spacing)
     fine, coarse = one * (1 + error), one * (1 + other)
-    known = errors_by_grids(fine, one, spacing, [(coarse, ratio * spacing)], LAW)
+    known = errors_by_grids(fine, one, spacing, [(coarse, ratio * spacing)], law)
     assert (known * (1 + error) / error).numpy() == pytest.approx(1)
-    known = errors_by_grids(coarse, one, ratio * spacing, [(fine, spacing)], LAW)
+    known = errors_by_grids(coarse, one, ratio * spacing, [(fine, spacing)], law)
     assert (known * (1 + other) / other).numpy() == pytest.approx(1)
-
-
-@given(st.floats(2, 4), st.floats(1.15, 1.7), st.floats(1.15, 1.7), st.floats(1e-6, 1e-3))
-def test_three_grids_show_the_order_of_errors(order, first, second, error):
-    one, law = torch.ones(2, 3, dtype=torch.complex128), Law(8.5, aligned=True)
-    coarsest, coarser, fine = (one * (1 + error * ratio**order) for ratio in (first * second, second, 1.0))
-    others = [(coarsest, first * second), (coarser, second)]
-    claim = errors_by_grids(fine, one, 1.0, others, law)
-    assert (claim * (1 + error) / error).numpy() == pytest.approx(1, rel=0.15)  # of orders 0.05 apart
 
 
 @given(st.floats(0.05, 0.25), st.floats(0.01, 1.0), st.floats(-7, 0))
 def test_estimates_lean_towards_the_usual_error(spacing, scattered, logarithm):
-    """The logarithm moves by a fifth towards it, by 0.2 at most, and no claim is below 0.37 of it."""
+    """The logarithm moves by 0.3 of the way, downwards by 0.3 at most, and no claim is below 0.37 of it."""
     free = torch.ones(1, 3, dtype=torch.complex128)
     matrix, usual = free * (1 + scattered), LAW.usual(spacing) * scattered / (1 + scattered)
     coarser = matrix * (1 + 10**logarithm), 1.3 * spacing
     (by_grids,), (claim,) = (
         of(matrix, free, spacing, [coarser], LAW).tolist() for of in (errors_by_grids, grid_errors)
     )
-    assert claim >= 0.36 * usual
-    assert claim <= max(by_grids, 0.38 * usual, min(usual, 1.59 * by_grids))
+    leaning = by_grids**0.7 * max(usual, by_grids / 10) ** 0.3
+    assert claim == pytest.approx(max(leaning, 0.37 * usual))
     (agreed,) = grid_errors(matrix, free, spacing, [(matrix, 1.3 * spacing)], LAW).tolist()
     assert agreed == pytest.approx(0.37 * usual)
 
@@ -218,9 +226,9 @@ def test_a_choice_ends_where_voxels_are_too_coarse(caplog):
     assert "the surface of obstacle 0 is known to" in caplog.text
 
 
-@given(st.floats(1e-3, 0.3), st.booleans())
-def test_a_spacing_has_its_growth(spacing, aligned):
-    law = Law(8.5e-3, aligned)
+@given(st.floats(1e-4, 0.3), st.floats(1.0, 1e3))
+def test_a_spacing_has_its_growth(spacing, edges):
+    law = Law(8.5e-3, aligned=True, edges=edges)
     assert law.spacing_of(law.growth(spacing)) == pytest.approx(spacing)
 
 
