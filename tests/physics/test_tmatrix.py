@@ -272,13 +272,3 @@ def test_a_sphere_and_its_image_are_a_sphere_before_a_plane(material):
     scale = 4 * math.pi * array.source_strength
     # eight digits of each sphere
     assert relative_error(matrix[:, :2] + matrix[:, 2:], scale * exact) < 1e-6
-
-
-def test_gradients_by_the_place_of_one_of_several_bodies():
-    first, second = (at.TMatrix.of(sphere, AIR, FREQUENCY, error=1e-2) for sphere in SPHERES[:2])
-
-    def loudness(offset: torch.Tensor) -> torch.Tensor:
-        return at.TMatrixCluster([first, second.moved(offset)]).transfer_matrix(ARRAY, OUTSIDE).abs().sum()
-
-    offset = torch.tensor([2e-3, -1e-3, 1e-3], dtype=torch.float64)
-    assert_slopes(loudness, offset, steps=[1e-6] * 3)
