@@ -110,7 +110,13 @@ def grid(count: int, side: float) -> torch.Tensor:
 
 
 class Bench:
-    """An array and a scene that both differ from the simulation."""
+    """An array and a scene that both differ from the simulation.
+
+    Attributes:
+        amounts: of the changes of the scene.
+        log_gain: logarithms of the gains (M,) of the transducers.
+        matrix: transfer matrix (P, M) of the bench.
+    """
 
     def __init__(self, propagator: Propagator, changes: Mapping[str, float], seed: int) -> None:
         """Draw the deviations, and compute the matrix of the scene as it is."""
@@ -119,9 +125,10 @@ class Bench:
         gain, phase = torch.randn(2, len(self.scene.array), dtype=torch.float64, generator=draws)
         direction = torch.randn(len(changes), dtype=torch.float64, generator=draws)
         widths = torch.tensor([*changes.values()], dtype=torch.float64)
-        amounts = len(changes) ** 0.5 * widths * direction / direction.norm()
-        there = SceneChanges(propagator, [*changes]).matrix(amounts).to("cpu", torch.complex128)
-        self.matrix = there * torch.polar((GAIN * gain).exp(), PHASE * phase)
+        self.amounts = len(changes) ** 0.5 * widths * direction / direction.norm()
+        there = SceneChanges(propagator, [*changes]).matrix(self.amounts).to("cpu", torch.complex128)
+        self.log_gain = GAIN * gain
+        self.matrix = there * torch.polar(self.log_gain.exp(), PHASE * phase)
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
         """Observe drives (B, M)."""
