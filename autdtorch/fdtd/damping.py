@@ -88,7 +88,8 @@ def fewest_stable_steps(cells: HeterogeneousCells, stencil: Stencil, shape: tupl
 
     The limit depends on the steps per period N itself, as damping counts by cot(pi / N).
     """
-    fewest = fewest_steps(stencil, largest_eigenvalue(cells.index, cells.weight, stencil, shape))
+    largest = largest_eigenvalue(cells.index, cells.weight, stencil, shape, cells.largest)
+    fewest = fewest_steps(stencil, largest)
     losses = cells.losses
     if losses is None or not (losses.coupling.any() or losses.ground.any()):
         return fewest

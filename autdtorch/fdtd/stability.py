@@ -43,8 +43,10 @@ _LARGE, _REPEATS = 20_000, 32
 _TOGETHER = 16_384  # Rows in a task: about a millisecond
 
 
-def largest_eigenvalue(index: Index, weight: Array, stencil: Stencil, shape: tuple[int, int, int]) -> float:
-    """Return an upper bound of the largest eigenvalue of the operator.
+def largest_eigenvalue(
+    index: Index, weight: Array, stencil: Stencil, shape: tuple[int, int, int], known: float = math.inf
+) -> float:
+    """Return an upper bound of the largest eigenvalue of the operator, at most a `known` one.
 
     It is the larger one of uniform air, and of the heterogeneous cells `index` (n,), ascending, with a rim of
     one cell. A mode above those of air is bound to these cells and fades within a cell. The weight of a cell
@@ -84,7 +86,7 @@ def largest_eigenvalue(index: Index, weight: Array, stencil: Stencil, shape: tup
         return bound, symmetric
 
     bounds, parts = zip(*spread(part, parts_of_size(len(rows), _TOGETHER)), strict=True)
-    bound: float = max(bounds)
+    bound: float = min(known, max(bounds))
     if bound <= CLOSE * air:
         return bound
     if not iterated:
@@ -93,8 +95,9 @@ def largest_eigenvalue(index: Index, weight: Array, stencil: Stencil, shape: tup
             " is iterated for at most %d", len(index), MOST_CELLS,
         )  # fmt: skip
         return bound
-    reached = _lanczos(parts, len(rows), _LANCZOS_STEPS)
-    return min(bound, max(air, MARGIN * reached))
+    enough = bound / CLOSE
+    reached = _lanczos(parts, len(rows), enough)
+    return bound if reached >= enough else min(bound, max(air, MARGIN * reached))
 
 
 def _shortened(
@@ -142,11 +145,12 @@ def _with_rim(index: Index, shape: tuple[int, int, int]) -> tuple[Index, NDArray
     return rows, place
 
 
-def _lanczos(parts: Sequence[csr_array], size: int, steps: int) -> float:
-    """Return the largest Ritz value of a symmetric matrix, a lower bound of its largest eigenvalue.
+def _lanczos(parts: Sequence[csr_array], size: int, enough: float) -> float:
+    """Return a lower bound of the largest eigenvalue of a symmetric matrix: its largest Ritz value.
 
-    Its rows (size, size) are those of all parts. Without reorthogonalisation Ritz values repeat, but none
-    leaves the spectrum (Paige 1980). The sums do not use BLAS, whose result depends on the number of threads.
+    Iteration ends at a value that is `enough`. Rows (size, size) are those of all parts. Without
+    reorthogonalisation Ritz values repeat, but none leaves the spectrum (Paige 1980). The sums do not use
+    BLAS, whose result depends on the number of threads.
     """
 
     def product(vector: Array) -> Array:
@@ -155,17 +159,19 @@ def _lanczos(parts: Sequence[csr_array], size: int, steps: int) -> float:
     vector = np.random.default_rng(0).standard_normal(size)
     vector /= math.sqrt((vector * vector).sum())
     previous, beta = np.zeros_like(vector), 0.0
-    diagonal, beside = [], []
-    for _ in range(steps):
+    diagonal: list[float] = []
+    beside: list[float] = []
+    for _ in range(_LANCZOS_STEPS):
         image = product(vector) - beta * previous
         diagonal.append(float((vector * image).sum()))
+        reached = float(eigvalsh_tridiagonal(diagonal, beside)[-1])
         image -= diagonal[-1] * vector
         beta = math.sqrt((image * image).sum())
-        if beta <= 1e-12 * abs(diagonal[0]):  # the vectors span an invariant space
+        if reached >= enough or beta <= 1e-12 * abs(diagonal[0]):  # the vectors span an invariant space
             break
         beside.append(beta)
         previous, vector = vector, image / beta
-    return float(eigvalsh_tridiagonal(diagonal, beside[: len(diagonal) - 1])[-1])
+    return reached
 
 
 def fewest_steps(stencil: Stencil, largest: float) -> float:

@@ -73,6 +73,7 @@ class HeterogeneousCells:
     rigid: Index  # flat indices of the rigid cells, ascending
     shell: Index  # rigid cells next to other cells; no cell reads those behind them
     enclosed: Index  # rigid cells of air, which no sound reaches, ascending
+    largest: float = math.inf  # upper bound of the eigenvalues of the rows, that of the elements
     losses: LossyCells | None = None  # None if nothing absorbs
     tangent: float = 0.0  # largest ratio of damping to stiffness in a material
 
@@ -105,7 +106,8 @@ def heterogeneous_cells(
     vertices, around = _vertices(elements, shape), np.zeros(shape, bool)
     around.ravel()[vertices] = True
     touched = inner_cells(around)
-    cut, hard, rows = _without_rigid(elements, vertices, touched, shape, stencil)
+    largest = _largest_of_elements(elements.materials, stencil)
+    cut, hard, rows = _without_rigid(elements, vertices, touched, shape, stencil, largest)
     enclosed = np.zeros(0, np.int64)
     if elements.materials.rigid.any():
         usual = stencil.total / _densest(elements)
@@ -137,8 +139,14 @@ def heterogeneous_cells(
     losses = elements.materials.losses
     tangent = 0.0 if losses is None else losses.tangent
     return HeterogeneousCells(
-        index, weight, mass, np.flatnonzero(hard), shell, enclosed, lossy_cells(loss), tangent
+        index, weight, mass, np.flatnonzero(hard), shell, enclosed, largest, lossy_cells(loss), tangent
     )
+
+
+def _largest_of_elements(materials: Materials, stencil: Stencil) -> float:
+    """Return the eigenvalue that no element exceeds, and therefore no sum of elements."""
+    margin = _FINE_MARGIN if stencil.kappa <= 2 * math.pi / _FINE_CELLS else _COARSE_MARGIN
+    return margin * stencil.largest_symbol * float(materials.speed.max())
 
 
 def lossy_cells(loss: Array) -> LossyCells | None:
@@ -212,7 +220,7 @@ class _ElementSums(NamedTuple):
 
 
 def _without_rigid(
-    elements: Elements, vertices: Index, touched: Index, shape: GridShape, stencil: Stencil
+    elements: Elements, vertices: Index, touched: Index, shape: GridShape, stencil: Stencil, largest: float
 ) -> tuple[_ElementSums, NDArray[np.bool_], _Rows]:
     """Return the elements without rigid vertices, the mask of rigid cells (k,), and the touched rows."""
     materials = elements.materials
@@ -227,8 +235,6 @@ def _without_rigid(
     enough = np.where(sliver[touched], max(_SLIVER_COUPLING / densest, _LEAST_COUPLING), _RIGID_COUPLING)
     enough *= stencil.total
     hard[touched] = False
-    margin = _FINE_MARGIN if stencil.kappa <= 2 * math.pi / _FINE_CELLS else _COARSE_MARGIN
-    largest = margin * stencil.largest_symbol * float(materials.speed.max())
     number, least = np.zeros(shape, np.int32), _least_mass(every.coupling, largest)
     number[:-1, :-1, :-1] = elements.material
     number.ravel()[vertices[:, 0]] = kind
