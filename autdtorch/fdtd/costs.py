@@ -134,11 +134,12 @@ class Costs:
         for body, is_mesh in zip(region.bodies, self.meshes, strict=True):
             vertices, triangles = (part.numpy() for part in body.shape.surface())
             doubled = doubled_normals(np.clip(vertices, *inner)[triangles])
-            continued = doubled_normals(np.clip(vertices, *outer)[triangles])
             area = float(np.linalg.norm(doubled, axis=1).sum()) / 2
             # a plane of normal n cuts |nx| + |ny| + |nz| elements for each area of a cell
             cut += float(np.abs(doubled).sum()) / 2 / spacing**2
-            columns += (float(np.linalg.norm(continued, axis=1).sum()) / 2 - area) / spacing**2
+            if not self.in_boxes:
+                continued = doubled_normals(np.clip(vertices, *outer)[triangles])
+                columns += (float(np.linalg.norm(continued, axis=1).sum()) / 2 - area) / spacing**2
             beside = _BESIDE * area / spacing**2
             absorbs = body.impedance is not None or (body.fluid is not None and body.fluid.is_lossy)
             rows = _LOSSY if absorbs else 1.0

@@ -75,4 +75,8 @@ def unit_normals(normals: ArrayLike, count: int) -> torch.Tensor:
         return rows.new_tensor(unit_vector(name, rows)).repeat(count, 1)
     if rows.shape != (count, 3):
         raise ValueError(f"{name}: shape {tuple(rows.shape)}; must be (3,) or ({count}, 3) as positions")
-    return rows.new_tensor([unit_vector(f"{name}[{m}]", row) for m, row in enumerate(rows)])
+    scaled = rows.clone()
+    unlike = ~((rows.norm(dim=1) - 1).abs() <= 2 * torch.finfo(torch.float64).eps)
+    for m in unlike.nonzero()[:, 0].tolist():  # `unit_vector` returns the others as they are
+        scaled[m] = rows.new_tensor(unit_vector(f"{name}[{m}]", rows[m]))
+    return scaled
