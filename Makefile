@@ -53,8 +53,9 @@ PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 8
 test: $(INSTALLED)-dev $(VENV)/.kernels
 	$(PYTEST) --dist worksteal -m 'not (docs or browser or processes)' $(ARGS)
 
+# By file, as the live view, the documentation and reports take 5 to 20 s to make
 test-rest: $(INSTALLED)-dev $(VENV)/.kernels
-	$(PYTEST) --dist loadgroup -m 'docs or browser or processes' $(ARGS)
+	$(PYTEST) --dist loadfile -m 'docs or browser or processes' $(ARGS)
 
 lint: $(INSTALLED)-dev
 	$(BIN)/ruff check .

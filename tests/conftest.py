@@ -22,10 +22,6 @@ from PIL import Image
 
 TESTS = Path(__file__).parent
 
-SHARED = {"shared", "built", "reports"}
-"""Fixtures that take 5 to 20 s: the live view, the documentation, reports. One process makes each, and runs
-its tests, by `--dist loadgroup`."""
-
 gc.disable()  # until tests begin: what is imported and collected stays
 
 # `nohup pytest &` in a script ignores signals that tests send, in this process and in those that it starts. A
@@ -86,8 +82,6 @@ def pytest_xdist_auto_num_workers() -> int:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         item.add_marker(item.path.relative_to(TESTS).parts[0])
-        for shared in SHARED.intersection(getattr(item, "fixturenames", ())):
-            item.add_marker(pytest.mark.xdist_group(shared))
 
 
 def pytest_collection_finish() -> None:
