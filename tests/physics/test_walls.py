@@ -284,8 +284,8 @@ def test_a_bore_that_a_later_fluid_cuts_is_that_of_a_mesh():
         assert max(run.periods for run in propagator.runs) < 100
         return pressure
 
-    # meshes also have the edges of the inner rim
-    assert relative_error(matrix(tube, bore), matrix(mesh)) < 0.1
+    # measured 0.0098; without edges at the rims that the fluid cuts 0.08
+    assert relative_error(matrix(tube, bore), matrix(mesh)) < 0.03
 
 
 @pytest.mark.parametrize(

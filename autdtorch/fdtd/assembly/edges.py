@@ -1,30 +1,36 @@
-"""Convex edges of bodies, at which the field is singular.
-
-At an edge with the angle w of air around it, the pressure varies as r^(pi / w). Finite elements overestimate
-the energy next to it, which would cost the whole field an order of accuracy. A reduced stiffness near the
-edge corrects this (energy-corrected finite elements: Egger, Rüde and Wohlmuth 2014, doi:10.1137/120871377).
-"""
+"""Convex edges of bodies, at which the field is singular: straight, circular, and along bores."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
 
-from autdtorch.fdtd.shapes import Shape
+from autdtorch.fdtd.shapes import Shape, Solids
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.spatial import connected_parts, doubled_normals, sides_of
 
 _SHARP = np.radians(20)  # Smallest angle between the normals of two faces that meet in an edge
-_REACH = 1.2  # Distance from an edge within which the stiffness is reduced [cells]
-# Reduction of the stiffness at an edge of a cuboid. With 0.25, 0.3 and 0.35 a tilted rigid cube of 15 mm has
-# errors of up to 1.6, 1.5 and 2.1 % at 1 mm and 0.7, 0.5 and 0.3 % at 0.5 mm.
-_REDUCTION = 0.3
 _FEWEST_SIDES = 16  # Fewest sides of a polygon that represents a circle
 _ROUND = 1e-6  # Largest relative deviation of its corners from the circle
 _OUTSIDE = 1e-6  # Distance from a face of the point that shows whether another body covers it [m]
+_STEP = 1e-3  # Distance of the points that tell the directions of two faces beside their edge [cells]
+_NEAR = 2.0  # Distance from an edge of a bore up to which it is looked for [cells]
+_ON = (
+    0.1  # Distance from both surfaces, and from what is left, up to which a place is on such an edge [cells]
+)
+
+
+class Nearest(NamedTuple):
+    """Places of an edge nearest to n points."""
+
+    way: Array  # to the place (n, 3) [m], infinite beyond the edge's reach
+    normals: Array  # unit vectors out of the two faces there (n, 2, 3)
 
 
 @dataclass(frozen=True)
@@ -33,19 +39,20 @@ class Segment:
 
     begin: Array  # its ends (3,) [m]
     end: Array
-    reduction: float  # relative reduction of the stiffness next to it
+    normals: Array  # of its faces (2, 3)
+    share: float = 1.0  # of what corrects a rigid edge in air
 
     @property
     def bounds(self) -> tuple[Array, Array]:
         """Corners (3,) [m] of its bounding box."""
         return np.minimum(self.begin, self.end), np.maximum(self.begin, self.end)
 
-    def nearest(self, points: Array) -> tuple[Array, Array]:
-        """Return the distance (n,) [m] of points (n, 3), and the edge's direction (n, 3) next to them."""
+    def nearest(self, points: Array) -> Nearest:
+        """Return its places nearest to points (n, 3) [m]."""
         whole = self.end - self.begin
-        share = np.clip((points - self.begin) @ whole / (whole @ whole), 0, 1)
-        gap = points - self.begin - share[:, None] * whole
-        return np.linalg.norm(gap, axis=1), np.broadcast_to(whole / np.linalg.norm(whole), gap.shape)
+        part = np.clip((points - self.begin) @ whole / (whole @ whole), 0, 1)
+        way = self.begin + part[:, None] * whole - points
+        return Nearest(way, np.broadcast_to(self.normals, (len(points), 2, 3)))
 
 
 @dataclass(frozen=True)
@@ -55,7 +62,9 @@ class Circle:
     center: Array  # (3,) [m]
     normal: Array  # unit vector (3,)
     radius: float  # [m]
-    reduction: float  # relative reduction of the stiffness next to it
+    slopes: Array  # components of the normals of its two faces along its own normal (2,)
+    outwards: Array  # and away from its centre (2,)
+    share: float = 1.0  # of what corrects a rigid edge in air
 
     @property
     def bounds(self) -> tuple[Array, Array]:
@@ -63,45 +72,73 @@ class Circle:
         reach = self.radius * np.sqrt(np.clip(1 - self.normal**2, 0, 1))
         return self.center - reach, self.center + reach
 
-    def nearest(self, points: Array) -> tuple[Array, Array]:
-        """Return the distance (n,) [m] of points (n, 3), and the edge's direction (n, 3) next to them."""
+    def nearest(self, points: Array) -> Nearest:
+        """Return its places nearest to points (n, 3) [m]."""
         from_center = points - self.center
         height = from_center @ self.normal
-        around = np.cross(self.normal, from_center)
-        from_axis = np.linalg.norm(around, axis=1)
-        direction = around / np.maximum(from_axis, 1e-9 * self.radius)[:, None]
-        return np.hypot(from_axis - self.radius, height), direction
+        flat = from_center - height[:, None] * self.normal
+        away = flat / np.maximum(np.linalg.norm(flat, axis=1), 1e-9 * self.radius)[:, None]
+        normals = self.slopes[:, None] * self.normal + self.outwards[:, None] * away[:, None]
+        return Nearest(self.radius * away - from_center, normals)
 
 
-def reductions(edges: Sequence[Segment | Circle], centers: Array, spacing: float) -> Array:
-    """Return the relative reductions (n, 3, 3) of the stiffness of elements at `centers` (n, 3) [m].
+@dataclass(frozen=True)
+class Rim:
+    """Edges of what later fluids leave of rigid bodies, where the surfaces of two shapes cross."""
 
-    A reduction falls to zero with the square of the distance from an edge; several edges are averaged. The
-    stiffness along an edge is unchanged, as the field is not singular in this direction.
-    """
-    total, weights = np.zeros((len(centers), 3, 3)), np.zeros(len(centers))
-    reach = _REACH * spacing
-    lowest, highest = centers.min(axis=0) - reach, centers.max(axis=0) + reach
-    for edge in edges:
-        lower, upper = edge.bounds
-        if (lower > highest).any() or (upper < lowest).any():
-            continue
-        near = np.flatnonzero(((centers > lower - reach) & (centers < upper + reach)).all(axis=1))
-        distance, along = edge.nearest(centers[near])
-        weight = np.maximum(0, 1 - (distance / reach) ** 2)
-        across = np.eye(3) - along[:, :, None] * along[:, None, :]
-        total[near] += (edge.reduction * weight**2)[:, None, None] * across
-        weights[near] += weight
-    return total / np.where(weights > 0, weights, 1)[:, None, None]
+    shapes: tuple[Shape, Shape]
+    solid: tuple[bool, bool]  # whether the bodies are inside of a shape, or outside
+    bodies: Solids  # all rigid bodies, and the fluids that cut them
+    spacing: float  # of the cells [m]
+    share: float = 1.0  # of what corrects a rigid edge in air
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Corners (3,) [m] of its bounding box."""
+        first, second = self.shapes
+        return np.maximum(first.lower, second.lower), np.minimum(first.upper, second.upper)
+
+    def nearest(self, points: Array) -> Nearest:
+        """Return its places nearest to points (n, 3) [m], with faces that are flat there."""
+        way, normals = np.full(points.shape, np.inf), np.zeros((len(points), 2, 3))
+        level = self._levels(points)
+        near = np.flatnonzero((np.abs(level) < _NEAR * self.spacing).all(axis=1))
+        if not len(near):
+            return Nearest(way, normals)
+        steps = _STEP * self.spacing * np.eye(3)[:, None]
+        ahead, behind = (self._levels(points[near] + step) for step in (steps, -steps))
+        normal = np.moveaxis(ahead - behind, 0, -1) / (2 * _STEP * self.spacing)
+        cosine = (normal[:, 0] * normal[:, 1]).sum(axis=1)
+        sharp = np.abs(cosine) < math.cos(_SHARP)
+        near, normal, cosine = near[sharp], normal[sharp], cosine[sharp]
+        part = (cosine[:, None] * level[near, ::-1] - level[near]) / (1 - cosine**2)[:, None]
+        ways = (part[:, :, None] * normal).sum(axis=1)
+        places = points[near] + ways
+        off = np.abs(np.column_stack((self._levels(places), self.bodies.distance(places)))).max(axis=1)
+        real = off < _ON * self.spacing
+        way[near[real]], normals[near] = ways[real], normal
+        return Nearest(way, normals)
+
+    def _levels(self, points: Array) -> Array:
+        """Return the signed distances (..., 2) [m] of points (..., 3), negative in the bodies."""
+        where = torch.from_numpy(points)
+        pairs = zip(self.shapes, self.solid, strict=True)
+        return np.stack(
+            [(1 if solid else -1) * shape.signed_distance(where).numpy() for shape, solid in pairs], axis=-1
+        )
+
+
+Edge: TypeAlias = Segment | Circle | Rim
 
 
 def edges_of(shape: Shape, others: Sequence[Shape] = ()) -> list[Segment | Circle]:
     """Return the convex edges of a shape that `others` do not cover."""
     vertices, triangles = (part.numpy() for part in shape.surface())
-    ends, angles, beside = _sharp_sides(vertices, triangles)
+    ends, normals = _sharp_sides(vertices, triangles)
     if not len(ends):
         return []
     covered = np.zeros(len(ends), bool)
+    beside = ends.mean(axis=1)[:, None] + _OUTSIDE * (normals - 2 * normals[:, ::-1])
     for other in others:
         covered |= (other.signed_distance(torch.from_numpy(beside)) < 0).any(dim=1).numpy()
     corners = ends.reshape(-1, 3)
@@ -110,40 +147,64 @@ def edges_of(shape: Shape, others: Sequence[Shape] = ()) -> list[Segment | Circl
     first, second = number.reshape(-1, 2).T
     part = connected_parts((first, second), len(places))
     edges: list[Segment | Circle] = []
-    # 1 - pi / w is a third for a cuboid, whose normals are pi / 2 apart
-    shares = _REDUCTION * 3 * angles / (np.pi + angles)
     for polygon in range(part.max(initial=-1) + 1):
         chosen = part[first] == polygon
         free = chosen & ~covered
-        circle = _circle(places[part == polygon], float(shares[chosen].mean()), int(chosen.sum()))
+        circle = _circle(places[part == polygon], ends[chosen], normals[chosen])
         if circle and free.any():  # whole: sides of a polygon would depend on its corners
             edges.append(circle)
         elif not circle:
             edges += [
-                Segment(begin, end, float(share))
-                for (begin, end), share in zip(ends[free], shares[free], strict=True)
+                Segment(begin, end, both)
+                for (begin, end), both in zip(ends[free], normals[free], strict=True)
             ]
     return edges
 
 
-def _circle(corners: Array, reduction: float, sides: int) -> Circle | None:
-    """Return the circle through `corners` (n, 3) [m] if these form a regular polygon, else None."""
-    if not _FEWEST_SIDES <= sides == len(corners):
+def rims_of(
+    shapes: Sequence[Shape], rigid: Sequence[bool], density: Sequence[float], spacing: float
+) -> list[Rim]:
+    """Return the edges on cells [m] of what later fluids of a relative density leave of rigid shapes.
+
+    A dense fluid fills its bore like a rigid body: without an edge.
+    """
+    pairs = set()
+    for number in np.flatnonzero(rigid).tolist():
+        fluids = [later for later in range(number + 1, len(rigid)) if not rigid[later]]
+        pairs |= set(combinations([number, *fluids], 2))
+    rims, bodies = [], Solids(shapes, rigid)
+    for first, second in sorted(pairs):
+        both, solid = (shapes[first], shapes[second]), (rigid[first], rigid[second])
+        share = 1 / max(1.0, *(density[number] for number in (first, second) if not rigid[number]))
+        rim = Rim(both, solid, bodies, spacing, share)
+        if (np.subtract(*rim.bounds) < 0).all():
+            rims.append(rim)
+    return rims
+
+
+def _circle(corners: Array, ends: Array, normals: Array) -> Circle | None:
+    """Return the circle through `corners` (n, 3) [m] if these form a regular polygon, else None.
+
+    Of its sides these are the `ends` (n, 2, 3) [m], and the `normals` of the faces (n, 2, 3).
+    """
+    if not _FEWEST_SIDES <= len(ends) == len(corners):
         return None
     center = corners.mean(axis=0)
     _, sizes, axes = np.linalg.svd(corners - center)
     radii = np.linalg.norm(corners - center, axis=1)
     radius = float(radii.mean())
-    flat = sizes[2] < _ROUND * sizes[0] and np.ptp(radii) < _ROUND * radius
-    return Circle(center, axes[2], radius, reduction) if flat else None
+    if sizes[2] > _ROUND * sizes[0] or np.ptp(radii) > _ROUND * radius:
+        return None
+    slopes, away = normals @ axes[2], ends.mean(axis=1) - center
+    away /= np.linalg.norm(away, axis=1)[:, None]
+    outwards = (normals * away[:, None]).sum(axis=2)
+    order = slopes.argsort(axis=1)  # sides list their faces in any order
+    slopes, outwards = (np.take_along_axis(each, order, axis=1).mean(axis=0) for each in (slopes, outwards))
+    return Circle(center, axes[2], radius, slopes, outwards)
 
 
-def _sharp_sides(vertices: Array, triangles: Index) -> tuple[Array, Array, Array]:
-    """Return ends, angles and outside points of the sides at convex edges of a surface.
-
-    Ends are (n, 2, 3) [m], angles between the normals of the two faces (n,) [rad]. The points (n, 2, 3) [m]
-    are just outside each face, next to the middle of the edge.
-    """
+def _sharp_sides(vertices: Array, triangles: Index) -> tuple[Array, Array]:
+    """Return the ends (n, 2, 3) [m] of the sides at convex edges of a surface, and their faces' normals."""
     _, number = np.unique(vertices.round(9), axis=0, return_inverse=True)  # corners may be listed twice
     corners, place = vertices[triangles], number.ravel()[triangles]
     normal = doubled_normals(corners)
@@ -157,6 +218,5 @@ def _sharp_sides(vertices: Array, triangles: Index) -> tuple[Array, Array, Array
     towards = corners[other].mean(axis=1) - corners[one].mean(axis=1)
     convex = np.einsum("ij,ij->i", normal[one], towards) < 0
     chosen = convex & (angle > _SHARP) & (double[one] > 0) & (double[other] > 0)
-    ends, first, second = ends[order[pairs[chosen]]], normal[one[chosen]], normal[other[chosen]]
-    outside = np.stack((first - 2 * second, second - 2 * first), axis=1)
-    return ends, angle[chosen], ends.mean(axis=1)[:, None] + _OUTSIDE * outside
+    both = np.stack((normal[one[chosen]], normal[other[chosen]]), axis=1)
+    return ends[order[pairs[chosen]]], both

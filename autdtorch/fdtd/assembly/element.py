@@ -107,6 +107,10 @@ def _factors(places: Array) -> Array:
     return np.where(VERTICES == 1, places[..., None, :], 1 - places[..., None, :])
 
 
+HATS = hats(SUBCENTERS)  # Those functions at the centres of the sub-cells (64, 8)
+SLOPES = np.stack([hat_slopes(SUBCENTERS, axis) for axis in range(3)], axis=2)  # Their gradients (64, 8, 3)
+
+
 def coupling_by_edges(stencil: Stencil) -> Array:
     """Return the coupling (4,) in air by edges between vertices; 4 elements share a face, 2 an edge."""
     return np.array((0.0, stencil.face / 4, stencil.edge / 2, stencil.corner))
@@ -125,6 +129,12 @@ def stiffness_matrix(coupling: Array, pairs: Index = PAIRS) -> Array:
     matrix += matrix.swapaxes(-2, -1)
     matrix[..., range(size), range(size)] = -matrix.sum(axis=-1)
     return matrix
+
+
+def tuning_of(stencil: Stencil) -> Array:
+    """Return the difference (8, 8) of the stiffness of an element of air from that of trilinear functions."""
+    trilinear = np.einsum("qix,qjx->ij", SLOPES, SLOPES) / SUBCELLS**3
+    return np.asarray(stiffness_matrix(uniform_coupling(stencil)) - trilinear)
 
 
 def without_negative(matrices: Array) -> Array:

@@ -18,7 +18,8 @@ from scipy.ndimage import binary_dilation
 
 from autdtorch.fdtd.assembly.absorbing_surfaces import with_impedance, with_impedance_faces
 from autdtorch.fdtd.assembly.aligned import Blocks, aligned_elements
-from autdtorch.fdtd.assembly.edges import edges_of, reductions
+from autdtorch.fdtd.assembly.edge_energy import reductions
+from autdtorch.fdtd.assembly.edges import Edge, edges_of, rims_of
 from autdtorch.fdtd.assembly.element import (
     CORNERS,
     FAR,
@@ -54,9 +55,9 @@ _CHUNK = 4096  # Interface elements assembled at a time
 _DEPTHS = np.array([1.0, 1.6, 2.2])
 # Deviation [cells] of a signed distance from a quadratic one at which a second face is near
 _ROUGH = 0.01
-# Reduction of the stiffness at edges of fluids over that at rigid edges. With 0.15 and 0.3, tilted cubes of
+# Change of the stiffness at edges of fluids over that at rigid edges. With 0.15 and 0.3, tilted cubes of
 # density ratio 77 have errors of up to 2.4 and 2.7 % (15 mm) and 2.8 and 2.1 % (8 mm) at 1 mm.
-_FLUID_REDUCTION = 0.3
+_FLUID_SHARE = 0.3
 _SAME = 1e-9  # Difference of distances [cells] up to which elements are alike
 _GROUND_GRADIENT = 0.3  # Least mean gradient of a signed distance in an element with one surface
 
@@ -262,19 +263,26 @@ def _interface(
         return []
     numbers = np.array([body.material for body in bodies], np.int64)
     shapes = [shape for body in bodies for shape in body.shapes]
-    edges = [
-        replace(edge, reduction=edge.reduction * (1 if body.rigid else _FLUID_REDUCTION))
+    edges: list[Edge] = [
+        edge if body.rigid else replace(edge, share=_FLUID_SHARE)
         for body in bodies
         if body.finite
         for shape in body.shapes
         for edge in edges_of(shape, [each for each in shapes if each is not shape])
     ]
+    carved = [(shape, body) for body in bodies if body.finite or not body.rigid for shape in body.shapes]
+    edges += rims_of(
+        [shape for shape, _ in carved],
+        [body.rigid for _, body in carved],
+        [float(materials.density[body.material]) for _, body in carved],
+        grid.spacing,
+    )
     shape = tuple(cells - 1 for cells in grid.shape)
 
     def chunk(begin: int) -> tuple[InterfaceElements, Index]:
         first = places_of(index[begin : begin + _CHUNK], shape)
         centers = np.array(grid.origin) + grid.spacing * (first + 0.5)
-        less = reductions(edges, centers, grid.spacing)
+        less = reductions(edges, centers, grid.spacing, stencil)
         distance = _distances(bodies, first, grid)
         edged = np.asarray(less.any(axis=(1, 2)))
         finite, walls = _finite(bodies, distance, first, edged, whole, grid)

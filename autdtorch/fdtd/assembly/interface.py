@@ -29,18 +29,17 @@ from numpy.typing import NDArray
 from autdtorch.fdtd.assembly.element import (
     CORNERS,
     FAR,
+    HATS,
     PAIRS,
+    SLOPES,
     SUBCELLS,
-    SUBCENTERS,
     InterfaceElements,
     Materials,
     distance_to_material,
-    hat_slopes,
-    hats,
     line_coverage,
     shares,
-    stiffness_matrix,
     subcell_means,
+    tuning_of,
     uniform_coupling,
     volume_coverage,
     without_vertices,
@@ -87,8 +86,9 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
     vertex = _vertex_materials(distance, material)
     layered = layered_axis(distance)
     near = (np.abs(left_by_fluids(distance, materials.rigid[material])) < FAR).any(axis=2)
-    # a surface with an impedance needs pressures on both sides
-    allowed = bodies.finite & ((layered < 0) | materials.reacting[material, None])
+    # a surface with an impedance needs pressures on both sides, and so does a face beside an edge
+    beside = (layered < 0) | bodies.reductions.any(axis=(1, 2))
+    allowed = bodies.finite & (beside | materials.reacting[material, None])
     finite = np.asarray((near & allowed).any(axis=0))
     coupling, mass = np.zeros((len(vertex), 28)), np.zeros(vertex.shape)
     if finite.any():
@@ -237,12 +237,12 @@ def _lumped_mass(vertex: Index, volumes: Array, materials: Materials) -> Array:
         inside = vertex == number
         beside = ~inside & ~materials.rigid[vertex]
         beside[~inside.any(axis=1)] = True
-        near, far = inside @ _HATS.T, beside @ _HATS.T
+        near, far = inside @ HATS.T, beside @ HATS.T
         passed = np.minimum(1, (materials.density[number] / mean)[:, None] * far)
         passed[~inside.any(axis=1)] = 1
         volume = volumes[:, :, number] / SUBCELLS**3
-        here = (volume * np.divide(1 - passed, near, out=np.zeros_like(near), where=near > 0)) @ _HATS
-        there = (volume * np.divide(passed, far, out=np.zeros_like(far), where=far > 0)) @ _HATS
+        here = (volume * np.divide(1 - passed, near, out=np.zeros_like(near), where=near > 0)) @ HATS
+        there = (volume * np.divide(passed, far, out=np.zeros_like(far), where=far > 0)) @ HATS
         total += mass * (np.where(inside, here, 0) + np.where(beside, there, 0))
     return total
 
@@ -271,9 +271,7 @@ def _balanced_mass(surface: Surface, whole_cell: Array, mass: Array) -> Array:
     return np.asarray(mass * (1 + change * np.minimum(1, _MOST_TAKEN / np.maximum(-least, 1e-12))))
 
 
-_HATS = hats(SUBCENTERS)  # Trilinear functions of the vertices at the centres of the sub-cells (64, 8)
-_SLOPES = np.stack([hat_slopes(SUBCENTERS, axis) for axis in range(3)], axis=2)  # Their gradients (64, 8, 3)
-_PRODUCTS = np.einsum("qix,qjx->qij", _SLOPES, _SLOPES)
+_PRODUCTS = np.einsum("qix,qjx->qij", SLOPES, SLOPES)
 
 
 def _cut_coupling(volumes: Array, materials: Materials, reductions: Array, stencil: Stencil) -> Array:
@@ -282,13 +280,13 @@ def _cut_coupling(volumes: Array, materials: Materials, reductions: Array, stenc
     `reductions` (n, 3, 3) is the relative reduction of the stiffness near edges.
     """
     mobility = volumes @ np.where(materials.rigid, 0, 1 / materials.density) / SUBCELLS**3
-    tuning = stiffness_matrix(uniform_coupling(stencil)[None])[0] - _PRODUCTS.mean(axis=0)
+    tuning = tuning_of(stencil)
     near = np.trace(reductions, axis1=1, axis2=2) / 2
     matrix = np.tensordot(mobility, _PRODUCTS, axes=1)
     matrix += ((1 - near) * mobility.sum(axis=1))[:, None, None] * tuning
     some = np.flatnonzero(near)
-    across = _SLOPES @ reductions[some, None]
-    matrix[some] -= np.einsum("nq,nqix,qjx->nij", mobility[some], across, _SLOPES, optimize=True)
+    across = SLOPES @ reductions[some, None]
+    matrix[some] -= np.einsum("nq,nqix,qjx->nij", mobility[some], across, SLOPES, optimize=True)
     return np.asarray(-matrix[:, PAIRS[:, 0], PAIRS[:, 1]])
 
 
@@ -298,8 +296,8 @@ def _cut_mass(volumes: Array, materials: Materials, out: NDArray[np.bool_]) -> A
     Vertices `out` (n, 8) leave theirs to the others.
     """
     cells = volumes @ np.where(materials.rigid, 0, materials.mass) / SUBCELLS**3
-    mass, parted = cells @ _HATS, np.flatnonzero(out.any(axis=1))
-    hats = _HATS * ~out[parted, None]
+    mass, parted = cells @ HATS, np.flatnonzero(out.any(axis=1))
+    hats = HATS * ~out[parted, None]
     whole = hats.sum(axis=2, keepdims=True)
     hats = np.divide(hats, whole, out=np.zeros_like(hats), where=whole > 0)
     mass[parted] = (cells[parted, None] @ hats)[:, 0]

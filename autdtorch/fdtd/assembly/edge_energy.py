@@ -1,0 +1,127 @@
+"""The stiffness of finite elements beside convex edges, at which the field is singular.
+
+At an edge with the angle w of air around it, the pressure varies as s = r^a cos(a t), with a = pi / w and
+the angle t from one of its faces. Trilinear functions between the values of s at the vertices have another
+energy than s, which would cost the whole field an order of accuracy. A change of the stiffness corrects this
+(energy-corrected finite elements: Egger, Rüde and Wohlmuth 2014, doi:10.1137/120871377).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from autdtorch.fdtd.assembly.edges import Edge
+from autdtorch.fdtd.assembly.element import (
+    LATTICE,
+    SLOPES,
+    SUBCELLS,
+    VERTICES,
+    subcell_means,
+    tuning_of,
+    volume_coverage,
+)
+from autdtorch.fdtd.stencil import Stencil
+from autdtorch.utils.array_types import Array, Index
+
+_REACH = 1.5  # Distance from an edge within which the stiffness is changed [cells]
+# Share of the difference of energies: the field of least energy has less than that between the values of s.
+# Around a rectangular edge in 2D, energies are then right in the mean over its places and tilts; their spread
+# is an eighth of what an unchanged stiffness adds. Tilted rigid boxes of 8 to 15 mm have errors of 0.5 to 0.9
+# and 0.15 to 0.23 % at 1 and 0.6 mm, with a reduction by the distance alone 0.7 to 1.4 and 0.36 to 0.54 %.
+_SHARE = 0.85
+_MOST = 0.7  # Largest relative reduction
+_LEAST = -0.5  # and least: an increase
+_HALF_WAY = 1e-3  # Difference of the depths below two faces up to which a vertex is between both [cells]
+_TINY = 1e-9  # Energy of an element without air
+_NEAREST = 0.35 / SUBCELLS  # Distance from the edge whose slope is that of a sub-cell around it [cells]
+
+
+def reductions(edges: Sequence[Edge], centers: Array, spacing: float, stencil: Stencil) -> Array:
+    """Return the relative reductions (n, 3, 3) of the stiffness of elements at `centers` (n, 3) [m].
+
+    Those of several edges add up, but are averaged where the edges meet. The stiffness along an edge is
+    unchanged, as the field is not singular in this direction.
+    """
+    reach = _REACH * spacing
+    lowest, highest = centers.min(axis=0) - reach, centers.max(axis=0) + reach
+    parts = []
+    for edge in edges:
+        lower, upper = edge.bounds
+        if (lower > highest).any() or (upper < lowest).any():
+            continue
+        near = np.flatnonzero(((centers > lower - reach) & (centers < upper + reach)).all(axis=1))
+        way, normals = edge.nearest(centers[near])
+        some = np.flatnonzero((way**2).sum(axis=1) < reach**2)
+        parts.append((near[some], way[some] / spacing, normals[some], np.full(len(some), edge.share)))
+    total = np.zeros((len(centers), 3, 3))
+    if not parts:
+        return total
+    element, way, normals, share = map(np.concatenate, zip(*parts, strict=True))
+    reduction = share * _reduction(way, normals, tuning_of(stencil))
+    along = np.cross(normals[:, 0], normals[:, 1])
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.eye(3) - along[:, :, None] * along[:, None, :]
+    np.add.at(total, element, (reduction * _parted(element, way))[:, None, None] * across)
+    whole = np.trace(total, axis1=1, axis2=2) / 2
+    return np.asarray(total * (_MOST / np.maximum(whole, _MOST))[:, None, None])
+
+
+def _parted(element: Index, way: Array) -> Array:
+    """Return the weights (k,) of edges that are a `way` (k, 3) [cells] from the centres of elements (k,).
+
+    Edges of an element that are far apart have the weight 1; those that meet in a place have a mean.
+    """
+    weight = 1 - (way**2).sum(axis=1) / _REACH**2
+    one, other = _pairs(element)
+    apart = ((way[one] - way[other]) ** 2).sum(axis=1) / _REACH**2
+    return np.asarray(weight / np.bincount(one, np.maximum(0, 1 - apart) * weight[other], len(element)))
+
+
+def _pairs(element: Index) -> tuple[Index, Index]:
+    """Return all pairs of entries (k,) of the same element, each entry with itself too."""
+    order = np.argsort(element, kind="stable")
+    _, first, count = np.unique(element[order], return_index=True, return_counts=True)
+    size, begin = np.repeat(count, count), np.repeat(first, count)  # of the group of each entry
+    one = np.repeat(np.arange(len(element)), size)
+    other = np.arange(len(one)) - np.repeat(np.cumsum(size) - size, size) + np.repeat(begin, size)
+    return order[one], order[other]
+
+
+def _reduction(way: Array, normals: Array, tuning: Array) -> Array:
+    """Return the relative reduction (k,) of the stiffness of elements beside an edge in air.
+
+    The edge is a `way` (k, 3) [cells] from their centre, between faces with `normals` (k, 2, 3). `tuning` as
+    of `tuning_of`.
+    """
+    cosine = (normals[:, 0] * normals[:, 1]).sum(axis=1)
+    power = np.pi / (np.pi + np.arccos(np.clip(cosine, -1, 1)))
+    level = (normals @ (LATTICE.T - 0.5 - way[:, :, None])).max(axis=1)
+    air = 1 - volume_coverage(level)
+    radius, angle = _polar(subcell_means(LATTICE.T - 0.5 - way[:, :, None]), normals)
+    slope = power[:, None] * np.maximum(radius, _NEAREST) ** (power[:, None] - 1)
+    exact = (air * slope**2).mean(axis=1)
+    places = VERTICES.T - 0.5 - way[:, :, None]
+    radius, angle = _polar(places, normals)
+    field = radius ** power[:, None] * np.cos(power[:, None] * angle)
+    heights = normals @ places
+    field[(np.abs(heights[:, 0] - heights[:, 1]) < _HALF_WAY) & (heights[:, 0] < 0)] = 0
+    slopes = np.einsum("qvx,kv->kqx", SLOPES, field)
+    energy = (air[:, :, None] * slopes**2).sum(axis=2).mean(axis=1)
+    energy += air.mean(axis=1) * np.einsum("kv,vw,kw->k", field, tuning, field)
+    return np.asarray(np.clip(_SHARE * (1 - exact / np.maximum(energy, _TINY)), _LEAST, _MOST))
+
+
+def _polar(places: Array, normals: Array) -> tuple[Array, Array]:
+    """Return the distances of places (k, 3, p) from an edge, and their angles from its first face (k, p).
+
+    Beyond half the body angles are those from the other side.
+    """
+    first, second = normals[:, :1], normals[:, 1:]
+    cosine = (first * second).sum(axis=2, keepdims=True)
+    along = (cosine * first - second) / np.sqrt(1 - cosine**2)  # the first face, away from the edge
+    height, forward = (first @ places)[:, 0], (along @ places)[:, 0]
+    middle = (3 * np.pi + np.arccos(cosine[:, 0])) / 2  # of the body
+    angle = np.mod(np.arctan2(height, forward) - middle, 2 * np.pi) + middle - 2 * np.pi
+    return np.hypot(height, forward), angle
