@@ -28,7 +28,7 @@ _REGULARISATION = 1e-5  # Keeps weights small where the fit does not determine t
 _ONE_SIDED_REGULARISATION = 1e-2
 # Distance [cells] along each axis of the cells that are then fitted: larger systems take long
 ONE_SIDED_REACH = 3
-_AT_CENTRE = 1e-6  # Distance from a cell's centre that is rounding [cells]
+AT_CENTRE = 1e-6  # Distance from a cell's centre that is rounding [cells]
 _ABSCISSA, _QUADRATURE = np.polynomial.legendre.leggauss(24)  # of wavenumbers up to the drive's
 
 
@@ -65,7 +65,7 @@ def exclude_cells(
     excluded. At the centre of a cell that is not, points have its pressure: a fit would leave out the short
     waves of a grid at a surface.
     """
-    centred = (np.abs(cells - cells.round()) < _AT_CENTRE).all(axis=1)
+    centred = (np.abs(cells - cells.round()) < AT_CENTRE).all(axis=1)
     centred &= ~np.take_along_axis(excluded, points.weight.argmax(axis=1)[:, None], axis=1)[:, 0]
     rows = np.flatnonzero(excluded.any(axis=1) & ~centred)
     if len(rows) == 0:
@@ -78,11 +78,13 @@ def exclude_cells(
     numbers = np.arange(points.index.shape[1]).reshape(counts)
     for row, corner in zip(rows, corners, strict=True):
         off = [np.abs(corner[axis] + np.arange(counts[axis]) - cells[row, axis]) for axis in range(3)]
-        near = [np.flatnonzero(along < ONE_SIDED_REACH) for along in off]
+        # as many on both sides of a point at a centre
+        near = [np.flatnonzero(along < min(ONE_SIDED_REACH, len(along) / 2) - AT_CENTRE) for along in off]
         columns = numbers[np.ix_(*near)].ravel()
         x, y, z = (along[places] for along, places in zip(off, near, strict=True))
         out = excluded[row, columns]
-        beside = (x[:, None, None] < 1) & (y[:, None] < 1) & (z < 1)
+        x_beside, y_beside, z_beside = (along < 1 - AT_CENTRE for along in (x, y, z))
+        beside = x_beside[:, None, None] & y_beside[:, None] & z_beside
         if (beside.ravel() & ~out).any():
             x, y, z = (np.sinc(kappa / np.pi * along) for along in (x, y, z))
             target = np.where(out, 0.0, (x[:, None, None] * y[:, None] * z).ravel())

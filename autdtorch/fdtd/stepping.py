@@ -19,6 +19,7 @@ from autdtorch.fdtd.assembly.unions import Union, measured, nearest_normals, rig
 from autdtorch.fdtd.damping import at_time_step, fewest_stable_steps
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.interpolation import (
+    AT_CENTRE,
     ONE_SIDED_REACH,
     Interpolation,
     average_nodes,
@@ -110,12 +111,14 @@ class Assembly:
         block = np.ravel_multi_index(tuple(np.moveaxis(first[:, None] + _BLOCK, -1, 0)), grid.shape)
         rigid = np.isin(block, self.heterogeneous.rigid)
         behind = self._behind_surfaces(points[some].numpy(), block, rigid)
-        seen = ~(rigid | behind).reshape(-1, *(_LAYERS,) * 3)
+        off = np.abs(first[:, None] + _BLOCK - cells[some, None])
+        beside, seen = off < 1 - AT_CENTRE, ~(rigid | behind) & (off < 2 - AT_CENTRE).all(axis=2)
         places = points.clone()
         for axis in range(3):
-            column = np.moveaxis(seen, axis + 1, 1)[:, :, 1:-1, 1:-1]  # the cells beside the point across
-            layers = np.asarray(column.any(axis=(2, 3)))
-            only = (layers.sum(axis=1) == 1) & layers[:, 1:-1].any(axis=1)
+            column = seen & np.delete(beside, axis, axis=2).all(axis=2)  # the cells beside the point across
+            cube = np.moveaxis(column.reshape(-1, *(_LAYERS,) * 3), axis + 1, 1)
+            layers = np.asarray(cube.any(axis=(2, 3)))
+            only = (layers.sum(axis=1) == 1) & (column & beside[..., axis]).any(axis=1)
             layer = first[only, axis] + layers[only].argmax(axis=1)
             places[some[only], axis] = torch.from_numpy(grid.origin[axis] + grid.spacing * layer)
         return places
@@ -155,7 +158,7 @@ class Assembly:
             row, cell = np.nonzero((off < reach) & (free[place] > 0) & ~seen)
             seen[row, cell] = sees(points[some[row]], ends[row, cell], solids, spacing)
             seen |= (self._outward(numbers)[place] * way).sum(axis=2) < 0
-            beside = (seen & ~rigid[some] & (off < spacing)).any(axis=1)
+            beside = (seen & ~rigid[some] & (off < (1 - AT_CENTRE) * spacing)).any(axis=1)
             behind[some] = ~seen & (off < reach) & beside[:, None]
         return behind
 
