@@ -144,11 +144,11 @@ def _assembled(
 
 
 def _on(index: Index, cells: HeterogeneousCells, stencil: Stencil) -> tuple[Array, Array, Array]:
-    """Return rows (n, 27), mass (n,) and losses (n, 29) at `index` (n,), of `cells` and of cells of air."""
-    weight, mass = np.tile(stencil.weights, (len(index), 1)), np.ones(len(index))
+    """Return rows (n, 27), mass (n,) and losses (n, 29) at `index` (n,), air's rows beside `cells`."""
+    weight, mass = np.tile(stencil.weights, (len(index), 1)), cells.mass_of(index)
     loss = np.zeros((len(index), 29))
     place = np.searchsorted(index, cells.index)
-    weight[place], mass[place], loss[place] = cells.weight, cells.mass, cells.loss_rows
+    weight[place], loss[place] = cells.weight, cells.loss_rows
     return weight, mass, loss
 
 
@@ -177,9 +177,9 @@ def cells_of_maps(
     weight, mass = _rows(stencil, relative, fluidity)
     axes = [np.arange(part.start - 1, part.stop + 1) for part in cells]
     index = np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), grid.shape).ravel()
-    nothing = np.zeros(0, np.int64)
+    no, nothing = np.zeros(0, np.int64), np.zeros(0)
     numbers = weight.detach().numpy(), mass.detach().numpy()
-    return DifferentiableCells(HeterogeneousCells(index, *numbers, nothing, nothing, nothing), weight, mass)
+    return DifferentiableCells(HeterogeneousCells(index, *numbers, no, no, no, no, nothing), weight, mass)
 
 
 def _speed_factor(stencil: Stencil, speed_ratio: Tensor) -> Tensor:

@@ -24,6 +24,7 @@ WALL = at.Box((6e-3, 6e-3, 12e-3), (40e-3, 40e-3, 2e-3), density=5.0, sound_spee
 
 DRIVE = torch.tensor([0.9, 0.9j, -0.4, 0.3 - 0.7j], dtype=torch.complex128)
 EXACT = {"spacing": 2e-3, "periods": 3, "kernel": "cpu", "dtype": "float64"}
+LONGER = EXACT | {"periods": 9}
 
 
 def materials(*obstacles):
@@ -72,6 +73,30 @@ def test_every_material_has_a_derivative():
         slope = (ends[0] - ends[1]) / (2 * float(step[number]))
         assert float(values.grad[number]) == pytest.approx(slope, rel=1e-6)
     assert all(values.grad[1] == 0 for values in medium.values())  # the rigid one
+
+
+def test_cells_of_airs_sound_speed_have_their_mass():
+    """Inside a dense body whose cells step like air, and by the densities of two that touch as one."""
+    fluid = {"density": 20.0, "sound_speed": AIR.sound_speed}
+    bodies = at.Box((12e-3,) * 3, (9e-3,) * 3, **fluid), at.Box((12e-3, 12e-3, 19e-3), (5e-3,) * 3, **fluid)
+    scene, inside = small_scene(bodies, extent=24e-3), [(12e-3,) * 3]
+    density = torch.tensor([20.0, 20.0], dtype=torch.float64, requires_grad=True)
+    drive = DRIVE.clone().requires_grad_()
+
+    def pressure(density, points=None):
+        # the largest stable time step changes with the density
+        field = at.differentiable_field(scene, drive, points, density=density, time_step=3e-6, **LONGER)
+        return torch.view_as_real(field).sum()
+
+    # the field is linear in the drive
+    (within := pressure(None, inside)).backward()
+    linear = torch.view_as_real(drive.grad.conj() * drive)[..., 0].sum()
+    assert linear.item() == pytest.approx(within.item(), rel=1e-9)
+    pressure(density).backward()
+    for step, slope in zip(0.02 * torch.eye(2, dtype=torch.float64), density.grad, strict=True):
+        ends = [pressure(density.detach() + way * step).item() for way in (1, -1)]
+        # truncation is (1e-3)^2 of the slope
+        assert float(slope) == pytest.approx((ends[0] - ends[1]) / 0.04, rel=1e-4)
 
 
 def test_several_drives_are_one_by_one():

@@ -73,6 +73,8 @@ class HeterogeneousCells:
     rigid: Index  # flat indices of the rigid cells, ascending
     shell: Index  # rigid cells next to other cells; no cell reads those behind them
     enclosed: Index  # rigid cells of air, which no sound reaches, ascending
+    inner: Index  # flat indices of cells inside obstacles whose rows are those of air, but not their mass
+    inner_mass: Array  # m_i of these
     largest: float = math.inf  # upper bound of the eigenvalues of the rows, that of the elements
     losses: LossyCells | None = None  # None if nothing absorbs
     tangent: float = 0.0  # largest ratio of damping to stiffness in a material
@@ -87,10 +89,11 @@ class HeterogeneousCells:
         return rows
 
     def mass_of(self, cells: Index) -> Array:
-        """Return the mass (k,) of cells (k,) that are heterogeneous or of air."""
+        """Return the mass (k,) of distinct cells (k,)."""
         mass = np.ones(len(cells))
-        _, ours, theirs = np.intersect1d(self.index, cells, return_indices=True)
-        mass[theirs] = self.mass[ours]
+        for index, masses in ((self.index, self.mass), (self.inner, self.inner_mass)):
+            _, ours, theirs = np.intersect1d(index, cells, return_indices=True)
+            mass[theirs] = masses[ours]
         return mass
 
 
@@ -127,7 +130,7 @@ def heterogeneous_cells(
     spread(divide, parts_of_size(len(touched), _TOGETHER))
     changed &= ~hard[touched]
     index, weight, mass, loss = touched[changed], weight[changed], mass[changed], loss[changed]
-    uniform = _uniform_cells(elements, touched, hard, shape, stencil)
+    *uniform, inner, inner_mass = _uniform_cells(elements, touched, hard, shape, stencil)
     if len(uniform[0]):
         both = zip((index, weight, mass, loss), uniform, strict=True)
         index, weight, mass, loss = map(np.concatenate, both)
@@ -139,7 +142,17 @@ def heterogeneous_cells(
     losses = elements.materials.losses
     tangent = 0.0 if losses is None else losses.tangent
     return HeterogeneousCells(
-        index, weight, mass, np.flatnonzero(hard), shell, enclosed, largest, lossy_cells(loss), tangent
+        index,
+        weight,
+        mass,
+        np.flatnonzero(hard),
+        shell,
+        enclosed,
+        inner,
+        inner_mass,
+        largest,
+        lossy_cells(loss),
+        tangent,
     )
 
 
@@ -338,16 +351,24 @@ def _transferred_mass(coupling: Array, mass: Array, need: Array, touched: Index,
 
 def _uniform_cells(
     elements: Elements, touched: Index, hard: NDArray[np.bool_], shape: GridShape, stencil: Stencil
-) -> tuple[Index, Array, Array, Array]:
-    """Return index, weight, mass and losses of cells inside obstacles that absorb or have another speed."""
+) -> tuple[Index, Array, Array, Array, Index, Array]:
+    """Return index, weight, mass and losses of cells inside obstacles that absorb or have another speed.
+
+    Then index and mass of those that have air's rows, but not its mass.
+    """
     materials = elements.materials
     factor, losses = materials.speed, materials.losses
     loss = np.zeros((len(factor), 0))
     if losses is not None:
         nothing = np.zeros_like(losses.mass)
         loss = np.column_stack((losses.coupling[:, None] * stencil.weights, losses.mass, nothing))
-    unlike, material = (factor != 1) | loss.any(axis=1), _cell_material(elements)
-    inside = unlike[material] & ~hard
+    stepped, material = (factor != 1) | loss.any(axis=1), _cell_material(elements)
+    inside = (stepped | (materials.mass != 1))[material] & ~hard
     inside[touched] = False
-    number = material[index := inner_cells(inside.reshape(shape))]
-    return index, factor[number, None] * stencil.weights, materials.mass[number], loss[number]
+    index = inner_cells(inside.reshape(shape))
+    number = material[index]
+    differs = stepped[number]
+    inner, inner_mass = index[~differs], materials.mass[number[~differs]]
+    index, number = index[differs], number[differs]
+    rows = factor[number, None] * stencil.weights
+    return index, rows, materials.mass[number], loss[number], inner, inner_mass
