@@ -145,7 +145,8 @@ class Assembly:
         spacing = self.grid.spacing
         behind, reach = np.zeros(cells.shape, bool), ONE_SIDED_REACH * spacing
         around = solids.distance(points)
-        near = np.flatnonzero((around > -LENGTH_TOLERANCE) & (around < math.sqrt(3) * reach))
+        farthest = math.sqrt(3) * spacing * round(cells.shape[1] ** (1 / 3))
+        near = np.flatnonzero((around > -LENGTH_TOLERANCE) & (around < farthest))
         for first in range(0, len(near), _LOOKING):
             some = near[first : first + _LOOKING]
             numbers, place = np.unique(cells[some], return_inverse=True)
@@ -159,7 +160,7 @@ class Assembly:
             seen[row, cell] = sees(points[some[row]], ends[row, cell], solids, spacing)
             seen |= (self._outward(numbers)[place] * way).sum(axis=2) < 0
             beside = (seen & ~rigid[some] & (off < (1 - AT_CENTRE) * spacing)).any(axis=1)
-            behind[some] = ~seen & (off < reach) & beside[:, None]
+            behind[some] = ~seen & ((off < reach) | (free[place] <= 0)) & beside[:, None]
         return behind
 
     def _outward(self, cells: Index) -> Array:

@@ -114,6 +114,21 @@ def test_points_on_a_thin_plate_read_the_sound_on_their_side(material):
     assert relative_error(matrix[:2], matrix[2:]) < 0.02
 
 
+def test_the_error_falls_with_the_distance_from_a_fluid_body():
+    """From one to four cells beside it, where kernels of coarse grids reach into the body."""
+    body = Box((0, 0, 0), (14e-3, 14e-3, 10e-3), density=25.0, sound_speed=600.0)
+    array = TransducerArray.grid((2, 2), 10e-3, (0, 0, -50e-3), (0, 0, 1))
+    points = [(7e-3 + gap * 0.5e-3, 0.3e-3, 1e-3) for gap in range(5, 17)]
+    scene = Scene(array, AIR, 40e3, points, (body,))
+    fine, coarse = (
+        make_propagator(scene, "box", spacing, 1e-3, cache=False).transfer_matrix()
+        for spacing in (1e-3, 2e-3)
+    )
+    errors = (coarse - fine).norm(dim=1) / fine.norm(dim=1)
+    # 1.0 to 1.9 % measured; 13 % at three cells where kernels take the pressure in the body for that in air
+    assert errors.max() < 0.04
+
+
 def test_a_small_disc_alone_in_the_box_is_a_point_source():
     """No source is outside the box, where waves are summed."""
     body = Box((0, 0, 0), (6e-3, 6e-3, 6e-3), rigid=True)
