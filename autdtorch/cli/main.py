@@ -123,8 +123,8 @@ def main() -> None:
 def _end_without_cleaning_up() -> None:
     """Free no memory at the end, which the system does sooner.
 
-    Python ends as it does otherwise. Its last collection of garbage is left out, and what C++ libraries do
-    after Python's end, 0.1 s in PyTorch's.
+    Python ends as it does otherwise. Its last collection of garbage is left out, and the destructors of C++
+    libraries after Python's end, 0.1 s in PyTorch's.
     """
     gc.freeze()
     # glibc gives the status to functions of `on_exit`, and calls the last one first.
@@ -133,12 +133,15 @@ def _end_without_cleaning_up() -> None:
 
 
 def _load_torch_library() -> None:
-    """Load PyTorch's largest library in a thread, 0.15 s, while Hydra composes; its import then finds it."""
+    """Load PyTorch's largest library in a thread, 0.15 s, while Hydra composes; its import then finds it.
+
+    Python waits for the thread before it ends: a library that loads at exit crashes, as its destructors run.
+    """
     spec = find_spec("torch")
     if sys.platform == "linux" and spec is not None and spec.origin is not None:
         library = Path(spec.origin).with_name("lib") / "libtorch_cpu.so"
         dlopen = ctypes.CDLL(None).dlopen  # without the interpreter lock, which ctypes.CDLL(library) holds
-        threading.Thread(target=dlopen, args=(bytes(library), os.RTLD_NOW), daemon=True).start()
+        threading.Thread(target=dlopen, args=(bytes(library), os.RTLD_NOW)).start()
 
 
 @hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")

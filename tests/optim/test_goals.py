@@ -1,10 +1,11 @@
-"""Goals: scores, slopes and bounds; one that is new. Functions of methods: defaults, old keywords."""
+"""Goals: scores, slopes and bounds; one that is new. Functions of methods: settings, old keywords."""
 
 import inspect
 import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 
 import autdtorch as at
 from autdtorch.io.goal_section import GOALS, goal_section, load_goal
+from autdtorch.methods import functions
 from autdtorch.methods.catalogue import METHODS, VARIANTS
 from autdtorch.methods.gradient import climb, random_drives
 from autdtorch.objectives.goals import derivative, goal_of
@@ -247,6 +249,48 @@ def test_a_function_has_the_settings_of_its_method_and_parameters_of_run_with_th
         default = of_run[each.name].default if each.name in of_run else getattr(method, each.name)
         assert each.default == default
     assert parameters.keys() >= vars(method).keys() | ({"trials", "seed"} if method.random else set())
+
+
+OTHERS = {
+    "levels": 5,
+    "order": [1, 0],
+    "first": 3,
+    "passes": 2,
+    "evaluations": 20,
+    "initial": 7,
+    "fixed_transducer": 1,
+    "model": "foci",
+    "kernel": "phasor",
+    "acquisition": "log_ei",
+    "initial_points": "random",
+    "noise": 0.2,
+    "prior": at.Prior(gain=0.3),
+    "device": "cuda",
+    "rounds": 6,
+    "starts": 8,
+    "steps": 9,
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_function_runs_its_method_with_the_settings_and_arguments_it_is_called_with(name, monkeypatch):
+    calls = []
+
+    def noted(method, objective, trials=1, seed=0, *, goal=None, readings=None):
+        calls.append((method, objective, trials, seed, goal, readings))
+
+    monkeypatch.setattr(functions, "run", noted)
+    monkeypatch.setattr("autdtorch.methods.bayes_opt.device_type", Mock())  # no GPU is needed
+    names = inspect.signature(getattr(at, name)).parameters.keys()
+    of_run = {"trials": 4, "seed": 11, "goal": at.MeanPressure(), "readings": object()}
+    settings = {key: value for key, value in OTHERS.items() if key in names}
+    getattr(at, name)("objective", **settings, **{key: of_run[key] for key in names & of_run.keys()})
+    kind = type(VARIANTS[name]) if name in VARIANTS else METHODS[name]
+    passed = [
+        of_run[key] if key in names else default
+        for key, default in zip(of_run, (1, 0, None, None), strict=True)
+    ]
+    assert calls == [(kind(**settings), "objective", *passed)]
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
