@@ -36,7 +36,7 @@ class Law:
 
     Fitted to 160 random scenes of 19 kinds (rods, bars, slits, blocks, balls, rings, and the shadows of
     plates, cubes and phones) on grids of 4 to 12 cells per wavelength. On the second and third grid, claims
-    were 0.5 to 3.2 times the error in nine of ten.
+    were 0.5 to 3.4 times the error in nine of ten.
     """
 
     wavelength: float
