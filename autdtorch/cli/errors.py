@@ -102,6 +102,13 @@ def _siblings(error: BaseException | None) -> list[str]:
     return [str(key) for key in parent if key != TARGET] if isinstance(parent, DictConfig) else []
 
 
+def _in_groups(error: BaseException | None, key: str) -> list[str]:
+    """Return the settings of the groups that end in a key, where an error of OmegaConf is about it."""
+    parent = getattr(error, "parent_node", None)
+    groups = parent.items_ex(resolve=False) if isinstance(parent, DictConfig) else ()
+    return [f"{group!s}.{key}" for group, each in groups if isinstance(each, DictConfig) and key in each]
+
+
 def _of_hydra(error: BaseException, text: str) -> str:
     """Return a message of Hydra in our words; others as they are, in one line."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
@@ -111,7 +118,10 @@ def _of_hydra(error: BaseException, text: str) -> str:
     if unknown := re.match(r"Could not override '(.+)'", text):
         key = str(getattr(error.__cause__, "full_key", None) or unknown[1])
         keys = _siblings(error.__cause__)
-        hint = did_you_mean(key.rpartition(".")[2], keys)
+        elsewhere = _in_groups(error.__cause__, unknown[1])
+        hint = (
+            f" (did you mean {elsewhere[0]!r}?)" if elsewhere else did_you_mean(key.rpartition(".")[2], keys)
+        )
         listed = ""
         if "." in key:  # others are all set, and Hydra's advice to add one would then be refused
             added = re.search(r"To append to your config use (\+.+)", text)

@@ -32,6 +32,7 @@ WRONG = {
     "method=GABS": r"method: 'GABS'; must be one of .* \(did you mean 'gabs'\?\)",
     "experiment=nature": "experiment: 'nature'; must be one of paper",
     "trails=3": r"trails: unknown key \(did you mean 'trials'\?\)",
+    "spacing=2e-3": r"spacing: unknown key \(did you mean 'solver.spacing'\?\)",
     "scene.freqency=4": r"scene\.freqency: unknown key \(did you mean 'frequency'\?\)",
     "method.level=8": r"method\.level: unknown key \(did you mean 'levels'\?\); keys that are set: levels, ",
     "scene.medium.absorption=1": r"scene\.medium\.absorption: .*; .* as \+scene\.medium\.absorption=1;",
