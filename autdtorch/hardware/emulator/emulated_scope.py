@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from autdtorch.hardware.emulator.bench import EmulatedBench, EmulatedDevice, stall, time_out
-from autdtorch.hardware.sensors.scope_microphones import FREQUENCIES, SENSITIVITIES
+from autdtorch.hardware.sensors.scpi_scope import FREQUENCIES, SENSITIVITIES
 from autdtorch.utils.validation import (
     integer_at_least,
     integers,

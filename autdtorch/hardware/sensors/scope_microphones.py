@@ -17,8 +17,10 @@ from autdtorch.hardware.sensors.by_hand import MovedMicrophone
 from autdtorch.hardware.sensors.scpi_scope import (
     COARSEST,
     FINEST,
+    FREQUENCIES,
     KEYSIGHT,
     RIGOL,
+    SENSITIVITIES,
     Oscilloscope,
     Waveform,
     open_scope,
@@ -39,10 +41,6 @@ from autdtorch.utils.validation import (
 
 logger = logging.getLogger(__name__)
 
-#: Sensitivities of microphones with their amplifiers that are taken for true [V/Pa].
-SENSITIVITIES = (1e-9, 1e3)
-#: Frequencies that an oscilloscope may capture [Hz].
-FREQUENCIES = (1.0, 1e9)
 _PERIODS_A_DIVISION = 5  # 50 or 60 on a screen, 20 samples each
 _QUIET = 5  # standard errors
 # Vertical scales. A sound twice or half as loud as the last needs no change.

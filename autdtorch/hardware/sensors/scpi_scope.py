@@ -25,6 +25,10 @@ logger = logging.getLogger(__name__)
 FINEST = 1e-3
 #: Coarsest vertical scale that both makers have [V/division].
 COARSEST = 5.0
+#: Sensitivities of microphones with their amplifiers that are taken for true [V/Pa].
+SENSITIVITIES = (1e-9, 1e3)
+#: Frequencies that an oscilloscope may capture [Hz].
+FREQUENCIES = (1.0, 1e9)
 _CAPTURE_TIME = 2.0  # time limit of a capture [s]
 # Commands of both makers: of an input, with its vertical scale, and for its waveform.
 _SET_UP_INPUT = (
