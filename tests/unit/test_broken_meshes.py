@@ -174,11 +174,18 @@ def test_vertices_that_differ_by_rounding_are_one(noise):
     assert volume(mesh) == pytest.approx(1, abs=6 * noise)
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_another_fault_is_refused_with_its_reason_and_its_place(name):
+NO_TRIANGLES = [
+    name for name in REFUSED if name.startswith(("an index", "a vertex", "no triangles", "faces of"))
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "repair"), [*((name, False) for name in REFUSED), *((name, True) for name in NO_TRIANGLES)]
+)
+def test_another_fault_is_refused_with_its_reason_and_its_place(name, repair):
     surface, reason, place = REFUSED[name]
     with pytest.raises(ValueError, match=r"^Mesh\.surface: ") as caught:
-        Mesh.from_surface(surface, rigid=True)
+        Mesh.from_surface(surface, rigid=True, repair=repair)
     assert reason in str(caught.value)
     assert place in str(caught.value)
     assert "\n" not in str(caught.value)

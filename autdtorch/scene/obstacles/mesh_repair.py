@@ -18,6 +18,7 @@ from autdtorch.scene.obstacles.mesh_solid import (
     joined,
     open_edges,
     place_of,
+    require_triangles,
     solid_of,
     winding_number,
 )
@@ -43,8 +44,10 @@ def repaired(corners: Array, triangles: Index) -> Repaired:
     """Return the solid of triangles with faults, and what was mended, with numbers and places.
 
     Raises:
-        ValueError: a sheet without an inside, or a hole too large to guess; the message names it.
+        ValueError: a sheet without an inside, a hole too large to guess, or what are no triangles of the
+            vertices; the message names it.
     """
+    require_triangles(corners, triangles)
     with contextlib.suppress(ValueError):
         return Repaired(*solid_of(corners, triangles), [])
     done: list[str] = []

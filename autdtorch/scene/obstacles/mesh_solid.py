@@ -65,7 +65,7 @@ def solid_of(corners: Array, triangles: Index) -> Triangles:
     """
     import igl
 
-    _require_triangles(corners, triangles)
+    require_triangles(corners, triangles)
     vertices, faces = joined(corners, triangles)
     if not len(faces):
         raise ValueError(f"{_box(vertices)} has no volume; must enclose a volume")
@@ -168,7 +168,7 @@ def winding_number(vertices: Array, faces: Index, points: Array) -> Array:
     return winding
 
 
-def _require_triangles(corners: Array, triangles: Index) -> None:
+def require_triangles(corners: Array, triangles: Index) -> None:
     """Check the shapes, the vertices and the indices."""
     if triangles.size == 0 or triangles.ndim != 2 or triangles.shape[1] != 3:
         raise ValueError(f"faces of shape {triangles.shape}; must be triangles (F, 3), F >= 1")
