@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from operator import attrgetter
-from typing import TYPE_CHECKING
 
 import torch
 
 from autdtorch.scene.arrays import TransducerArray, radii_of
+from autdtorch.scene.contents import SceneContents
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.base import overlap, shared_box
 from autdtorch.scene.reflectors import require_in_front
@@ -19,9 +19,6 @@ from autdtorch.utils.array_types import REAL
 from autdtorch.utils.spatial import closest_pair, require_distinct
 from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import LENGTH_TOLERANCE, Vector, invalid
-
-if TYPE_CHECKING:
-    from autdtorch.scene.scene import Scene
 
 _SHORTEST = 0.1  # [wavelengths per m of wavelength] across array and control points: 1 m at 100 Hz in air
 _LONGEST = 5e3  # [wavelengths] across array and control points
@@ -44,20 +41,20 @@ class OverlapWarning(UserWarning):
     """Two obstacles of different materials overlap."""
 
 
-def require_places(scene: Scene) -> None:
+def require_places(scene: SceneContents) -> None:
     """Refuse contents behind a reflector, in an obstacle, on each other or outside the domain."""
     _require_in_front(scene)
     _require_separate_points(scene)
     _require_in_domain(scene)
 
 
-def warn_of_doubts(scene: Scene) -> None:
+def warn_of_doubts(scene: SceneContents) -> None:
     """Warn of overlaps, and of what is possible but seldom meant."""
     _warn_of_overlaps(scene.obstacles)
     _warn_of_implausible(scene)
 
 
-def _contents(scene: Scene) -> list[tuple[str, torch.Tensor]]:
+def _contents(scene: SceneContents) -> list[tuple[str, torch.Tensor]]:
     """Return names and points (N, 3) [m] of everything that must be inside the domain."""
     positions, reach = scene.array.positions, scene.array.half_extents
     contents = [
@@ -71,7 +68,7 @@ def _contents(scene: Scene) -> list[tuple[str, torch.Tensor]]:
     return contents
 
 
-def everything_of(scene: Scene) -> list[tuple[str, torch.Tensor]]:
+def everything_of(scene: SceneContents) -> list[tuple[str, torch.Tensor]]:
     """Return names and points (N, 3) [m] of the contents and of the obstacles' bounding boxes."""
     bounds = [
         (f"Scene.obstacles[{index}] corner", scene.control_points.new_tensor([body.lower, body.upper]))
@@ -88,7 +85,7 @@ def require_within(name: str, points: torch.Tensor) -> None:
         raise invalid(name, first, f"every coordinate must be in {-_FARTHEST:g} to {_FARTHEST:g}", "m")
 
 
-def require_waves(scene: Scene) -> None:
+def require_waves(scene: SceneContents) -> None:
     """Refuse absorptions that leave no wave, in the medium or in an obstacle."""
     most = _MOST_ABSORPTION / scene.wavelength
     if scene.medium.absorption > most:
@@ -105,7 +102,7 @@ def require_waves(scene: Scene) -> None:
                 raise invalid(f"Scene.obstacles[{index}].absorption", obstacle.absorption, accepted, "dB/m")
 
 
-def _require_in_front(scene: Scene) -> None:
+def _require_in_front(scene: SceneContents) -> None:
     """Refuse what lies behind a reflector; obstacles that cross one are cut."""
     if not scene.reflectors:
         return
@@ -122,7 +119,7 @@ def _require_in_front(scene: Scene) -> None:
                 raise ValueError(f"Scene.obstacles[{index}]: {extent_of(obstacle)}; {accepted}")
 
 
-def _require_separate_points(scene: Scene) -> None:
+def _require_separate_points(scene: SceneContents) -> None:
     """Refuse coincident points and points in or on an obstacle; on it, rounding would choose the side."""
     require_distinct("Scene.control_points", scene.control_points)
     array, points = scene.array, scene.control_points
@@ -145,13 +142,13 @@ def _require_separate_points(scene: Scene) -> None:
                 raise invalid(f"Scene.{name}{list(first)}", group[first], accepted, "m")
 
 
-def _is_of_medium(scene: Scene, obstacle: Obstacle) -> bool:
+def _is_of_medium(scene: SceneContents, obstacle: Obstacle) -> bool:
     """Return whether an obstacle is of the medium's material: it cuts earlier ones, and hides no point."""
     material = obstacle.density, obstacle.sound_speed, obstacle.absorption
     return material == (scene.medium.density, scene.medium.sound_speed, 0.0)
 
 
-def _in_later_medium(scene: Scene, index: int, points: torch.Tensor) -> torch.Tensor:
+def _in_later_medium(scene: SceneContents, index: int, points: torch.Tensor) -> torch.Tensor:
     """Return whether points (..., 3) are within an obstacle of the medium's material that follows `index`."""
     cleared = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu")
     for later in scene.obstacles[index + 1 :]:
@@ -201,7 +198,7 @@ def require_inside(domain: tuple[Vector, Vector], name: str, points: torch.Tenso
         raise invalid(f"{name}[{first}]", points[first], accepted, "m")
 
 
-def _require_in_domain(scene: Scene) -> None:
+def _require_in_domain(scene: SceneContents) -> None:
     for name, points in _contents(scene):
         require_inside(scene.domain, name, points, "; domain=None fits it to the scene")
     for index, obstacle in enumerate(scene.obstacles):
@@ -211,7 +208,7 @@ def _require_in_domain(scene: Scene) -> None:
             raise ValueError(f"Scene.obstacles[{index}]: {extent_of(obstacle)}; {accepted}")
 
 
-def _warn_of_implausible(scene: Scene) -> None:
+def _warn_of_implausible(scene: SceneContents) -> None:
     """Warn of units, foci behind the array and the air of another frequency."""
     extent, wavelength, places = _diagonal(_observed(scene)), scene.wavelength, scene.array.positions
     is_absorbed = scene.medium.density < _DENSEST_GAS and scene.frequency > _HIGHEST
@@ -230,7 +227,7 @@ def _warn_of_implausible(scene: Scene) -> None:
         warn_user(f"Scene.medium: absorption is for {expected:g} Hz, the scene has {frequency:g} Hz; {fix}")
 
 
-def unit_hint(scene: Scene, obstacle: Obstacle) -> str:
+def unit_hint(scene: SceneContents, obstacle: Obstacle) -> str:
     """Return what to do about a refused obstacle far larger or farther than array and foci; else nothing."""
     points = _observed(scene)
     both = torch.cat([points, points.new_tensor([obstacle.lower, obstacle.upper])])
@@ -244,7 +241,7 @@ def extent_of(obstacle: Obstacle) -> str:
     return f"{low} to {high} m"
 
 
-def _too_large(scene: Scene) -> Iterator[tuple[str, str]]:
+def _too_large(scene: SceneContents) -> Iterator[tuple[str, str]]:
     """Yield names and descriptions of parts far larger than array and control points.
 
     The domain is compared with everything in it.
@@ -273,12 +270,12 @@ def _too_large(scene: Scene) -> Iterator[tuple[str, str]]:
         yield "domain", f": {scene.domain[0]} to {scene.domain[1]} m; {ask}"
 
 
-def _is_too_large(scene: Scene, points: torch.Tensor, part: torch.Tensor) -> bool:
+def _is_too_large(scene: SceneContents, points: torch.Tensor, part: torch.Tensor) -> bool:
     """Return whether a part (N, 3) reaches implausibly far beyond points (N, 3) [m]."""
     return _diagonal(torch.cat([points, part])) > max(_usual_reach(scene, points), _FAR)
 
 
-def _usual_reach(scene: Scene, points: torch.Tensor) -> float:
+def _usual_reach(scene: SceneContents, points: torch.Tensor) -> float:
     return _USUAL_RATIO * max(_diagonal(points), _LEAST_EXTENT * scene.wavelength)
 
 
@@ -292,7 +289,7 @@ def _without_slabs(corners: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
     return torch.where(passes, torch.stack([lower, upper]), corners)
 
 
-def _observed(scene: Scene) -> torch.Tensor:
+def _observed(scene: SceneContents) -> torch.Tensor:
     return torch.cat([scene.array.positions, scene.control_points])
 
 
@@ -301,7 +298,7 @@ def _diagonal(points: torch.Tensor) -> float:
     return float((points.amax(dim=0) - points.amin(dim=0)).norm())
 
 
-def _warn_of_foci_behind(scene: Scene) -> None:
+def _warn_of_foci_behind(scene: SceneContents) -> None:
     """Warn if all control points and obstacles lie behind every transducer; a few point sources face nowhere.
 
     Some of them may lie behind, since an obstacle ahead may reflect.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from autdtorch.scene.checks import (
     require_within,
     warn_of_doubts,
 )
+from autdtorch.scene.contents import SceneContents
 from autdtorch.scene.geometry import Coordinates, Plane
 from autdtorch.scene.medium import Medium as Medium
 from autdtorch.scene.obstacles import Obstacle
@@ -28,8 +28,8 @@ from autdtorch.utils.hints import suggesting
 from autdtorch.utils.images import Image, images_of
 from autdtorch.utils.process import cached_property
 from autdtorch.utils.text import counted, html_facts
-from autdtorch.utils.units import DECIBELS, angles
 from autdtorch.utils.units import ScaleWarning as ScaleWarning
+from autdtorch.utils.units import angles
 from autdtorch.utils.validation import (
     ArrayLike,
     Vector,
@@ -48,7 +48,7 @@ _FREQUENCIES = 1e-3, 1e12  # [Hz]
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
-class Scene:
+class Scene(SceneContents):
     """The description of a field: array, medium, frequency, obstacles and points of observation.
 
     The tensors are copies on the CPU. No coordinate may exceed 1e6 m.
@@ -64,16 +64,6 @@ class Scene:
         name: for titles and file names.
         reflectors: planes that reflect everything in front of them.
     """
-
-    array: TransducerArray
-    medium: Medium
-    frequency: float
-    control_points: torch.Tensor
-    obstacles: tuple[Obstacle, ...]
-    observation_plane: Plane | None
-    domain: tuple[Vector, Vector]
-    name: str
-    reflectors: tuple[Reflector, ...]
 
     def __init__(
         self,
@@ -133,31 +123,6 @@ class Scene:
         require_arrangement(self.reflectors, self.complex_wavenumber)
         require_places(self)
         warn_of_doubts(self)
-
-    @property
-    def angular_frequency(self) -> float:
-        """Angular frequency of the drive, 2 pi f [rad/s]."""
-        return 2 * math.pi * self.frequency
-
-    @property
-    def wavenumber(self) -> float:
-        """Wavenumber in the medium, k = 2 pi f / c [rad/m]."""
-        return self.angular_frequency / self.medium.sound_speed
-
-    @property
-    def attenuation(self) -> float:
-        """Attenuation in the medium, alpha [Np/m]: a plane wave decays as e^{-alpha x}."""
-        return self.medium.absorption / DECIBELS
-
-    @property
-    def complex_wavenumber(self) -> complex:
-        """Complex wavenumber in the medium, k + i alpha [rad/m]: a plane wave is e^{i (k + i alpha) x}."""
-        return complex(self.wavenumber, self.attenuation)
-
-    @property
-    def wavelength(self) -> float:
-        """Wavelength in the medium, c / f [m]."""
-        return self.medium.sound_speed / self.frequency
 
     @suggesting
     def moved(
