@@ -345,13 +345,22 @@ def test_a_surface_that_crosses_itself_is_made_anew(caplog):
     assert cosine.sum() > 0.95 * float(normals.norm(dim=1).sum())
 
 
+CORNERS = BALL[0][BALL[1]]
+APART = (
+    (0.2 * CORNERS.mean(axis=1, keepdims=True) + 0.8 * CORNERS).reshape(-1, 3),
+    np.arange(CORNERS.size // 3).reshape(-1, 3),
+)
+
+
 @pytest.mark.parametrize(
     ("surface", "reason"),
     [
         ((SHEET, np.array([[0, 1, 2], [0, 2, 3]])), "100%"),
         ((BALL[0], BALL[1][BALL[0][BALL[1]].mean(axis=1)[:, 2] > 0]), "of all area; must be at most 30%"),
+        ((BALL[0], np.zeros((4, 3))), "no triangle has an area"),
+        (APART, "must be triangles with common edges"),
     ],
-    ids=["a sheet", "half a ball"],
+    ids=["a sheet", "half a ball", "a point", "triangles apart"],
 )
 def test_what_would_be_guessed_is_refused(surface, reason):
     with pytest.raises(ValueError, match=reason):
