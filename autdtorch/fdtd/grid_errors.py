@@ -43,7 +43,9 @@ class Law:
     aligned: bool  # whether all faces are parallel to their grids
     air: float = math.inf  # wavelength around bodies [m]
     thickness: float = math.inf  # their mean thickness [m]
-    edges: float = math.inf  # length of their edges over their area [1/m], for aligned faces alone
+    # length of their edges over their area [1/m], and the largest extent of one [m], for aligned faces alone
+    edges: float = math.inf
+    extent: float = math.inf
 
     @property
     def _at_edges(self) -> float:
@@ -55,9 +57,12 @@ class Law:
 
         Faces that cut cells are off by a share of a cell, which counts relative to the size of a body: rigid
         spheres of 1 to 7 mm err in proportion to 1 / radius, as fluid ones do. Cells see nothing thinner.
+        Aligned bodies of less than half a wavelength err as the square of a cell over their extent: 14 boxes
+        of 0.07 to 0.25 wavelengths have errors of 0.15 to 2.6 times the usual ones.
         """
         if self.aligned:
-            return _USUAL * self.growth(spacing)
+            small = self.wavelength / (2 * max(self.extent, spacing))
+            return _USUAL * max(small, 1.0) ** 2 * self.growth(spacing)
         thin = self.wavelength**2 / (2 * self.air) / max(self.thickness, spacing)
         return _USUAL * _CUT * max(thin, 1.0) * self.growth(spacing)
 

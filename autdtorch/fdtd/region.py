@@ -25,6 +25,7 @@ from autdtorch.utils.spatial import (
     areas_of,
     doubled_normals,
     edge_length,
+    extents,
     places_on,
     spread_evenly,
     volume_and_area,
@@ -149,6 +150,11 @@ class Region:
         """Length of all edges of bodies that end over their area [1/m]; infinite without such bodies."""
         area = sum(volume_and_area(*surface)[1] for surface in self._surfaces)
         return sum(edge_length(*surface) for surface in self._surfaces) / area if area else math.inf
+
+    @cached_property
+    def largest_extent(self) -> float:
+        """Largest extent of the bodies that end [m]; infinite without such bodies."""
+        return max((float(extents(vertices)[0]) for vertices, _ in self._surfaces), default=math.inf)
 
     @property
     def _surfaces(self) -> list[tuple[Array, Index]]:

@@ -158,8 +158,10 @@ class Plan:
     def law(self) -> Law:
         """The growth of its errors with the spacing."""
         region, aligned = self.region, self.grouping.aligned
-        edges = region.edges_per_area if aligned else math.inf
-        return Law(region.shortest_wavelength, aligned, region.wavelength, region.mean_thickness, edges)
+        law = Law(region.shortest_wavelength, aligned, region.wavelength, region.mean_thickness)
+        if aligned:
+            law = replace(law, edges=region.edges_per_area, extent=region.largest_extent)
+        return law
 
     @property
     def on_grids(self) -> Self:
