@@ -39,7 +39,7 @@ CASES = (
     ("microphones", 32, 12),
     ("microphones", 64, 24),
 )
-"""What is read, random drives, and drives of `identify`."""
+"""Cases: the sensor, the number of random drives, and that of drives by `identify`."""
 
 OPTIONS = {
     "--trials": {"type": int, "default": 20, "help": "arrays that are measured"},
