@@ -2,6 +2,7 @@
 
 import os
 import re
+import subprocess
 import sys
 
 import pytest
@@ -155,3 +156,12 @@ def test_a_module_that_cannot_be_imported_is_named_with_the_reason(refused, writ
         line = refused(f"method._target_={name}.search", f"modules={name}")
         message = rf"autdtorch: method\._target_: '{name}\.search'; {name} cannot be imported \({reason}"
         assert re.match(message, line)
+
+
+@pytest.mark.parametrize(("setting", "status"), [("scene=typo", 2), ("--version", 0)])
+def test_a_process_ends_with_its_status_and_all_that_it_wrote(setting, status, tmp_path):
+    """Also where PyTorch's library is still loading."""
+    command = [sys.executable, "-m", "autdtorch", setting]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == status
+    assert len(f"{done.stdout}{done.stderr}".splitlines()) == 1
