@@ -225,7 +225,9 @@ class TestFocusProblem:
         turns = torch.cat(
             [points[..., :1], torch.zeros(2, 5, 1, dtype=torch.float64), points[..., 1:]], dim=-1
         )
-        pressure = objective(drive_from_phases(2 * math.pi * turns))
+        drives = drive_from_phases(2 * math.pi * turns)
+        pressure = objective(drives)
+        torch.testing.assert_close(problem.drives(points), drives)
         torch.testing.assert_close(problem.pressures(points), pressure)
         torch.testing.assert_close(problem(points), pressure.amin(dim=-1))
         assert problem.bounds.tolist() == [[0, 0, 0], [1, 1, 1]]

@@ -19,7 +19,8 @@ class FocusProblem(BaseTestProblem):
     """The score of an objective over the phases of its transducers, for loops written with BoTorch.
 
     A point holds the phases in turns, from 0 to 1, of all transducers but one, whose phase stays 0; all are
-    fully on. ``problem(X)`` gives the scores (...) of points (..., M - 1), to be maximised.
+    fully on. ``problem(X)`` gives the scores (...) of points (..., M - 1), to be maximised, and
+    ``problem.drives(X)`` their drives (..., M), to save or to play.
     """
 
     num_objectives = 1
@@ -67,8 +68,8 @@ class FocusProblem(BaseTestProblem):
         warnings.warn("FocusProblem.score is now FocusProblem.goal", DeprecationWarning, stacklevel=2)
         return self.goal
 
-    def pressures(self, X: torch.Tensor) -> torch.Tensor:
-        """Return the pressures (..., P) [Pa] at points (..., M - 1).
+    def drives(self, X: torch.Tensor) -> torch.Tensor:
+        """Return the drives (..., M) of points (..., M - 1).
 
         Raises:
             ValueError: points that are no finite numbers, or of another shape.
@@ -76,7 +77,15 @@ class FocusProblem(BaseTestProblem):
         X = real_tensor("X", X, "turns").detach()
         if X.ndim == 0 or X.shape[-1] != self.dim or X.numel() == 0:
             raise ValueError(f"X: shape {tuple(X.shape)}; must be (..., {self.dim}), not empty")
-        return observe_drives(self.objective, drives_at(X, self.fixed_transducer), self.dim + 1)
+        return drives_at(X, self.fixed_transducer)
+
+    def pressures(self, X: torch.Tensor) -> torch.Tensor:
+        """Return the pressures (..., P) [Pa] at points (..., M - 1).
+
+        Raises:
+            ValueError: points that are no finite numbers, or of another shape.
+        """
+        return observe_drives(self.objective, self.drives(X), self.dim + 1)
 
     def _evaluate_true(self, X: torch.Tensor) -> torch.Tensor:
         return self.goal(self.pressures(X)).to(X)
