@@ -153,6 +153,25 @@ def fewest_periods(arrival: float) -> int:
     return RAMP_PERIODS + math.ceil(arrival)
 
 
+def blocks_needed(phasors: Tensor, floor: float, tolerance: float) -> tuple[float, int]:
+    """Return the estimated residual of a run's last block, and the number of blocks that would do.
+
+    `phasors` (n, P) are those of all blocks of a run from silence, not extrapolated. The residual is relative
+    to the norm of the last ones, or to `floor` if that is more. The blocks follow from how fast changes fell
+    in the last quarter of the run, and are at most 4 n.
+    """
+    count = len(phasors)
+    whole = torch.cat([phasors.new_zeros((_JUDGED - 1, phasors.shape[1])), phasors])
+    least = torch.tensor([max(floor, torch.finfo(torch.float64).tiny)], **REAL)
+    residual = float(_residuals([value[:, None] for value in whole[-_JUDGED:]], least)[0])
+    if residual <= tolerance:
+        return residual, count
+    changes, part = whole.diff(dim=0).norm(dim=1), math.ceil(count / 4)
+    fallen = float(changes[-2 - part : -part].max() / changes[-2:].max())
+    more = part * math.log(residual / tolerance) / math.log(fallen) if fallen > 1 else math.inf
+    return residual, count + math.ceil(min(more, 3 * count))
+
+
 def phasors_kept(cells: int) -> int:
     """Return the number of phasors of `cells` cells that a run stores."""
     return min(max(_FEWEST_PHASORS, _MOST_NUMBERS // max(1, cells)), _MOST_PHASORS)

@@ -11,9 +11,9 @@ from autdtorch.fdtd.grid import make_grid
 from autdtorch.fdtd.kernels import available_kernel, make_kernel, precision_of
 from autdtorch.fdtd.material_gradients import cells_of_maps, cells_of_obstacles, domain_cells
 from autdtorch.fdtd.region import Region, require_fine, warn_if_coarse
-from autdtorch.fdtd.steady_state import block_of, fewest_periods
+from autdtorch.fdtd.steady_state import SILENCE, block_of, blocks_needed, fewest_periods
 from autdtorch.fdtd.stepping import drive_dft, drive_signal
-from autdtorch.propagators.notices import warn_of_ending_walls, warn_of_near_points
+from autdtorch.propagators.notices import warn_of_ending_walls, warn_of_few_periods, warn_of_near_points
 from autdtorch.propagators.plan import region_of
 from autdtorch.scene.arrays import apertures_of, complex_strengths_of
 from autdtorch.scene.checks import require_inside
@@ -30,6 +30,8 @@ from autdtorch.utils.validation import (
     real_tensor,
     require_kind,
 )
+
+_STEADY = 2e-3  # estimated relative distance to the steady state that is tolerated, as by `make_propagator`
 
 
 def differentiable_field(
@@ -62,7 +64,8 @@ def differentiable_field(
         sound_speed: (K,) or (nx, ny, nz) [m/s], > 0; of no effect for rigid obstacles.
         spacing: edge of a cell [m], at most a third of the wavelength.
         periods: periods of the drive that are stepped, in blocks of a few; the phasors are those of the last
-            block. By default sound crosses the domain twice; resonances need more.
+            block. By default sound crosses the domain twice; resonances need more, and bring a
+            `SteadyStateWarning` with the number that is expected to do.
         device: as in `make_propagator`, as is `kernel`; gradients pass to tensors on any.
         kernel: the kernel.
         dtype: precision of the fields, float32 or float64.
@@ -101,9 +104,8 @@ def differentiable_field(
     warn_if_coarse(speeds, scene.frequency, spacing)
     warn_of_ending_walls(scene)
     warn_of_near_points(scene, "points", targets, grid.spacing)
-    if periods is None:
-        periods = fewest_periods(2 * grid.crossing)
-    periods = integer_at_least("periods", periods, 1)
+    usual = fewest_periods(2 * grid.crossing)
+    periods = usual if periods is None else integer_at_least("periods", periods, 1)
     time_step = None if time_step is None else positive("time_step", time_step, "s")
     by_maps = any(values is not None and values.ndim == 3 for values in materials)
     cells = (cells_of_maps if by_maps else cells_of_obstacles)(region, grid, *materials)
@@ -112,13 +114,21 @@ def differentiable_field(
     nodes, weights = apertures_of(scene.array, scene.wavenumber).with_images(scene.images)
     images = len(weights) // len(scene.array)
     steps, block = block_of(assembly.steps_per_period)
-    signal = drive_signal(assembly.steps_per_period, 0, steps * math.ceil(periods / block)).to(precision)
-    fields = [torch.zeros((0, len(targets)), **COMPLEX)]
+    blocks = math.ceil(periods / block)
+    signal = drive_signal(assembly.steps_per_period, 0, steps * blocks).to(precision)
+    arrived = blocks * block >= fewest_periods(grid.crossing)
+    fields, needs = [torch.zeros((0, len(targets)), **COMPLEX)], [(0.0 if arrived else 1.0, blocks)]
     for row in drive.reshape(-1, drive.shape[-1]):
         strength = weights * (complex_strengths_of(scene.array) * row.cpu()).repeat(images)
         sources = cells.driven(assembly.sources(nodes.positions, strength, nodes.weights), assembly)
         record = recorded(stepper, assembly, sources, receivers, signal)
         fields.append(drive_dft(record[-steps:], block)[None])  # the last block
+        phasors = drive_dft(record.detach().reshape(blocks, steps, -1), block)
+        floor = SILENCE * nodes.loudest(targets, strength.detach(), grid.spacing / 2)
+        needs.append(blocks_needed(phasors, floor, _STEADY))
+    residual, enough = max(needs)
+    if residual > _STEADY:
+        warn_of_few_periods(blocks * block, residual, _STEADY, max(enough * block, usual))
     return torch.cat(fields).reshape(*drive.shape[:-1], len(targets)).to(device_of(drive))
 
 

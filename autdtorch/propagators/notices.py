@@ -134,5 +134,13 @@ def warn_of_unsettled(runs: Sequence[Run], tolerance: float) -> None:
         )  # fmt: skip
 
 
+def warn_of_few_periods(periods: int, residual: float, tolerance: float, enough: int) -> None:
+    """Warn that a run of fixed length ended before its steady state; so many periods are expected to do."""
+    warn_user(
+        f"no steady state after {periods} periods: estimated relative error {residual:.1e}, tolerance "
+        f"{tolerance:g}; raise periods to about {enough}", SteadyStateWarning,
+    )  # fmt: skip
+
+
 def _in_mm(point: torch.Tensor) -> tuple[float, ...]:
     return tuple(round(1e3 * entry, 3) for entry in point.tolist())

@@ -382,9 +382,8 @@ class Simulation(ABC):
         It is -80 dB, or the least whose tolerance is above rounding, relative to free space, as if the
         sources of strength (N,) [Pa m] did not cancel each other.
         """
-        distance = torch.cdist(points.mean(dim=1), sources.centers)
         faintest = max(SILENCE, torch.finfo(self.plan.dtype).eps / self.plan.tolerance)
-        return faintest * float((strength.abs() / distance.clamp(min=self.plan.spacing / 2)).norm())
+        return faintest * sources.loudest(points.mean(dim=1), strength, self.plan.spacing / 2)
 
     def _refuse_enclosed_transducers(self) -> None:
         if len(self._enclosed_transducers):

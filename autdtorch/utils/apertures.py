@@ -67,6 +67,14 @@ class Apertures(NamedTuple):
         axes, radii = (None if part is None else part[index] for part in (self.axes, self.radii))
         return self._replace(centers=self.centers[index], axes=axes, radii=radii)
 
+    def loudest(self, points: torch.Tensor, strength: torch.Tensor, nearest: float) -> float:
+        """Return the norm of the free-space pressure [Pa] at points (P, 3), as if no sources cancelled.
+
+        Strengths (N,) are in Pa m; distances below `nearest` [m] count as that.
+        """
+        distance = torch.cdist(points, self.centers).clamp(min=nearest)
+        return float((strength.abs() / distance).norm())
+
     def with_images(self, images: Sequence[Image]) -> tuple[Self, torch.Tensor]:
         """Return all images of the apertures, one image after the other, and their weights (G N,)."""
         spanning = self.centers

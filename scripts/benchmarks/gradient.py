@@ -5,6 +5,7 @@ also by the materials of the cubes, and also by density and sound speed of every
 process, which compiles the kernel first. Takes 5 minutes on 2 idle cores.
 """
 
+import warnings
 from typing import NamedTuple
 
 import torch
@@ -64,6 +65,8 @@ def gradient(case: str, spacing: float, periods: int) -> Cost:
     scene, materials = medium(case, spacing)
     drive = torch.ones(len(scene.array), dtype=torch.complex128)
     settings = {"spacing": spacing, "periods": periods, "time_step": 1 / (scene.frequency * STEPS_PER_PERIOD)}
+
+    warnings.simplefilter("ignore", at.SteadyStateWarning)  # costs are those of any field
 
     def field() -> torch.Tensor:
         return at.differentiable_field(scene, drive, **materials, **settings)

@@ -237,6 +237,7 @@ def test_pressures_are_those_of_the_cpu_kernel(name, method):
 
 
 @needs_gpu
+@pytest.mark.filterwarnings("ignore::autdtorch.SteadyStateWarning")
 def test_gradients_are_those_of_the_cpu_kernel():
     scene, drive = small_scene((CUBE,)), drive_from_phases([0.0, 1.0, 2.0, 3.0])
 

@@ -250,6 +250,7 @@ def test_kept_fields_of_unequal_transducers_are_those_of_drives():
     assert relative_error(matrix, expected) < ROUNDING
 
 
+@pytest.mark.filterwarnings("ignore::autdtorch.SteadyStateWarning")
 def test_the_differentiable_field_takes_strengths_as_amplitudes():
     drive = torch.tensor([1.0, 0.5j, -0.2, 0.1], dtype=torch.complex128)
     settings = {"spacing": 1.3e-3, "periods": 4, "dtype": "float64"}

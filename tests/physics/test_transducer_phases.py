@@ -68,6 +68,7 @@ def test_a_calibrated_array_takes_no_runs_of_its_own(method):
     assert len(after.runs) == 0
 
 
+@pytest.mark.filterwarnings("ignore::autdtorch.SteadyStateWarning")
 def test_gradients_of_the_differentiable_field_have_them():
     """Through time steps: rounding of some hundred."""
     step = {"spacing": 1.3e-3, "periods": 4, "dtype": "float64"}
