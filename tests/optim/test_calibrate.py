@@ -171,6 +171,26 @@ def test_transducers_in_another_order_are_doubted(matrix):
     assert "in another order" in " ".join(at.calibrate(matrix, mixed).doubts)
 
 
+@pytest.mark.parametrize("silent", [(3, 9), (5,)])
+@pytest.mark.parametrize("points", [1, 3])
+def test_silent_transducers_are_named(silent, points):
+    matrix = at.make_propagator(scene(points)).transfer_matrix()
+    bench = Bench(matrix, 8)
+    bench.matrix[:, silent] = 0
+    (doubt,) = at.calibrate(matrix, bench.readings(150 // points)).doubts
+    named = f"transducers {silent[0]}, {silent[1]} are" if len(silent) > 1 else f"transducer {silent[0]} is"
+    assert doubt.startswith(f"{named} silent, or below")
+
+
+def test_weak_and_idle_transducers_are_not_silent(matrix):
+    bench = Bench(matrix, 8)
+    bench.matrix[:, 2] *= 0.6
+    readings = bench.readings(60)
+    readings.drives[:, 7] = 0
+    readings.pressure[:] = bench.pressure(readings.drives).abs()
+    assert not at.calibrate(matrix, readings, folds=0).doubts
+
+
 def test_saturated_readings_do_not_count_as_errors(matrix):
     readings = Bench(matrix, 6).readings(60)
     pressure = readings.pressure.clamp(max=float(readings.pressure.median()))

@@ -23,6 +23,7 @@ from autdtorch.utils.validation import ArrayLike, complex_tensor, points_tensor
 _LISTED = 5  # outliers or groups in a summary
 _SCALED = 20.0  # scale, or its inverse, that no gain of a sensor explains
 _USELESS = 0.3  # relative error at readings held back that is no calibration
+_SILENT = 0.3  # share of the pressure that the simulation and the scale expect of a transducer, at most
 _ALIKE = 0.9999  # cosine of two transducers' derivatives above which readings show them only together
 
 
@@ -260,7 +261,7 @@ class Calibration:
                 ("error at readings held back", error),
                 ("within 95 % intervals", f"{100 * held.coverage:.0f} % of {held.readings}"),
             ]
-        gains, phases = _spreads(self)
+        gains, phases = _spreads(self, torch.ones_like(self.gain, dtype=torch.bool))
         facts += [
             ("scale", f"{self.scale.value:.4g} +- {self.scale.deviation:.2g}"),
             ("gains", f"spread {_percent(gains)}, each +- {_percent(float(self.gain_deviation.mean()))}"),
@@ -290,7 +291,12 @@ def fit_doubts(calibration: Calibration) -> Iterator[str]:
         yield f"the scale is {calibration.scale.value:.3g}: {causes}"
     settings = calibration.settings
     most = 1.5 + 3 / (2 * len(calibration.gain)) ** 0.5  # and three deviations of the rms of so many draws
-    gains, phases = _spreads(calibration)
+    silent = _silent(calibration)
+    if silent.any():
+        numbers = ", ".join(map(str, silent.nonzero()[:, 0].tolist()))
+        which = f"transducers {numbers} are" if silent.sum() > 1 else f"transducer {numbers} is"
+        yield f"{which} silent, or below {100 * _SILENT:.0f} % of the simulation: failed, or not connected?"
+    gains, phases = _spreads(calibration, ~silent)
     causes = "are transducers in another order, or is the prior too narrow?"
     if gains > most * settings.gain:
         yield f"gains spread {_percent(gains)}, prior.gain is {_percent(settings.gain)}: {causes}"
@@ -302,10 +308,22 @@ def fit_doubts(calibration: Calibration) -> Iterator[str]:
         yield f"predictions are {_percent(held.error)} off readings held back: {causes}"
 
 
-def _spreads(calibration: Calibration) -> tuple[float, float]:
-    """Return the rms of the logarithms of gains around their mean, and of phases [rad]."""
-    gains = calibration.gain.log()
-    rms = [part.square().mean().sqrt() for part in (gains - gains.mean(), calibration.phase)]
+def _silent(calibration: Calibration) -> torch.Tensor:
+    """Return the transducers (M,), bool, whose columns of the fitted matrix are nearly 0.
+
+    Gains alone do not show it: single entries take over what is unlikely for the prior of the gains.
+    """
+    prior = calibration.fit.posterior.prior
+    expected = prior.rows + (calibration.fit.amounts[:, None, None] * prior.changes).sum(dim=0)
+    share = calibration.transfer_matrix.norm(dim=0) / expected.norm(dim=0)
+    silent: torch.Tensor = share < _SILENT * share.nanmedian()
+    return silent
+
+
+def _spreads(calibration: Calibration, among: torch.Tensor) -> tuple[float, float]:
+    """Return the rms of the logarithms of gains around their mean, and of phases [rad], of some (M,)."""
+    gains, phases = calibration.gain[among].log(), calibration.phase[among]
+    rms = [part.square().mean().sqrt() for part in (gains - gains.mean(), phases)]
     return float(rms[0]), float(rms[1])
 
 
