@@ -292,8 +292,8 @@ def test_reflectors_are_in_field_and_gradient():
     pressure = field(density)
     whole = at.make_propagator(scene, method="full", spacing=2e-3, dtype="float64", tolerance=1e-4)
     expected = whole.transfer_matrix() @ drive
-    # kernels at mirrors reach other cells than those among images: 1.1e-3, far below the grid's error
-    assert (pressure - expected).abs().max() < 4e-3 * expected.abs().max()
+    # both end within 1e-4 of the steady state; 3e-6 measured, at any spacing
+    assert (pressure - expected).abs().max() < 3e-4 * expected.abs().max()
     (slope,) = torch.autograd.grad(pressure.abs().square().sum(), density)
     with torch.no_grad():
         ends = [float(field(density + step).abs().square().sum()) for step in (1e-3, -1e-3)]
