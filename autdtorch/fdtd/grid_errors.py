@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,6 +24,11 @@ _LEAST = 0.37  # Least error that is claimed, relative to the usual one
 _COMPARED = 2  # Last other grids that count: earlier ones may be too coarse for the scene
 _BESIDE = 0.6  # Width of the strip along an edge that its errors are relative to [wavelengths]
 _EQUAL = 0.28  # Spacing [wavelengths] at which the parts of second and sixth order are equal, all being edge
+# Error of points on a rigid surface, relative to the scattered field and the square of a cell in wavelengths.
+# Kernels there see one side, and at edges the field varies faster than waves do. At 5 to 10 cells per
+# wavelength, 880 points within 0.7 cells of 22 boxes err by more than three times their claims in 5 %, and
+# without this in 18 %; of 320 points of other boxes 3 %, not 19 %.
+_READING = 2.0
 _USUAL, _CUT = 0.6, 3.5  # Usual error relative to `growth`, and how many times as large where faces cut cells
 _TINY = torch.finfo(torch.float64).tiny
 
@@ -115,6 +121,17 @@ def shape_errors(matrix: Tensor, free: Tensor, region: Region) -> Tensor:
     """
     distance = max((body.uncertainty for body in region.bodies), default=0.0)
     errors: Tensor = 2 * region.wavenumber * distance * _scattered(matrix, free)
+    return errors
+
+
+def reading_errors(matrix: Tensor, free: Tensor, points: Tensor, region: Region, spacing: float) -> Tensor:
+    """Return the relative errors (P,) of the rows of a matrix (P, M) due to reading points beside walls.
+
+    The points (P, 3) [m] are read on cells of a `spacing` [m]; from a cell away on, other errors are larger.
+    """
+    beside = np.clip(1 - np.abs(region.walls.distance(points.numpy())) / spacing, 0, None)
+    on_surface = _READING * (spacing / region.wavelength) ** 2
+    errors: Tensor = on_surface * torch.from_numpy(beside) * _scattered(matrix, free)
     return errors
 
 

@@ -9,7 +9,14 @@ from pathlib import Path
 
 import torch
 
-from autdtorch.fdtd.grid_errors import errors_by_grids, grid_errors, rigid_errors, shape_errors, sizes
+from autdtorch.fdtd.grid_errors import (
+    errors_by_grids,
+    grid_errors,
+    reading_errors,
+    rigid_errors,
+    shape_errors,
+    sizes,
+)
 from autdtorch.propagators.absorbed_power import AbsorbedPower
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.free_space import PAIR_BYTES, free_space_matrix
@@ -126,7 +133,8 @@ class SimulatedPropagator(ScenePropagator):
         results, free = self._results(places, with_error=True), self._free(places)
         matrix, residual = results[0].matrix, results[0].residual
         settling = torch.where(matrix.any(dim=1), residual * matrix.norm() / sizes(matrix, free), 0.0)
-        return (self._errors(results, free) + settling).to(device_of(points))
+        reading = reading_errors(matrix, free, places, self.plan.region, self.spacing)
+        return (self._errors(results, free) + reading + settling).to(device_of(points))
 
     @one_library_thread()
     def known_errors(self) -> tuple[float, float, float]:
@@ -211,8 +219,11 @@ class SimulatedPropagator(ScenePropagator):
 
     def _error(self, results: Sequence[PressureMap], points: torch.Tensor) -> float:
         """Return the relative error of the first matrix of points, estimated from those of other grids."""
+        matrix, residual, free = results[0].matrix, results[0].residual, self._free(points)
         flat = [replace(each, matrix=each.matrix.reshape(1, -1)) for each in results]
-        return results[0].residual + float(self._errors(flat, self._free(points).reshape(1, -1)))
+        reading = reading_errors(matrix, free, points, self.plan.region, self.spacing) * sizes(matrix, free)
+        whole = sizes(flat[0].matrix, free.reshape(1, -1))
+        return residual + float(self._errors(flat, free.reshape(1, -1)) + reading.norm() / whole)
 
     def _errors(self, results: Sequence[PressureMap], free: torch.Tensor) -> torch.Tensor:
         """Return the errors (P,) of the rows of the first matrix by grid, shape and bodies taken as rigid.
