@@ -107,8 +107,8 @@ def moved(obstacles: tuple[Box, ...], angles: tuple[float, ...], offset: tuple[f
 
 def test_a_body_is_simulated_once_wherever_it_is(monkeypatch):
     pair = (SMALL, replace(SMALL, center=(15e-3, 13e-3, 12e-3), size=(2e-3, 2e-3, 2e-3)))
-    simulate, simulated = body._simulated, []
-    monkeypatch.setattr(body, "_simulated", lambda still: simulated.append(still) or simulate(still))
+    simulate, simulated = body.StillBody.simulated, []
+    monkeypatch.setattr(body.StillBody, "simulated", lambda still: simulated.append(still) or simulate(still))
     BODIES.forget()
     by_tmatrix(scene_of(*pair)).transfer_matrix()
     for angles, offset in (
