@@ -1,11 +1,12 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autdtorch.fdtd.assembly.edge_energy import _reduction, reductions
+from autdtorch.fdtd.assembly.edge_energy import _reduction, changes
 from autdtorch.fdtd.assembly.edges import edges_of, rims_of
 from autdtorch.fdtd.assembly.element import tuning_of
 from autdtorch.fdtd.stencil import tuned_stencil
@@ -42,7 +43,7 @@ def test_the_rim_of_a_bore_that_a_fluid_cuts_is_the_edge_of_what_is_left(turn, r
     )
     off = np.random.default_rng(1).uniform(-4e-4, 4e-4, (40, 3))
     (rim,) = rims_of([block, bore], [True, False], [1.0, 1.0], 1e-3)
-    way, normals = rim.nearest((on + off) @ rotation.T)
+    way, normals, _ = rim.nearest((on + off) @ rotation.T)
     circle = np.hypot(on[:, 0] + off[:, 0] - shift, on[:, 1] + off[:, 1]) - radius
     # the bore's curvature is left out, to second order
     assert np.linalg.norm(way, axis=1) == pytest.approx(np.hypot(circle, off[:, 2]), abs=1e-6)
@@ -56,9 +57,41 @@ def test_the_rim_of_a_bore_that_a_fluid_cuts_is_the_edge_of_what_is_left(turn, r
 def test_two_edges_of_a_sheet_add_up_and_corners_count_once():
     centers = np.array([[5.1e-3, 0, 0.5e-3], [5.1e-3, 0, -1.5e-3]])
     thick, sheet = (
-        reductions(edges_of(Box((0, 0, -z / 2), (1e-2, 1e-2, z), rigid=True)), centers, 1e-3, STENCIL)
+        changes(edges_of(Box((0, 0, -z / 2), (1e-2, 1e-2, z), rigid=True)), centers, 1e-3, STENCIL).reductions
         for z in (9e-3, 1.9e-3)
     )
     assert thick[0] == pytest.approx(sheet[0], rel=0.2, abs=1e-2)
     assert np.abs(sheet[1]).max() > 0.5 * np.abs(thick[1]).max()
     assert np.trace(sheet, axis1=1, axis2=2).max() < 2
+
+
+@settings(max_examples=10)
+@given(turn=angles, cut=st.floats(0.3, 0.7), x=within, y=within)
+def test_an_edge_in_two_parts_is_the_whole_one(turn, cut, x, y):
+    edge, *_ = edges_of(Box((0, 0, 0), (9e-3, 8e-3, 7e-3), turn, rigid=True))
+    middle = edge.begin + cut * (edge.end - edge.begin)
+    parts = [replace(edge, end=middle), replace(edge, begin=middle)]
+    along = np.linspace(-0.2, 0.2, 9)[:, None] * (edge.end - edge.begin)
+    centers = middle + along + 1e-3 * (x * edge.normals[0] + y * edge.normals[1])
+    whole, parted = (changes(edges, centers, 1e-3, STENCIL) for edges in ([edge], parts))
+    assert parted.reductions == pytest.approx(whole.reductions, abs=1e-9)
+    assert (parted.beside == whole.beside).all()
+
+
+def test_an_element_beyond_the_end_of_an_edge_is_unchanged():
+    edge, *_ = edges_of(Box((0, 0, 0), (9e-3, 8e-3, 7e-3), rigid=True))
+    along = (edge.end - edge.begin) / np.linalg.norm(edge.end - edge.begin)
+    place = edge.end + 0.3e-3 * edge.normals.sum(axis=0)
+    centers = np.array([place - 1e-3 * along, place, place + 1e-3 * along])
+    within, at_end, beyond = np.trace(changes([edge], centers, 1e-3, STENCIL).reductions, axis1=1, axis2=2)
+    assert at_end == pytest.approx(within / 2)
+    assert within != 0
+    assert beyond == 0
+
+
+def test_elements_on_the_axis_of_a_cylinder_have_no_edge_near():
+    rims = edges_of(Cylinder((0, 0, 0), 4e-3, 8e-3, (0, 0, 1), rigid=True))
+    assert np.linalg.norm(rims[0].nearest(np.array([rims[0].center])).way) == pytest.approx(4e-3)
+    centers = np.array([(0, 0, 4.1e-3), (4e-3, 0, 4.1e-3)])
+    near = changes(rims, centers, 1e-3, STENCIL).reductions.any(axis=(1, 2))
+    assert near.tolist() == [False, True]

@@ -54,7 +54,7 @@ def element(*distance, density=(1, 77), mass=None, stencil=STENCIL):
     )
     count = len(distance)
     numbers, none = np.arange(count) + 1, np.zeros(count, bool)
-    near = Bodies(np.stack(distance)[:, None], numbers, none[:, None], np.zeros((1, 3, 3)), OPEN)
+    near = Bodies(np.stack(distance)[:, None], numbers, none[:, None], np.zeros((1, 3, 3)), none[:1], OPEN)
     return interface_elements(near, materials, stencil)
 
 
@@ -62,7 +62,7 @@ def rigid_element(distance, reduction=0.0, sides=OPEN):
     """One element that a tilted rigid surface cuts."""
     materials = Materials(np.array([1, 1e5]), np.array([1, 1e-5]), np.ones(2), np.array([False, True]))
     reductions = np.broadcast_to(reduction, (1, 3, 3))
-    near = Bodies(distance[None, None], ONE, ONE[None] > 0, reductions, sides)
+    near = Bodies(distance[None, None], ONE, ONE[None] > 0, reductions, reductions.any(axis=(1, 2)), sides)
     return interface_elements(near, materials, STENCIL)
 
 

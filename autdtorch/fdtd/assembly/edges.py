@@ -29,8 +29,9 @@ _ON = (
 class Nearest(NamedTuple):
     """Places of an edge nearest to n points."""
 
-    way: Array  # to the place (n, 3) [m], infinite beyond the edge's reach
+    way: Array  # to the place (n, 3) [m], infinite beyond a rim's reach
     normals: Array  # unit vectors out of the two faces there (n, 2, 3)
+    inside: Array  # distances along it from its nearer end (n,) [m], negative beyond; infinite without ends
 
 
 @dataclass(frozen=True)
@@ -48,11 +49,13 @@ class Segment:
         return np.minimum(self.begin, self.end), np.maximum(self.begin, self.end)
 
     def nearest(self, points: Array) -> Nearest:
-        """Return its places nearest to points (n, 3) [m]."""
+        """Return the places of its line nearest to points (n, 3) [m]."""
         whole = self.end - self.begin
-        part = np.clip((points - self.begin) @ whole / (whole @ whole), 0, 1)
+        length = math.sqrt(whole @ whole)
+        part = (points - self.begin) @ whole / length**2
         way = self.begin + part[:, None] * whole - points
-        return Nearest(way, np.broadcast_to(self.normals, (len(points), 2, 3)))
+        normals = np.broadcast_to(self.normals, (len(points), 2, 3))
+        return Nearest(way, normals, length * np.minimum(part, 1 - part))
 
 
 @dataclass(frozen=True)
@@ -77,9 +80,12 @@ class Circle:
         from_center = points - self.center
         height = from_center @ self.normal
         flat = from_center - height[:, None] * self.normal
-        away = flat / np.maximum(np.linalg.norm(flat, axis=1), 1e-9 * self.radius)[:, None]
+        from_axis = np.linalg.norm(flat, axis=1)
+        on_axis = from_axis < 1e-9 * self.radius  # as near to one place as to another
+        flat[on_axis], from_axis[on_axis] = _across(self.normal), 1
+        away = flat / from_axis[:, None]
         normals = self.slopes[:, None] * self.normal + self.outwards[:, None] * away[:, None]
-        return Nearest(self.radius * away - from_center, normals)
+        return Nearest(self.radius * away - from_center, normals, np.full(len(points), np.inf))
 
 
 @dataclass(frozen=True)
@@ -101,10 +107,11 @@ class Rim:
     def nearest(self, points: Array) -> Nearest:
         """Return its places nearest to points (n, 3) [m], with faces that are flat there."""
         way, normals = np.full(points.shape, np.inf), np.zeros((len(points), 2, 3))
+        endless = np.full(len(points), np.inf)
         level = self._levels(points)
         near = np.flatnonzero((np.abs(level) < _NEAR * self.spacing).all(axis=1))
         if not len(near):
-            return Nearest(way, normals)
+            return Nearest(way, normals, endless)
         steps = _STEP * self.spacing * np.eye(3)[:, None]
         ahead, behind = (self._levels(points[near] + step) for step in (steps, -steps))
         normal = np.moveaxis(ahead - behind, 0, -1) / (2 * _STEP * self.spacing)
@@ -117,7 +124,7 @@ class Rim:
         off = np.abs(np.column_stack((self._levels(places), self.bodies.distance(places)))).max(axis=1)
         real = off < _ON * self.spacing
         way[near[real]], normals[near] = ways[real], normal
-        return Nearest(way, normals)
+        return Nearest(way, normals, endless)
 
     def _levels(self, points: Array) -> Array:
         """Return the signed distances (..., 2) [m] of points (..., 3), negative in the bodies."""
@@ -180,6 +187,12 @@ def rims_of(
         if (np.subtract(*rim.bounds) < 0).all():
             rims.append(rim)
     return rims
+
+
+def _across(axis: Array) -> Array:
+    """Return a unit vector (3,) across an axis (3,)."""
+    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    return np.asarray(across / np.linalg.norm(across))
 
 
 def _circle(corners: Array, ends: Array, normals: Array) -> Circle | None:

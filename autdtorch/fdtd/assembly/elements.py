@@ -18,7 +18,7 @@ from scipy.ndimage import binary_dilation
 
 from autdtorch.fdtd.assembly.absorbing_surfaces import with_impedance, with_impedance_faces
 from autdtorch.fdtd.assembly.aligned import Blocks, aligned_elements
-from autdtorch.fdtd.assembly.edge_energy import reductions
+from autdtorch.fdtd.assembly.edge_energy import changes
 from autdtorch.fdtd.assembly.edges import Edge, edges_of, rims_of
 from autdtorch.fdtd.assembly.element import (
     CORNERS,
@@ -233,11 +233,21 @@ def _wall_normals(
 
 
 def _distinct(
-    distance: Array, finite: NDArray[np.bool_], less: Array, sides: Sequence[Side]
+    distance: Array,
+    finite: NDArray[np.bool_],
+    less: Array,
+    beside: NDArray[np.bool_],
+    sides: Sequence[Side],
 ) -> tuple[Index, Index]:
     """Return the first of each kind of equal elements, and the kind of each element (n,)."""
     count = len(less)
-    parts = (np.moveaxis(distance, 1, 0) / _SAME, finite.T, less / _SAME, *(side.out for side in sides))
+    parts = (
+        np.moveaxis(distance, 1, 0) / _SAME,
+        finite.T,
+        less / _SAME,
+        beside,
+        *(side.out for side in sides),
+    )
     keys = np.concatenate([part.reshape(count, -1).round().astype(np.int64) for part in parts], axis=1)
     # sums modulo 2^64: keys that differ have the same sum once in 10^19
     sums = keys.view(np.uint64) @ np.random.default_rng(0).integers(
@@ -282,14 +292,14 @@ def _interface(
     def chunk(begin: int) -> tuple[InterfaceElements, Index]:
         first = places_of(index[begin : begin + _CHUNK], shape)
         centers = np.array(grid.origin) + grid.spacing * (first + 0.5)
-        less = reductions(edges, centers, grid.spacing, stencil)
+        less, beside = changes(edges, centers, grid.spacing, stencil)
         distance = _distances(bodies, first, grid)
         edged = np.asarray(less.any(axis=(1, 2)))
         finite, walls = _finite(bodies, distance, first, edged, whole, grid)
         level = rigid_level(bodies, distance)
         sides = sides_of(level, _wall_normals(bodies, level, first, walls, grid), walls)
-        kinds, kind = _distinct(distance, finite, less, sides)
-        near = Bodies(distance, numbers, finite, less, sides).chosen(kinds)
+        kinds, kind = _distinct(distance, finite, less, beside, sides)
+        near = Bodies(distance, numbers, finite, less, beside, sides).chosen(kinds)
         elements = with_losses(lambda these: interface_elements(near, these, stencil), materials, stencil)
         elements = with_impedance(elements, near, materials, stencil)
         progress.advance(len(first))

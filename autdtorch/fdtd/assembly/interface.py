@@ -63,6 +63,7 @@ class Bodies(NamedTuple):
     material: Index  # number of the material of each body (K,)
     finite: NDArray[np.bool_]  # mask of the bodies that finite elements represent in an element (K, n)
     reductions: Array  # relative reduction of the stiffness near edges of such bodies (n, 3, 3)
+    beside: NDArray[np.bool_]  # mask of elements beside edges, which are finite at flat faces too (n,)
     sides: tuple[Side, ...]  # of thin rigid walls
 
     def chosen(self, some: Index | NDArray[np.bool_]) -> Bodies:
@@ -71,6 +72,7 @@ class Bodies(NamedTuple):
             distance=self.distance[:, some],
             finite=self.finite[:, some],
             reductions=self.reductions[some],
+            beside=self.beside[some],
             sides=tuple(side.chosen(some) for side in self.sides),
         )
 
@@ -87,8 +89,7 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
     layered = layered_axis(distance)
     near = (np.abs(left_by_fluids(distance, materials.rigid[material])) < FAR).any(axis=2)
     # a surface with an impedance needs pressures on both sides, and so does a face beside an edge
-    beside = (layered < 0) | bodies.reductions.any(axis=(1, 2))
-    allowed = bodies.finite & (beside | materials.reacting[material, None])
+    allowed = bodies.finite & ((layered < 0) | bodies.beside | materials.reacting[material, None])
     finite = np.asarray((near & allowed).any(axis=0))
     coupling, mass = np.zeros((len(vertex), 28)), np.zeros(vertex.shape)
     if finite.any():
