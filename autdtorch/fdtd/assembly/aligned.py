@@ -254,7 +254,7 @@ def _stacked(
 ) -> tuple[Array, Array]:
     """Return coupling (n, 28) and mass (n, 8) of kinds of elements (n, 3), stacks of slices along an axis.
 
-    A slice is that of an element at a level, and has a width [cells]; see `stacked`.
+    A slice of an element is at a level, and has a width [cells]; see `stacked`.
     """
     across = [other for other in range(3) if other != axis]
     key, sections, stacks = _key(materials), dict[int, _Sections](), list[list[Prisms]]()

@@ -40,7 +40,7 @@ _MOST = 0.7  # Largest relative reduction
 _LEAST = -0.5  # and least: an increase
 _HALF_WAY = 1e-3  # Difference of the depths below two faces up to which a vertex is between both [cells]
 _TINY = 1e-9  # Energy of an element without air
-_NEAREST = 0.35 / SUBCELLS  # Distance from the edge whose slope is that of a sub-cell around it [cells]
+_NEAREST = 0.35 / SUBCELLS  # [cells] from the edge: the slope here is taken for the whole sub-cell around it
 
 
 class Changes(NamedTuple):

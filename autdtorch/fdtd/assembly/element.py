@@ -132,7 +132,7 @@ def stiffness_matrix(coupling: Array, pairs: Index = PAIRS) -> Array:
 
 
 def tuning_of(stencil: Stencil) -> Array:
-    """Return the difference (8, 8) of the stiffness of an element of air from that of trilinear functions."""
+    """Return the stiffness (8, 8) of an element of air, less the one by trilinear functions."""
     trilinear = np.einsum("qix,qjx->ij", SLOPES, SLOPES) / SUBCELLS**3
     return np.asarray(stiffness_matrix(uniform_coupling(stencil)) - trilinear)
 

@@ -75,7 +75,7 @@ class HeterogeneousCells:
     enclosed: Index  # rigid cells of air, which no sound reaches, ascending
     inner: Index  # flat indices of cells inside obstacles whose rows are those of air, but not their mass
     inner_mass: Array  # m_i of these
-    largest: float = math.inf  # upper bound of the eigenvalues of the rows, that of the elements
+    largest: float = math.inf  # upper bound of the eigenvalues of the rows, by their elements
     losses: LossyCells | None = None  # None if nothing absorbs
     tangent: float = 0.0  # largest ratio of damping to stiffness in a material
 
