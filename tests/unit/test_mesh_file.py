@@ -345,10 +345,10 @@ def test_a_surface_that_crosses_itself_is_made_anew(caplog):
     assert cosine.sum() > 0.95 * float(normals.norm(dim=1).sum())
 
 
-CORNERS = BALL[0][BALL[1]]
+OF_TRIANGLES = BALL[0][BALL[1]]
 APART = (
-    (0.2 * CORNERS.mean(axis=1, keepdims=True) + 0.8 * CORNERS).reshape(-1, 3),
-    np.arange(CORNERS.size // 3).reshape(-1, 3),
+    (0.2 * OF_TRIANGLES.mean(axis=1, keepdims=True) + 0.8 * OF_TRIANGLES).reshape(-1, 3),
+    np.arange(OF_TRIANGLES.size // 3).reshape(-1, 3),
 )
 
 
