@@ -25,8 +25,7 @@ ArrayLike: TypeAlias = torch.Tensor | npt.ArrayLike
 Vector: TypeAlias = tuple[float, float, float]
 
 LENGTH_TOLERANCE = 1e-9
-"""Lengths that differ by less are taken to be equal [m]: far above rounding at metre scale, and far below
-any wavelength."""
+"""Lengths [m] that differ by less are equal: far above rounding at metre scale, far below wavelengths."""
 
 _UNIT_ROUNDING = 4 * sys.float_info.epsilon  # by which the computed length of a unit vector may differ from 1
 _LARGEST = 2**63 - 1  # largest integer that NumPy and PyTorch count with

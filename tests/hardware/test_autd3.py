@@ -104,7 +104,7 @@ class TestWithTheKit:
                                 link.play(drive)
                         finally:
                             link.off()
-                    assert client.on[-2:] == [False, False]
+                    assert not any(client.on[-2:])  # none yet where a signal came before the first `try`
         assert any(client.on)
 
     @pytest.mark.usefixtures("stray_signals_do_no_harm")
