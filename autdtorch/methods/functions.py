@@ -109,9 +109,11 @@ def bo_foci(
     readings: Readings | None = None,
 ) -> Solution:
     """Run `BayesOpt`, by default with a process for each focus; see `BayesOpt` and `run`."""
-    settings = model, kernel, acquisition, initial_points, noise, prior, device
-    method = BayesOpt(evaluations, initial, fixed_transducer, *settings)
-    return run(method, objective, trials, seed, goal=goal, readings=readings)
+    settings = evaluations, initial, trials, seed, fixed_transducer, goal
+    return bayes_opt(
+        objective, *settings, model=model, kernel=kernel, acquisition=acquisition,
+        initial_points=initial_points, noise=noise, prior=prior, device=device, readings=readings,
+    )  # fmt: skip
 
 
 @renamed_keywords(score="goal")

@@ -156,15 +156,15 @@ def _consistent(
     Linear interpolation underestimates the power of a pressure that varies along the surface: the squares of
     slopes along it are added. Vertices `out` (n, 8) have no share.
     """
-    shares = hats(surface.place) * ~out[:, None]
-    whole = shares.sum(axis=2, keepdims=True)
+    share = hats(surface.place) * ~out[:, None]
+    whole = share.sum(axis=2, keepdims=True)
     whole[whole == 0] = np.inf
-    area, shares = surface.area[:, :, None], shares / whole
-    both = (1 - _EXCESS * kappa**2) * (area * shares).transpose(0, 2, 1) @ shares
-    total, across = both.sum(axis=2), np.zeros_like(shares)
+    area, share = surface.area[:, :, None], share / whole
+    both = (1 - _EXCESS * kappa**2) * (area * share).transpose(0, 2, 1) @ share
+    total, across = both.sum(axis=2), np.zeros_like(share)
     for axis in range(3):
         slope = hat_slopes(surface.place, axis) * ~out[:, None] / whole
-        slope -= shares * slope.sum(axis=2, keepdims=True)
+        slope -= share * slope.sum(axis=2, keepdims=True)
         both += _ALONG * (area * slope).transpose(0, 2, 1) @ slope
         across += surface.normal[:, :, axis, None] * slope
     both -= _ALONG * (area * across).transpose(0, 2, 1) @ across
