@@ -26,6 +26,7 @@ from autdtorch.utils.spatial import (
     doubled_normals,
     edge_length,
     extents,
+    mean_thickness,
     places_on,
     spread_evenly,
     volume_and_area,
@@ -97,11 +98,22 @@ class Body:
         """Its flat faces."""
         return flat_faces(self.shape)
 
+    @property
+    def surface(self) -> tuple[Array, Index]:
+        """Vertices (V, 3) [m] and triangles (T, 3) of its surface."""
+        vertices, triangles = self.shape.surface()
+        return vertices.numpy(), triangles.numpy()
+
+    @property
+    def mean_thickness(self) -> float:
+        """Twice its volume over its area [m]."""
+        return mean_thickness(*self.surface)
+
     def is_along(self, axes: Array, spacing: float) -> bool:
         """Return whether its faces follow `axes`, one a row (3, 3), or it is slender on cells [m]."""
         if self.faces.all_aligned(axes):
             return True
-        return slender_faces(self.shape.surface()[0].numpy() @ axes.T / spacing) is not None
+        return slender_faces(self.surface[0] @ axes.T / spacing) is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,10 +151,13 @@ class Region:
 
         Later bodies of air cut into those before.
         """
-        numbers = [number for number, body in enumerate(self.bodies) if not body.continued]
         carved = any(body.fluid == self.fluid for body in self.bodies)
-        measure = self._remaining_volume_and_area if carved else self._volume_and_area
-        volume, area = np.array([measure(number) for number in numbers]).reshape(-1, 2).sum(axis=0).tolist()
+        sizes = [
+            self._remaining_volume_and_area(body) if carved else volume_and_area(*body.surface)
+            for body in self.bodies
+            if not body.continued
+        ]
+        volume, area = np.array(sizes).reshape(-1, 2).sum(axis=0).tolist()
         return 2 * volume / area if area else math.inf
 
     @cached_property
@@ -159,27 +174,20 @@ class Region:
     @property
     def _surfaces(self) -> list[tuple[Array, Index]]:
         """Vertices (V, 3) [m] and triangles (T, 3) of the bodies that end."""
-        surfaces = [body.shape.surface() for body in self.bodies if not body.continued]
-        return [(vertices.numpy(), triangles.numpy()) for vertices, triangles in surfaces]
+        return [body.surface for body in self.bodies if not body.continued]
 
-    def _volume_and_area(self, number: int) -> tuple[float, float]:
-        """Return volume [m^3] and area [m^2] of a body."""
-        vertices, triangles = self.bodies[number].shape.surface()
-        return volume_and_area(vertices.numpy(), triangles.numpy())
-
-    def _remaining_volume_and_area(self, number: int) -> tuple[float, float]:
+    def _remaining_volume_and_area(self, body: Body) -> tuple[float, float]:
         """Return the part of a body's surface in volume [m^3] and area [m^2] of what bodies of air leave.
 
         Places on the surface count where one side is air. Where that is inside, the volume is negative.
         """
-        shape = self.bodies[number].shape
-        vertices, triangles = (part.numpy() for part in shape.surface())
+        vertices, triangles = body.surface
         corners = vertices[triangles]
         normals = doubled_normals(corners)[spread_evenly(areas_of(corners), _PLACES)]
         normals /= np.linalg.norm(normals, axis=1)[:, None]
         places = places_on(corners, _PLACES)
         # triangles are chords of curved faces
-        places -= shape.signed_distance(torch.from_numpy(places)).numpy()[:, None] * normals
+        places -= body.shape.signed_distance(torch.from_numpy(places)).numpy()[:, None] * normals
         solids = Solids(self.shapes, [body.fluid != self.fluid for body in self.bodies])
         inside, outside = (solids.distance(places + side * _SKIN * normals) < 0 for side in (-1, 1))
         facing = inside.astype(np.float64) - outside

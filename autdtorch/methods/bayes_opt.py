@@ -36,9 +36,9 @@ from autdtorch.objectives.quiet import SeenPoints
 from autdtorch.objectives.readings import Readings
 from autdtorch.scene.drive import AMPLITUDE_TOLERANCE
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.process import device_type, one_library_thread
+from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.text import counted
-from autdtorch.utils.validation import integer_at_least, invalid, number_between, require_one_of
+from autdtorch.utils.validation import device_type, integer_at_least, invalid, number_between, require_one_of
 
 if TYPE_CHECKING:
     from autdtorch.methods.bayes.acquisition import Acquisition

@@ -24,9 +24,9 @@ from autdtorch.scene.scene import Scene
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.images import NO_MIRRORS, Image
-from autdtorch.utils.process import device_type, one_library_thread, require_memory
+from autdtorch.utils.process import one_library_thread, require_memory
 from autdtorch.utils.text import counted
-from autdtorch.utils.validation import ArrayLike, differentiable_points, require_kind
+from autdtorch.utils.validation import ArrayLike, device_type, differentiable_points, require_kind
 
 logger = logging.getLogger(__name__)
 

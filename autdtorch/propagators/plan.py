@@ -27,7 +27,6 @@ from autdtorch.scene.obstacles import Mesh, Obstacle
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.process import cached_property, require_memory
-from autdtorch.utils.spatial import mean_thickness
 from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
@@ -319,8 +318,7 @@ def difference_from_rigid(body: Body, region: Region) -> float:
     stiffer = abs(body.fluid.sound_speed) / abs(region.fluid.sound_speed)
     if heavier <= 1 or stiffer < _STIFF:
         return math.inf
-    thickness = mean_thickness(*(part.numpy() for part in body.shape.surface()))
-    moved = 1 + 1 / (region.wavenumber * thickness)
+    moved = 1 + 1 / (region.wavenumber * body.mean_thickness)
     return float(_NEAR_RIGID * (moved + 1 / stiffer) / heavier)
 
 

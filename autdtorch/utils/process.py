@@ -1,4 +1,4 @@
-"""Signals, forks, threads, available memory and GPU of this process.
+"""Signals, forks, threads and available memory of this process.
 
 Threads live for one call, so that none spins while it waits and none is missing after a fork.
 
@@ -28,9 +28,6 @@ import torch
 from threadpoolctl import ThreadpoolController
 
 from autdtorch.utils.validation import invalid
-
-ON_CPU = "the CPU gives the same results, to rounding"
-"""Last words of messages about a missing GPU."""
 
 _LATER = 1e-3  # [s]
 
@@ -353,32 +350,3 @@ def _left_to_process() -> Iterator[int]:
         most = resource.getrlimit(resource.RLIMIT_AS)[0]
         if most != resource.RLIM_INFINITY:
             yield most - psutil.Process().memory_info().vms
-
-
-def device_type(name: str, value: object) -> str | None:
-    """Return "cpu" or "cuda", the type of a device as text or `torch.device`, or None for None."""
-    if value is None:
-        return None
-    device = None
-    if isinstance(value, str | torch.device):
-        with contextlib.suppress(RuntimeError):  # of text that PyTorch does not know
-            device = torch.device(value)
-    if device is None or device.type not in ("cpu", "cuda"):
-        raise invalid(name, value, "must be 'cpu', 'cuda' or a torch.device of these")
-    if device.type == "cuda":
-        if not torch.cuda.is_available():
-            raise invalid(name, str(device), no_cuda())
-        current = torch.cuda.current_device()
-        if device.index not in (None, current):
-            accepted = f"must be the current one, cuda:{current}; torch.cuda.set_device chooses it"
-            raise invalid(name, str(device), accepted)
-    return device.type
-
-
-def no_cuda() -> str:
-    """Return for messages why PyTorch finds no CUDA device, and what to do."""
-    built = torch.version.cuda is not None
-    why = "it finds no GPU or driver" if built else "it is built for the CPU; pytorch.org has builds for CUDA"
-    return (
-        f"needs an NVIDIA GPU that PyTorch can use, but {why} (torch.cuda.is_available() is false); {ON_CPU}"
-    )

@@ -1,10 +1,24 @@
-"""Text of values: in tables of numbers, and as HTML for Jupyter."""
+"""Text of values: in messages, in tables of numbers, and as HTML for Jupyter."""
 
 from __future__ import annotations
 
+import contextlib
 import math
+import reprlib
 from collections.abc import Iterable, Sequence
 from html import escape
+from typing import Any
+
+import numpy as np
+import torch
+
+from autdtorch.utils.array_types import is_dense
+
+SHOWN_ENTRIES = 9
+"""Most entries of an array that messages show."""
+
+_SHOWN_CHARACTERS = 120
+_SHOWN_BITS = 128  # of an integer; Python refuses to write out very large ones
 
 
 def decimals_of(numbers: Iterable[float], digits: int = 3) -> int:
@@ -47,3 +61,38 @@ def _caption(title: str) -> str:
 def _row(tag: str, cells: Sequence[str]) -> str:
     end = tag.partition(" ")[0]
     return "<tr>" + "".join(f"<{tag}>{escape(cell)}</{end}>" for cell in cells) + "</tr>"
+
+
+def shown(value: object) -> str:
+    """Return the text of a value for a message, however large or deep the value is."""
+    if isinstance(value, torch.Tensor) and not is_dense(value):
+        return f"tensor of {value.dtype}, {value.layout}, on {value.device}"
+    if isinstance(value, np.ma.MaskedArray):
+        return f"masked array of shape {value.shape}"
+    if isinstance(value, torch.Tensor | np.ndarray):
+        if math.prod(value.shape) > SHOWN_ENTRIES:
+            return f"array of shape {tuple(value.shape)}"
+        value = value.tolist()
+    if isinstance(value, list):
+        value = tuple(value)
+    text = _Short().repr(value)
+    return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}..."
+
+
+class _Short(reprlib.Repr):
+    """The text of a value, cut where it gets long."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlevel, self.maxtuple, self.maxlist = 3, SHOWN_ENTRIES, SHOWN_ENTRIES
+        self.maxstring = self.maxother = _SHOWN_CHARACTERS
+
+    def repr_int(self, value: int, level: int) -> str:
+        bits = value.bit_length()
+        return repr(value) if bits <= _SHOWN_BITS else f"integer of {bits} bits"
+
+    def repr_instance(self, value: Any, level: int) -> str:
+        with contextlib.suppress(Exception):  # of a user's class
+            if isinstance(value, Sequence) and not isinstance(value, memoryview):
+                return self.repr_list(value, level)  # type: ignore[arg-type]
+        return super().repr_instance(value, level)

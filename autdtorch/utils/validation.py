@@ -10,7 +10,6 @@ import cmath
 import contextlib
 import math
 import numbers
-import reprlib
 import sys
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any, TypeAlias, TypeGuard
@@ -19,7 +18,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from autdtorch.utils.array_types import MOST_AXES, is_dense
 from autdtorch.utils.hints import did_you_mean
+from autdtorch.utils.text import SHOWN_ENTRIES, shown
 
 ArrayLike: TypeAlias = torch.Tensor | npt.ArrayLike
 Vector: TypeAlias = tuple[float, float, float]
@@ -27,16 +28,16 @@ Vector: TypeAlias = tuple[float, float, float]
 LENGTH_TOLERANCE = 1e-9
 """Lengths [m] that differ by less are equal: far above rounding at metre scale, far below wavelengths."""
 
+ON_CPU = "the CPU gives the same results, to rounding"
+"""Last words of messages about a missing GPU."""
+
 _UNIT_ROUNDING = 4 * sys.float_info.epsilon  # by which the computed length of a unit vector may differ from 1
 _LARGEST = 2**63 - 1  # largest integer that NumPy and PyTorch count with
-_DEEPEST = 16  # most axes of an array, or levels of nested lists; some functions of PyTorch take at most 25
-_SHOWN_ENTRIES, _SHOWN_CHARACTERS = 9, 120
-_SHOWN_BITS = 128  # of an integer; Python refuses to write out very large ones
 
 
 def invalid(name: str, value: object, accepted: str, unit: str = "") -> ValueError:
     """Return the error to raise for `value` of field `name`; `accepted` says what is allowed."""
-    message = f"{name}: {_shown(value)}{f' {unit}' if unit else ''}; {accepted}"
+    message = f"{name}: {shown(value)}{f' {unit}' if unit else ''}; {accepted}"
     return ValueError(" ".join(message.split("\n")))
 
 
@@ -196,6 +197,35 @@ def indices(name: str, value: object, count: int) -> list[int]:
     return chosen
 
 
+def device_type(name: str, value: object) -> str | None:
+    """Return "cpu" or "cuda", the type of a device as text or `torch.device`, or None for None."""
+    if value is None:
+        return None
+    device = None
+    if isinstance(value, str | torch.device):
+        with contextlib.suppress(RuntimeError):  # of text that PyTorch does not know
+            device = torch.device(value)
+    if device is None or device.type not in ("cpu", "cuda"):
+        raise invalid(name, value, "must be 'cpu', 'cuda' or a torch.device of these")
+    if device.type == "cuda":
+        if not torch.cuda.is_available():
+            raise invalid(name, str(device), no_cuda())
+        current = torch.cuda.current_device()
+        if device.index not in (None, current):
+            accepted = f"must be the current one, cuda:{current}; torch.cuda.set_device chooses it"
+            raise invalid(name, str(device), accepted)
+    return device.type
+
+
+def no_cuda() -> str:
+    """Return for messages why PyTorch finds no CUDA device, and what to do."""
+    built = torch.version.cuda is not None
+    why = "it finds no GPU or driver" if built else "it is built for the CPU; pytorch.org has builds for CUDA"
+    return (
+        f"needs an NVIDIA GPU that PyTorch can use, but {why} (torch.cuda.is_available() is false); {ON_CPU}"
+    )
+
+
 def finite_vector(name: str, value: object, unit: str = "m") -> Vector:
     """Return `value` as three finite floats."""
     x, y, z = _entries(name, value, 3, unit)
@@ -321,7 +351,7 @@ def _holds_numbers(value: object) -> bool:
     twice.
     """
     entries = [value]
-    for _ in range(_DEEPEST):
+    for _ in range(MOST_AXES):
         if not all(map(_is_plain, entries)):
             return False
         lists = {id(entry): entry for entry in entries if _is_list(entry)}
@@ -344,19 +374,10 @@ def _require_finite(name: str, tensor: torch.Tensor, unit: str = "") -> None:
     # Of complex numbers, `isfinite` takes three times as long.
     if torch.isfinite(torch.view_as_real(values) if values.is_complex() else values).all():
         return
-    if tensor.numel() <= _SHOWN_ENTRIES:
+    if tensor.numel() <= SHOWN_ENTRIES:
         raise invalid(name, tensor, "every entry must be finite", unit)
     index = torch.nonzero(~torch.isfinite(values))[0].tolist()
     raise invalid(f"{name}{index}", tensor[tuple(index)].item(), "every entry must be finite", unit)
-
-
-def is_dense(value: torch.Tensor | npt.NDArray[Any] | np.generic) -> bool:
-    """Check that an array has few axes and holds unmasked numbers or booleans in memory."""
-    if isinstance(value, torch.Tensor):
-        plain = value.layout == torch.strided and not (value.is_quantized or value.is_nested or value.is_meta)
-    else:
-        plain = value.dtype.kind in "biufc" and not np.ma.is_masked(value)
-    return plain and value.ndim <= _DEEPEST
 
 
 def _is_plain(value: object) -> bool:
@@ -364,37 +385,3 @@ def _is_plain(value: object) -> bool:
     if isinstance(value, torch.Tensor | np.ndarray | np.generic):
         return is_dense(value) and "bool" not in str(value.dtype)
     return not isinstance(value, bool)
-
-
-def _shown(value: object) -> str:
-    if isinstance(value, torch.Tensor) and not is_dense(value):
-        return f"tensor of {value.dtype}, {value.layout}, on {value.device}"
-    if isinstance(value, np.ma.MaskedArray):
-        return f"masked array of shape {value.shape}"
-    if isinstance(value, torch.Tensor | np.ndarray):
-        if math.prod(value.shape) > _SHOWN_ENTRIES:
-            return f"array of shape {tuple(value.shape)}"
-        value = value.tolist()
-    if isinstance(value, list):
-        value = tuple(value)
-    text = _Short().repr(value)
-    return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}..."
-
-
-class _Short(reprlib.Repr):
-    """The text of a value, however large or deep the value is."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.maxlevel, self.maxtuple, self.maxlist = 3, _SHOWN_ENTRIES, _SHOWN_ENTRIES
-        self.maxstring = self.maxother = _SHOWN_CHARACTERS
-
-    def repr_int(self, value: int, level: int) -> str:
-        bits = value.bit_length()
-        return repr(value) if bits <= _SHOWN_BITS else f"integer of {bits} bits"
-
-    def repr_instance(self, value: Any, level: int) -> str:
-        with contextlib.suppress(Exception):  # of a user's class
-            if isinstance(value, Sequence) and not isinstance(value, memoryview):
-                return self.repr_list(value, level)  # type: ignore[arg-type]
-        return super().repr_instance(value, level)

@@ -9,8 +9,7 @@ import torch
 
 from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.utils.hints import with_extra
-from autdtorch.utils.process import ON_CPU, device_type
-from autdtorch.utils.validation import invalid, require_one_of
+from autdtorch.utils.validation import ON_CPU, device_type, invalid, require_one_of
 
 logger = logging.getLogger(__name__)
 

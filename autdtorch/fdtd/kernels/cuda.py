@@ -24,8 +24,7 @@ from autdtorch.fdtd.kernels.contract import (
     Sources,
     WaveState,
 )
-from autdtorch.utils.process import no_cuda
-from autdtorch.utils.validation import invalid
+from autdtorch.utils.validation import invalid, no_cuda
 
 _GRAPH_STEPS = 16  # Steps of a captured graph; even, so that both fields return to their places
 # Most cells of a grid whose steps are captured. Beyond, a step takes longer than its three launches from

@@ -19,14 +19,13 @@ from autdtorch.objectives.goals import Goal
 from autdtorch.objectives.objective import GoalFunction, Objective
 from autdtorch.objectives.perturbations import innermost
 from autdtorch.objectives.scenarios import Scenarios
-from autdtorch.utils.array_types import REAL
+from autdtorch.utils.array_types import REAL, is_dense
 from autdtorch.utils.validation import (
     ArrayLike,
     boolean,
     complex_tensor,
     integer_at_least,
     invalid,
-    is_dense,
     real_tensor,
     require_one_of,
 )

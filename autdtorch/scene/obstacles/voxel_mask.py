@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from autdtorch.scene.obstacles.base import Obstacle
 from autdtorch.scene.obstacles.voxel_surface import ThinError, VoxelCubes, VoxelSurface
-from autdtorch.utils.array_types import Array
+from autdtorch.utils.array_types import Array, is_dense
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import path_of, read_arrays, write_arrays
 from autdtorch.utils.hints import suggesting
@@ -27,7 +27,6 @@ from autdtorch.utils.validation import (
     finite_number,
     finite_vector,
     invalid,
-    is_dense,
     positive,
     positive_entries,
 )
