@@ -18,7 +18,12 @@ import torch
 from torch import Tensor
 
 from autdtorch.fdtd.assembly.elements import elements_of
-from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells, lossy_cells
+from autdtorch.fdtd.assembly.heterogeneous import (
+    CellMasses,
+    HeterogeneousCells,
+    heterogeneous_cells,
+    lossy_cells,
+)
 from autdtorch.fdtd.damping import Damping, SteppedCells, stepped_cells
 from autdtorch.fdtd.grid import Grid, domain_extent
 from autdtorch.fdtd.kernels.contract import Sources
@@ -177,9 +182,9 @@ def cells_of_maps(
     weight, mass = _rows(stencil, relative, fluidity)
     axes = [np.arange(part.start - 1, part.stop + 1) for part in cells]
     index = np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), grid.shape).ravel()
-    no, nothing = np.zeros(0, np.int64), np.zeros(0)
-    numbers = weight.detach().numpy(), mass.detach().numpy()
-    return DifferentiableCells(HeterogeneousCells(index, *numbers, no, no, no, no, nothing), weight, mass)
+    no, numbers = np.zeros(0, np.int64), (weight.detach().numpy(), mass.detach().numpy())
+    heterogeneous = HeterogeneousCells(index, *numbers, no, no, no, CellMasses(no, np.zeros(0)))
+    return DifferentiableCells(heterogeneous, weight, mass)
 
 
 def _speed_factor(stencil: Stencil, speed_ratio: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +62,14 @@ class LossyCells:
     ground: Array  # stiffness against silence (l,)
 
 
+@dataclass(frozen=True, eq=False)
+class CellMasses:
+    """Cells and their masses."""
+
+    index: Index  # flat cell indices (n,), ascending
+    mass: Array  # m_i (n,), 1 in air
+
+
 @dataclass(frozen=True)
 class HeterogeneousCells:
     """Cells whose stencil rows differ from those of uniform air."""
@@ -73,8 +81,7 @@ class HeterogeneousCells:
     rigid: Index  # flat indices of the rigid cells, ascending
     shell: Index  # rigid cells next to other cells; no cell reads those behind them
     enclosed: Index  # rigid cells of air, which no sound reaches, ascending
-    inner: Index  # flat indices of cells inside obstacles whose rows are those of air, but not their mass
-    inner_mass: Array  # m_i of these
+    inner: CellMasses  # cells inside obstacles whose rows are those of air, but not their mass
     largest: float = math.inf  # upper bound of the eigenvalues of the rows, by their elements
     losses: LossyCells | None = None  # None if nothing absorbs
     tangent: float = 0.0  # largest ratio of damping to stiffness in a material
@@ -91,9 +98,9 @@ class HeterogeneousCells:
     def mass_of(self, cells: Index) -> Array:
         """Return the mass (k,) of distinct cells (k,)."""
         mass = np.ones(len(cells))
-        for index, masses in ((self.index, self.mass), (self.inner, self.inner_mass)):
-            _, ours, theirs = np.intersect1d(index, cells, return_indices=True)
-            mass[theirs] = masses[ours]
+        for part in (self, self.inner):
+            _, ours, theirs = np.intersect1d(part.index, cells, return_indices=True)
+            mass[theirs] = part.mass[ours]
         return mass
 
 
@@ -129,31 +136,33 @@ def heterogeneous_cells(
 
     spread(divide, parts_of_size(len(touched), _TOGETHER))
     changed &= ~hard[touched]
-    index, weight, mass, loss = touched[changed], weight[changed], mass[changed], loss[changed]
-    *uniform, inner, inner_mass = _uniform_cells(elements, touched, hard, shape, stencil)
-    if len(uniform[0]):
-        both = zip((index, weight, mass, loss), uniform, strict=True)
-        index, weight, mass, loss = map(np.concatenate, both)
-        order = np.argsort(index, kind="stable")  # of two runs
-        index, weight, mass, loss = index[order], weight[order], mass[order], loss[order]
+    cells = _CellRows(touched[changed], weight[changed], mass[changed], loss[changed])
+    uniform, inner = _uniform_cells(elements, touched, hard, shape, stencil)
+    cells = cells.joined(uniform) if len(uniform.cell) else cells
     around[:] = False
     around.ravel()[touched] = True
     shell = inner_cells(with_neighbours(around) & hard.reshape(shape))
     losses = elements.materials.losses
     tangent = 0.0 if losses is None else losses.tangent
     return HeterogeneousCells(
-        index,
-        weight,
-        mass,
-        np.flatnonzero(hard),
-        shell,
-        enclosed,
-        inner,
-        inner_mass,
-        largest,
-        lossy_cells(loss),
-        tangent,
-    )
+        cells.cell, cells.weight, cells.mass, np.flatnonzero(hard), shell, enclosed, inner,
+        largest=largest, losses=lossy_cells(cells.loss), tangent=tangent,
+    )  # fmt: skip
+
+
+class _CellRows(NamedTuple):
+    """Cells with what `HeterogeneousCells` has of each."""
+
+    cell: Index  # flat indices (n,), ascending
+    weight: Array  # (n, 27)
+    mass: Array  # (n,)
+    loss: Array  # (n, 29), or (n, 0) if nothing absorbs
+
+    def joined(self, others: Self) -> Self:
+        """Return these cells and others in ascending order."""
+        both = [np.concatenate(parts) for parts in zip(self, others, strict=True)]
+        order = np.argsort(both[0], kind="stable")  # of two runs
+        return type(self)(*(part[order] for part in both))
 
 
 def _largest_of_elements(materials: Materials, stencil: Stencil) -> float:
@@ -351,11 +360,8 @@ def _transferred_mass(coupling: Array, mass: Array, need: Array, touched: Index,
 
 def _uniform_cells(
     elements: Elements, touched: Index, hard: NDArray[np.bool_], shape: GridShape, stencil: Stencil
-) -> tuple[Index, Array, Array, Array, Index, Array]:
-    """Return index, weight, mass and losses of cells inside obstacles that absorb or have another speed.
-
-    Then index and mass of those that have air's rows, but not its mass.
-    """
+) -> tuple[_CellRows, CellMasses]:
+    """Return the cells inside obstacles: those that absorb or have another speed, and those of air's rows."""
     materials = elements.materials
     factor, losses = materials.speed, materials.losses
     loss = np.zeros((len(factor), 0))
@@ -368,7 +374,7 @@ def _uniform_cells(
     index = inner_cells(inside.reshape(shape))
     number = material[index]
     differs = stepped[number]
-    inner, inner_mass = index[~differs], materials.mass[number[~differs]]
+    inner = CellMasses(index[~differs], materials.mass[number[~differs]])
     index, number = index[differs], number[differs]
     rows = factor[number, None] * stencil.weights
-    return index, rows, materials.mass[number], loss[number], inner, inner_mass
+    return _CellRows(index, rows, materials.mass[number], loss[number]), inner
