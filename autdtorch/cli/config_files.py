@@ -23,6 +23,9 @@ _PACKAGE = Path(__file__).parents[1]
 # A wheel carries the configs inside the package, a checkout beside it.
 CONFIGS = next(folder / "configs" for folder in (_PACKAGE, _PACKAGE.parent) if (folder / "configs").is_dir())
 
+GROUPS = sorted(folder.name for folder in CONFIGS.iterdir() if folder.is_dir())
+"""GROUPS: folders of configs, of which a setting chooses one; some are not chosen by default."""
+
 _TRUSTED = "hydra.searchpath in command-line"  # what Hydra calls a folder that this override adds
 
 _NAME = r"[^\W_][\w.+-]*"

@@ -17,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from autdtorch import hardware
 from autdtorch.cli.arguments import COMMANDS
+from autdtorch.cli.config_files import GROUPS
 from autdtorch.io.yaml_file import TARGET
 from autdtorch.utils.hints import did_you_mean, with_extra
 
@@ -25,7 +26,6 @@ FULL_ERROR = "HYDRA_FULL_ERROR"
 
 AGAIN = "the same command repeats what is not finished"
 
-_UNCHOSEN = ("hardware", "experiment")  # groups without a default, which a config may lack
 _REFUSALS = (ValueError, OSError, ImportError, HydraException, OmegaConfBaseException)
 
 _NO_SLURM = 'Could not detect "srun"'  # submitit, on a machine without Slurm
@@ -118,11 +118,11 @@ def _of_hydra(error: BaseException, text: str) -> str:
         return _of_missing(group, error.missing_cfg_file.removeprefix(f"{group}/"), error.options)
     if unknown := re.match(r"Could not override '(.+)'", text):
         key = str(getattr(error.__cause__, "full_key", None) or unknown[1])
-        if key in _UNCHOSEN:
+        if key in GROUPS:  # which this config lacks
             return f"{unknown[1]}: there is no {key}; must be chosen, as {key}=NAME"
         keys = _siblings(error.__cause__)
         parent, _, name = key.rpartition(".")
-        hint = did_you_mean(name, keys if parent else [*keys, *_UNCHOSEN])
+        hint = did_you_mean(name, keys if parent else [*keys, *GROUPS])
         elsewhere = _in_groups(error.__cause__, unknown[1].rpartition(".")[2])
         if elsewhere and not (hint and "." in unknown[1]):
             hint = f" (did you mean {elsewhere[0]!r}?)"
