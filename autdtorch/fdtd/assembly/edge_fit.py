@@ -107,13 +107,13 @@ class _Window:
         inside[1:-1, 1:-1] = True
         self._fixed, self._free = self.present & ~inside.ravel(), self.present & inside.ravel()
         self._fields = (fields.values[:, :, 1:] * importance(fields.order[1:])).reshape(len(self.present), -1)
-        self._matrix = _known_stiffness(section, materials, stencil)[self._free]
+        self._matrix = known_elements(section, materials, stencil)[0][self._free]
         self.columns = [columns_of(section, place) for place in varied]
         judged = self._free.copy()
         judged[np.concatenate(self.columns)] = False
         self._judged = judged[self._free]
-        pairs = np.concatenate([columns[COLUMN_PAIRS] for columns in self.columns])
-        self._one, self._other = pairs.T  # the vertices that each coupling connects
+        # the vertices that each coupling connects
+        self._pairs = np.concatenate([columns[COLUMN_PAIRS] for columns in self.columns])
 
     def missed(self, coupling: Array) -> Array:
         """Return the difference of the pressure at the vertices of other elements from the fields."""
@@ -123,27 +123,20 @@ class _Window:
     def slopes(self, coupling: Array) -> Array:
         """Return the derivatives (n, 6 k) of `missed` by the couplings."""
         solution, inverse = self._solved(coupling)
-        change = solution[self._one] - solution[self._other]
+        one, other = self._pairs.T
+        change = solution[one] - solution[other]
         padded = np.zeros((int(self._judged.sum()), len(self.present)))
         padded[:, self._free] = inverse[self._judged]
-        response = padded[:, self._other] - padded[:, self._one]
+        response = padded[:, other] - padded[:, one]
         return np.asarray((response[:, None] * change.T).reshape(-1, len(change)))
 
     def _solved(self, coupling: Array) -> tuple[Array, Array]:
         """Return the fields with the scheme's pressures inside the rim, and the inverse of the stiffness."""
-        whole = np.zeros((len(self.present),) * 2)
-        add_couplings(whole, self._one, self._other, coupling.ravel())
-        matrix = self._matrix + whole[self._free]
+        matrix = self._matrix + stiffness_between(self._pairs, coupling, len(self.present))[self._free]
         inverse = np.linalg.inv(matrix[:, self._free] + _GROUND * np.eye(len(matrix)))
         solution = self._fields.copy()
         solution[self._free] = -inverse @ (matrix[:, self._fixed] @ self._fields[self._fixed])
         return solution, np.asarray(inverse)
-
-
-def add_couplings(stiffness: Array, one: Index, other: Index, coupling: Array) -> None:
-    """Add couplings (n,) between vertices `one` (n,) and `other` (n,) to a stiffness matrix."""
-    for rows, columns, sign in ((one, other, -1), (other, one, -1), (one, one, 1), (other, other, 1)):
-        np.add.at(stiffness, (rows, columns), sign * coupling)
 
 
 def columns_of(section: Section, place: Sequence[int]) -> Index:
@@ -151,28 +144,37 @@ def columns_of(section: Section, place: Sequence[int]) -> Index:
     return np.asarray((COLUMNS + place + RING) @ (section.size[1] + 2 * RING + 1, 1))
 
 
-def _known_stiffness(section: Section, materials: MaterialKey, stencil: Stencil) -> Array:
-    """Return the stiffness matrix of the elements of a window that do not vary along both axes.
+def known_elements(
+    section: Section, materials: MaterialKey, stencil: Stencil, air: float | None = None
+) -> tuple[Array, Array]:
+    """Return stiffness matrix (n, n) and masses (n,) of the elements of a window that `layered_element` has.
 
     Elements beyond the section continue those beside it.
     """
     wide, tall = section.size
     alike = {
-        (x, y): layered_element(section, x, y, materials, stencil)
+        (x, y): layered_element(section, x, y, materials, stencil, air)
         for x, y in itertools.product(range(-1, wide + 1), range(-1, tall + 1))
     }
-    pairs, values = [], []
+    columns, couplings, masses = [], [], []
     for x, y in itertools.product(range(-RING, wide + RING), range(-RING, tall + RING)):
         element = alike[min(max(x, -1), wide), min(max(y, -1), tall)]
         if element is not None:
-            pairs.append(columns_of(section, (x, y))[COLUMN_PAIRS])
-            values.append(element.coupling)
-    one, other = np.concatenate(pairs).T
-    value, cells = np.concatenate(values), (wide + 2 * RING + 1) * (tall + 2 * RING + 1)
+            columns.append(columns_of(section, (x, y)))
+            couplings.append(element.coupling)
+            masses.append(element.mass.ravel())
+    count, place = (wide + 2 * RING + 1) * (tall + 2 * RING + 1), np.stack(columns)
+    mass = np.bincount(place.ravel(), np.concatenate(masses), count).astype(np.float64)
+    return stiffness_between(place[:, COLUMN_PAIRS], np.stack(couplings), count), mass
+
+
+def stiffness_between(pairs: Index, coupling: Array, count: int) -> Array:
+    """Return the stiffness matrix of `count` vertices with couplings (...) between pairs of them (..., 2)."""
+    (one, other), value = pairs.reshape(-1, 2).T, coupling.ravel()
     rows, columns = np.concatenate((one, other, one, other)), np.concatenate((other, one, one, other))
     entries = np.concatenate((-value, -value, value, value))
-    matrix = np.bincount(rows * cells + columns, entries, cells**2)
-    return np.asarray(matrix.reshape(cells, cells), np.float64)
+    matrix = np.bincount(rows * count + columns, entries, count**2)
+    return np.asarray(matrix.reshape(count, count), np.float64)
 
 
 class _Roots:

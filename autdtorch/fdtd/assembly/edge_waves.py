@@ -10,16 +10,14 @@ to 9 cells per wavelength.
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 from scipy.special import jv
 
-from autdtorch.fdtd.assembly.edge_fit import add_couplings, columns_of, importance
+from autdtorch.fdtd.assembly.edge_fit import columns_of, importance, known_elements, stiffness_between
 from autdtorch.fdtd.assembly.element import stiffness_matrix, without_negative
-from autdtorch.fdtd.assembly.sections import COLUMN_PAIRS, RING, MaterialKey, Section, layered_element
+from autdtorch.fdtd.assembly.sections import COLUMN_PAIRS, RING, MaterialKey, Section
 from autdtorch.fdtd.stencil import Stencil
-from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.array_types import Array
 
 _ORDERS = np.arange(5) * 2 / 3  # n of the waves
 _STEPS = 3  # Linear steps of the fit
@@ -50,17 +48,11 @@ def at_the_drive(
 ) -> tuple[Array, Array]:
     """Return coupling (6,) and masses (4,) of the element at a rigid corner, from those for long waves."""
     window = _Window(section, corner, materials, stencil)
-    change = window.fitted(coupling, mass)
-    pairs = window.pairs
-    result = coupling.copy()
-    result[pairs] += stencil.kappa**2 * change[len(window.air) :]
-    matrix = without_negative(stiffness_matrix(result, COLUMN_PAIRS))  # slivers would lose energy otherwise
-    result = -matrix[tuple(COLUMN_PAIRS.T)]
-    masses = mass.copy()
-    masses[window.air] += change[: len(window.air)]
+    fitted, masses = window.fitted(coupling, mass)
     if (masses < 0).any():  # in slivers, and where the fit diverges: the element for long waves remains
         return coupling, mass
-    return result, masses
+    matrix = without_negative(stiffness_matrix(fitted, COLUMN_PAIRS))  # slivers would lose energy otherwise
+    return -matrix[tuple(COLUMN_PAIRS.T)], masses
 
 
 class _Window:
@@ -76,61 +68,49 @@ class _Window:
         present = (from_edge > 0).any(axis=1)
         inside = ((places > -RING) & (places < RING + 1)).all(axis=1)
         self._present, self._rim = present, present & ~inside
-        self.columns = columns_of(section, (0, 0))
-        self.air = np.flatnonzero(present[self.columns])
-        self.pairs = np.flatnonzero(present[self.columns][COLUMN_PAIRS].all(axis=1))
+        self._columns = columns_of(section, (0, 0))
+        self._air = np.flatnonzero(present[self._columns])
+        self._pairs = np.flatnonzero(present[self._columns][COLUMN_PAIRS].all(axis=1))
         self._judged = present.copy()
-        self._judged[self.columns] = False
+        self._judged[self._columns] = False
         self._kappa, self._symbol = stencil.kappa, stencil.symbol
         radius, angle = np.hypot(*from_edge.T), np.arctan2(from_edge[:, 1], from_edge[:, 0]) + np.pi / 2
         waves = jv(_ORDERS, stencil.kappa * radius[:, None]) * np.cos(_ORDERS * angle[:, None])
         waves *= present[:, None]
         self._waves = waves / np.abs(waves).max(axis=0) * importance(_ORDERS)
-        self._operator = np.zeros((len(places),) * 2)
-        for x, y in itertools.product(range(-RING, RING + 1), repeat=2):
-            nearest = min(max(x, -1), 1), min(max(y, -1), 1)
-            element = layered_element(section, *nearest, materials, stencil, stencil.kappa)
-            if element is not None:
-                self._add(self._operator, columns_of(section, (x, y)), element.coupling, element.mass.ravel())
+        stiffness, masses = known_elements(section, materials, stencil, stencil.kappa)
+        self._operator = stiffness - self._symbol * np.diag(masses)
 
-    def fitted(self, coupling: Array, mass: Array) -> Array:
-        """Return the changes of the masses of columns in air, and of the couplings over the square of kappa.
-
-        Starts from a coupling (6,) and masses (4,).
-        """
-        operator = self._operator.copy()
-        self._add(operator, self.columns, coupling, mass)
-        count = len(self.air)
-        total = np.zeros(count + len(self.pairs))
-        least = np.concatenate((_RIDGE * np.eye(len(total)), _SUM * (np.arange(len(total)) < count)[None]))
-        first = np.linalg.norm(self._missed(operator)[0])
+    def fitted(self, coupling: Array, mass: Array) -> tuple[Array, Array]:
+        """Return coupling (6,) and masses (4,) that miss the waves by less than those to start from."""
+        count = len(self._air)
+        change = np.zeros(count + len(self._pairs))  # of the masses, and of the couplings over kappa squared
+        least = np.concatenate((_RIDGE * np.eye(len(change)), _SUM * (np.arange(len(change)) < count)[None]))
+        missed, slopes = self.missed(coupling, mass)
+        first = np.linalg.norm(missed)
         for _ in range(_STEPS):
-            missed, slopes = self._missed(operator)
-            both = np.concatenate((slopes, least)), np.concatenate((-missed, -least @ total))
-            step = np.linalg.lstsq(*both)[0]
-            total += step
-            change, masses = np.zeros(6), np.zeros(4)
-            change[self.pairs], masses[self.air] = self._kappa**2 * step[count:], step[:count]
-            self._add(operator, self.columns, change, masses)
-        return total if np.linalg.norm(self._missed(operator)[0]) < first else np.zeros_like(total)
+            both = np.concatenate((slopes, least)), np.concatenate((-missed, -least @ change))
+            change += np.linalg.lstsq(*both)[0]
+            fitted, masses = coupling.copy(), mass.copy()
+            masses[self._air] += change[:count]
+            fitted[self._pairs] += self._kappa**2 * change[count:]
+            missed, slopes = self.missed(fitted, masses)
+        return (fitted, masses) if np.linalg.norm(missed) < first else (coupling, mass)
 
-    def _add(self, operator: Array, columns: Index, coupling: Array, mass: Array) -> None:
-        """Add an element with a coupling (6,) and masses (4,) to an operator: stiffness less inertia."""
-        one, other = columns[COLUMN_PAIRS].T
-        add_couplings(operator, one, other, coupling)
-        operator[columns, columns] -= self._symbol * mass
-
-    def _missed(self, operator: Array) -> tuple[Array, Array]:
+    def missed(self, coupling: Array, mass: Array) -> tuple[Array, Array]:
         """Return the differences (n,) from the waves at the judged vertices, and their derivatives (n, k).
 
-        Real parts come first, then imaginary ones.
+        The element at the edge has a coupling (6,) and masses (4,). Real parts come first.
         """
+        columns, count = self._columns, len(self._operator)
+        operator = self._operator + stiffness_between(columns[COLUMN_PAIRS], coupling, count)
+        operator[columns, columns] -= self._symbol * mass
         some, judged = np.ix_(self._present, self._present), self._judged
         inverse = np.zeros(operator.shape, np.complex128)
         inverse[some] = np.linalg.inv((operator - 1j * self._kappa * np.diag(self._rim))[some])
         missed = -inverse[:, ~self._rim] @ (operator @ self._waves)[~self._rim]
         solution, response = self._waves + missed, inverse[judged]
-        air, (one, other) = self.columns[self.air], self.columns[COLUMN_PAIRS[self.pairs]].T
+        air, (one, other) = columns[self._air], columns[COLUMN_PAIRS[self._pairs]].T
         by_mass = self._symbol * response[:, air, None] * solution[air]
         across = (response[:, other] - response[:, one])[..., None]
         by_coupling = self._kappa**2 * across * (solution[one] - solution[other])
