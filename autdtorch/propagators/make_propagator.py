@@ -105,7 +105,8 @@ def make_propagator(
         memory: most memory for it [bytes].
         cache: folder for simulated transfer matrices, which are used again for the same scene, points,
             settings and version of this package. By default the environment variable AUTDTORCH_CACHE_DIR,
-            or no cache if it is not set; False: no cache. Several processes may share the folder.
+            or no cache if it is not set; False: no cache. Several processes may share the folder. Matrices
+            used last are kept, up to 1 GB.
 
     Returns:
         A propagator of the scene.

@@ -1,4 +1,4 @@
-"""Results that are kept in memory, up to a limit, and in a folder if there is one.
+"""Results that are kept in memory and, if there is one, in a folder, each up to a limit.
 
 A store makes a call quicker, never different: the key of a result is a digest of everything that affects it.
 The first line of a file is a checksum of its name, its shape and its content.
@@ -6,6 +6,7 @@ The first line of a file is a checksum of its name, its shape and its content.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import os
@@ -27,7 +28,7 @@ logger = logging.getLogger(__name__)
 SUFFIX = ".matrix"
 CACHE_VARIABLE = "AUTDTORCH_CACHE_DIR"
 MOST_BYTES = 1_000_000_000
-"""Limit of a store's memory [bytes]: the Huygens amplitudes of 256 transducers take 300 MB."""
+"""Limit of a store's memory and of its folder [bytes]: Huygens amplitudes of 256 transducers take 300 MB."""
 
 
 class StoredResult(Protocol):
@@ -43,7 +44,7 @@ ResultT = TypeVar("ResultT", bound=StoredResult)
 
 
 class Store:
-    """Results by key. Those used last stay in memory; matrices with a few numbers are also saved in a folder.
+    """Results by key. Those used last are kept; matrices with a few numbers are also saved in a folder.
 
     Attributes:
         folder: made with the first matrix; None for memory alone.
@@ -98,18 +99,25 @@ class Store:
         if not np.isfinite(values).all():
             logger.warning("%s holds no finite matrix of shape %s: computing again", path, shape)
             return None
+        with contextlib.suppress(OSError):  # a folder of another user
+            os.utime(path)
         return values[:-count].reshape(shape).copy(), values[-count:].real.tolist()
 
     def save(self, key: str, matrix: AnyArray, *numbers: float) -> None:
-        """Save a matrix and its numbers; a file that cannot be written is logged and left out."""
+        """Save a matrix and its numbers; a file that cannot be written is logged and left out.
+
+        Files that were used longest ago are removed, as far as the folder exceeds its limit.
+        """
         if self.folder is None:
             return
         body = np.append(matrix, numbers).astype(np.complex128).tobytes()
         path = self._path(self.folder, key)
         try:
-            replace_file(path, _with_checksum(key, matrix.shape, body))
+            if len(body) <= self._most_bytes:
+                replace_file(path, _with_checksum(key, matrix.shape, body))
         except OSError as error:
             logger.warning("%s cannot be written (%s): not kept", path, error.strerror)
+        _remove_oldest(self.folder, self._most_bytes)
 
     @staticmethod
     def _path(folder: Path, key: str) -> Path:
@@ -147,6 +155,22 @@ def store_in(folder: str | os.PathLike[str] | Literal[False] | None) -> Store:
         accepted = f"must be a folder, or one that can be made, but {there} is no folder to write in"
         raise invalid(name, str(path), accepted)
     return Store(path)
+
+
+def _remove_oldest(folder: Path, most_bytes: int) -> None:
+    """Remove the matrices of a folder that were used longest ago, until the rest takes `most_bytes`."""
+    matrices = []
+    for path in folder.glob(f"*{SUFFIX}"):
+        with contextlib.suppress(OSError):  # another process removes it too
+            status = path.stat()
+            matrices.append((status.st_mtime_ns, status.st_size, path))
+    total = sum(size for _, size, _ in matrices)
+    for _, size, path in sorted(matrices):
+        if total <= most_bytes:
+            break
+        with contextlib.suppress(OSError):  # or another user owns it
+            path.unlink()
+            total -= size
 
 
 def _with_checksum(key: str, shape: tuple[int, ...], body: bytes) -> bytes:

@@ -240,6 +240,20 @@ def test_a_folder_that_cannot_be_used_costs_no_result(tmp_path):
     assert not list((tmp_path / "folder").glob(f"*{PARTIAL}"))
 
 
+def test_a_folder_keeps_what_was_used_last(tmp_path):
+    """Four matrices of 200 numbers fit, of the bytes that five take; a larger one is not kept."""
+    cache = Store(tmp_path, most_bytes=5 * 200 * 16)
+    (tmp_path / "mine.npz").write_bytes(bytes(100_000))  # other files neither count nor go
+    for number, name in enumerate("abcd"):
+        cache.save(name, np.full(199, number), number)
+        os.utime(tmp_path / f"{name}{SUFFIX}", (number, number))
+    assert cache.load("a", (199,), 1) is not None  # used again
+    cache.save("e", np.full(199, 4.0), 4)
+    cache.save("whole", np.ones(1000), 0)
+    assert [path.stem for path in files(tmp_path)] == ["a", "c", "d", "e"]
+    assert (tmp_path / "mine.npz").exists()
+
+
 @needs_fork
 @pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")
 def test_writers_that_run_together_and_are_killed(tmp_path):
