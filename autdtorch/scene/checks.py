@@ -1,6 +1,6 @@
 """Checks of scenes: what is refused, and warnings of what is possible but seldom meant.
 
-Such are lengths in mm, foci behind the array, or other air.
+Such are lengths in mm or cm, foci behind the array, or other air.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _USUAL_RATIO = 50.0  # of everything to array and control points, unless lengths
 _LEAST_EXTENT = 15.0  # [wavelengths], for arrays and control points that are closer
 _FAR = 10.0  # [m]; nearer walls and wider domains may be meant
 _HIGHEST, _DENSEST_GAS = 1e6, 20.0  # [Hz, kg/m^3]; a gas absorbs what is higher within millimetres
-_WIDEST, _WIDEST_WAVES = 1.0, 30.0  # [m, wavelengths] between neighbours of an array
+_WIDEST, _WIDEST_WAVES = 0.5, 30.0  # [m, wavelengths] between neighbours of an array; 10 mm in cm are 1.0
 _FEWEST = 4  # transducers that make an array, whose normal counts
 _SAME_FREQUENCY = 0.01  # relative difference, for which the absorption changes by 2 %
 _PAIRS = 2**20  # of points and normals that are held at once

@@ -92,6 +92,7 @@ WARNED = {
     "points that face away": (lambda: scene(array=grid(0.2)), "control_points.*behind.*normal"),
     "MHz": (lambda: scene(frequency=40e6), "frequency in Hz"),
     "mm of pitch": (lambda: scene(array=grid(1e-3, pitch=10)), "array.*10 m apart.*in m"),
+    "cm of all": (lambda: scene(array=grid(0.1, pitch=1.0), control_points=100 * FOCI), "1 m apart.*in m"),
     "mm of all": (lambda: scene(array=grid(1.0, pitch=10.0), control_points=1e3 * FOCI), "lengths in m"),
     "behind": (lambda: facing(0.2, (1, 0, 0)), "control_points.*behind.*normal"),
     "turned away": (lambda: facing(1e-3, (-1, 0, 0)), "control_points.*behind.*normal"),
