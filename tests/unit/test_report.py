@@ -303,18 +303,16 @@ def test_matrices_that_were_kept_are_no_runs_and_not_exact(tmp_path):
         assert simulation_rows(results)[1][4] == runs
 
 
+def with_score(method, score):
+    solution = method.solution
+    return replace(method, solution=replace(solution, score=torch.full_like(solution.score, score)))
+
+
 def scored(results, scores, bound=10.0):
     scenes = {}
     for name, result in results.scenes.items():
         methods = {
-            method: replace(
-                one,
-                solution=replace(
-                    one.solution, score=torch.full_like(one.solution.score, scores[name][method])
-                ),
-            )
-            for method, one in result.methods.items()
-            if method in scores[name]
+            method: with_score(result.methods[method], score) for method, score in scores[name].items()
         }
         scenes[name] = replace(result, methods=methods, bound=bound)
     return replace(results, scenes=scenes)
