@@ -156,14 +156,8 @@ def rooms(draw):
     turn = tuple(draw(st.floats(-0.5, 0.5)) for _ in range(3)) if draw(st.booleans()) else (0.0, 0.0, 0.0)
     bodies = [at.Box((0.0, 0.0, height), (7e-3, 9e-3, 8e-3), turn, rigid=True)]
     if draw(st.booleans()):
-        bodies.append(
-            at.Sphere(
-                (3e-3, 18e-3, draw(st.floats(15e-3, 25e-3))),
-                RADIUS,
-                density=3.0 + 1.2j,
-                sound_speed=240.0 - 60j,
-            )
-        )
+        place = 3e-3, 18e-3, draw(st.floats(15e-3, 25e-3))
+        bodies.append(at.Sphere(place, RADIUS, density=3.0 + 1.2j, sound_speed=240.0 - 60j))
     return bodies, reflectors
 
 
