@@ -10,7 +10,8 @@ from matplotlib.patheffects import withStroke
 
 from autdtorch.hardware.camera.picture import Picture
 from autdtorch.plot.data import MM, largest
-from autdtorch.plot.pressure_maps import coordinates_in, plot_plane, plot_planes
+from autdtorch.plot.plane_map import coordinates_in
+from autdtorch.plot.pressure_maps import plot_plane, plot_planes
 from autdtorch.plot.style import styled
 from autdtorch.scene.geometry import Plane, cell_centers_of
 from autdtorch.scene.obstacles import Obstacle

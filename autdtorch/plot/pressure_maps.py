@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke, withTickedStroke
 
 from autdtorch.plot import data
-from autdtorch.plot.colours import EDGE_COLOUR, FLOOR, OBSTACLE_COLOUR, PRESSURE_MAP
-from autdtorch.plot.data import MM, ByMethod, clipped, outside_on_plane, plane_magnitude, require_each
+from autdtorch.plot.colours import FLOOR
+from autdtorch.plot.data import ByMethod, outside_on_plane, plane_magnitude, require_each
+from autdtorch.plot.plane_map import draw_plane
 from autdtorch.plot.style import TICK_SIZE, label_of, new_figure, readable, set_ticks, styled, wrapped
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle
-from autdtorch.scene.reflectors import Reflector, are_in_front
-from autdtorch.utils.array_types import REAL, Array
+from autdtorch.scene.reflectors import Reflector
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import (
-    LENGTH_TOLERANCE,
     ArrayLike,
     boolean,
     finite_number,
@@ -34,9 +31,6 @@ from autdtorch.utils.validation import (
     points_tensor,
     require_kind,
 )
-
-_AXIS_TOLERANCE = 1e-12  # deviation from 1 of the coordinate of a unit vector along x, y or z
-_OUTLINE_CELLS = 400  # samples along the longer side of a plane, to outline obstacles
 
 # Lengths [inch]
 _SIDE = 3.1  # of a square plane in a figure of one
@@ -109,7 +103,7 @@ def plot_plane(
         figure.set_layout_engine("compressed")  # "constrained" cuts off labels beside a square
         ax = figure.add_subplot()
     figure = cast(Figure, ax.get_figure(root=True))
-    mesh = _draw_plane(ax, values, plane, points, (obstacles, walls), size)
+    mesh = draw_plane(ax, values, plane, points, (obstacles, walls), size)
     mesh.set_clim(*limits)
     length, across = size if flat else (height, width)
     shape: Any = {"orientation": "horizontal" if flat else "vertical", "extend": _beyond([values], limits)}
@@ -153,40 +147,63 @@ def plot_planes(
     arguments: tuple[Any, ...] = pressure, planes, control_points, obstacles, reflectors
     if isinstance(planes, Plane):
         arguments = _as_one_scene(*arguments)
-    return _rows_of_maps(*arguments, vmin=vmin, vmax=vmax)
+    return _rows_of_maps(_checked(*arguments), vmin, vmax)
 
 
-def _rows_of_maps(
+class _SceneMaps(NamedTuple):
+    """The maps of a scene, and what is drawn on them."""
+
+    plane: Plane
+    magnitudes: Mapping[str, Array]  # |p| outside obstacles (Nu, Nv) [Pa], by method
+    points: torch.Tensor | None
+    obstacles: Sequence[Obstacle]
+    reflectors: Sequence[Reflector]
+
+
+def _checked(
     pressure: Mapping[str, ByMethod],
     planes: Mapping[str, Plane],
     control_points: Mapping[str, ArrayLike] | None,
     obstacles: Mapping[str, Iterable[Obstacle]] | None,
     reflectors: Mapping[str, Iterable[Reflector]] | None,
-    *,
-    vmin: float | None,
-    vmax: float | None,
-) -> Figure:
-    """Plot as `plot_planes` does, the arguments by name of the scene."""
+) -> dict[str, _SceneMaps]:
+    """Return the maps of all scenes, after checking the arguments of `plot_planes` by name of the scene."""
     data.require_scenes("pressure", pressure)
     require_each("planes", planes, pressure)
-    for scene in pressure:
-        require_kind(f"planes[{scene!r}]", planes[scene], Plane)
-    if control_points is not None:
-        require_each("control_points", control_points, pressure)
-    if obstacles is not None:
-        require_each("obstacles", obstacles, pressure)
-    if reflectors is not None:
-        require_each("reflectors", reflectors, pressure)
-    methods = data.methods_of(pressure.values())
-    full = all(method in maps for method in methods for maps in pressure.values())
-    alike = full and len({planes[scene] for scene in pressure}) == 1
-    sizes = [_panel(planes[scene], _SMALL_SIDE, _WIDTH / len(pressure)) for scene in pressure]
+    for name, of_scenes in (
+        ("control_points", control_points), ("obstacles", obstacles), ("reflectors", reflectors)
+    ):  # fmt: skip
+        if of_scenes is not None:
+            require_each(name, of_scenes, pressure)
+    scenes = {}
+    for scene, fields in pressure.items():
+        plane, points = planes[scene], None
+        require_kind(f"planes[{scene!r}]", plane, Plane)
+        bodies = () if obstacles is None else members(f"obstacles[{scene!r}]", obstacles[scene], Obstacle)
+        walls = () if reflectors is None else members(f"reflectors[{scene!r}]", reflectors[scene], Reflector)
+        magnitudes = {}
+        for method, field in fields.items():
+            magnitude = plane_magnitude(f"pressure[{scene!r}][{method!r}]", field)
+            magnitudes[method] = outside_on_plane(magnitude, plane, bodies, walls)
+        if control_points is not None:
+            points = points_tensor(f"control_points[{scene!r}]", control_points[scene])
+        scenes[scene] = _SceneMaps(plane, magnitudes, points, bodies, walls)
+    return scenes
+
+
+def _rows_of_maps(scenes: Mapping[str, _SceneMaps], vmin: float | None, vmax: float | None) -> Figure:
+    """Plot a row for each method and a column for each scene, as `plot_planes` does."""
+    every = [maps.magnitudes for maps in scenes.values()]
+    methods = data.methods_of(every)
+    full = all(method in magnitudes for method in methods for magnitudes in every)
+    alike = full and len({maps.plane for maps in scenes.values()}) == 1
+    sizes = [_panel(maps.plane, _SMALL_SIDE, _WIDTH / len(scenes)) for maps in scenes.values()]
     widths = [max(_LEAST_COLUMN, width) for width, _ in sizes]
     row = max(_LEAST_ROW, *(height for _, height in sizes))
     between = (0.25, 0.15) if alike else (_LABELS, 0.5)  # columns and rows [inch]
     names = [wrapped(label_of(method), row) for method in methods]
     beside = _NAME_LINE * max(len(name.splitlines()) for name in names) + _LABELS + _END
-    below = 1.4 if any(pressure) else 1.1  # or above: titles, the axis and the colour bar
+    below = 1.4 if any(scenes) else 1.1  # or above: titles, the axis and the colour bar
     figure = new_figure(
         beside + sum(widths) + between[0] * (len(widths) - 1), below + (row + between[1]) * len(methods)
     )
@@ -196,47 +213,50 @@ def _rows_of_maps(
     axes = figure.subplots(
         len(heights), len(widths), squeeze=False, height_ratios=heights, width_ratios=widths
     )
+    shown: list[tuple[QuadMesh, Collection[Array], float]] = []
+    for column, size, width, (scene, maps) in zip(axes.T, sizes, widths, scenes.items(), strict=True):
+        limits = _limits(vmin, vmax, 0.0, max(map(data.largest, maps.magnitudes.values())), "Pa")
+        mesh = _draw_column(column[:-1], maps, methods, size, limits)
+        column[0].set_title(wrapped(readable(scene), width), weight="bold")
+        shown.append((mesh, maps.magnitudes.values(), width))
+    if alike:
+        for ax in axes[:-2].ravel():
+            ax.set_xlabel("")
+            ax.tick_params(labelbottom=False)
+        for ax in axes[:-1, 1:].ravel():
+            ax.set_ylabel("")
+            ax.tick_params(labelleft=False)
+    for ax, name in zip(axes[:-1, 0], names, strict=True):
+        _name_row(ax, name)
     bars = axes[-1]
-    if vmax is not None:
+    if vmax is not None:  # one bar for all
         bars = [figure.add_subplot(axes[-1, 0].get_gridspec()[-1, :])]
         for ax in axes[-1]:
             ax.remove()
-    shown: list[tuple[QuadMesh, Collection[Array], float]] = []
-    for column, size, width, (scene, maps) in zip(axes.T, sizes, widths, pressure.items(), strict=True):
-        bodies = () if obstacles is None else members(f"obstacles[{scene!r}]", obstacles[scene], Obstacle)
-        walls = () if reflectors is None else members(f"reflectors[{scene!r}]", reflectors[scene], Reflector)
-        magnitudes = {}
-        for method, field in maps.items():
-            magnitude = plane_magnitude(f"pressure[{scene!r}][{method!r}]", field)
-            magnitudes[method] = outside_on_plane(magnitude, planes[scene], bodies, walls)
-        limits = _limits(vmin, vmax, 0.0, max(map(data.largest, magnitudes.values())), "Pa")
-        points = None
-        if control_points is not None:
-            points = points_tensor(f"control_points[{scene!r}]", control_points[scene])
-        for ax, method in zip(column[:-1], methods, strict=True):
-            if method not in magnitudes:
-                ax.set_axis_off()
-                continue
-            mesh = _draw_plane(ax, magnitudes[method], planes[scene], points, (bodies, walls), size)
-            mesh.set_clim(*limits)
-            if alike and ax is not column[-2]:
-                ax.set_xlabel("")
-                ax.tick_params(labelbottom=False)
-            if alike and column[0] is not axes[0, 0]:
-                ax.set_ylabel("")
-                ax.tick_params(labelleft=False)
-        column[0].set_title(wrapped(readable(scene), width), weight="bold")
-        shown.append((mesh, magnitudes.values(), width))
-    if vmax is not None:
-        every = [magnitude for _, magnitudes, _ in shown for magnitude in magnitudes]
-        shown = [(shown[0][0], every, sum(widths))]
+        shown = [(shown[0][0], [values for _, maps, _ in shown for values in maps], sum(widths))]
     for bar, (mesh, values, width) in zip(bars, shown, strict=True):
         beyond = _beyond(values, mesh.get_clim())
         drawn = figure.colorbar(mesh, cax=bar, orientation="horizontal", extend=beyond)
         _label_bar(drawn, mesh.get_clim(), "|p|", "Pa", width)
-    for ax, name in zip(axes[:-1, 0], names, strict=True):
-        _name_row(ax, name)
     return figure
+
+
+def _draw_column(
+    column: Iterable[Axes],
+    maps: _SceneMaps,
+    methods: Sequence[str],
+    size: tuple[float, float],
+    limits: tuple[float, float],
+) -> QuadMesh:
+    """Draw the maps of a scene into axes of a size [inch], one for each method; return the last one."""
+    for ax, method in zip(column, methods, strict=True):
+        if method not in maps.magnitudes:
+            ax.set_axis_off()
+            continue
+        parts = maps.obstacles, maps.reflectors
+        mesh = draw_plane(ax, maps.magnitudes[method], maps.plane, maps.points, parts, size)
+        mesh.set_clim(*limits)
+    return mesh
 
 
 def _panel(plane: Plane, side: float, widest: float = np.inf) -> tuple[float, float]:
@@ -288,107 +308,6 @@ def _beyond(maps: Collection[Array], limits: tuple[float, float]) -> str:
     low = any((values < limits[0]).any() for values in maps)
     high = any((values > limits[1]).any() for values in maps)
     return "both" if low and high else "min" if low else "max" if high else "neither"
-
-
-def _draw_plane(
-    ax: Axes,
-    values: Array,
-    plane: Plane,
-    points: torch.Tensor | None,
-    parts: tuple[Iterable[Obstacle], Sequence[Reflector]],
-    size: tuple[float, float],
-) -> QuadMesh:
-    """Draw |p| or its level (Nu, Nv), points, obstacles and reflectors into axes of a size [inch]."""
-    obstacles, reflectors = parts
-    axes = (_plane_axis(plane, side, cells) for side, cells in enumerate(values.shape))
-    (label_u, edges_u), (label_v, edges_v) = axes
-    colours = colormaps[PRESSURE_MAP].with_extremes(bad=OBSTACLE_COLOUR)  # of NaN
-    mesh = ax.pcolormesh(edges_u, edges_v, values.T, cmap=colours, rasterized=True)
-    for obstacle in obstacles:
-        _outline(ax, plane, obstacle, reflectors)
-    for reflector in reflectors:
-        _hatch(ax, plane, reflector, [other for other in reflectors if other is not reflector])
-    if points is not None:
-        _circle_points(ax, plane, points, max(values.shape))
-    ax.set(xlabel=label_u, ylabel=label_v, aspect="equal")
-    ax.tick_params(labelsize=TICK_SIZE)
-    for axis, length, edges in zip((ax.xaxis, ax.yaxis), size, (edges_u, edges_v), strict=True):
-        set_ticks(axis, length, (edges[0], edges[-1]))
-    return mesh
-
-
-def _plane_axis(plane: Plane, side: int, cells: int) -> tuple[str, Array]:
-    """Return the axis label and the edges of the cells [mm] along side u (0) or v (1) of the plane.
-
-    Along x, y or z these are coordinates, otherwise distances from the plane's centre.
-    """
-    direction = plane.basis[side]
-    along = MM * plane.size[side] * np.linspace(-0.5, 0.5, cells + 1)
-    axis = int(direction.abs().argmax())
-    if direction[axis].abs() <= 1 - _AXIS_TOLERANCE:
-        return f"{'uv'[side]} [mm]", along
-    return f"{'xyz'[axis]} [mm]", MM * plane.center[axis] + float(direction[axis]) * along
-
-
-def _outline(ax: Axes, plane: Plane, obstacle: Obstacle, reflectors: Sequence[Reflector]) -> None:
-    """Draw the intersection of an obstacle's surface, in front of reflectors, with the plane."""
-    edge = max(plane.size) / _OUTLINE_CELLS
-    points = plane.points(edge)
-    lower, upper = torch.tensor(obstacle.lower, **REAL), torch.tensor(obstacle.upper, **REAL)
-    near = ((points > lower - 2 * edge) & (points < upper + 2 * edge)).all(dim=2).numpy()
-    some = [near.any(axis=1), near.any(axis=0)]  # rows and columns
-    points = points[np.ix_(*some)]
-    distance = obstacle.signed_distance(points).numpy()
-    distance[~are_in_front(reflectors, points).numpy()] = np.nan
-    if not np.nanmin(distance, initial=np.inf) < 0 < np.nanmax(distance, initial=-np.inf):
-        return
-    edges = (_plane_axis(plane, side, cells)[1] for side, cells in enumerate(near.shape))
-    centers = ((along[:-1] + along[1:])[part] / 2 for along, part in zip(edges, some, strict=True))
-    lines = ax.contour(*centers, distance.T, levels=[0.0], colors="white", linewidths=1.0)
-    lines.set_path_effects([withStroke(linewidth=2.2, foreground="black")])
-
-
-def _hatch(ax: Axes, plane: Plane, reflector: Reflector, others: Iterable[Reflector]) -> None:
-    """Draw the line where a reflector crosses the plane in front of the others, with strokes on its back."""
-    corners = plane.corners[[0, 1, 3, 2]]
-    height = reflector.mirror.height(corners).numpy()
-    height[np.abs(height) < LENGTH_TOLERANCE] = 0.0
-    ends = list(corners[height == 0].numpy())
-    for here, there in zip(range(4), (1, 2, 3, 0), strict=True):
-        if height[here] * height[there] < 0:
-            share = height[here] / (height[here] - height[there])
-            ends.append((corners[here] + share * (corners[there] - corners[here])).numpy())
-    if len(ends) != 2:  # it misses the plane, or touches a corner
-        return
-    ends = list(clipped(np.array(ends), (-math.inf,) * 3, (math.inf,) * 3, others)[:2])
-    if len(ends) != 2:
-        return
-    here, there = coordinates_in(plane, torch.from_numpy(np.array(ends))).numpy()
-    far = int(np.abs(height).argmax())
-    aside = coordinates_in(plane, corners)[far].numpy() - here
-    line = MM * np.array([here, there])
-    if ((there - here)[0] * aside[1] - (there - here)[1] * aside[0]) * height[far] > 0:
-        line = line[::-1]  # strokes are on the left
-    style: Any = {"color": EDGE_COLOUR, "linewidth": 1.4, "clip_on": False}
-    ax.plot(*line.T, path_effects=[withTickedStroke(spacing=4.5, angle=135, length=0.7)], **style)
-
-
-def coordinates_in(plane: Plane, points: torch.Tensor) -> torch.Tensor:
-    """Return the coordinates (P, 2) [m] of points (P, 3) in a map of the plane, as of `_plane_axis`."""
-    sides = torch.stack(plane.basis).to(points)
-    axes = sides.abs().argmax(dim=1)
-    along_axis = sides.abs().amax(dim=1) > 1 - _AXIS_TOLERANCE
-    return torch.where(along_axis, points[:, axes], (points - points.new_tensor(plane.center)) @ sides.T)
-
-
-def _circle_points(ax: Axes, plane: Plane, points: torch.Tensor, cells: int) -> None:
-    """Circle the `points` (P, 3) [m] that are less than one cell away from the plane."""
-    center = points.new_tensor(plane.center)
-    near = ((points - center) @ points.new_tensor(plane.normal)).abs() < max(plane.size) / cells
-    coordinates = coordinates_in(plane, points[near])
-    style: Any = {"marker": "o", "ms": 9, "mfc": "none", "mec": "white", "mew": 1.2, "linestyle": "none"}
-    outline = [withStroke(linewidth=2.6, foreground="black")]
-    ax.plot(*(MM * coordinates.T.cpu().numpy()), path_effects=outline, **style)
 
 
 def _label_bar(bar: Colorbar, limits: tuple[float, float], quantity: str, unit: str, length: float) -> None:
