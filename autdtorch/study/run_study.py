@@ -17,7 +17,7 @@ from autdtorch.methods.base import Method
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.forces import ForceGoal, ForceObjective, Push
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
-from autdtorch.objectives.metrics import focus_metrics
+from autdtorch.objectives.metrics import FocusMetrics, focus_metrics
 from autdtorch.objectives.over_scenes import OverScenes
 from autdtorch.objectives.scenarios import observed_goal
 from autdtorch.propagators import Propagator, SimulatedPropagator, TMatrixPropagator, make_propagator
@@ -220,21 +220,34 @@ def _run_scene(
     progress.advance(1)
     results = {}
     for (method_name, (solution, seconds)), pressure in zip(solutions.items(), planes, strict=True):
-        metrics = focus_metrics(solution.pressure) if goal.of_pressures else None
-        if metrics is not None and pressure is not None:  # of the first scene, where there are several
-            foci = solution.pressure[:, : len(scene.control_points)]
-            metrics = replace(metrics, area=focus_metrics(foci, pressure.abs(), cell_area).area)
+        metrics = None
+        if goal.of_pressures:
+            metrics = _metrics(solution.pressure, pressure, len(scene.control_points), cell_area)
         shown = median_trial(solution.score)
         shown_plane = None if pressure is None else pressure[shown].clone()
         results[method_name] = MethodResult(solution, metrics, seconds, shown, shown_plane)
-    simulation = SceneSimulation(
-        "free_space", scene.wavelength, None, None, (), matrix_seconds, plane_seconds
-    )
-    if isinstance(propagator, SimulatedPropagator | TMatrixPropagator):
-        grid = {"spacing": propagator.spacing, "tolerance": propagator.tolerance}
-        simulation = replace(simulation, method=propagator.method, **grid, runs=tuple(propagator.runs))
+    simulation = _simulation(propagator, matrix_seconds, plane_seconds)
     known = transfer_matrix, float(maximised.bound(transfer_matrix)), simulation, results
     return SceneResult(len(scene.obstacles), *known, goal_section(maximised), goal.unit)
+
+
+def _metrics(
+    pressure: torch.Tensor, plane: torch.Tensor | None, foci: int, cell_area: float | None
+) -> FocusMetrics:
+    """Return the metrics of pressures (T, P), whose first `foci` are those of the plane."""
+    metrics = focus_metrics(pressure)
+    if plane is None:
+        return metrics
+    return replace(metrics, area=focus_metrics(pressure[:, :foci], plane.abs(), cell_area).area)
+
+
+def _simulation(propagator: Propagator, matrix_seconds: float, plane_seconds: float) -> SceneSimulation:
+    """Return the simulation that gave a matrix and the planes in these times [s]."""
+    seconds = matrix_seconds, plane_seconds
+    if isinstance(propagator, SimulatedPropagator | TMatrixPropagator):
+        settings = propagator.spacing, propagator.tolerance, tuple(propagator.runs)
+        return SceneSimulation(propagator.method, propagator.scene.wavelength, *settings, *seconds)
+    return SceneSimulation("free_space", propagator.scene.wavelength, None, None, (), *seconds)
 
 
 def _run_trials(
