@@ -68,18 +68,26 @@ def _plane_axis(plane: Plane, side: int, cells: int) -> tuple[str, Array]:
 
 def _outline(ax: Axes, plane: Plane, obstacle: Obstacle, reflectors: Sequence[Reflector]) -> None:
     """Draw the intersection of an obstacle's surface, in front of reflectors, with the plane."""
+    center = torch.tensor(plane.center, **REAL)
+    axes = torch.stack((*plane.basis, center.new_tensor(plane.normal)))
+    corners = torch.cartesian_prod(*center.new_tensor((obstacle.lower, obstacle.upper)).T)
+    lower, upper = ((corners - center) @ axes.T).aminmax(dim=0)
+    if lower[2] > 0 or upper[2] < 0:  # it is beside the plane
+        return
     edge = max(plane.size) / _OUTLINE_CELLS
-    points = plane.points(edge)
-    lower, upper = torch.tensor(obstacle.lower, **REAL), torch.tensor(obstacle.upper, **REAL)
-    near = ((points > lower - 2 * edge) & (points < upper + 2 * edge)).all(dim=2).numpy()
-    some = [near.any(axis=1), near.any(axis=0)]  # rows and columns
+    points, reach = plane.points(edge), 2 * edge
+    along = (points[:, 0] - center) @ axes[0], (points[0] - center) @ axes[1]
+    some = [
+        ((lower[side] - reach < places) & (places < upper[side] + reach)).numpy()
+        for side, places in enumerate(along)
+    ]
     points = points[np.ix_(*some)]
     distance = obstacle.signed_distance(points).numpy()
     distance[~are_in_front(reflectors, points).numpy()] = np.nan
     if not np.nanmin(distance, initial=np.inf) < 0 < np.nanmax(distance, initial=-np.inf):
         return
-    edges = (_plane_axis(plane, side, cells)[1] for side, cells in enumerate(near.shape))
-    centers = ((along[:-1] + along[1:])[part] / 2 for along, part in zip(edges, some, strict=True))
+    edges = (_plane_axis(plane, side, cells)[1] for side, cells in enumerate(map(len, some)))
+    centers = ((ends[:-1] + ends[1:])[part] / 2 for ends, part in zip(edges, some, strict=True))
     lines = ax.contour(*centers, distance.T, levels=[0.0], colors="white", linewidths=1.0)
     lines.set_path_effects([withStroke(linewidth=2.2, foreground="black")])
 

@@ -225,7 +225,7 @@ def inside_any(points: torch.Tensor, obstacles: Iterable[Obstacle]) -> torch.Ten
     """Return whether each of the points (..., 3) [m] is inside an obstacle, bool (...)."""
     inside = torch.zeros(points.shape[:-1], dtype=torch.bool, device=points.device)
     for obstacle in obstacles:
-        inside[~inside] = obstacle.contains(points[~inside])
+        inside |= obstacle.contains(points)
     return inside
 
 
