@@ -14,7 +14,7 @@ from autdtorch.fdtd.kernels.cpu_intrinsics import (
 )
 from autdtorch.fdtd.kernels.cpu_layers import stretch
 from autdtorch.fdtd.kernels.cpu_sweep import sweep_planes
-from autdtorch.utils.compiled import INNER, entry
+from autdtorch.utils.compiled import INNER, NO_ARRAYS, entry
 
 COUNTERS = 32  # Numbers that hold the two counters, 0 at first
 _CLAIMED, _FINISHED = 0, 16  # Their places, on separate cache lines
@@ -144,7 +144,7 @@ def _finish_columns(p, q, columns, memory):  # type: ignore[no-untyped-def]
             q[index[n, depth + 1]] += terms[depth * count + n]
 
 
-@entry()
+@entry(**NO_ARRAYS)
 def advance(  # type: ignore[no-untyped-def]
     p, q, medium, layers, cells, losses, room, columns, memory, sound_hard, sources, receivers, signal,
     recorded, counters,
