@@ -246,10 +246,10 @@ class BayesOpt(Method):
     def _doubts(self, state: State) -> Sequence[Iterable[str]]:
         """Describe a lone highest score, and readings that are not used: at the beginning and at the end."""
         doubts = [[*texts] for texts in super()._doubts(state)]
-        told = [readings for readings in (state.problem.readings, state.readings) if readings is not None]
-        unused = sum(len(readings) - len(_usable(readings) or ()) for readings in told)
+        parts = [readings for readings in (state.problem.readings, state.readings) if readings is not None]
+        unused = sum(len(readings) - len(_usable(readings) or ()) for readings in parts)
         if unused and (state.done or not state.evaluations):
-            every = sum(map(len, told))
+            every = sum(map(len, parts))
             text = f"{unused} of {every} readings are not used: they have gaps or amplitudes below 1"
             doubts = [[text, *texts] for texts in doubts or [[]]]
         if state.done and "outliers" in state.search:

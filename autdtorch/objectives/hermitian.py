@@ -47,8 +47,8 @@ def forms_bound(rows: ComplexArray, weights: Array) -> float:
         The bound, >= 0: without sound all forms are 0. Where it is 0, no drive makes all forms positive.
     """
     scale = float(np.abs(rows).max()) or 1.0
-    heard = np.abs(rows).max(axis=0) > 0
-    rows = rows[:, heard] / scale
+    audible = np.abs(rows).max(axis=0) > 0
+    rows = rows[:, audible] / scale
     if (np.abs(weights) @ (np.abs(rows) ** 2).sum(axis=1)).min() == 0:
         return 0.0
     mixing, basis = _factors(rows)

@@ -80,7 +80,7 @@ def _source_of(kind: type) -> str:
     """Return the source of a user's class or of its module, or a new text where the source is unknown."""
     if kind.__module__.partition(".")[0] == __package__.partition(".")[0]:
         return ""  # the digest of the package's source covers it
-    for thing in (sys.modules.get(kind.__module__), kind):
+    for owner in (sys.modules.get(kind.__module__), kind):
         with contextlib.suppress(OSError, TypeError):
-            return inspect.getsource(thing)  # type: ignore[arg-type]
+            return inspect.getsource(owner)  # type: ignore[arg-type]
     return uuid.uuid4().hex

@@ -109,9 +109,9 @@ def on_path() -> str:
 
     matrix = poses.transfer_matrix(scene.array, scene.control_points)
     best = torch.tensor([float(at.gradient_ascent(each).score[0]) for each in matrix])
-    found, seconds = shortest(lambda: drives(scene.array), REPEATS)
+    chosen, seconds = shortest(lambda: drives(scene.array), REPEATS)
     _, of_discs = shortest(lambda: drives(autd3_of_discs()), 1)
-    share = weakest(matrix, found) / best
+    share = weakest(matrix, chosen) / best
     return (
         f"A cube on a path of {PATH} poses, 16 transducers: {PATH / seconds:,.0f} poses a second from the\n"
         f"pose to the drive (`holography` with {STARTS} starts), {PATH / of_discs:,.0f} with the 249 discs\n"

@@ -82,7 +82,7 @@ class Scan:
 
     def pose(self, radius: float, fit_radius: bool = False) -> Pose:
         """Return the pose that fits best: of all orientations and shifts, then by least squares."""
-        starts = [max(self._shifts(z, radius), key=lambda found: found[0])[1] for z in DISTANCES]
+        starts = [max(self._shifts(z, radius), key=lambda pair: pair[0])[1] for z in DISTANCES]
         fits = [self._refined(start, 6 if fit_radius else 5) for start in starts]
         return min(fits, key=lambda fit: fit[0])[1]
 

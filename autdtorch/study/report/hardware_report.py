@@ -111,7 +111,7 @@ def write_hardware_report(
         version=autdtorch.__version__,
         times=times,
         interval=statistics.median_low(gaps) if gaps else 0.0,  # an interruption does not change it
-        found=solution,
+        solution=solution,
         convergence=convergence,
         goal=score_label(goal.name),
         of_pressures=goal.of_pressures,
