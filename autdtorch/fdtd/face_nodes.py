@@ -7,6 +7,7 @@ give it anywhere. Transposed, this interpolation moves the amplitudes of cells t
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -31,18 +32,18 @@ class FaceNodes:
     Attributes:
         positions: along the axes of the grid (m, 3) [m].
         faces: of each layer of a face, the cells (A, B) by their place in the surface, and the weights (a, A)
-            and (b, B) that move amplitudes to its nodes (a, b).
+            and (b, B) that move amplitudes to its nodes (a, b), on a device.
         bounds: lower and upper corner of the surface, along the axes of the grid [m].
         clearance: least distance of receivers from the surface [m].
     """
 
     positions: Array
-    faces: tuple[tuple[Index, Array, Array], ...]
+    faces: Sequence[Sequence[Tensor]]
     bounds: tuple[Array, Array]
     clearance: float
 
     @classmethod
-    def of(cls, grid: Grid, surface: Index, wavenumber: float) -> Self:
+    def of(cls, grid: Grid, surface: Index, wavenumber: float, device: str = "cpu") -> Self:
         """Return the nodes of a surface, by the flat indices (n,) of its cells.
 
         These are two and three cells from the rim of the interior.
@@ -60,7 +61,8 @@ class FaceNodes:
             )
             for layer in np.unique(np.concatenate([cells[axis][:2], cells[axis][-2:]])):
                 cells[axis] = np.array([layer])
-                faces.append((place[np.ix_(*cells)].squeeze(axis), first, second))
+                inside = place[np.ix_(*cells)].squeeze(axis)
+                faces.append([torch.from_numpy(part).to(device) for part in (inside, first, second)])
                 node = np.empty((len(along), len(across), 3))
                 node[..., axis], node[..., one], node[..., other] = layer, along[:, None], across
                 positions.append(node.reshape(-1, 3))
@@ -68,7 +70,7 @@ class FaceNodes:
         lower, upper, everywhere = (
             grid.origin + grid.spacing * each for each in (*bounds, np.concatenate(positions))
         )
-        return cls(everywhere, tuple(faces), (lower, upper), _CLEAR * 2 * math.pi / wavenumber)
+        return cls(everywhere, faces, (lower, upper), _CLEAR * 2 * math.pi / wavenumber)
 
     def reach(self, points: Array, radii: Array | float = 0.0) -> NDArray[np.bool_]:
         """Return which points (P, 3) [m], or discs about them, are far enough, along the axes of the grid."""
@@ -77,16 +79,14 @@ class FaceNodes:
         return np.asarray(np.linalg.norm(apart, axis=1) >= self.clearance + radii)
 
     def amplitudes(self, amplitude: Tensor) -> Tensor:
-        """Return the amplitudes (m, R) of the nodes from those (n, R) of the cells."""
-        values = torch.view_as_real(amplitude).flatten(1).numpy()
+        """Return the amplitudes (m, R) of the nodes, on the CPU, from those (n, R) of the cells."""
+        values = torch.view_as_real(amplitude.to(self.faces[0][0].device)).flatten(1)
         parts = []
         for cells, first, second in self.faces:
-            moved = first @ values[cells].reshape(len(cells), -1)
+            moved = first @ values[cells].flatten(1)
             moved = second @ moved.reshape(len(first), cells.shape[1], -1)
-            parts.append(moved.reshape(-1, values.shape[1]))
-        return torch.view_as_complex(
-            torch.from_numpy(np.concatenate(parts).reshape(-1, amplitude.shape[1], 2))
-        )
+            parts.append(moved.flatten(0, 1))
+        return torch.view_as_complex(torch.cat(parts).reshape(-1, *amplitude.shape[1:], 2).cpu())
 
 
 def _nodes(cells: Index, phase: float) -> tuple[Array, Array]:

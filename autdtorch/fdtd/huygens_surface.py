@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Self
@@ -27,7 +28,7 @@ from torch import Tensor
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.stencil import OFFSETS, Stencil, flat_offsets, flat_strides
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.process import parts_of_size, spread
+from autdtorch.utils.process import cached_property, parts_of_size, spread
 from autdtorch.utils.spatial import places_among
 
 # Wavenumbers along a face up to which its weights are fitted, relative to air's, and the weight of those
@@ -82,10 +83,22 @@ class HuygensSurface:
         return cls(cells, matrix, scale * grid.spacing / stencil.source_factor(steps_per_period))
 
     def of_phasors(self, phasors: Tensor) -> Tensor:
-        """Return amplitudes (n, R) [Pa m] from the phasors (n, R) [Pa] of the cells."""
-        values = torch.view_as_real(phasors.contiguous()).flatten(1).numpy()
-        amplitude = torch.from_numpy(self.weights @ values).reshape(len(self.cells), -1, 2)
-        return self.factor * torch.view_as_complex(amplitude)
+        """Return amplitudes (n, R) [Pa m] from the phasors (n, R) [Pa] of the cells, on their device."""
+        values = torch.view_as_real(phasors.contiguous()).flatten(1)
+        if values.is_cuda:
+            amplitude = self._weights_on_gpu @ values
+        else:
+            amplitude = torch.from_numpy(self.weights @ values.numpy())
+        return self.factor * torch.view_as_complex(amplitude.reshape(len(self.cells), -1, 2))
+
+    @cached_property
+    def _weights_on_gpu(self) -> Tensor:
+        """The weights on the current GPU."""
+        parts = self.weights.indptr, self.weights.indices, self.weights.data
+        first_of_row, place, weight = (torch.from_numpy(part).cuda() for part in parts)
+        with warnings.catch_warnings():  # that PyTorch may change its sparse matrices
+            warnings.simplefilter("ignore", UserWarning)
+            return torch.sparse_csr_tensor(first_of_row, place, weight, self.weights.shape)
 
 
 @lru_cache(maxsize=64)

@@ -173,7 +173,9 @@ class ScatteredField:
         read = np.concatenate((surface, inner.index.ravel()))
         cells = distinct_cells(read, math.prod(self.assembly.grid.shape))
         outward = slice(None) if len(cells) == len(surface) else np.searchsorted(cells, surface)
-        return NearToFar(self, targets, far, within, cells, outward, inner.matrix(cells))
+        around = np.unique(inner.index)
+        read = np.searchsorted(cells, around)
+        return NearToFar(self, targets, far, within, cells, outward, read, inner.matrix(around))
 
     def radiated(
         self, amplitude: Tensor, points: Tensor | Discs, images: Sequence[Image] | None = None
@@ -214,7 +216,7 @@ class ScatteredField:
         """Nodes that radiate like the surface, if they are fewer; None in double precision."""
         if self.assembly.dtype != torch.float32:
             return None
-        nodes = FaceNodes.of(self.assembly.grid, self.surface.cells, self.wavenumber.real)
+        nodes = FaceNodes.of(self.assembly.grid, self.surface.cells, self.wavenumber.real, self.device)
         return nodes if len(nodes.positions) < _FEWER * len(self.surface.cells) else None
 
     def inside(self, points: Tensor, margin: Tensor | float = 0.0) -> Tensor:
@@ -300,11 +302,13 @@ class NearToFar:
     within: Tensor  # mask of the other targets' nodes in the box, where its cells are read (Q, n)
     cells: Index  # flat indices (k,) of the cells whose phasors are needed
     outward: slice | Index  # the Huygens surface's cells among those
-    inward: csr_array  # field at the nodes in the box from those phasors
+    read: Index  # the cells about the nodes in the box among those (r,)
+    inward: csr_array  # field at these nodes from the phasors of `read` (q, r)
 
     def field(self, phasors: Tensor) -> Tensor:
         """Return scattered fields (P, R) at the targets, from the cells' phasors (k, R) in R runs."""
-        return self._mean(self.amplitudes(phasors), torch.from_numpy(self.inward @ phasors.numpy()))
+        inner = self.inward @ phasors[self.read].cpu().numpy()
+        return self._mean(self.amplitudes(phasors), torch.from_numpy(inner))
 
     def radiated(self, amplitude: Tensor) -> Tensor:
         """Return scattered fields (P, R) at targets outside the box, from amplitudes (n, R) [Pa m]."""
@@ -326,7 +330,10 @@ class NearToFar:
         return mean
 
     def amplitudes(self, phasors: Tensor) -> Tensor:
-        """Return amplitudes (n, R) [Pa m] of the Huygens surface, from the cells' phasors (k, R)."""
+        """Return amplitudes (n, R) [Pa m] of the Huygens surface, from the cells' phasors (k, R).
+
+        They are on the device of these.
+        """
         return self.box.surface.of_phasors(phasors[self.outward])
 
     def matrices(self, every: int) -> FieldMatrices:
@@ -387,12 +394,12 @@ class FieldMatrices:
     transform: NearToFar
     nodes: FaceNodes | None  # those that stand for the surface, where they reach all targets
     received: Tensor  # waves from the surface, or from its nodes, to the targets (n, P)
-    inner: csr_array  # field at the targets in the box from phasors (P, k)
+    inner: csr_array  # field at the targets in the box from the phasors of `transform.read` (P, r)
 
     def field(self, phasors: Tensor) -> Tensor:
         """Return the scattered field (P, R) at the targets, from the cells' phasors (k, R)."""
         amplitude = self.transform.amplitudes(phasors)
-        amplitude = self.nodes.amplitudes(amplitude) if self.nodes else amplitude
+        amplitude = self.nodes.amplitudes(amplitude) if self.nodes else amplitude.cpu()
         # by NumPy: in single precision PyTorch may take products of a few bits
         outside = self.received.numpy().T @ amplitude.to(self.received.dtype).numpy()
-        return torch.from_numpy(outside + self.inner @ phasors.numpy())
+        return torch.from_numpy(outside + self.inner @ phasors[self.transform.read].cpu().numpy())

@@ -56,7 +56,7 @@ def short_runs(
         state, _ = kernel.advance(state, assembly.coefficients, sources, nothing, signal[:-recorded])
         _, record = kernel.advance(state, assembly.coefficients, sources, receivers, signal[-recorded:])
         stepped(periods * len(record))
-        phasors = fourier_sum(basis, record).cpu()
+        phasors = fourier_sum(basis, record)
         return [SteadyState(each, periods, math.inf, converged=False) for each in phasors]
 
     return in_batches(together, count, kernel, assembly.grid.shape, len(cells))

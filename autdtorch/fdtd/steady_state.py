@@ -57,7 +57,7 @@ _FALLING = 0.1
 class SteadyState:
     """Phasors of cells in a run, with their estimated residual."""
 
-    pressure: Tensor  # phasors (k,), complex
+    pressure: Tensor  # phasors (k,), complex, on the kernel's device
     periods: int  # periods stepped
     residual: float  # estimated relative distance to the steady state; a bound of it if not converged
     converged: bool  # whether the residual is within the tolerance
@@ -115,7 +115,7 @@ def run_to_steady_state(
             done = converged | (count >= max_periods)
             for place in np.flatnonzero(done):
                 state = count, float(residual[place]), bool(converged[place])
-                states[runs[place]] = SteadyState(limits[:, place].contiguous().cpu(), *state)
+                states[runs[place]] = SteadyState(limits[:, place].contiguous(), *state)
             if done.all():
                 break
             judging.choose(~done)

@@ -306,7 +306,7 @@ class BoxSimulation(Simulation):
         least = torch.tensor(floors, **REAL).mT.clamp(min=torch.finfo(torch.float64).tiny)
 
         def observed(phasors: torch.Tensor, runs: Index) -> list[torch.Tensor]:
-            parts = zip(readings, torch.split(phasors.cpu(), sizes), strict=True)
+            parts = zip(readings, torch.split(phasors, sizes), strict=True)
             scattered = [spread_runs(reading.field, part) for reading, part in parts]
             pressure = audible * (incident[:, runs] + torch.stack(scattered).sum(dim=0))
             return [pressure[group] for group in groups]

@@ -105,7 +105,8 @@ class BoxScatterer:
                 torch.zeros((1, len(loud)), **REAL) if floors is None else floors[:, loud],
                 echoed if self.echo and not self.comes_back_later else None,
             )  # fmt: skip
-        silent = SteadyState(torch.zeros(len(cells), **COMPLEX), 0, 0.0, True)
+        nothing = torch.zeros(len(cells), **COMPLEX).to(self.kernel.device)
+        silent = SteadyState(nothing, 0, 0.0, True)
         answers = [silent] * len(tolerances)
         for run, state in zip(loud, states, strict=True):
             answers[run] = state

@@ -84,7 +84,7 @@ class DomainSimulation(Simulation):
             stepped, torch.tensor([floors], **REAL),
         )  # fmt: skip
         seconds = (time.perf_counter() - begin) / len(drives)
-        phasors = torch.stack([state.pressure for state in states], dim=1)
+        phasors = torch.stack([state.pressure for state in states], dim=1).cpu()
         pressure = torch.from_numpy(reading @ phasors.numpy())
         return pressure.mT, [Run.of(state, seconds) for state in states]
 

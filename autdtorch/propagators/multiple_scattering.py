@@ -85,7 +85,7 @@ def iterated(
             share = waves.norm(dim=0) / largest
             looser = (tolerance / 2 ** (number + 1) / share).clamp(max=_LOOSEST)  # half of it in all passes
             steady = body.answers(waves, looser.tolist())
-            parts.append(torch.stack([each.pressure for each in steady], dim=1))
+            parts.append(torch.stack([each.pressure for each in steady], dim=1).cpu())
             periods += [each.periods for each in steady]
             reached &= [each.converged for each in steady]
             residuals[index] = share * torch.tensor([each.residual for each in steady], **REAL)

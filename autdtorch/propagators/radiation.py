@@ -61,7 +61,10 @@ class Radiation:
 
 
 class Solved(NamedTuple):
-    """The steady states of R runs in boxes: the phasors (k, R) of the cells that each transform reads."""
+    """The steady states of R runs in boxes: the phasors (k, R) of the cells that each transform reads.
+
+    They are on the kernel's device.
+    """
 
     transforms: Sequence[NearToFar]
     phasors: Sequence[torch.Tensor]
@@ -77,7 +80,7 @@ class Solved(NamedTuple):
     def amplitudes(self) -> list[torch.Tensor]:
         """The amplitudes (n, R) [Pa m] of each box's Huygens surface."""
         pairs = zip(self.transforms, self.phasors, strict=True)
-        return [spread_runs(transform.amplitudes, part) for transform, part in pairs]
+        return [spread_runs(transform.amplitudes, part).cpu() for transform, part in pairs]
 
 
 def spread_runs(linear: Callable[[torch.Tensor], torch.Tensor], phasors: torch.Tensor) -> torch.Tensor:

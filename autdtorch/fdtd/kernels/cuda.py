@@ -26,7 +26,7 @@ from autdtorch.fdtd.kernels.contract import (
 )
 from autdtorch.utils.validation import invalid, no_cuda
 
-_GRAPH_STEPS = 16  # Steps of a captured graph; even, so that both fields return to their places
+_GRAPH_STEPS = 16  # Most steps of a captured graph; even, so that both fields return to their places
 # Most cells of a grid whose steps are captured. Beyond, a step takes longer than its three launches from
 # Python, some 100 us: 17 million cells take 112 us on an H100.
 _MOST_CAPTURED = 2**25
@@ -92,7 +92,8 @@ class DeviceMedium:
         self.settled = settled_table(c, device)
         self.terms = no_terms(shape, runs, c, device)
         nx, ny, nz = shape
-        z, y, yz = (2 * triton.cdiv(rows, blocks.lanes) for rows in (nx * ny, nx * nz, 2 * self.cells * nx))
+        columns = (nx * ny, nx * nz, 2 * self.cells * nx) if self.cells else (0, 0, 0)
+        z, y, yz = (2 * triton.cdiv(count, blocks.lanes) for count in columns)
         heterogeneous = triton.cdiv(self.heterogeneous.size, self.depths * blocks.lanes)
         crossed = triton.cdiv(self.crossed.size, blocks.lanes)
         self.ends = Ends(*itertools.accumulate((z, y, yz, heterogeneous, crossed)))
@@ -116,17 +117,17 @@ class DeviceRun:
         self.signal = torch.zeros((steps, sources.force.shape[2]), dtype=dtype, device=device)
         self._first = torch.zeros((), dtype=torch.int64, device=device)
         self._turn = 0
-        self._graphs: dict[int, torch.cuda.CUDAGraph] = {}
+        self._graphs: dict[tuple[int, int], torch.cuda.CUDAGraph] = {}  # by turn and number of steps
 
     def advance(self, signal: Tensor) -> Tensor:
         """Step once per row of the signal; return the record of the receivers."""
         self.signal.copy_(signal)
         self._first.zero_()
         steps, small = len(signal), self._fields[0].numel() <= _MOST_CAPTURED
-        captured = self.medium.device.type == "cuda" and steps > _GRAPH_STEPS and small
-        done = self._replay(steps) if captured else 0
-        for offset in range(steps - done):
-            self._step(self._turn + offset, offset)
+        if self.medium.device.type == "cuda" and steps > _GRAPH_STEPS and small:
+            self._replay(steps)
+        else:
+            self._launch(self._turn, steps)
         self._turn = (self._turn + steps) % 2
         m, received, block = self.medium, self._received, self.medium.depths * self.medium.blocks.lanes
         grid = (m.runs * triton.cdiv(received.size, block),)
@@ -137,24 +138,27 @@ class DeviceRun:
         self.state = WaveState(now, before, self._memories[self._turn])
         return received.recorded.clone()
 
-    def _replay(self, steps: int) -> int:
-        """Step by replays of a captured graph; return the number of steps done."""
+    def _replay(self, steps: int) -> None:
+        """Step by replays of captured graphs."""
         done = 0
-        if self._turn not in self._graphs:
-            # two steps first: nothing may be compiled while a graph is captured
-            for done in (1, 2):
-                self._step(self._turn + done - 1, done - 1)
-            self._first += done
-            graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(graph):
-                for offset in range(_GRAPH_STEPS):
-                    self._step(self._turn + offset, offset)
-                self._first += _GRAPH_STEPS
-            self._graphs[self._turn] = graph
-        while steps - done >= _GRAPH_STEPS:
-            self._graphs[self._turn].replay()
-            done += _GRAPH_STEPS
-        return done
+        if not self._graphs:  # nothing may be compiled while a graph is captured
+            done = 2
+            self._launch(self._turn, done)
+        while done < steps:
+            part = self._turn, min(_GRAPH_STEPS, steps - done)
+            if part not in self._graphs:
+                graph = torch.cuda.CUDAGraph()
+                with torch.cuda.graph(graph):
+                    self._launch(*part)
+                self._graphs[part] = graph
+            self._graphs[part].replay()
+            done += part[1]
+
+    def _launch(self, turn: int, steps: int) -> None:
+        """Launch steps, and count them."""
+        for offset in range(steps):
+            self._step(turn + offset, offset)
+        self._first += steps
 
     def _step(self, turn: int, offset: int) -> None:
         """Launch the step `offset` rows of the signal after the first one."""

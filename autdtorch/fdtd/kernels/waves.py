@@ -33,7 +33,7 @@ def superposition(
         return superposition_on(device, points, sources, amplitude, wavenumber).cpu()
     from autdtorch.fdtd.kernels.cpu_waves import superposition as compiled  # loads numba
 
-    return compiled(points, sources, amplitude, wavenumber, dtype)
+    return compiled(points, sources, amplitude.cpu(), wavenumber, dtype)
 
 
 def superposition_on(

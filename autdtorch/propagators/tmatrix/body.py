@@ -157,7 +157,7 @@ class StillBody:
                 lambda phasors, runs: [observed @ phasors.cpu()], progress.advance,
                 torch.zeros((1, count), **REAL),
             )  # fmt: skip
-        answers = outgoing @ torch.stack([steady.pressure for steady in states], dim=1)
+        answers = outgoing @ torch.stack([steady.pressure for steady in states], dim=1).cpu()
         matrix, kinds = torch.zeros_like(mixing), self._kinds
         for waves, answer in zip(self.runs, answers.mT, strict=True):
             for wave in waves:
