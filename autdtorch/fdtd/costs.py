@@ -12,6 +12,7 @@ from autdtorch.fdtd.grid import domain_extent
 from autdtorch.fdtd.grouping import USUAL_PERIODS, Grouping
 from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels import make_kernel
+from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import MOST_JUDGED, phasors_kept
 from autdtorch.utils.process import cached_property, thread_count
@@ -119,7 +120,8 @@ class Costs:
         assembly = _SCENE_STEPS + _ASSEMBLY_STEPS * filled.assembled + _MESH_STEPS * filled.meshed
         echoes = sum(grid.echo_work(self.runs) for grid in grids)
         pairs = sum(grid.radiating for grid in grids) * self.terms if self.in_boxes else 0
-        return assembly + echoes + _PAIR_STEPS * pairs + math.ceil(self.runs / self._at_once) * run
+        at_a_time = max(1, self._at_once // self._kernel.threads(grids[0].shape))  # each as fast as alone
+        return assembly + echoes + _PAIR_STEPS * pairs + math.ceil(self.runs / at_a_time) * run
 
     @cached_property
     def _heterogeneity(self) -> Heterogeneity:
@@ -164,11 +166,15 @@ class Costs:
     def _at_once(self) -> int:
         """Threads that step runs; coupled boxes run one after the other."""
         grids = self.grouping.grids
-        return make_kernel(self.kernel).at_once(grids[0].shape) if len(grids) == 1 else 1
+        return self._kernel.at_once(grids[0].shape) if len(grids) == 1 else 1
 
     @property
     def _together(self) -> int:
         """Runs that a thread steps together; those on a GPU are in a memory of its own."""
         if self.kernel == "cuda":
             return 1
-        return make_kernel(self.kernel).together(self.grouping.grids[0].shape, self._cells_read)
+        return self._kernel.together(self.grouping.grids[0].shape, self._cells_read)
+
+    @cached_property
+    def _kernel(self) -> Kernel:
+        return make_kernel(self.kernel)

@@ -99,9 +99,15 @@ def grid_errors(
     spacings [m]; the last ones count.
     """
     by_grids = errors_by_grids(matrix, free, spacing, others, law)
-    usual = law.usual(spacing) * _scattered(matrix, free)
+    usual = usual_errors(matrix, free, spacing, law)
     near = torch.maximum(usual, by_grids / _MOST_ABOVE)
     return torch.maximum(by_grids ** (1 - _WEIGHT) * near**_WEIGHT, _LEAST * usual)
+
+
+def usual_errors(matrix: Tensor, free: Tensor, spacing: float, law: Law) -> Tensor:
+    """Return the usual relative errors (P,) of the rows of a matrix (P, M); see `Law.usual`."""
+    errors: Tensor = (law.usual(spacing) * _scattered(matrix, free)).clamp(min=_TINY)
+    return errors
 
 
 def errors_by_grids(

@@ -36,14 +36,18 @@ _FINER_IF_SLOW = 1.6
 a coarse grid gives next to a resonance tells nothing of the others."""
 
 _SMALLEST_STEP, _LARGEST_STEP = 1.25, 1.6
-"""Ratios of a spacing and the next: the smallest that tells two errors apart; the largest, also the first,
-over which the fall of an error is known."""
+"""Ratios of a spacing and the next: the smallest that tells two errors apart; the largest over which the fall
+of an error is known."""
 
 _BY_TWO_GRIDS, _BY_THREE_GRIDS = 0.45, 0.7
 """Estimated error, relative to the tolerance, that is accepted. Two coarse grids may agree by chance."""
 
 _AIM = 0.5
 """Error for which a spacing is chosen, relative to the tolerance."""
+
+_UNUSUAL = 3.5
+"""Safety factor: the second spacing is chosen as if the first had this many times the usual error. Two grids
+claim 0.3 to 3 times the usual error of the finer one."""
 
 _SHAPE = 3.0
 """Ratio of the errors of uncertain surfaces and of the grid from which a finer grid is of no use."""
@@ -194,19 +198,19 @@ def _refined(pilot: Plan, budget: _Budget, store: Store) -> SimulatedPropagator:
                 "obstacles taken as rigid would leave an error of %.2g: their materials count", rigid_error
             )
             return _refined(pilot.with_materials, budget, store)
-        step = _LARGEST_STEP
+        known = shape + rigid_error
+        grid_error = error - known if others else _UNUSUAL * propagator.usual_error()
         if others:
             accepted = tolerance * (_BY_TWO_GRIDS if len(others) == 1 else _BY_THREE_GRIDS)
-            known = shape + rigid_error
-            if error - known <= max(accepted - known, shape / _SHAPE):
+            if grid_error <= max(accepted - known, shape / _SHAPE):
                 _warn_of_shape(region, shape, error, tolerance)
                 return propagator
             if not math.isfinite(error):
                 reason = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
                 raise ValueError(f"max_periods: {plan.max_periods}; {reason}")
-            aim = max(_AIM * tolerance - known, shape / _SHAPE)
-            wanted = aim / (error - known) * law.growth(plan.spacing)
-            step = min(max(plan.spacing / law.spacing_of(wanted), _SMALLEST_STEP), _LARGEST_STEP)
+        aim = max(_AIM * tolerance - known, shape / _SHAPE)
+        wanted = aim / grid_error * law.growth(plan.spacing)
+        step = min(max(plan.spacing / law.spacing_of(wanted), _SMALLEST_STEP), _LARGEST_STEP)
         for ratio in (step, _SMALLEST_STEP):
             finer = plan.fitted(plan.spacing / ratio, plan.tolerance)
             if budget.fits(finer, plan, taken):

@@ -16,6 +16,7 @@ from autdtorch.fdtd.grid_errors import (
     rigid_errors,
     shape_errors,
     sizes,
+    usual_errors,
 )
 from autdtorch.propagators.absorbed_power import AbsorbedPower
 from autdtorch.propagators.box import BoxSimulation
@@ -147,6 +148,13 @@ class SimulatedPropagator(ScenePropagator):
         matrix, free = (part.reshape(1, -1) for part in (results[0].matrix, self._free(points)))
         shape, rigid = (float(of(matrix, free, self.plan.region)) for of in (shape_errors, rigid_errors))
         return self._error(results, points) if self._coarser else math.inf, shape, rigid
+
+    @one_library_thread()
+    def usual_error(self) -> float:
+        """Simulate the control points; return the error that grids of this spacing usually have."""
+        points = self.scene.control_points
+        matrix = self._results(points, with_error=False)[0].matrix.reshape(1, -1)
+        return float(usual_errors(matrix, self._free(points).reshape(1, -1), self.spacing, self.plan.law))
 
     @one_library_thread()
     def _field(self, drive: torch.Tensor, points: torch.Tensor, is_picture: bool) -> torch.Tensor:

@@ -263,11 +263,19 @@ def test_estimates_lean_towards_the_usual_error(spacing, scattered, logarithm):
 
 @pytest.mark.parametrize("ratio", [0.5, 1.0])
 def test_bodies_of_slow_fluids_start_on_a_finer_grid(ratio):
-    """Loose enough for two grids, the second 1.6 times as fine as the first."""
+    """Loose enough for two grids, the second 1.25 times as fine as the first."""
     ball = Sphere(CENTER, 1.5e-3, density=3 * AIR.density, sound_speed=ratio * AIR.sound_speed)
     scene = small_scene((ball,))
     chosen = make_propagator(scene, "box", None, tolerance=0.5).spacing
-    assert chosen == pytest.approx(region_of(scene).coarsest_spacing / 1.6 / min(1 / ratio, 1.6))
+    assert chosen == pytest.approx(region_of(scene).coarsest_spacing / 1.25 / min(1 / ratio, 1.6))
+
+
+def test_the_second_grid_is_no_finer_than_the_usual_error_asks():
+    """Both choices take two grids; steps to the second are 1.25 and 1.6, up to 8 % for the place of faces."""
+    scene = small_scene((at.Box(CENTER, (8e-3, 9e-3, 10e-3), rigid=True),))
+    loose, tight = (make_propagator(scene, "box", None, tolerance) for tolerance in (0.3, 0.05))
+    assert loose.spacing > 1.15 * tight.spacing
+    assert loose.usual_error() < 0.3 / 2
 
 
 def test_a_choice_ends_where_voxels_are_too_coarse(caplog):

@@ -199,6 +199,9 @@ class Kernel(Protocol):
     def at_once(self, shape: tuple[int, int, int]) -> int:
         """Return the number of calls on a grid of `shape` that threads may make concurrently."""
 
+    def threads(self, shape: tuple[int, int, int]) -> int:
+        """Return the number of threads of a call on a grid of `shape`, if it is made alone."""
+
     def together(self, shape: tuple[int, int, int], receivers: int) -> int:
         """Return the number of runs on a grid of `shape`, with q receivers each, that a call should step."""
 

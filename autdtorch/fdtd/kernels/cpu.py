@@ -3,7 +3,7 @@
 The shape of the grid alone determines its chunks of planes (`_cuts`), so that results do not depend on the
 number of threads. A step sweeps each chunk once (`cpu_sweep.py`). Then the outermost planes of a chunk
 receive the terms of its neighbours, and single cells are corrected. A small grid is one chunk, stepped by one
-thread: several runs can be stepped concurrently.
+thread. Several runs are stepped concurrently, each by one thread.
 
 Workers do these tasks, which are numbered phase by phase. A worker claims the next task, waits until all
 tasks of earlier phases are finished, and does it. A suspended worker delays the others by one task, and
@@ -47,6 +47,9 @@ _FLAT_PLANES = 12  # Fewest planes of two chunks of large planes
 # Shares of the processors' time that workers got: below the first a single worker continues, above the second
 # several again
 _CROWDED, _FREE = 0.75, 0.9
+# Most runs of a large grid at once, each of up to a gigabyte. What a run does beside its steps, up to half of
+# its time, takes one thread.
+_FEW = 4
 _UNROLLED = 32  # Cells that a compiled loop computes at once: the lanes of four vectors
 _TICKS = 10  # Fewest ticks of the thread clock for a meaningful time
 
@@ -168,9 +171,12 @@ class CpuKernel:
         self._crowded = False
 
     def at_once(self, shape: tuple[int, int, int]) -> int:
-        """Return as many as threads allow with one for each chunk, of grids of more than two chunks 1."""
-        chunks = len(_cuts(shape)) - 1
-        return max(1, thread_count() // chunks) if chunks <= 2 else 1
+        """Return as many as threads allow with one for each chunk, or a few, each by one thread."""
+        return max(thread_count() // (len(_cuts(shape)) - 1), min(thread_count(), _FEW))
+
+    def threads(self, shape: tuple[int, int, int]) -> int:
+        """Return a thread for each chunk, as far as there are any."""
+        return min(thread_count(), len(_cuts(shape)) - 1)
 
     def together(self, shape: tuple[int, int, int], receivers: int) -> int:
         """Return 1: the fields of several runs would share the caches."""

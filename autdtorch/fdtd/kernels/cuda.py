@@ -201,6 +201,10 @@ class CudaKernel:
         """Return 1: the device holds the last runs."""
         return 1
 
+    def threads(self, shape: tuple[int, int, int]) -> int:
+        """Return 1, which waits for the device."""
+        return 1
+
     def together(self, shape: tuple[int, int, int], receivers: int) -> int:
         """Return as many as fit half of the free memory, at most enough to occupy the device."""
         cells = math.prod(shape)

@@ -39,6 +39,10 @@ class ReferenceKernel:
         """Return 1: this kernel is not meant to be fast."""
         return 1
 
+    def threads(self, shape: tuple[int, int, int]) -> int:
+        """Return 1."""
+        return 1
+
     def together(self, shape: tuple[int, int, int], receivers: int) -> int:
         """Return 1, as it holds all states."""
         return 1
