@@ -14,8 +14,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 
-from autdtorch.fdtd.region import Region
+from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.shapes import Shape
 from autdtorch.fdtd.turning import ALIGNED, slender_faces
 from autdtorch.utils.array_types import Array, Index
@@ -38,6 +39,7 @@ _NARROWER = 0.2  # Distance of the faces that represent a slender cylinder from 
 _BEST = 0.48  # Best distance of a face behind the last centre [cells]
 _STEEPER = 1.7  # Weight of larger distances: edges at 0.74 cells miss 1.5 to 2.5 times as much as at 0.24
 _CLOSED = 1.0  # Square error of the faces of a slit without a centre in it
+_SAMPLES = 16  # Places along each side of a face at which bodies beside it are looked up
 _ROOM = 0.08  # Most by which a spacing is changed for the faces, relative to it
 _TRIED, _MOST_TRIED = 8, 256  # Spacings tried for each cell by which the longest body changes; most in all
 
@@ -104,17 +106,74 @@ def _faces(region: Region, surfaces: list[tuple[Array, Array]], axis: int, origi
     """
     low, high = (corner[axis] for corner in region.domain)
     parts = [np.zeros((3, 0))]
-    for body, (corner, normal) in zip(region.bodies, surfaces, strict=True):
+    for number, (corner, normal) in enumerate(surfaces):
         double = np.linalg.norm(normal, axis=1)
         aligned = np.abs(normal[:, axis]) > ALIGNED * double
-        place, outward = corner[aligned, axis], np.sign(normal[aligned, axis])
-        heavier = body.fluid is None or body.fluid.inertia >= region.fluid.inertia
-        inside = (place > low) & (place < high)
-        first = -outward if heavier else outward
-        parts.append(np.stack((place - origin, first, double[aligned] / 2))[:, inside])
+        faces = _joined(corner[aligned, axis], np.sign(normal[aligned, axis]), double[aligned] / 2)
+        for place, outward, area in faces[:, (faces[0] > low) & (faces[0] < high)].T.tolist():
+            heavier, lighter = _weights(region, number, axis, place, outward)
+            both = [[place - origin] * 2, [-outward, outward], [heavier * area, lighter * area]]
+            parts.append(np.array(both))
     place, first, area = np.concatenate(parts, axis=1)
-    faces, number = np.unique(np.stack((place.round(9), first)), axis=1, return_inverse=True)
+    return _joined(place[area > 0], first[area > 0], area[area > 0])
+
+
+def _joined(place: Array, side: Array, area: Array) -> Array:
+    """Return distinct places and sides of faces, and the sums of their areas (3, F)."""
+    faces, number = np.unique(np.stack((place.round(9), side)), axis=1, return_inverse=True)
     return np.vstack((faces, np.bincount(number.ravel(), area, faces.shape[1])))
+
+
+def _weights(region: Region, number: int, axis: int, place: float, outward: float) -> tuple[float, float]:
+    """Return the weights of a body's face where the body is heavier than what is in front, and lighter.
+
+    The `place` [m] is along an axis. In front of air the weight is 1, of another body the contrast of both,
+    so that the seam of two bodies of one material has none, and inside a later body 0.
+    """
+    body = region.bodies[number]
+    lower, upper = np.array(body.shape.lower), np.array(body.shape.upper)
+    lower[axis] = upper[axis] = place
+    others = [
+        (index, other)
+        for index, other in enumerate(region.bodies)
+        if index != number
+        and (lower < np.array(other.shape.upper) + LENGTH_TOLERANCE).all()
+        and (upper > np.array(other.shape.lower) - LENGTH_TOLERANCE).all()
+    ]
+    if not others:
+        return (1.0, 0.0) if _inertia(body.fluid) >= region.fluid.inertia else (0.0, 1.0)
+    along = [(np.arange(_SAMPLES) + 0.5) / _SAMPLES] * 3
+    along[axis] = np.zeros(1)
+    share = np.stack(np.meshgrid(*along, indexing="ij"), axis=-1).reshape(-1, 3)
+    places = torch.from_numpy(lower + share * (upper - lower))
+    step = torch.from_numpy(outward * LENGTH_TOLERANCE * np.eye(3)[axis])
+    of_body = body.shape.signed_distance(places - step) < 0
+    shown, front = of_body.clone(), torch.full(of_body.shape, -1)
+    for index, other in others:
+        front[other.shape.signed_distance(places + step) < 0] = index
+        if index > number:
+            shown &= other.shape.signed_distance(places - step) >= 0
+    weights = [0.0, 0.0]
+    for index in set(front[shown].tolist()):
+        fluid = region.fluid if index < 0 else region.bodies[index].fluid
+        contrast = 1.0 if index < 0 else _contrast(body.fluid, fluid)
+        covered = float((shown & (front == index)).sum() / of_body.sum())
+        weights[_inertia(body.fluid) < _inertia(fluid)] += contrast * covered
+    return weights[0], weights[1]
+
+
+def _inertia(fluid: Fluid | None) -> float:
+    """Return the inertia of a material [kg/m^3], infinite where no sound enters."""
+    return math.inf if fluid is None else fluid.inertia
+
+
+def _contrast(one: Fluid | None, other: Fluid | None) -> float:
+    """Return the difference of two materials, from 0 to 1: of their densities or bulk moduli."""
+    if one is None or other is None:
+        return float(one != other)
+    ratio = one.inertia / other.inertia
+    ratios = ratio, ratio * (one.phase_speed / other.phase_speed) ** 2
+    return max(abs(each - 1) / (each + 1) for each in ratios)
 
 
 def _axis_offset(faces: Array, transducers: Array, length: float, spacing: float) -> float:
