@@ -78,6 +78,19 @@ def test_an_edge_in_two_parts_is_the_whole_one(turn, cut, x, y):
     assert (parted.beside == whole.beside).all()
 
 
+def test_a_body_flush_with_a_face_covers_a_part_of_its_edge():
+    plate = Box((0, 0, 0), (12e-3, 8e-3, 3e-3), rigid=True)
+    leg = Box((1e-3, -2e-3, -4e-3), (3e-3, 4e-3, 5e-3), rigid=True)  # its back is in the plane of the plate's
+    edges = [
+        edge
+        for edge in edges_of(plate, [leg])
+        if np.allclose(edge.begin[1:], (-4e-3, -1.5e-3)) and np.allclose(edge.end[1:], (-4e-3, -1.5e-3))
+    ]
+    ends = sorted(sorted((edge.begin[0], edge.end[0])) for edge in edges)
+    # places of 32 along the edge tell which parts are covered
+    np.testing.assert_allclose(ends, [[-6e-3, -0.5e-3], [2.5e-3, 6e-3]], atol=12e-3 / 32)
+
+
 def test_an_element_beyond_the_end_of_an_edge_is_unchanged():
     edge, *_ = edges_of(Box((0, 0, 0), (9e-3, 8e-3, 7e-3), rigid=True))
     along = (edge.end - edge.begin) / np.linalg.norm(edge.end - edge.begin)

@@ -10,15 +10,18 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from autdtorch.fdtd.shapes import Shape, Solids
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.spatial import connected_parts, doubled_normals, sides_of
 
 _SHARP = np.radians(20)  # Smallest angle between the normals of two faces that meet in an edge
+_SLIT = 1e-3  # Angle of two faces [rad] up to which they are those of a slit without width
 _FEWEST_SIDES = 16  # Fewest sides of a polygon that represents a circle
 _ROUND = 1e-6  # Largest relative deviation of its corners from the circle
 _OUTSIDE = 1e-6  # Distance from a face of the point that shows whether another body covers it [m]
+_PARTS = 32  # Parts of a side, each of which another body may cover
 _STEP = 1e-3  # Distance of the points that tell the directions of two faces beside their edge [cells]
 _NEAR = 2.0  # Distance from an edge of a bore up to which it is looked for [cells]
 _ON = (
@@ -144,10 +147,7 @@ def edges_of(shape: Shape, others: Sequence[Shape] = ()) -> list[Segment | Circl
     ends, normals = _sharp_sides(vertices, triangles)
     if not len(ends):
         return []
-    covered = np.zeros(len(ends), bool)
-    beside = ends.mean(axis=1)[:, None] + _OUTSIDE * (normals - 2 * normals[:, ::-1])
-    for other in others:
-        covered |= (other.signed_distance(torch.from_numpy(beside)) < 0).any(dim=1).numpy()
+    covered = _covered(ends, normals, others)
     corners = ends.reshape(-1, 3)
     _, once, number = np.unique(corners.round(9), axis=0, return_index=True, return_inverse=True)
     places = corners[once]
@@ -156,16 +156,39 @@ def edges_of(shape: Shape, others: Sequence[Shape] = ()) -> list[Segment | Circl
     edges: list[Segment | Circle] = []
     for polygon in range(part.max(initial=-1) + 1):
         chosen = part[first] == polygon
-        free = chosen & ~covered
+        free = chosen & ~covered.all(axis=1)
         circle = _circle(places[part == polygon], ends[chosen], normals[chosen])
         if circle and free.any():  # whole: sides of a polygon would depend on its corners
             edges.append(circle)
         elif not circle:
-            edges += [
-                Segment(begin, end, both)
-                for (begin, end), both in zip(ends[free], normals[free], strict=True)
-            ]
+            for side in np.flatnonzero(free):
+                begin, whole = ends[side, 0], ends[side, 1] - ends[side, 0]
+                edges += [
+                    Segment(begin + low * whole, begin + high * whole, normals[side])
+                    for low, high in _runs(~covered[side])
+                ]
     return edges
+
+
+def _covered(ends: Array, normals: Array, others: Sequence[Shape]) -> NDArray[np.bool_]:
+    """Return which parts of sides, with ends (n, 2, 3) [m] between faces with normals (n, 2, 3), are covered.
+
+    A mask (n, `_PARTS`): another shape has a place in front of one of both faces, next to the side.
+    """
+    covered = np.zeros((len(ends), _PARTS), bool)
+    share = ((np.arange(_PARTS) + 0.5) / _PARTS)[:, None]
+    for other in others:
+        away = np.maximum(ends.min(axis=1) - other.upper, other.lower - ends.max(axis=1))
+        near = np.flatnonzero((away < 2 * _OUTSIDE).all(axis=1))
+        places = (1 - share) * ends[near, :1] + share * ends[near, 1:]
+        beside = places[:, :, None] + _OUTSIDE * (normals - 2 * normals[:, ::-1])[near, None]
+        covered[near] |= (other.signed_distance(torch.from_numpy(beside)) < 0).any(dim=2).numpy()
+    return covered
+
+
+def _runs(mask: NDArray[np.bool_]) -> Array:
+    """Return where runs of a mask (n,) begin and end (r, 2), as shares of its length."""
+    return np.flatnonzero(np.diff(mask, prepend=False, append=False)).reshape(-1, 2) / len(mask)
 
 
 def rims_of(
@@ -230,6 +253,6 @@ def _sharp_sides(vertices: Array, triangles: Index) -> tuple[Array, Array]:
     angle = np.arccos(np.clip(np.einsum("ij,ij->i", normal[one], normal[other]), -1, 1))
     towards = corners[other].mean(axis=1) - corners[one].mean(axis=1)
     convex = np.einsum("ij,ij->i", normal[one], towards) < 0
-    chosen = convex & (angle > _SHARP) & (double[one] > 0) & (double[other] > 0)
+    chosen = convex & (angle > _SHARP) & (angle < np.pi - _SLIT) & (double[one] > 0) & (double[other] > 0)
     both = np.stack((normal[one[chosen]], normal[other[chosen]]), axis=1)
     return ends[order[pairs[chosen]]], both
