@@ -6,9 +6,10 @@ planes along each axis are of one kind, and each kind is assembled once.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -169,6 +170,54 @@ def aligned_elements(
     kinds: Index, blocks: Blocks, materials: Materials, stencil: Stencil
 ) -> InterfaceElements:
     """Return elements of each of the kinds (k, 3)."""
+    coupling, mass = _coupling_and_mass(kinds, blocks, materials, stencil)
+    for pair, some, part in _seams(kinds, blocks, materials):
+        alike = materials.alike(*pair)
+        coupling[some] *= 1 - alike
+        mass[some] *= 1 - alike
+        for number, weight in zip(pair, alike * part.T[:, :, None], strict=True):
+            single = replace(
+                blocks, material=np.where(np.isin(blocks.material, pair), number, blocks.material)
+            )
+            added = _coupling_and_mass(kinds[some], single, materials, stencil)
+            coupling[some] += weight * added[0]
+            mass[some] += weight * added[1]
+    first = np.stack([each.begin[kind] for each, kind in zip(blocks.planes, kinds.T, strict=True)], axis=-1)
+    vertex = blocks.at_vertices(first[:, None] + VERTICES)
+    nothing = np.zeros(len(kinds), bool), np.zeros((len(kinds), 0))
+    return InterfaceElements(coupling, mass, vertex, *nothing)
+
+
+def _seams(
+    kinds: Index, blocks: Blocks, materials: Materials
+) -> Iterator[tuple[tuple[int, int], Index, Array]]:
+    """Yield pairs of fluids, the kinds at their seam that a third material touches, and their parts (n, 2).
+
+    If they are alike, such elements tend to the mean of elements of each of the two.
+    """
+    fluids = np.flatnonzero(~materials.rigid & np.isin(np.arange(len(materials.rigid)), blocks.material))
+    if len(fluids) < 2 or not len(kinds):
+        return
+    share = np.stack([_volumes(kind, blocks, len(materials.rigid)) for kind in kinds.tolist()])
+    for pair in itertools.combinations(fluids.tolist(), 2):
+        some = np.flatnonzero((share[:, pair] > 0).all(axis=1) & ((share > 0).sum(axis=1) > 2))
+        if len(some):
+            part = share[some][:, pair]
+            yield pair, some, part / part.sum(axis=1, keepdims=True)
+
+
+def _volumes(kind: Sequence[int], blocks: Blocks, count: int) -> Array:
+    """Return the volume (count,) of each material in elements of a kind (3,)."""
+    each = list(zip(blocks.planes, kind, strict=True))
+    part = blocks.material[np.ix_(*(range(planes.first[k], planes.last[k] + 1) for planes, k in each))]
+    x, y, z = (np.diff(np.concatenate(([0.0], planes.cuts(k), [1.0]))) for planes, k in each)
+    return np.asarray(np.bincount(part.ravel(), np.einsum("i,j,k->ijk", x, y, z).ravel(), count), np.float64)
+
+
+def _coupling_and_mass(
+    kinds: Index, blocks: Blocks, materials: Materials, stencil: Stencil
+) -> tuple[Array, Array]:
+    """Return coupling (k, 28) and mass (k, 8) of elements of each of the kinds (k, 3)."""
     varied = np.stack([each[tuple(kinds.T)] for each in blocks.varied], axis=1)
     coupling, mass = np.zeros((len(kinds), 28)), np.zeros((len(kinds), 8))
     for axis in range(3):
@@ -180,10 +229,7 @@ def aligned_elements(
             coupling[mask], mass[mask] = make(axis, kinds[mask], blocks, materials, stencil)
     corners = varied.all(axis=1)
     coupling[corners], mass[corners] = _cornered(kinds[corners], blocks, materials, stencil)
-    first = np.stack([each.begin[kind] for each, kind in zip(blocks.planes, kinds.T, strict=True)], axis=-1)
-    vertex = blocks.at_vertices(first[:, None] + VERTICES)
-    nothing = np.zeros(len(kinds), bool), np.zeros((len(kinds), 0))
-    return InterfaceElements(coupling, mass, vertex, *nothing)
+    return coupling, mass
 
 
 def _layered(

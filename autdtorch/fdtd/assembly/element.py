@@ -32,6 +32,8 @@ SUBCENTERS = (np.array(list(np.ndindex((SUBCELLS,) * 3))) + 0.5) / SUBCELLS  # C
 # Indices of the vertices in `LATTICE`
 CORNERS = np.ravel_multi_index((VERTICES * SUBCELLS).T, (SUBCELLS + 1,) * 3)
 
+_ALIKE = 0.1  # Difference of two densities over their sum at which they are half alike
+
 
 class MaterialLosses(NamedTuple):
     """Losses of materials relative to air, which is number 0; see `losses.py`."""
@@ -58,6 +60,11 @@ class Materials:
         """Mask of the materials whose surface has an impedance (m,)."""
         nothing = np.zeros(len(self.rigid), bool)
         return nothing if self.losses is None else np.asarray(self.losses.admittance != 0)
+
+    def alike(self, one: int, other: int) -> float:
+        """Return how much two fluids are alike: 1 for equal densities, 0 for very different ones."""
+        first, second = self.density[[one, other]]
+        return float(1 / (1 + ((first - second) / (first + second) / _ALIKE) ** 2))
 
     @property
     def speed(self) -> Array:

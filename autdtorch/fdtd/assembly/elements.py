@@ -31,7 +31,7 @@ from autdtorch.fdtd.assembly.element import (
 )
 from autdtorch.fdtd.assembly.interface import Bodies, interface_elements, left_by_fluids
 from autdtorch.fdtd.assembly.losses import with_losses
-from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, quadratic, roughness
+from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, quadratic, roughness, unfolded
 from autdtorch.fdtd.assembly.thin_walls import Side, sides_of
 from autdtorch.fdtd.assembly.unions import (
     Union,
@@ -160,7 +160,8 @@ def _distances(bodies: list[Union], first: Index, grid: Grid) -> Array:
         lower, upper = bounds(body.shapes)
         near = ((center > lower - 2 * grid.spacing) & (center < upper + 2 * grid.spacing)).all(axis=1)
         if near.any():
-            far[near] = lattice_distances(partial(body.distance, grid=grid), first[near])
+            level = lattice_distances(partial(body.distance, grid=grid), first[near])
+            far[near] = level if body.rigid else unfolded(level)
     return distance
 
 
@@ -181,6 +182,10 @@ def _finite(
     near, left = np.asarray((np.abs(distance) < FAR).any(axis=2)), left_by_fluids(distance, hard)
     finite, thin, crossed = near.copy(), np.zeros(len(first), bool), np.zeros(len(first), bool)
     walls = np.zeros(len(first), bool)
+    fluids = np.array([body.finite and not body.rigid for body in bodies])
+    rough = near_edge.copy()
+    if fluids.any() and rough.any():
+        rough[rough] = roughness(unfolded(left[fluids][:, rough].min(axis=0))) > _ROUGH
     for body, mask, level, here in zip(bodies, finite, left, near, strict=True):
         if body.rigid and body.finite:
             walls[mask] |= ~_thick(bodies, level[mask], first[mask], whole, grid)
@@ -188,8 +193,7 @@ def _finite(
             crossed |= (level < 0).any(axis=1) & (level > 0).any(axis=1)
             thin |= here
         else:
-            mask &= near_edge & body.finite
-            mask[mask] = roughness(level[mask]) > _ROUGH
+            mask &= rough
         mask &= body.finite
     finite &= (hard[:, None] | ~thin) & ~crossed
     return finite, np.asarray(walls & finite.any(axis=0))

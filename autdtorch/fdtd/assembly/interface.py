@@ -20,6 +20,7 @@ is added in proportion to the volume.
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -45,7 +46,7 @@ from autdtorch.fdtd.assembly.element import (
     without_vertices,
 )
 from autdtorch.fdtd.assembly.layers import crossed_by_layers, flat_elements, layered_axis, mean_thickness
-from autdtorch.fdtd.assembly.smooth_faces import Surface, fields, smooth_stiffness, surfaces
+from autdtorch.fdtd.assembly.smooth_faces import Surface, fields, smooth_stiffness, surfaces, unfolded
 from autdtorch.fdtd.assembly.thin_walls import Side
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
@@ -98,9 +99,7 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
         if len(flat := np.flatnonzero(~finite & (layered == axis))):
             coupling[flat], mass[flat] = flat_elements(axis, distance[:, flat], material, materials, stencil)
     if len(other := np.flatnonzero(~finite & (layered < 0))):
-        coupling[other], mass[other] = _oblique_elements(
-            vertex[other], bodies.chosen(other), materials, stencil
-        )
+        coupling[other], mass[other] = _oblique_elements(bodies.chosen(other), materials, stencil)
     return InterfaceElements(coupling, mass, vertex, finite, np.zeros((len(vertex), 0)))
 
 
@@ -122,14 +121,41 @@ class _Cut(NamedTuple):
     mass: Array  # (n, 8)
 
 
-def _oblique_elements(
-    vertex: Index, bodies: Bodies, materials: Materials, stencil: Stencil
-) -> tuple[Array, Array]:
+def _oblique_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -> tuple[Array, Array]:
     """Return coupling (n, 28) and mass (n, 8) of elements that vary along several axes, not finite ones.
 
-    The materials at their vertices are `vertex` (n, 8).
+    In front of the seam of two fluids that are alike, they tend to the mean of elements of each of the two.
     """
+    coupling, mass = _elements_in_series(bodies, materials, stencil)
+    fluids = np.unique(bodies.material[~materials.rigid[bodies.material]]).tolist()
+    for pair in itertools.combinations(fluids, 2):
+        of_pair = np.isin(bodies.material, pair)
+        both = np.stack([bodies.distance[bodies.material == number].min(axis=0) for number in pair])
+        crossed = (np.abs(both) < FAR).any(axis=2).all(axis=0)
+        if not len(some := np.flatnonzero(crossed & (both.min(axis=0) > 0).any(axis=1))):
+            continue
+        distance, joint = bodies.distance[:, some], unfolded(both[:, some].min(axis=0))
+        volumes = shares(volume_coverage, distance, bodies.material, len(materials.density)).mean(axis=1)
+        part = volumes[:, pair] / np.maximum(volumes[:, pair].sum(axis=1, keepdims=True), 1e-12)
+        distance[of_pair] = FAR
+        distance[of_pair.argmax()] = joint
+        alike = materials.alike(*pair)
+        coupling[some] *= 1 - alike
+        mass[some] *= 1 - alike
+        for number, weight in zip(pair, alike * part.T[:, :, None], strict=True):
+            single = bodies.chosen(some)._replace(
+                distance=distance, material=np.where(of_pair, number, bodies.material)
+            )
+            added = _elements_in_series(single, materials, stencil)
+            coupling[some] += weight * added[0]
+            mass[some] += weight * added[1]
+    return coupling, mass
+
+
+def _elements_in_series(bodies: Bodies, materials: Materials, stencil: Stencil) -> tuple[Array, Array]:
+    """Return coupling (n, 28) and mass (n, 8): in series, or local fields at a smooth surface of two."""
     count, distance, material = len(materials.density), bodies.distance, bodies.material
+    vertex = _vertex_materials(distance, material)
     grow = mean_thickness(materials, stencil)[material, None, None]
     volumes = shares(volume_coverage, distance - grow, material, count)
     lines = shares(line_coverage, distance, material, count)

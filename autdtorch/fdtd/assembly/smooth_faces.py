@@ -23,6 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from autdtorch.fdtd.assembly.element import (
     CORNERS,
@@ -51,6 +52,12 @@ _LEAST_ENERGY = 0.01  # Smallest energy of a sum of fields, relative to theirs, 
 _MIDDLE = len(LATTICE) // 2  # The centre of an element in the lattice
 # Weight of a vertex for the flow on the other side of a surface: power of the ratio of densities
 _BESIDE = 0.33
+# Weights of slopes and second derivatives, for those that few places do not show
+_FLAT, _BENT = 1e-9, 1e-6
+# Largest deviations of a smooth face from a quadratic function [cells], and of its slope from one
+_UNFOLDED, _STEEP = 0.01, 0.1
+# Of lattices of n elements, a place alone and with those beside it
+_ALONE, _AROUND = np.ones((1, 1, 1, 1), bool), np.ones((1, 3, 3, 3), bool)
 _SQUARES = 2  # Squares along each side of a face, each of four triangles on which distances are linear
 _SINGULAR = 1e-10  # Relative size of eigenvalues that are rounding
 
@@ -108,6 +115,37 @@ def mean_gradient(level: Array) -> Array:
 def roughness(level: Array) -> Array:
     """Return the largest deviation (n,) of signed distances (n, 125) from a quadratic function."""
     return np.asarray(np.abs(level - level @ _FIT.T @ _MONOMIALS.T).max(axis=1))
+
+
+def unfolded(level: Array) -> Array:
+    """Return signed distances (n, 125) of unions, continued from outside into them where a face is smooth.
+
+    Inside, the distance of the nearest of several shapes is not that from their union: it has a ridge at the
+    seam of two that touch. Outside, and inside beside the face, it is exact.
+    """
+    level = level.copy()
+    for around in (_ALONE, _AROUND):  # a few places outside do not show the slope
+        outside = level > 0
+        some = np.flatnonzero(outside.any(axis=1) & ~outside.all(axis=1) & (roughness(level) > _UNFOLDED))
+        here, inside = level[some], ~outside[some]
+        seen = binary_dilation(outside[some].reshape(-1, *(SUBCELLS + 1,) * 3), around)
+        fit, smooth = _continued(here, seen.reshape(here.shape))
+        smooth &= (fit < _UNFOLDED).all(axis=1, where=inside)
+        level[some] = np.where(inside & smooth[:, None], np.minimum(fit, here), here)
+    return level
+
+
+def _continued(level: Array, seen: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
+    """Return quadratic functions (n, 125) that fit signed distances (n, 125) where these are `seen`.
+
+    Also returns a mask (n,) of those that do, and have a slope of one.
+    """
+    monomials = seen[:, :, None] * _MONOMIALS
+    least = np.diag([_FLAT] * 4 + [_BENT] * 6)
+    factors = np.linalg.solve(monomials.mT @ _MONOMIALS + least, monomials.mT @ level[:, :, None])[:, :, 0]
+    fit = factors @ _MONOMIALS.T
+    good = (np.abs(fit - level) < _UNFOLDED).all(axis=1, where=seen)
+    return fit, good & (np.abs(np.linalg.norm(factors[:, 1:4], axis=1) - 1) < _STEEP)
 
 
 def surfaces(level: Array, density: Array) -> tuple[NDArray[np.bool_], Surface]:

@@ -1,0 +1,67 @@
+"""Bodies that touch or overlap: of one material, their field is that of their union."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_scenes import AIR, relative_error
+
+from autdtorch.propagators import make_propagator
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.geometry import rotation_matrix
+from autdtorch.scene.obstacles import Box
+from autdtorch.scene.scene import Scene
+
+SPACING = 1.4e-3
+RIGID, DENSE = {"rigid": True}, {"density": 77 * AIR.density, "sound_speed": 900.0}
+LIGHT = {"density": 3 * AIR.density, "sound_speed": 500.0}
+
+
+def field(*boxes):
+    """The field of boxes, on a grid that is not turned along them."""
+    array = TransducerArray(np.array([[-3e-3, 1e-3, -10e-3], [6e-3, -4e-3, -9e-3]]), (0.0, 0.0, 1.0))
+    points = [[1e-3, 2e-3, 10e-3], [6e-3, -3e-3, 9e-3], [-7e-3, 5e-3, 8e-3]]
+    scene = Scene(array, AIR, 40e3, points, boxes, domain=((-11e-3,) * 3, (11e-3,) * 3))
+    return make_propagator(scene, "full", SPACING).transfer_matrix()
+
+
+def parts(box, axis, share, overlap=0.0):
+    """The two parts of a box that is cut across one of its axes; the first one overlaps the second."""
+    along = rotation_matrix(box.rotation).numpy()[:, axis] * box.size[axis]
+    for begin, end in ((0.0, share + overlap), (share, 1.0)):
+        size = np.array(box.size)
+        size[axis] *= end - begin
+        yield replace(box, center=tuple(box.center + ((begin + end) / 2 - 0.5) * along), size=tuple(size))
+
+
+@settings(max_examples=8)
+@given(
+    size=st.tuples(*[st.floats(4e-3, 8e-3)] * 3),
+    rotation=st.sampled_from([(0.0, 0.0, 0.0), (0.5, 0.4, 0.3), (math.pi / 4, 0.0, 0.0)]),
+    axis=st.integers(0, 2),
+    share=st.floats(0.05, 0.95),
+    overlap=st.sampled_from([0.0, 0.04]),
+    material=st.sampled_from([RIGID, DENSE, LIGHT]),
+)
+def test_parts_of_a_box_have_the_field_of_the_whole(size, rotation, axis, share, overlap, material):
+    box = Box((0.3e-3, -0.2e-3, 0.1e-3), size, rotation, **material)
+    whole, cut = field(box), field(*parts(box, axis, share, overlap))
+    # boxes at an angle err by 2 to 4 %, and their parts differed by 0.3 %; without continued distances by up
+    # to 3 %, and along the grid, where seams moved it, as much
+    assert relative_error(cut, whole) < (1e-4 if rotation == (0.0, 0.0, 0.0) else 0.01)
+
+
+@settings(max_examples=6)
+@given(
+    rotation=st.sampled_from([(0.0, 0.0, 0.0), (0.5, 0.4, 0.3)]),
+    axis=st.integers(0, 2),
+    share=st.floats(0.1, 0.9),
+    material=st.sampled_from([DENSE, LIGHT]),
+)
+def test_a_field_is_continuous_in_the_density_of_parts(rotation, axis, share, material):
+    box = Box((0.3e-3, -0.2e-3, 0.1e-3), (7e-3, 6e-3, 8e-3), rotation, **material)
+    first, second = parts(box, axis, share)
+    denser = replace(second, density=(1 + 1e-6) * second.density)
+    assert relative_error(field(first, denser), field(box)) < 0.01  # 0.3 %, without means of elements 3 %
