@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -38,12 +38,13 @@ class Exact(NamedTuple):
 class Drawn(NamedTuple):
     """The bodies of a scene, the sphere that is the same, if any, and how far behind them the points are [m].
 
-    Without a distance, sources and points are all around.
+    Without a distance, sources and points are all around, in front of `reflectors`.
     """
 
     bodies: list[at.Obstacle]
     exact: Exact | None = None
     behind: float | None = None
+    reflectors: Sequence[at.Reflector] = ()
 
 
 Family = Callable[[np.random.Generator], Drawn]
@@ -206,11 +207,27 @@ def shadow(rng: np.random.Generator) -> Drawn:
     return Drawn([at.Box((0.0, 0.0, 0.0), size, tilt, rigid=True)], behind=50e-3)
 
 
+def room(rng: np.random.Generator) -> Drawn:
+    """One or two bodies, some of which absorb, in front of one or two planes, some of which do."""
+    bodies = (apart, absorber, block, touching)[rng.integers(4)](rng).bodies
+    surface = np.concatenate([body.surface()[0].numpy() for body in bodies])
+    planes = []
+    for normal in rotation_matrix(_angles(rng)).numpy()[: rng.integers(1, 3)]:
+        reflection, behind = 1.0, rng.uniform(1e-3, 8e-3) - float((surface @ normal).min())
+        if rng.uniform() < 0.4:  # is refused next to bodies
+            reflection, behind = (
+                rng.uniform(-1, 1),
+                14e-3 + float(np.abs(normal) @ np.abs(surface).max(axis=0)),
+            )
+        planes.append(at.Reflector(-behind * normal, normal, reflection))
+    return Drawn(bodies, reflectors=planes)
+
+
 FAMILIES: Mapping[str, Family] = {
     each.__name__: each
     for each in (
         *(plate, slit, corner, block, apart, needle, cylinder),
-        *(sphere, slow, absorber, lined, touching, torus, shell, voxels, shadow),
+        *(sphere, slow, absorber, lined, touching, torus, shell, voxels, shadow, room),
     )
 }
 
@@ -218,7 +235,7 @@ FAMILIES: Mapping[str, Family] = {
 def scene_of(family: str, seed: int) -> tuple[at.Scene, torch.Tensor | None]:
     """Return a scene of three sources and three points around drawn bodies, and its exact matrix if known."""
     rng = np.random.default_rng([seed, *family.encode()])
-    bodies, exact, behind = FAMILIES[family](rng)
+    bodies, exact, behind, reflectors = FAMILIES[family](rng)
     places: list[Array] = []
     if behind is not None:
         across = rng.uniform(-behind / 3, behind / 3, (6, 2))
@@ -226,8 +243,10 @@ def scene_of(family: str, seed: int) -> tuple[at.Scene, torch.Tensor | None]:
     while len(places) < 6:
         direction = rng.normal(size=3)
         place = direction / np.linalg.norm(direction) * rng.uniform(18e-3, 34e-3)
-        if all(float(body.signed_distance(torch.from_numpy(place)[None])) > _CLEAR for body in bodies):
+        gaps = [float(body.signed_distance(torch.from_numpy(place)[None])) for body in bodies]
+        gaps += [float((place - plane.point) @ plane.normal) for plane in reflectors]
+        if min(gaps) > _CLEAR:
             places.append(place)
     array = at.TransducerArray(np.array(places[:3]), (1, 0, 0))
-    scene = at.Scene(array, AIR, FREQUENCY, np.array(places[3:]), bodies)
+    scene = at.Scene(array, AIR, FREQUENCY, np.array(places[3:]), bodies, reflectors=reflectors)
     return scene, None if exact is None else cases.sphere_matrix(scene, *exact)
