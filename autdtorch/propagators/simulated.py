@@ -135,7 +135,7 @@ class SimulatedPropagator(ScenePropagator):
         matrix, residual = results[0].matrix, results[0].residual
         settling = torch.where(matrix.any(dim=1), residual * matrix.norm() / sizes(matrix, free), 0.0)
         reading = reading_errors(matrix, free, places, self.plan.region, self.spacing)
-        return (self._errors(results, free) + reading + settling).to(device_of(points))
+        return torch.hypot(self._errors(results, free) + reading, settling).to(device_of(points))
 
     @one_library_thread()
     def known_errors(self) -> tuple[float, float, float]:
@@ -231,7 +231,8 @@ class SimulatedPropagator(ScenePropagator):
         flat = [replace(each, matrix=each.matrix.reshape(1, -1)) for each in results]
         reading = reading_errors(matrix, free, points, self.plan.region, self.spacing) * sizes(matrix, free)
         whole = sizes(flat[0].matrix, free.reshape(1, -1))
-        return residual + float(self._errors(flat, free.reshape(1, -1)) + reading.norm() / whole)
+        known = float(self._errors(flat, free.reshape(1, -1)) + reading.norm() / whole)
+        return math.hypot(residual, known)
 
     def _errors(self, results: Sequence[PressureMap], free: torch.Tensor) -> torch.Tensor:
         """Return the errors (P,) of the rows of the first matrix by grid, shape and bodies taken as rigid.

@@ -213,12 +213,9 @@ def room(rng: np.random.Generator) -> Drawn:
     surface = np.concatenate([body.surface()[0].numpy() for body in bodies])
     planes = []
     for normal in rotation_matrix(_angles(rng)).numpy()[: rng.integers(1, 3)]:
-        reflection, behind = 1.0, rng.uniform(1e-3, 8e-3) - float((surface @ normal).min())
-        if rng.uniform() < 0.4:  # is refused next to bodies
-            reflection, behind = (
-                rng.uniform(-1, 1),
-                14e-3 + float(np.abs(normal) @ np.abs(surface).max(axis=0)),
-            )
+        absorbs = rng.uniform() < 0.4  # which is refused next to bodies
+        reflection = rng.uniform(-1, 1) if absorbs else 1.0
+        behind = 45e-3 if absorbs else rng.uniform(1e-3, 8e-3) - float((surface @ normal).min())
         planes.append(at.Reflector(-behind * normal, normal, reflection))
     return Drawn(bodies, reflectors=planes)
 
