@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve
 from scipy.sparse import csr_array
 
 from autdtorch.fdtd.stencil import places_of
@@ -28,6 +28,7 @@ _REGULARISATION = 1e-5  # Keeps weights small where the fit does not determine t
 _ONE_SIDED_REGULARISATION = 1e-2
 # Distance [cells] along each axis of the cells that are then fitted: larger systems take long
 ONE_SIDED_REACH = 3
+_TOGETHER = 64  # Points whose systems are solved together: a few MB
 AT_CENTRE = 1e-6  # Distance from a cell's centre that is rounding [cells]
 _ABSCISSA, _QUADRATURE = np.polynomial.legendre.leggauss(24)  # of wavenumbers up to the drive's
 
@@ -76,20 +77,28 @@ def exclude_cells(
     corners, far = (places_of(points.index[rows, column], shape) for column in (0, -1))
     counts = far[0] - corners[0] + 1
     numbers = np.arange(points.index.shape[1]).reshape(counts)
-    for row, corner in zip(rows, corners, strict=True):
-        off = [np.abs(corner[axis] + np.arange(counts[axis]) - cells[row, axis]) for axis in range(3)]
-        # as many on both sides of a point at a centre
-        near = [np.flatnonzero(along < min(ONE_SIDED_REACH, len(along) / 2) - AT_CENTRE) for along in off]
-        columns = numbers[np.ix_(*near)].ravel()
-        x, y, z = (along[places] for along, places in zip(off, near, strict=True))
-        out = excluded[row, columns]
-        x_beside, y_beside, z_beside = (along < 1 - AT_CENTRE for along in (x, y, z))
-        beside = x_beside[:, None, None] & y_beside[:, None] & z_beside
-        if (beside.ravel() & ~out).any():
-            x, y, z = (np.sinc(kappa / np.pi * along) for along in (x, y, z))
-            target = np.where(out, 0.0, (x[:, None, None] * y[:, None] * z).ravel())
-            weight[row, columns] = _fit_to_others(target, out, _inverse_of_block(kappa, *map(len, near)))
+    off = [np.abs(corners[:, [axis]] + np.arange(counts[axis]) - cells[rows][:, [axis]]) for axis in range(3)]
+    # as many on both sides of a point at a centre
+    near = [along < min(ONE_SIDED_REACH, along.shape[1] / 2) - AT_CENTRE for along in off]
+    blocks, block_of = np.unique(np.concatenate(near, axis=1), axis=0, return_inverse=True)
+    for number, block in enumerate(blocks):
+        some = np.flatnonzero(block_of.ravel() == number)
+        sides = np.split(block, np.cumsum(counts)[:-1])
+        columns = numbers[np.ix_(*sides)].ravel()
+        out = excluded[np.ix_(rows[some], columns)]
+        distances = [along[some][:, side] for along, side in zip(off, sides, strict=True)]
+        beside = _products([along < 1 - AT_CENTRE for along in distances])
+        target = np.where(out, 0.0, _products([np.sinc(kappa / np.pi * along) for along in distances]))
+        fitted = (beside & ~out).any(axis=1)
+        inverse = _inverse_of_block(kappa, *(int(side.sum()) for side in sides))
+        weight[np.ix_(rows[some[fitted]], columns)] = _fit_to_others(target[fitted], out[fitted], inverse)
     return Interpolation(points.index, weight)
+
+
+def _products(factors: list[NDArray[Any]]) -> NDArray[Any]:
+    """Return the products (P, i * j * k) of factors (P, i), (P, j) and (P, k) along three axes."""
+    x, y, z = factors
+    return (x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]).reshape(len(x), -1)
 
 
 @lru_cache(maxsize=16)
@@ -103,15 +112,25 @@ def _inverse_of_block(kappa: float, *counts: int) -> Array:
 
 
 def _fit_to_others(target: Array, out: NDArray[np.bool_], inverse: Array) -> Array:
-    """Return the weights (n,) of the cells that are not `out` (n,), by the `inverse` of the system of all.
+    """Return weights (P, n) of the cells that are not `out` (P, n), by the `inverse` of the system of all.
 
-    The few cells that are out then need a small system: weights of all, less those that make theirs 0.
+    The few cells that are out then need a small system: weights of all, less those that make theirs 0. Points
+    with about as many of them are solved together; rows of the identity matrix fill up the smaller systems.
     """
-    weight = inverse @ target
-    if out.any():
-        part = inverse[:, out]
-        weight -= part @ solve(part[out], weight[out], assume_a="pos", check_finite=False)
-        weight[out] = 0
+    weight = target @ inverse
+    count = out.sum(axis=1)
+    ascending = np.argsort(count, kind="stable")
+    for first in range(0, len(target), _TOGETHER):
+        some = ascending[first : first + _TOGETHER]
+        places = np.argsort(~out[some], axis=1, kind="stable")[:, : count[some[-1]]]
+        is_out = np.take_along_axis(out[some], places, axis=1)
+        both = is_out[:, :, None] & is_out[:, None, :]
+        system = np.where(both, inverse[places[:, :, None], places[:, None, :]], np.eye(places.shape[1]))
+        excess = np.where(is_out, np.take_along_axis(weight[some], places, axis=1), 0.0)
+        taken = np.zeros((len(some), out.shape[1]))
+        np.put_along_axis(taken, places, np.linalg.solve(system, excess[..., None])[..., 0], axis=1)
+        weight[some] -= taken @ inverse
+    weight[out] = 0
     return weight
 
 
