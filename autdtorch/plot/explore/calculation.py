@@ -48,6 +48,7 @@ _NODES = 0.25  # wavelengths between places that radiate; smaller cells are merg
 _COARSER = 2  # ratio of the spacings of a coarse and a fine calculation
 _COARSE_TOLERANCE = 1e-2  # half the time of the default, where the grid errs by 2 to 5 %
 _REST = 1.0  # s without a request before a volume is calculated, which a request does not end
+_SCENES = 3  # whose simulations are kept: an undone move is shown at once
 _COARSEST = 0.24  # wavelengths; the error of larger cells rises steeply, and each would log a warning
 
 
@@ -134,7 +135,7 @@ class Calculator:
         self._wanted: Request | None = None
         self._changed = threading.Condition()
         self._closed = False
-        self._propagators: dict[bool, Propagator] = {}
+        self._propagators: dict[bool, list[Propagator]] = {}  # of the last scenes, fine or not
         self._thread = threading.Thread(target=self._work, name="autdtorch explore", daemon=True)
         self._thread.start()
 
@@ -223,15 +224,17 @@ class Calculator:
             yield replace(result, volume=volume, seconds=time.monotonic() - begun)
 
     def _propagator(self, situation: Situation, fine: bool) -> Propagator:
-        """Return the propagator of a situation: the last one, if it has the same scene."""
-        propagator = self._propagators.get(fine)
-        if propagator is None or propagator.scene is not situation.scene:
-            scene, spacing = situation.scene, self._cells(situation, fine)
+        """Return the propagator of a situation: that of one of the last scenes, if it is the same."""
+        scene, last = situation.scene, self._propagators.get(fine, [])
+        propagator = next((each for each in last if each.scene is scene), None)
+        if propagator is None:
+            spacing = self._cells(situation, fine)
             if fine:
                 propagator = make_propagator(scene, spacing=spacing)
             else:
                 propagator = make_propagator(scene, spacing=spacing, tolerance=_COARSE_TOLERANCE)
-            self._propagators[fine] = propagator
+        others = [each for each in last if each is not propagator]
+        self._propagators[fine] = [propagator, *others][:_SCENES]
         return propagator
 
     def _cells(self, situation: Situation, fine: bool) -> float:
