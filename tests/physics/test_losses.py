@@ -279,7 +279,7 @@ def surface_of_box(x, y, z):
 # The sum of the damping is off by the square of the phase between two cells at 4 kHz, 5e-4 and less; along
 # the grid areas are exact. Elsewhere distances are linear in quarters of a cell: edges are rounded by a few
 # hundredths of a cell, 0.4 % of these bodies, and 1.6 % of the plate, whose rim is two edges.
-@pytest.mark.parametrize("spacing", [0.93e-3, 1.1e-3, 1.21e-3, 1.31e-3, 1.6e-3])
+@pytest.mark.parametrize("spacing", [0.93e-3, 1.21e-3, 1.6e-3])
 @pytest.mark.parametrize(
     ("shape", "area", "tolerance"),
     [

@@ -93,20 +93,20 @@ def plate_above_a_table():
 
 
 def test_a_large_plate_and_its_image_share_a_grid_where_that_is_cheaper(monkeypatch):
-    """Both ways have the same limit: they differ by less than they claim, 2 % at 1.5 mm."""
+    """Both ways have the same limit: they differ by less than they claim, 4 % at 2 mm."""
     matrices = []
     for cheaper, mirrors in ((grouping._CHEAPER, (0,)), (0.0, ())):
         monkeypatch.setattr(grouping, "_CHEAPER", cheaper)
-        propagator = make_propagator(plate_above_a_table(), "box", 1.5e-3, 5e-4, cache=False)
+        propagator = make_propagator(plate_above_a_table(), "box", 2e-3, 5e-4, cache=False)
         assert propagator.plan.grouping.grids[0].mirrors == mirrors
         matrices.append(propagator.transfer_matrix())
-    assert relative_error(*matrices) < 0.02
+    assert relative_error(*matrices) < 0.04
 
 
 def test_the_memory_of_waves_that_mirrors_send_back_is_planned(monkeypatch):
     """The rank of their parts is estimated; within a factor of two of the numbers that are kept."""
     monkeypatch.setattr(grouping, "_CHEAPER", 0.0)
-    propagator = make_propagator(plate_above_a_table(), "box", 1.5e-3, cache=False)
+    propagator = make_propagator(plate_above_a_table(), "box", 2e-3, cache=False)
     box, grid = propagator.simulation.boxes[0], propagator.plan.grouping.grids[0]
     pairs = coupling.coupling_of(box, box, box.echoes).pairs
     assert 0.5 < sum(pair.left.size + pair.right.size for pair in pairs) / grid.echo_numbers < 2

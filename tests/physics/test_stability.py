@@ -191,7 +191,7 @@ def test_energy_is_symmetric_positive_and_bounded(number):
 
 @pytest.mark.parametrize("number", SCENES)
 def test_random_scenes_are_stable(number, caplog, monkeypatch):
-    trial = replace(draw_trial(0, number, long_share=1.0), steps=1_000)
+    trial = replace(draw_trial(0, number, long_share=1.0), steps=500)
     caplog.set_level(logging.ERROR)
     monkeypatch.setattr("checks.stability.SAMPLES", 4)  # of windows of 31 steps; calls for two steps are slow
     outcome = run_trial(trial)
