@@ -22,7 +22,7 @@ help:
 	@echo "make paper   run the paper's experiment and write outputs/paper/report.html"
 	@echo "             (make paper trials=5 changes a setting, as does ARGS='trials=5 seed=1')"
 	@echo "make test    test the package (ARGS='-m unit' selects)"
-	@echo "make test-rest   test documentation, its commands and notebooks, pages in a browser, launchers and forks"
+	@echo "make test-rest   test scripts, documentation and its notebooks, pages in a browser, launchers and forks"
 	@echo "make lint    ruff, mypy, import-linter"
 	@echo "make docs    build the documentation in outputs/docs, executing its notebooks"
 	@echo "make clean   remove .venv and the tools' caches; outputs/ stays"
