@@ -98,7 +98,8 @@ def exclude_cells(
 def _products(factors: list[NDArray[Any]]) -> NDArray[Any]:
     """Return the products (P, i * j * k) of factors (P, i), (P, j) and (P, k) along three axes."""
     x, y, z = factors
-    return (x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]).reshape(len(x), -1)
+    products: NDArray[Any] = x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]
+    return products.reshape(len(x), -1)
 
 
 @lru_cache(maxsize=16)
