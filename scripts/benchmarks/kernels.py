@@ -59,7 +59,8 @@ def triad(a, b, c):  # type: ignore[no-untyped-def]
 
 def fastest(step: Callable[[int], object], work: float, seconds: float) -> float:
     """Return the work per second of `step(times)`, with about `seconds` for each repeat."""
-    step(2)
+    for times in (2, 3):
+        step(times)
     _, three = timed(lambda: step(3))
     times = max(3, int(3 * seconds / three))
     return work * times / shortest(lambda: step(times), REPEATS)[1]

@@ -27,9 +27,12 @@ from autdtorch.fdtd.kernels.contract import (
 from autdtorch.utils.validation import invalid, no_cuda
 
 _GRAPH_STEPS = 16  # Most steps of a captured graph; even, so that both fields return to their places
-# Most cells of a grid whose steps are captured. Beyond, a step takes longer than its three launches from
-# Python, some 100 us: 17 million cells take 112 us on an H100.
-_MOST_CAPTURED = 2**25
+# Steps of a run that are launched one by one, at some 100 us each from Python; to capture its graphs takes
+# as long as 500 to 1000 of these
+_LAUNCHED = 512
+# Most cells of runs whose steps are captured. Beyond, a step takes longer than its three launches from
+# Python: with absorbing layers, 7 million cells take 90 us on an H200.
+_MOST_CAPTURED = 2**23
 _MOST_CACHED = 2**22  # Most cells whose two fields, in single precision, stay in 50 MB of cache
 _FEWEST_PROGRAMS = 1400  # That occupy a GPU of 132 multiprocessors
 _MOST_RUNS, _MOST_CELLS = 256, 2**27  # Of a launch; more take their time one after the other
@@ -46,13 +49,14 @@ class BlockSizes(NamedTuple):
     z: int = 64  # cells of its rows, which are contiguous
     rows: int = 2  # rows that a thread steps
     lanes: int = 16  # columns through an absorbing layer
+    registers: int | None = None  # most of a thread of the sweep, in single precision
 
 
 def blocks_of(shape: Cells, runs: int) -> BlockSizes:
     """Return the blocks for runs on a grid, by timings on an H200."""
     nx, ny, nz = shape
     if runs * nx * ny * nz > _MOST_CACHED:
-        return BlockSizes(y=4, rows=4)
+        return BlockSizes(y=4, rows=4, registers=128)
     blocks = BlockSizes()
     tiles = runs * triton.cdiv(ny, blocks.y) * triton.cdiv(nz, blocks.z)
     # a march takes its time however few programs there are
@@ -81,6 +85,8 @@ class DeviceMedium:
         self.coefficients, self.shape, self.runs, self.blocks, self.device = c, shape, runs, blocks, device
         self.cells, self.depths = c.layer_cells, triton.next_power_of_2(max(1, c.layer_cells))
         self.dtype = c.layer_decay.dtype
+        # whether programs of the next launch may begin, and wait, while those of a launch end
+        self.early = device.type == "cuda" and torch.cuda.get_device_capability() >= (9, 0)
         weights = c.center, c.face, c.edge, c.corner, c.keep
         self.weights = torch.tensor(weights, dtype=self.dtype, device=device)
         padding = 0, 2 * self.depths + 1 - len(c.layer_decay)
@@ -116,18 +122,19 @@ class DeviceRun:
         self._received = receiver_table(receivers, medium.runs, steps, dtype, device)
         self.signal = torch.zeros((steps, sources.force.shape[2]), dtype=dtype, device=device)
         self._first = torch.zeros((), dtype=torch.int64, device=device)
-        self._turn = 0
+        self._turn = self._launched = 0
         self._graphs: dict[tuple[int, int], torch.cuda.CUDAGraph] = {}  # by turn and number of steps
 
     def advance(self, signal: Tensor) -> Tensor:
         """Step once per row of the signal; return the record of the receivers."""
         self.signal.copy_(signal)
         self._first.zero_()
-        steps, small = len(signal), self._fields[0].numel() <= _MOST_CAPTURED
-        if self.medium.device.type == "cuda" and steps > _GRAPH_STEPS and small:
+        steps, on_gpu = len(signal), self.medium.device.type == "cuda"
+        if on_gpu and self._launched >= _LAUNCHED and self._fields[0].numel() <= _MOST_CAPTURED:
             self._replay(steps)
         else:
             self._launch(self._turn, steps)
+            self._launched += steps
         self._turn = (self._turn + steps) % 2
         m, received, block = self.medium, self._received, self.medium.depths * self.medium.blocks.lanes
         grid = (m.runs * triton.cdiv(received.size, block),)
@@ -141,9 +148,6 @@ class DeviceRun:
     def _replay(self, steps: int) -> None:
         """Step by replays of captured graphs."""
         done = 0
-        if not self._graphs:  # nothing may be compiled while a graph is captured
-            done = 2
-            self._launch(self._turn, done)
         while done < steps:
             part = self._turn, min(_GRAPH_STEPS, steps - done)
             if part not in self._graphs:
@@ -166,7 +170,8 @@ class DeviceRun:
         now, old = self._fields[turn % 2], self._memories[turn % 2]
         other, new = self._fields[(turn + 1) % 2], self._memories[(turn + 1) % 2]
         lanes = m.depths * blocks.lanes
-        sizes = {"CELLS": m.cells, "DEPTHS": m.depths, "LANES": blocks.lanes}
+        early = {"EARLY": m.early, "launch_pdl": m.early}
+        sizes = {"CELLS": m.cells, "DEPTHS": m.depths, "LANES": blocks.lanes, **early}
         cuda_steps.prepare[(m.runs * (m.ends.crossed + triton.cdiv(received.size, lanes)),)](
             now, other, m.shape, m.weights, m.profile, old, new, m.terms, m.heterogeneous, m.crossed,
             received, m.ends, m.runs, self._first, offset, LOSSY=len(m.heterogeneous.loss) > 0,
@@ -175,12 +180,13 @@ class DeviceRun:
         cuda_sweep.sweep[(m.runs * (m.tiles + triton.cdiv(m.columns.size, blocks.lanes)),)](
             now, other, m.shape, m.weights, m.profile, old, new, m.terms, m.columns, m.crossed, m.tiles,
             m.runs, COLUMNS_WIDTH=len(m.columns.weight), X=blocks.x, Y=blocks.y, Z=blocks.z,
-            ROWS=blocks.rows, num_warps=max(1, blocks.y * blocks.z // (32 * blocks.rows)), **sizes,
+            ROWS=blocks.rows, num_warps=max(1, blocks.y * blocks.z // (32 * blocks.rows)),
+            maxnreg=blocks.registers if m.dtype == torch.float32 else None, **sizes,
         )  # fmt: skip
         cuda_steps.settle[(m.runs * triton.cdiv(driven.size, lanes),)](
             other, m.shape, m.heterogeneous, m.settled, driven, m.terms, m.columns, self.signal, m.runs,
             self._first, offset, SHARES=len(m.settled.share), SIGNALS=driven.force.shape[1], CELLS=m.cells,
-            LANES=lanes,
+            LANES=lanes, **early,
         )  # fmt: skip
 
 

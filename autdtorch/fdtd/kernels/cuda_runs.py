@@ -7,11 +7,20 @@ from __future__ import annotations
 
 import triton
 import triton.language as tl
+from triton.language.extra.cuda import gdc_launch_dependents, gdc_wait
 
 from autdtorch.fdtd.kernels.contract import Layer
 
 # Places in the tensor of weights; scalars would be passed in single precision
 CENTER, FACE, EDGE, CORNER, KEEP = (tl.constexpr(place) for place in range(5))
+
+
+@triton.jit
+def begin(EARLY: tl.constexpr):
+    """Wait for the launch before, and let the next one come: where `EARLY`, its programs wait here too."""
+    if EARLY:
+        gdc_wait()
+        gdc_launch_dependents()
 
 
 @triton.jit

@@ -19,7 +19,7 @@ import triton
 import triton.language as tl
 
 from autdtorch.fdtd.kernels.cuda_layers import stretch_columns, stretch_y, stretch_yz, stretch_z
-from autdtorch.fdtd.kernels.cuda_runs import KEEP, field_of, layer_of, task_of
+from autdtorch.fdtd.kernels.cuda_runs import KEEP, begin, field_of, layer_of, task_of
 
 
 @triton.jit
@@ -70,8 +70,9 @@ def _read(p, receivers, row, program, run, LANES: tl.constexpr):
 @triton.jit(do_not_specialize=["runs", "offset"])
 def prepare(p, before, shape, weights, profile, old, new, terms, heterogeneous, crossed, receivers, ends,
             runs, first, offset, LOSSY: tl.constexpr, CROSSED_WIDTH: tl.constexpr, CELLS: tl.constexpr,
-            DEPTHS: tl.constexpr, LANES: tl.constexpr):  # fmt: skip
+            DEPTHS: tl.constexpr, LANES: tl.constexpr, EARLY: tl.constexpr):  # fmt: skip
     """The part of a step that only reads pressures; receivers are read after the step before."""
+    begin(EARLY)
     program, run = task_of(runs)
     p, ends_of_rows, rows = field_of(p, shape, run), 2 * shape.nx * shape.ny, 2 * shape.nx * shape.nz
     if program < ends.z:
@@ -108,8 +109,9 @@ def prepare(p, before, shape, weights, profile, old, new, terms, heterogeneous, 
 @triton.jit(do_not_specialize=["runs", "offset"])
 def settle(q, shape, heterogeneous, settled, driven, terms, columns, signal, runs, first, offset,
            SHARES: tl.constexpr, SIGNALS: tl.constexpr, CELLS: tl.constexpr,
-           LANES: tl.constexpr):  # fmt: skip
+           LANES: tl.constexpr, EARLY: tl.constexpr):  # fmt: skip
     """Correct the cells that the sweep leaves wrong."""
+    begin(EARLY)
     program, run = task_of(runs)
     n = program * LANES + tl.arange(0, LANES)
     mask, still = n < driven.size, n < driven.settled

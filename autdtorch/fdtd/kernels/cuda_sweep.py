@@ -9,7 +9,17 @@ import triton
 import triton.language as tl
 
 from autdtorch.fdtd.kernels.cuda_layers import advance, stretch_columns
-from autdtorch.fdtd.kernels.cuda_runs import CENTER, CORNER, EDGE, FACE, KEEP, field_of, layer_of, task_of
+from autdtorch.fdtd.kernels.cuda_runs import (
+    CENTER,
+    CORNER,
+    EDGE,
+    FACE,
+    KEEP,
+    begin,
+    field_of,
+    layer_of,
+    task_of,
+)
 
 
 @triton.jit
@@ -146,8 +156,10 @@ def _march(p, q, shape, weights, profile, old, new, terms_y, terms_z, terms_yz, 
 @triton.jit(do_not_specialize=["tiles", "runs"])
 def sweep(p, q, shape, weights, profile, old, new, terms, columns, crossed, tiles, runs,
           COLUMNS_WIDTH: tl.constexpr, CELLS: tl.constexpr, DEPTHS: tl.constexpr, LANES: tl.constexpr,
-          X: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr, ROWS: tl.constexpr):  # fmt: skip
+          X: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr, ROWS: tl.constexpr,
+          EARLY: tl.constexpr):  # fmt: skip
     """The 27-point sum with all layers, in place of the pressures before, and the columns."""
+    begin(EARLY)
     program, run = task_of(runs)
     p = field_of(p, shape, run)
     if program < tiles:
