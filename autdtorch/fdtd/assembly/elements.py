@@ -29,7 +29,7 @@ from autdtorch.fdtd.assembly.element import (
     InterfaceElements,
     Materials,
 )
-from autdtorch.fdtd.assembly.interface import Bodies, interface_elements, left_by_fluids
+from autdtorch.fdtd.assembly.interface import Bodies, interface_elements, is_near, left_by_fluids
 from autdtorch.fdtd.assembly.losses import with_losses
 from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, quadratic, roughness, unfolded
 from autdtorch.fdtd.assembly.thin_walls import Side, sides_of
@@ -44,10 +44,11 @@ from autdtorch.fdtd.assembly.unions import (
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.shapes import bounds
-from autdtorch.fdtd.stencil import Stencil, places_of
+from autdtorch.fdtd.stencil import Stencil, flat_strides, places_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.process import one_library_thread, spread
 from autdtorch.utils.progress import show_progress
+from autdtorch.utils.spatial import distinct_cells, places_among
 
 _CHUNK = 4096  # Interface elements assembled at a time
 # Depths below its surface [cells]: a body that contains points this deep is thick. Vertices inside a thinner
@@ -155,10 +156,11 @@ def _measured(
 def _distances(bodies: list[Union], first: Index, grid: Grid) -> Array:
     """Return distances (K, n, L) of bodies from the lattices of elements, by their first cells (n, 3)."""
     center = np.array(grid.origin) + grid.spacing * grid.clip(np.asarray(first + 0.5))
-    distance = np.full((len(bodies), len(first), len(LATTICE)), FAR)
+    distance = np.empty((len(bodies), len(first), len(LATTICE)))
     for far, body in zip(distance, bodies, strict=True):
         lower, upper = bounds(body.shapes)
         near = ((center > lower - 2 * grid.spacing) & (center < upper + 2 * grid.spacing)).all(axis=1)
+        far[~near] = FAR
         if near.any():
             level = lattice_distances(partial(body.distance, grid=grid), first[near])
             far[near] = level if body.rigid else unfolded(level)
@@ -179,7 +181,7 @@ def _finite(
     body crosses an element, no body is: sound would pass. `whole` as in `_thick`.
     """
     hard = np.array([body.rigid for body in bodies])
-    near, left = np.asarray((np.abs(distance) < FAR).any(axis=2)), left_by_fluids(distance, hard)
+    near, left = is_near(distance), left_by_fluids(distance, hard)
     finite, thin, crossed = near.copy(), np.zeros(len(first), bool), np.zeros(len(first), bool)
     walls = np.zeros(len(first), bool)
     fluids = np.array([body.finite and not body.rigid for body in bodies])
@@ -244,21 +246,25 @@ def _distinct(
     sides: Sequence[Side],
 ) -> tuple[Index, Index]:
     """Return the first of each kind of equal elements, and the kind of each element (n,)."""
-    count = len(less)
-    parts = (
-        np.moveaxis(distance, 1, 0) / _SAME,
-        finite.T,
-        less / _SAME,
-        beside,
-        *(side.out for side in sides),
-    )
-    keys = np.concatenate([part.reshape(count, -1).round().astype(np.int64) for part in parts], axis=1)
-    # sums modulo 2^64: keys that differ have the same sum once in 10^19
-    sums = keys.view(np.uint64) @ np.random.default_rng(0).integers(
-        2**64, size=keys.shape[1], dtype=np.uint64
-    )
+    sums = _sums(distance[:, :, CORNERS].swapaxes(0, 1) / _SAME)
+    _, kind, count = np.unique(sums, return_inverse=True, return_counts=True)
+    some = np.flatnonzero(count[kind] > 1)  # few at curved surfaces
+    outs = (side.out[some] for side in sides)
+    between = distance[:, some].swapaxes(0, 1) / _SAME
+    sums[some] = _sums(between, finite.T[some], less[some] / _SAME, beside[some], *outs)
     _, first, place = np.unique(sums, return_index=True, return_inverse=True)
     return first, place
+
+
+def _sums(*parts: Array | NDArray[np.bool_]) -> NDArray[np.uint64]:
+    """Return numbers (n,) of n elements with values (n, ...), which differ where rounded values do.
+
+    They are sums modulo 2^64: rows that differ have the same sum once in 10^19.
+    """
+    rows = [part.reshape(len(part), -1).round().astype(np.int64) for part in parts if part.size]
+    keys = np.concatenate(rows, axis=1) if rows else np.zeros((len(parts[0]), 0), np.int64)
+    factors = np.random.default_rng(0).integers(2**64, size=keys.shape[1], dtype=np.uint64)
+    return np.asarray(keys.view(np.uint64) @ factors)
 
 
 def _interface(
@@ -350,11 +356,11 @@ def near_surface(measure: Measure, lower: Index, upper: Index) -> tuple[Index, A
 
 def lattice_distances(measure: Measure, first: Index) -> Array:
     """Return the distances (n, 125) at the lattice of elements, by their first cells (n, 3)."""
-    halves = _at_lattice(measure, first, _HALVES)
+    halves = _at_lattice(measure, first, 2)
     bent = (np.abs(halves @ _BEYOND_QUADRATIC) > _SMOOTH).any(axis=1)
     rough = np.flatnonzero(bent | (np.linalg.norm(halves @ _GRADIENT, axis=1) < _STEEP))
     distance = np.asarray(halves @ _INTERPOLATION)
-    distance[rough] = _at_lattice(measure, first[rough], LATTICE)
+    distance[rough] = _at_lattice(measure, first[rough], SUBCELLS)
     return distance
 
 
@@ -370,22 +376,23 @@ def _parts(places: Index, size: int, step: int, upper: Index) -> Index:
     return np.asarray(parts[(parts < upper).all(axis=1)])
 
 
-def _at_lattice(measure: Measure, first: Index, lattice: Array) -> Array:
-    """Return the distances (n, L) at the lattice (L, 3) of elements; neighbours share places.
+def _at_lattice(measure: Measure, first: Index, steps: int) -> Array:
+    """Return the distances (n, (steps + 1)^3) at the points of elements `1 / steps` apart.
 
-    Places in a cell are measured one after the other, as meshes find near places more quickly.
+    Elements share points. Points in a cell are measured one after the other, as meshes find near places more
+    quickly.
     """
-    if len(first) == 0:
-        return np.zeros((0, len(lattice)))
-    quarters = SUBCELLS * (first - first.min(axis=0))[:, None] + (SUBCELLS * lattice).astype(np.int64)
-    axes = np.moveaxis(quarters, -1, 0)
-    cells, within = axes // SUBCELLS, axes % SUBCELLS
-    shape = *(cells.max(axis=(1, 2)) + 1).tolist(), *3 * [SUBCELLS]
-    index = np.ravel_multi_index((*cells, *within), shape)
-    used, place = np.unique(index, return_inverse=True)
-    cell, quarter = np.split(places_of(used, shape), 2, axis=1)
-    places = cell + quarter / SUBCELLS + first.min(axis=0)
-    return np.asarray(measure(places)[place.reshape(index.shape)])
+    points = np.array(list(np.ndindex((steps + 1,) * 3)))
+    low, among = first.min(axis=0, initial=np.iinfo(np.int64).max), (steps,) * 3
+    cells, within = np.divmod(points, steps)
+    shape = tuple((np.ptp(first, axis=0) + 2).tolist()) if len(first) else (0,) * 3
+    cell = ((first - low) @ flat_strides(shape))[:, None] + cells @ flat_strides(shape)
+    used = distinct_cells(cell, math.prod(shape))
+    point = steps**3 * places_among(used, math.prod(shape))[cell] + within @ flat_strides(among)
+    distinct = distinct_cells(point, steps**3 * len(used))
+    cell, within = np.divmod(distinct, steps**3)
+    places = low + places_of(used[cell], shape) + places_of(within, among) / steps
+    return measure(places)[places_among(distinct, steps**3 * len(used))[point]]
 
 
 def _quadratic_factors(x: Array) -> Array:

@@ -45,7 +45,7 @@ from autdtorch.fdtd.assembly.element import (
     volume_coverage,
     without_vertices,
 )
-from autdtorch.fdtd.assembly.layers import crossed_by_layers, flat_elements, layered_axis, mean_thickness
+from autdtorch.fdtd.assembly.layers import Survey, flat_elements, mean_thickness
 from autdtorch.fdtd.assembly.smooth_faces import Surface, fields, smooth_stiffness, surfaces, unfolded
 from autdtorch.fdtd.assembly.thin_walls import Side
 from autdtorch.fdtd.stencil import Stencil
@@ -80,15 +80,13 @@ class Bodies(NamedTuple):
 
 def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -> InterfaceElements:
     """Return the stiffness and mass of n elements that surfaces of K bodies intersect."""
-    distance, material = bodies.distance, bodies.material
+    distance, material, survey = bodies.distance.copy(), bodies.material, Survey.of(bodies.distance)
     # bodies that do not intersect an element must not enter its shares
-    crossed = crossed_by_layers(distance)
-    outside, inside = (distance > 0).all(axis=2) & ~crossed, (distance < 0).all(axis=2) & ~crossed
-    distance = np.where(outside[:, :, None], FAR, np.where(inside[:, :, None], -FAR, distance))
+    uncut = ((survey.least > 0) | (survey.most < 0)) & ~survey.crossed(distance)
+    distance[uncut] = np.copysign(FAR, survey.least[uncut])[:, None]
     bodies = bodies._replace(distance=distance)
-    vertex = _vertex_materials(distance, material)
-    layered = layered_axis(distance)
-    near = (np.abs(left_by_fluids(distance, materials.rigid[material])) < FAR).any(axis=2)
+    vertex, layered = _vertex_materials(distance, material), survey.axis(constant=uncut)
+    near = is_near(left_by_fluids(distance, materials.rigid[material]))
     # a surface with an impedance needs pressures on both sides, and so does a face beside an edge
     allowed = bodies.finite & ((layered < 0) | bodies.beside | materials.reacting[material, None])
     finite = np.asarray((near & allowed).any(axis=0))
@@ -105,11 +103,18 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
 
 def left_by_fluids(distance: Array, rigid: NDArray[np.bool_]) -> Array:
     """Return signed distances (K, n, L) of bodies; of `rigid` ones (K,), those of what later fluids leave."""
+    if (np.diff(rigid.astype(np.int8)) >= 0).all():  # no fluid after a rigid body
+        return distance
     left = distance.copy()
     for number in np.flatnonzero(rigid):
         for later in number + 1 + np.flatnonzero(~rigid[number + 1 :]):
             left[number] = np.maximum(left[number], -distance[later])
     return left
+
+
+def is_near(distance: Array) -> NDArray[np.bool_]:
+    """Return whether bodies with signed distances (K, n, L) are near elements (K, n)."""
+    return np.asarray((distance.min(axis=2) < FAR) & (distance.max(axis=2) > -FAR))
 
 
 class _Cut(NamedTuple):
@@ -156,8 +161,8 @@ def _elements_in_series(bodies: Bodies, materials: Materials, stencil: Stencil) 
     """Return coupling (n, 28) and mass (n, 8): in series, or local fields at a smooth surface of two."""
     count, distance, material = len(materials.density), bodies.distance, bodies.material
     vertex = _vertex_materials(distance, material)
-    grow = mean_thickness(materials, stencil)[material, None, None]
-    volumes = shares(volume_coverage, distance - grow, material, count)
+    grow = np.repeat(mean_thickness(materials, stencil)[material, None], len(vertex), axis=1)
+    volumes = np.moveaxis(_mixed(bodies, grow, np.eye(count)), 0, -1)
     lines = shares(line_coverage, distance, material, count)
     coupling, mass = _series_coupling(lines, materials, stencil), _lumped_mass(vertex, volumes, materials)
     at_vertices = (vertex[:, :, None] == np.arange(count)).any(axis=1)
@@ -205,19 +210,31 @@ def _finite_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -> 
     contrast = np.where(materials.rigid, 1, (materials.density - 1) / (materials.density + 1))
     hard = bodies.finite & materials.rigid[bodies.material, None]
     cutting = ~bodies.finite & (np.cumsum(hard, axis=0) > 0)
-    grown = np.where(cutting, -1, contrast[bodies.material, None] * bodies.finite)[:, :, None]
-    grown = bodies.distance - _added_thickness(stencil.kappa) * grown
-    volumes = shares(volume_coverage, grown, bodies.material, len(materials.density))
-    coupling, mass = np.zeros((len(volumes), 28)), np.zeros((len(volumes), 8))
+    grown = np.where(cutting, -1, contrast[bodies.material, None] * bodies.finite)
+    values = np.stack((1 / materials.density, materials.mass)) * ~materials.rigid / SUBCELLS**3
+    mobility, weight = _mixed(bodies, _added_thickness(stencil.kappa) * grown, values)
+    coupling, mass = np.zeros((len(weight), 28)), np.zeros((len(weight), 8))
     for side in bodies.sides:
         here = np.flatnonzero(side.share.any(axis=1))
-        part, out = volumes[here] * side.share[here, :, None], side.out[here]
-        added = _cut_coupling(part, materials, bodies.reductions[here], stencil)
+        share, out = side.share[here], side.out[here]
+        added = _cut_coupling(mobility[here] * share, bodies.reductions[here], stencil)
         parted = np.flatnonzero(out.any(axis=1))
         added[parted], _ = without_vertices(added[parted], out[parted])
         coupling[here] += added
-        mass[here] += _cut_mass(part, materials, out)
+        mass[here] += _cut_mass(weight[here] * share, out)
     return coupling, mass
+
+
+def _mixed(bodies: Bodies, grown: Array, values: Array) -> Array:
+    """Return the means (v, n, 64) of values (v, m) over the materials in sub-cells; see `mix_materials`.
+
+    Bodies are `grown` by distances (K, n).
+    """
+    from autdtorch.fdtd.assembly.element_kernels import mix_materials  # loads numba
+
+    mixed = np.empty((len(values), bodies.distance.shape[1], SUBCELLS**3))
+    mix_materials(bodies.distance, grown, bodies.material, values, mixed)
+    return mixed
 
 
 def _vertex_materials(distance: Array, material: Index) -> Index:
@@ -298,31 +315,29 @@ def _balanced_mass(surface: Surface, whole_cell: Array, mass: Array) -> Array:
     return np.asarray(mass * (1 + change * np.minimum(1, _MOST_TAKEN / np.maximum(-least, 1e-12))))
 
 
-_PRODUCTS = np.einsum("qix,qjx->qij", SLOPES, SLOPES)
+_PRODUCTS = np.einsum("qix,qjx->qij", SLOPES, SLOPES)[:, PAIRS[:, 0], PAIRS[:, 1]]
 
 
-def _cut_coupling(volumes: Array, materials: Materials, reductions: Array, stencil: Stencil) -> Array:
-    """Return the coupling (n, 28) of elements, from the share of each material in sub-cells (n, 64, m).
+def _cut_coupling(mobility: Array, reductions: Array, stencil: Stencil) -> Array:
+    """Return the coupling (n, 28) of elements, from the mobility of sub-cells (n, 64).
 
     `reductions` (n, 3, 3) is the relative reduction of the stiffness near edges.
     """
-    mobility = volumes @ np.where(materials.rigid, 0, 1 / materials.density) / SUBCELLS**3
-    tuning = tuning_of(stencil)
     near = np.trace(reductions, axis1=1, axis2=2) / 2
-    matrix = np.tensordot(mobility, _PRODUCTS, axes=1)
-    matrix += ((1 - near) * mobility.sum(axis=1))[:, None, None] * tuning
+    tuning = tuning_of(stencil)[PAIRS[:, 0], PAIRS[:, 1]]
+    coupling = -(mobility @ _PRODUCTS) - np.outer((1 - near) * mobility.sum(axis=1), tuning)
     some = np.flatnonzero(near)
     across = SLOPES @ reductions[some, None]
-    matrix[some] -= np.einsum("nq,nqix,qjx->nij", mobility[some], across, SLOPES, optimize=True)
-    return np.asarray(-matrix[:, PAIRS[:, 0], PAIRS[:, 1]])
+    reduced = np.einsum("nq,nqix,qjx->nij", mobility[some], across, SLOPES, optimize=True)
+    coupling[some] += reduced[:, PAIRS[:, 0], PAIRS[:, 1]]
+    return np.asarray(coupling)
 
 
-def _cut_mass(volumes: Array, materials: Materials, out: NDArray[np.bool_]) -> Array:
-    """Return the masses at the vertices (n, 8), from the share of each material in sub-cells (n, 64, m).
+def _cut_mass(cells: Array, out: NDArray[np.bool_]) -> Array:
+    """Return the masses at the vertices (n, 8), from those of sub-cells (n, 64).
 
     Vertices `out` (n, 8) leave theirs to the others.
     """
-    cells = volumes @ np.where(materials.rigid, 0, materials.mass) / SUBCELLS**3
     mass, parted = cells @ HATS, np.flatnonzero(out.any(axis=1))
     hats = HATS * ~out[parted, None]
     whole = hats.sum(axis=2, keepdims=True)

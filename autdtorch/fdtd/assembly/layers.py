@@ -156,36 +156,45 @@ def mean_thickness(materials: Materials, stencil: Stencil) -> Array:
 
 _VARIATION = 1e-6  # Largest variation of a distance along a face [cells]: rounding
 _STEP = 1 / SUBCELLS  # Distance of the points of a profile [cells]
-_BESIDE_FIRST = SUBCELLS * (SUBCELLS + 1) ** np.array([2, 1, 0])  # vertices of the lattice, along each axis
 
 
-def layered_axis(distance: Array) -> Index:
-    """Return the only axis (n,) along which signed distances (K, n, 125) of bodies vary, or -1."""
-    only = np.full(distance.shape[1], -1)
-    # most vary between the first vertex and those beside it
-    change = np.abs(distance[..., _BESIDE_FIRST] - distance[..., :1]).max(axis=0, initial=0)
-    for axis in range(3):
-        across = [other for other in range(3) if other != axis]
-        some = np.flatnonzero((change[:, across] < _VARIATION).all(axis=1))
-        cube = distance[:, some].reshape(len(distance), len(some), *(SUBCELLS + 1,) * 3)
-        variation = np.ptp(cube, axis=(2 + across[0], 2 + across[1])).max(axis=(0, 2), initial=0)
-        only[some[variation < _VARIATION]] = axis
-    return only
+class Survey(NamedTuple):
+    """Signed distances of K bodies in n elements at a glance."""
 
+    least: Array  # (K, n)
+    most: Array  # (K, n)
+    layered: NDArray[np.bool_]  # whether they vary along an axis alone (K, n, 3)
 
-def crossed_by_layers(distance: Array) -> NDArray[np.bool_]:
-    """Return whether bodies with signed distances (K, n, 125) have faces across one axis in elements (K, n).
+    @classmethod
+    def of(cls, distance: Array) -> Survey:
+        """Look at the distances at lattices (K, n, 125)."""
+        from autdtorch.fdtd.assembly.element_kernels import survey_lattices  # loads numba
 
-    A thin body, or a narrow gap, may lie between points that all have distances of one sign.
-    """
-    crossed = np.zeros(distance.shape[:2], bool)
-    for number, of_body in enumerate(distance):
-        axes = layered_axis(of_body[None])
+        size = distance.shape[:2]
+        survey = cls(np.empty(size), np.empty(size), np.empty((*size, 3), bool))
+        survey_lattices(distance, _VARIATION, *survey)
+        return survey
+
+    def crossed(self, distance: Array) -> NDArray[np.bool_]:
+        """Return whether the bodies with these distances have faces across one axis in elements (K, n).
+
+        A thin body, or a narrow gap, may lie between points that all have distances of one sign.
+        """
+        crossed, axes = np.zeros(self.least.shape, bool), _last(self.layered)
         for axis in range(3):
-            rows = np.flatnonzero(axes == axis)
-            lines = _lines(axis, of_body[None, rows])[:, 0]
-            crossed[number, rows] = [len(_faces(line)) > 0 for line in lines]
-    return crossed
+            here = np.nonzero(axes == axis)
+            lines = _lines(axis, distance[here][None])[:, 0]
+            crossed[here] = [len(_faces(line)) > 0 for line in lines]
+        return crossed
+
+    def axis(self, constant: NDArray[np.bool_]) -> Index:
+        """Return the only axis (n,) along which all distances vary, or -1; some (K, n) count as constant."""
+        return _last((self.layered | constant[:, :, None]).all(axis=0))
+
+
+def _last(axes: NDArray[np.bool_]) -> Index:
+    """Return the last of the axes in masks (..., 3), or -1."""
+    return np.where(axes.any(axis=-1), 2 - axes[..., ::-1].argmax(axis=-1), -1)
 
 
 def _lines(axis: int, distance: Array) -> Array:
