@@ -250,7 +250,7 @@ def _without_rigid(
     kind = len(materials.density) + elements.kind
     hard = materials.rigid[_cell_material(elements)]
     hard[vertices] = materials.rigid[every.material][kind]
-    inside, count = hard[touched], -1
+    inside = hard[touched]
     densest = _densest(elements)
     sliver = np.zeros(len(hard), bool)
     sliver[vertices[every.finite[kind]]] = True
@@ -261,19 +261,25 @@ def _without_rigid(
     number[:-1, :-1, :-1] = elements.material
     number.ravel()[vertices[:, 0]] = kind
     sums = _ElementSums(number, every, least)
-    while True:
-        rows = sums.rows(touched, hard)
+    rows, before = sums.rows(touched, hard), np.zeros_like(hard)
+    while inside.any():
         hard[touched] |= inside & (rows.total <= enough)
-        if hard.sum() == count or not inside.any():
-            return sums, hard, rows
-        count, out = hard.sum(), hard[vertices]
-        some = np.flatnonzero(out.any(axis=1))
-        both = kind[some] << 8 | np.packbits(out[some], axis=1)[:, 0]
+        if not (new := hard & ~before).any():
+            break
+        some, before = np.flatnonzero(new[vertices].any(axis=1)), hard.copy()
+        out = hard[vertices[some]]
+        both = kind[some] << 8 | np.packbits(out, axis=1)[:, 0]
         _, first, other = np.unique(both, return_index=True, return_inverse=True)
-        less = _all_condensed(every.chosen(kind[some[first]]), out[some[first]])
-        number.ravel()[vertices[some, 0]] = len(least) + other
-        needed = np.concatenate((least, _least_mass(less.coupling, largest)))
-        sums = _ElementSums(number, InterfaceElements.joined([every, less]), needed)
+        less = _all_condensed(every.chosen(kind[some[first]]), out[first])
+        number.ravel()[vertices[some, 0]] = len(sums.least) + other
+        needed = np.concatenate((sums.least, _least_mass(less.coupling, largest)))
+        sums = _ElementSums(number, InterfaceElements.joined([sums.kinds, less]), needed)
+        beside = np.zeros_like(hard)
+        beside[neighbours(touched[new[touched]], shape)] = beside[vertices[some]] = True
+        changed = np.flatnonzero(beside[touched])
+        for whole, part in zip(rows, sums.rows(touched[changed], hard), strict=True):
+            whole[changed] = part
+    return sums, hard, rows
 
 
 def _uniform_elements(materials: Materials, stencil: Stencil) -> InterfaceElements:
