@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
-from autdtorch.utils.compiled import entry
+from autdtorch.utils.compiled import INNER, entry
+
+_ROUNDING = 4e-16
 
 
 @entry()
@@ -87,3 +90,101 @@ def join_cells(cells, coupling, least, place, free, number, neighbours, region):
                 region[high] = here = low
     for each in range(len(region)):
         region[each] = region[region[each]]
+
+
+@njit(**INNER)
+def _tridiagonalize(matrix, diagonal, beside, vector, image):  # type: ignore[no-untyped-def]
+    """Write the diagonal (n,) of a symmetric matrix (n, n) after reflections, and the squares beside (n,).
+
+    `matrix` is overwritten, and so are `vector` and `image` (n,).
+    """
+    size = len(diagonal)
+    for step in range(size - 1):
+        square = 0.0
+        for row in range(step + 1, size):
+            vector[row] = matrix[row, step]
+            square += vector[row] * vector[row]
+        diagonal[step], beside[step], first = matrix[step, step], square, vector[step + 1]
+        length = np.sqrt(square) if first < 0.0 else -np.sqrt(square)
+        half = square - first * length  # half the square of the vector of the reflection
+        if half <= 0.0:
+            continue
+        vector[step + 1] = first - length
+        product = 0.0
+        for row in range(step + 1, size):
+            image[row] = 0.0
+            for column in range(step + 1, size):
+                image[row] += matrix[row, column] * vector[column]
+            image[row] /= half
+            product += image[row] * vector[row]
+        for row in range(step + 1, size):
+            image[row] -= product / (2 * half) * vector[row]
+        for row in range(step + 1, size):
+            for column in range(step + 1, size):
+                matrix[row, column] -= vector[row] * image[column] + image[row] * vector[column]
+    diagonal[size - 1], beside[size - 1] = matrix[size - 1, size - 1], 0.0
+
+
+@njit(**INNER)
+def _largest_eigenvalue(diagonal, beside):  # type: ignore[no-untyped-def]
+    """Return the largest eigenvalue of a tridiagonal matrix, by its diagonal and the squares beside (n,).
+
+    Laguerre's method for the determinant of x less the matrix converges from above.
+    """
+    size, value, before = len(diagonal), -np.inf, 0.0
+    for row in range(size):
+        here = np.sqrt(beside[row])
+        value, before = max(value, diagonal[row] + before + here), here
+    while True:
+        # the pivots of the elimination, and their first two derivatives by the value
+        pivot, slope, bend, square, first, second = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for row in range(size):
+            inverse = 1 / pivot
+            share = square * inverse * inverse
+            bend = share * (bend - 2 * slope * slope * inverse)
+            slope = 1 + share * slope
+            pivot = value - diagonal[row] - square * inverse
+            if pivot <= 0.0:  # rounding
+                return value
+            square = beside[row]
+            first += slope / pivot
+            second += (slope / pivot) ** 2 - bend / pivot
+        root = np.sqrt(max((size - 1) * (size * second - first * first), 0.0))
+        change = size / (first + root)
+        if not change > _ROUNDING * abs(value):
+            return value
+        value -= change
+
+
+@entry()
+def least_masses(coupling, ends, largest, masses):  # type: ignore[no-untyped-def]
+    """Write masses of vertices with which elements have eigenvalues up to `largest`.
+
+    They are in proportion to the stiffness of a vertex that moves alone.
+
+    Args:
+        coupling: coefficients of pairs of vertices (k, p).
+        ends: the vertices of the pairs (p, 2).
+        largest: the eigenvalue.
+        masses: (k, v), to be written.
+    """
+    count, size = masses.shape
+    matrix, scale = np.empty((size, size)), np.empty(size)
+    diagonal, beside, vector, image = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
+    for row in range(count):
+        alone = masses[row]
+        alone[:] = 0.0
+        for pair in range(len(ends)):
+            alone[ends[pair, 0]] += coupling[row, pair]
+            alone[ends[pair, 1]] += coupling[row, pair]
+        for vertex in range(size):
+            alone[vertex] = max(alone[vertex], 0.0)
+            scale[vertex] = 1 / np.sqrt(alone[vertex]) if alone[vertex] > 0.0 else 0.0
+            matrix[vertex, vertex] = 1.0 if alone[vertex] > 0.0 else 0.0
+        for pair in range(len(ends)):
+            one, other = ends[pair, 0], ends[pair, 1]
+            matrix[one, other] = matrix[other, one] = -coupling[row, pair] * scale[one] * scale[other]
+        _tridiagonalize(matrix, diagonal, beside, vector, image)
+        needed = _largest_eigenvalue(diagonal, beside) / largest
+        for vertex in range(size):
+            alone[vertex] *= needed

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.assembly.element import (
     PAIR_OF,
+    PAIRS,
     VERTICES,
     InterfaceElements,
     Materials,
-    stiffness_matrix,
     uniform_coupling,
     without_vertices,
 )
@@ -324,14 +324,13 @@ def _least_mass(coupling: Array, largest: float) -> Array:
     Eigenvalues of a sum of elements are then as small. Masses are in proportion to the stiffness of a vertex
     that moves alone, so that an element of air needs its mass.
     """
-    masses = np.zeros((len(coupling), 8))
+    from autdtorch.fdtd.assembly.cell_kernels import least_masses  # loads numba
+
+    masses, coupling = np.empty((len(coupling), 8)), np.ascontiguousarray(coupling)
 
     def limit(ends: tuple[int, int]) -> None:
-        matrix = stiffness_matrix(coupling[(part := slice(*ends))])
-        alone = np.diagonal(matrix, axis1=1, axis2=2).clip(min=0)
-        scale = np.divide(1, np.sqrt(alone), out=np.zeros_like(alone), where=alone > 0)
-        scaled = scale[:, :, None] * matrix * scale[:, None, :]
-        masses[part] = alone * np.linalg.eigvalsh(scaled)[:, -1:] / largest
+        part = slice(*ends)
+        least_masses(coupling[part], PAIRS, largest, masses[part])
 
     spread(limit, parts_of_size(len(coupling), _TOGETHER))
     return masses
