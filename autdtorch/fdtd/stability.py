@@ -52,6 +52,8 @@ def largest_eigenvalue(
     one cell. A mode above those of air is bound to these cells and fades within a cell. The weight of a cell
     itself, zero in air, counts as stiffness against silence.
     """
+    from autdtorch.fdtd.assembly.cell_kernels import symmetric_rows  # loads numba
+
     air = stencil.largest_symbol
     unlike = stencil.differs_from(weight)  # most rows of maps are those of air
     index, weight = index[unlike], weight[unlike]
@@ -62,28 +64,16 @@ def largest_eigenvalue(
     rows, place = _with_rim(index, shape)
     forth = np.broadcast_to(stencil.weights, (len(rows), 27)).copy()
     forth[place[index]] = weight
-    iterated = len(index) <= MOST_CELLS
+    iterated, offsets = len(index) <= MOST_CELLS, flat_offsets(shape)
 
-    def part(ends: tuple[int, int]) -> tuple[float, csr_array | None]:
-        """Return the bound of some rows, and these rows of the symmetric matrix if it is iterated."""
-        ahead, here = forth[slice(*ends)], np.arange(*ends, dtype=np.int32)
-        neighbour = place[rows[here, None] + flat_offsets(shape)]
-        inside = neighbour >= 0
-        back = np.where(inside, forth[neighbour, _REVERSED], stencil.weights)
-        # Coupling K adds K (p_i - p_j)^2 <= max(K, 0) (1/m_i + 1/m_j) (m_i p_i^2 + m_j p_j^2) to the energy.
-        # Summed over the neighbours of a cell, this bounds the largest eigenvalue at any contrast.
-        bound = float(np.maximum(ahead + back, 0).sum(1).max())
-        if not iterated:
-            return bound, None
-        # zeros by rounding may differ in sign
-        product = np.where(inside, ahead * back, 0).clip(min=0)
-        matrix = -np.sign(ahead) * np.sqrt(product)
-        matrix[:, 13] = ahead.sum(1)
-        column = np.where(inside, neighbour, here[:, None])
-        first = np.arange(0, 27 * len(here) + 1, 27)
-        symmetric = csr_array((matrix.ravel(), column.ravel(), first), (len(here), len(rows)))
-        symmetric.eliminate_zeros()
-        return bound, symmetric
+    def part(ends: tuple[int, int]) -> tuple[float, csr_array]:
+        """Return the bound of some rows, and these rows of the symmetric matrix, zero if not iterated."""
+        size = 27 * (ends[1] - ends[0]) if iterated else 0
+        values, columns = np.empty(size), np.empty(size, np.int32)
+        begin = np.zeros(ends[1] - ends[0] + 1, np.int32)
+        bound = symmetric_rows(*ends, rows, place, forth, stencil.weights, offsets, values, columns, begin)
+        matrix = values[: begin[-1]], columns[: begin[-1]], begin
+        return bound, csr_array(matrix, (len(begin) - 1, len(rows)))
 
     bounds, parts = zip(*spread(part, parts_of_size(len(rows), _TOGETHER)), strict=True)
     bound: float = min(known, max(bounds))
@@ -130,9 +120,6 @@ def _shortened(
     index = np.ravel_multi_index(tuple(place.T), (x, y, z))
     order = np.argsort(index)
     return index[order], weight[order], (x, y, z)
-
-
-_REVERSED = 26 - np.arange(27)  # Index in `OFFSETS` of the opposite offset
 
 
 def _with_rim(index: Index, shape: tuple[int, int, int]) -> tuple[Index, NDArray[np.int32]]:

@@ -92,6 +92,44 @@ def join_cells(cells, coupling, least, place, free, number, neighbours, region):
         region[each] = region[region[each]]
 
 
+@entry()
+def symmetric_rows(first, last, rows, place, weight, air, neighbours, values, columns, begin):  # type: ignore[no-untyped-def]
+    """Write rows of a symmetric matrix with the eigenvalues of the stencil; return a bound of these.
+
+    Coupling K adds K (p_i - p_j)^2 <= max(K, 0) (1/m_i + 1/m_j) (m_i p_i^2 + m_j p_j^2) to the energy. Summed
+    over the neighbours of a cell, this bounds the largest eigenvalue at any contrast.
+
+    Args:
+        first: number of the first row.
+        last: one past the last row.
+        rows: flat indices of the cells (n,).
+        place: of each cell of the grid among these, negative for others.
+        weight: stencil rows of the cells (n, 27).
+        air: that of all others (27,).
+        neighbours: offsets (27,).
+        values: of the matrix, those that are not zero one after the other, to be written; maybe none.
+        columns: of these, to be written.
+        begin: of each row among these (last - first + 1,), to be written.
+    """
+    bound, count = 0.0, 0
+    for row in range(first, last):
+        total, own = 0.0, 0.0
+        for number in range(27):
+            own += weight[row, number]
+        for number in range(27):
+            near, ahead = place[rows[row] + neighbours[number]], weight[row, number]
+            back = air[number] if near < 0 else weight[near, 26 - number]
+            total += max(ahead + back, 0.0)
+            # zeros by rounding may differ in sign
+            value = -np.copysign(np.sqrt(max(ahead * back, 0.0)), ahead)
+            value = own if number == 13 else value
+            if near >= 0 and value != 0.0 and count < len(values):
+                values[count], columns[count] = value, near
+                count += 1
+        bound, begin[row - first + 1] = max(bound, total), count
+    return bound
+
+
 @njit(**INNER)
 def _tridiagonalize(matrix, diagonal, beside, vector, image):  # type: ignore[no-untyped-def]
     """Write the diagonal (n,) of a symmetric matrix (n, n) after reflections, and the squares beside (n,).
