@@ -392,7 +392,7 @@ def _at_lattice(measure: Measure, first: Index, steps: int) -> Array:
     distinct = distinct_cells(point, steps**3 * len(used))
     cell, within = np.divmod(distinct, steps**3)
     places = low + places_of(used[cell], shape) + places_of(within, among) / steps
-    return measure(places)[places_among(distinct, steps**3 * len(used))[point]]
+    return np.asarray(measure(places)[places_among(distinct, steps**3 * len(used))[point]])
 
 
 def _quadratic_factors(x: Array) -> Array:

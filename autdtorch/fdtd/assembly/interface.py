@@ -136,7 +136,7 @@ def _oblique_elements(bodies: Bodies, materials: Materials, stencil: Stencil) ->
     for pair in itertools.combinations(fluids, 2):
         of_pair = np.isin(bodies.material, pair)
         both = np.stack([bodies.distance[bodies.material == number].min(axis=0) for number in pair])
-        crossed = (np.abs(both) < FAR).any(axis=2).all(axis=0)
+        crossed = is_near(both).all(axis=0)
         if not len(some := np.flatnonzero(crossed & (both.min(axis=0) > 0).any(axis=1))):
             continue
         distance, joint = bodies.distance[:, some], unfolded(both[:, some].min(axis=0))

@@ -189,7 +189,7 @@ class Survey(NamedTuple):
 
     def axis(self, constant: NDArray[np.bool_]) -> Index:
         """Return the only axis (n,) along which all distances vary, or -1; some (K, n) count as constant."""
-        return _last((self.layered | constant[:, :, None]).all(axis=0))
+        return _last(np.asarray((self.layered | constant[:, :, None]).all(axis=0)))
 
 
 def _last(axes: NDArray[np.bool_]) -> Index:
