@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from autdtorch.fdtd.assembly.element import FAR
 from autdtorch.utils.compiled import INNER, entry
 
 _LEAST_WIDTH = 1e-12
+_BEYOND = 3.01  # Distance [cells] from the first vertex of an element of a body that does not touch it
 
 
 @njit(**INNER)
@@ -62,9 +62,9 @@ def mix_materials(distance, grown, material, values, mixed):  # type: ignore[no-
     rows, planes = np.empty((2, 4, 25)), np.empty((3, 4, 4, 5))
     level, nearest, covered, solid = np.empty(125), np.empty(125), np.empty(64), np.empty(64)
     for row in range(distance.shape[1]):
-        nearest[:], solid[:], mixed[:, row] = FAR, 0.0, 0.0
+        nearest[:], solid[:], mixed[:, row] = _BEYOND, 0.0, 0.0
         for body in range(len(distance)):
-            if distance[body, row, 0] == FAR:
+            if distance[body, row, 0] > _BEYOND:
                 continue
             for point in range(125):
                 level[point] = distance[body, row, point] - grown[body, row]
