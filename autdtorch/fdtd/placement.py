@@ -148,7 +148,7 @@ def _weights(region: Region, number: int, axis: int, place: float, outward: floa
     places = torch.from_numpy(lower + share * (upper - lower))
     step = torch.from_numpy(outward * LENGTH_TOLERANCE * np.eye(3)[axis])
     of_body = body.shape.signed_distance(places - step) < 0
-    shown, front = of_body.clone(), torch.full(of_body.shape, -1)
+    shown, front = of_body.clone(), torch.full(of_body.shape, -1, dtype=torch.int64, device="cpu")
     for index, other in others:
         front[other.shape.signed_distance(places + step) < 0] = index
         if index > number:
