@@ -88,10 +88,10 @@ def exclude_cells(
         out = excluded[np.ix_(rows[some], columns)]
         distances = [along[some][:, side] for along, side in zip(off, sides, strict=True)]
         beside = _products([along < 1 - AT_CENTRE for along in distances])
-        target = np.where(out, 0.0, _products([np.sinc(kappa / np.pi * along) for along in distances]))
-        fitted = (beside & ~out).any(axis=1)
+        fitted = np.flatnonzero((beside & ~out).any(axis=1))
+        factors = [np.sinc(kappa / np.pi * along[fitted]) for along in distances]
         inverse = _inverse_of_block(kappa, *(int(side.sum()) for side in sides))
-        weight[np.ix_(rows[some[fitted]], columns)] = _fit_to_others(target[fitted], out[fitted], inverse)
+        weight[np.ix_(rows[some[fitted]], columns)] = _fit_to_others(factors, out[fitted], inverse)
     return Interpolation(points.index, weight)
 
 
@@ -112,25 +112,26 @@ def _inverse_of_block(kappa: float, *counts: int) -> Array:
     return inverse
 
 
-def _fit_to_others(target: Array, out: NDArray[np.bool_], inverse: Array) -> Array:
+def _fit_to_others(factors: list[Array], out: NDArray[np.bool_], inverse: Array) -> Array:
     """Return weights (P, n) of the cells that are not `out` (P, n), by the `inverse` of the system of all.
 
     The few cells that are out then need a small system: weights of all, less those that make theirs 0. Points
     with about as many of them are solved together; rows of the identity matrix fill up the smaller systems.
+    The right side of the system of all is the products of `factors` along the axes.
     """
-    weight = target @ inverse
-    count = out.sum(axis=1)
+    weight, count = np.zeros(out.shape), out.sum(axis=1)
     ascending = np.argsort(count, kind="stable")
-    for first in range(0, len(target), _TOGETHER):
+    for first in range(0, len(out), _TOGETHER):
         some = ascending[first : first + _TOGETHER]
+        of_all = np.where(out[some], 0.0, _products([along[some] for along in factors])) @ inverse
         places = np.argsort(~out[some], axis=1, kind="stable")[:, : count[some[-1]]]
         is_out = np.take_along_axis(out[some], places, axis=1)
         both = is_out[:, :, None] & is_out[:, None, :]
         system = np.where(both, inverse[places[:, :, None], places[:, None, :]], np.eye(places.shape[1]))
-        excess = np.where(is_out, np.take_along_axis(weight[some], places, axis=1), 0.0)
-        taken = np.zeros((len(some), out.shape[1]))
+        excess = np.where(is_out, np.take_along_axis(of_all, places, axis=1), 0.0)
+        taken = np.zeros(of_all.shape)
         np.put_along_axis(taken, places, np.linalg.solve(system, excess[..., None])[..., 0], axis=1)
-        weight[some] -= taken @ inverse
+        weight[some] = of_all - taken @ inverse
     weight[out] = 0
     return weight
 
