@@ -52,7 +52,6 @@ _BACKGROUND = 1e-20
 _CELL_BYTES = 20  # Memory of an assembled cell
 _FEWEST_IDLE = 32  # Cells of a row from which it is quicker to skip them than to step them
 _LOOKING = 512  # Points whose kernels are looked at together
-_TOGETHER = 16_384  # Receivers whose records in double precision stay in the CPU's cache
 _LAYERS = 4  # Cells along an axis, two on each side of a point, that tell whether it is in a slit
 _BLOCK = np.moveaxis(np.indices((_LAYERS,) * 3), 0, -1).reshape(-1, 3)  # those of all axes, from the first
 _ONE_NODE = torch.ones(1, **REAL)  # Weight of a point with a single node
@@ -343,10 +342,11 @@ def drive_basis(steps: int, periods: int) -> Tensor:
 def fourier_sum(basis: Tensor, recorded: Tensor) -> Tensor:
     """Return sums (..., q) of records (..., steps, q) with the weights (2, steps) of a phasor."""
     # in single precision PyTorch may take products of a few bits (torch.set_float32_matmul_precision)
-    basis = basis.to(recorded.device)
-    width = _TOGETHER if recorded.device.type == "cpu" else max(1, recorded.shape[-1])
-    parts = [basis @ part.double() for part in torch.split(recorded, width, dim=-1)]
-    cosine, sine = torch.cat(parts, dim=-1).unbind(-2)
+    if recorded.device.type == "cpu" and not recorded.requires_grad:
+        sums = torch.from_numpy(basis.to(recorded.dtype).numpy() @ recorded.numpy()).double()
+    else:
+        sums = basis.to(recorded.device) @ recorded.double()
+    cosine, sine = sums.unbind(-2)
     return torch.complex(cosine, sine)
 
 
