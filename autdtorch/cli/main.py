@@ -21,7 +21,6 @@ import sys
 import threading
 import warnings
 from collections.abc import Iterator
-from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -96,8 +95,6 @@ def main() -> None:
                 raise ValueError(f"{command}: a sweep; must be one scene at a time")
             sys.argv[1:] = arguments
             register()
-            if not any(word.startswith("-") for word in arguments):  # most options print and end
-                _load_torch_library()
             if command is None:
                 _run()
             else:
@@ -130,18 +127,6 @@ def _end_without_cleaning_up() -> None:
     # glibc gives the status to functions of `on_exit`, and calls the last one first.
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "on_exit"):
         libc.on_exit(libc._exit, None)
-
-
-def _load_torch_library() -> None:
-    """Load PyTorch's largest library in a thread, 0.15 s, while Hydra composes; its import then finds it.
-
-    Python waits for the thread before it ends: a library that loads at exit crashes, as its destructors run.
-    """
-    spec = find_spec("torch")
-    if sys.platform == "linux" and spec is not None and spec.origin is not None:
-        library = Path(spec.origin).with_name("lib") / "libtorch_cpu.so"
-        dlopen = ctypes.CDLL(None).dlopen  # without the interpreter lock, which ctypes.CDLL(library) holds
-        threading.Thread(target=dlopen, args=(bytes(library), os.RTLD_NOW)).start()
 
 
 @hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")

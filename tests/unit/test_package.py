@@ -100,7 +100,7 @@ def test_wheel_holds_configs_stub_and_type_marker(tmp_path: Path, monkeypatch: p
     templates = {f"autdtorch/study/report/templates/{name}" for name in ("study.md", "page.html")}
     assert wanted | templates | {"autdtorch/__init__.pyi", "autdtorch/py.typed"} <= names
     assert not any(name.startswith(("configs/", "tests/")) for name in names)
-    assert "autdtorch = autdtorch.cli.main:main" in entry_points
+    assert "autdtorch = autdtorch.__main__:main" in entry_points
 
 
 LENGTHS = (
