@@ -78,6 +78,19 @@ def test_an_edge_in_two_parts_is_the_whole_one(turn, cut, x, y):
     assert (parted.beside == whole.beside).all()
 
 
+@settings(max_examples=10)
+@given(turn=angles, cut=st.floats(0.02, 0.98), place=st.tuples(within, within, within))
+def test_pieces_of_an_edge_count_as_the_whole_one_where_others_meet_it(turn, cut, place):
+    edge, *others = edges_of(Box((0, 0, 0), (9e-3, 8e-3, 7e-3), turn, rigid=True))
+    middle = edge.begin + cut * (edge.end - edge.begin)
+    parts = [replace(edge, end=middle), replace(edge, begin=middle)]
+    centers = np.stack((edge.begin, edge.end, middle)) + 1e-3 * np.array(place)
+    whole, parted = (
+        changes([*edges, *others], centers, 1e-3, STENCIL).reductions for edges in ([edge], parts)
+    )
+    assert parted == pytest.approx(whole, abs=1e-9)
+
+
 def test_a_body_flush_with_a_face_covers_a_part_of_its_edge():
     plate = Box((0, 0, 0), (12e-3, 8e-3, 3e-3), rigid=True)
     leg = Box((1e-3, -2e-3, -4e-3), (3e-3, 4e-3, 5e-3), rigid=True)  # its back is in the plane of the plate's

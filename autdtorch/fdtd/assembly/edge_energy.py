@@ -36,6 +36,9 @@ _BESIDE = 5.0
 # is an eighth of what an unchanged stiffness adds. Tilted rigid boxes of 8 to 15 mm have errors of 0.5 to 0.9
 # and 0.15 to 0.23 % at 1 and 0.6 mm, with a reduction by the distance alone 0.7 to 1.4 and 0.36 to 0.54 %.
 _SHARE = 0.85
+# Weight of other edges near an edge, where they meet. With 0.5 and 4, cubes of 8 mm turned by 45 degrees have
+# errors of 3.1 and 2.7 % at 1.4 mm, and plates of 0.6 and 2 mm turned so 1.8 and 2.2 % at 1 mm.
+_MEETING = 2.5
 _MOST = 0.7  # Largest relative reduction
 _LEAST = -0.5  # and least: an increase
 _HALF_WAY = 1e-3  # Difference of the depths below two faces up to which a vertex is between both [cells]
@@ -53,7 +56,7 @@ class Changes(NamedTuple):
 def changes(edges: Sequence[Edge], centers: Array, spacing: float, stencil: Stencil) -> Changes:
     """Return the changes of elements at `centers` (n, 3) [m] by edges.
 
-    Those of several edges add up, but are averaged where the edges meet. The stiffness along an edge is
+    Those of several edges add up, but less where the edges meet. The stiffness along an edge is
     unchanged, as the field is not singular in this direction.
     """
     reach = _BESIDE * spacing
@@ -65,9 +68,9 @@ def changes(edges: Sequence[Edge], centers: Array, spacing: float, stencil: Sten
             continue
         near = np.flatnonzero(((centers > lower - reach) & (centers < upper + reach)).all(axis=1))
         way, normals, inside = edge.nearest(centers[near])
-        way, part = way / spacing, np.clip(0.5 + inside / spacing, 0, 1)
+        way, part = way / spacing, np.clip(0.5 + inside / spacing, 0, 1).sum(axis=1) - 1
         square = (way**2).sum(axis=1)
-        beside[near[(square < _BESIDE**2) & (inside > -reach)]] = True
+        beside[near[(square < _BESIDE**2) & (inside > -reach).all(axis=1)]] = True
         some = np.flatnonzero((square < _REACH**2) & (part > 0))
         parts.append((near[some], way[some], normals[some], part[some], np.full(len(some), edge.share)))
     if not parts:
@@ -77,22 +80,27 @@ def changes(edges: Sequence[Edge], centers: Array, spacing: float, stencil: Sten
     along = np.cross(normals[:, 0], normals[:, 1])
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     across = np.eye(3) - along[:, :, None] * along[:, None, :]
-    np.add.at(total, element, (reduction * _parted(element, way, part))[:, None, None] * across)
+    weight = _weights(element, way, normals, part)
+    np.add.at(total, element, (reduction * weight)[:, None, None] * across)
     whole = np.trace(total, axis1=1, axis2=2) / 2
     return Changes(np.asarray(total * (_MOST / np.maximum(whole, _MOST))[:, None, None]), beside)
 
 
-def _parted(element: Index, way: Array, part: Array) -> Array:
+def _weights(element: Index, way: Array, normals: Array, part: Array) -> Array:
     """Return the weights (k,) of edges that are a `way` (k, 3) [cells] from the centres of elements (k,).
 
-    Beside an edge is a `part` (k,) of the element's length. Edges of an element that are far apart have this
-    as their weight; those that meet in a place have a mean where their parts exceed the element.
+    An edge between faces with `normals` (k, 2, 3) is beside a `part` (k,) of the element's length. Pieces of
+    an edge, of which the faces agree, have weights as the whole one. Beside others that are near, an edge
+    counts less: where they meet, the field is less singular than at each.
     """
     near = 1 - (way**2).sum(axis=1) / _REACH**2
     one, other = _pairs(element)
-    apart = ((way[one] - way[other]) ** 2).sum(axis=1) / _REACH**2
-    whole = np.bincount(one, np.maximum(0, 1 - apart) * (near * part)[other], len(element))
-    return np.asarray(near * part / np.maximum(near, whole))
+    together = np.maximum(0, 1 - ((way[one] - way[other]) ** 2).sum(axis=1) / _REACH**2) * part[other]
+    cosines = np.maximum(0, normals[one] @ normals[other].mT)
+    agree = np.maximum(cosines[:, 0, 0] * cosines[:, 1, 1], cosines[:, 0, 1] * cosines[:, 1, 0])
+    pieces = np.bincount(one, agree * together, len(element))
+    others = np.bincount(one, (1 - agree) * together * near[other], len(element))
+    return np.asarray(part / np.maximum(1, pieces) * near / (near + _MEETING * others))
 
 
 def _pairs(element: Index) -> tuple[Index, Index]:

@@ -34,7 +34,7 @@ class Nearest(NamedTuple):
 
     way: Array  # to the place (n, 3) [m], infinite beyond a rim's reach
     normals: Array  # unit vectors out of the two faces there (n, 2, 3)
-    inside: Array  # distances along it from its nearer end (n,) [m], negative beyond; infinite without ends
+    inside: Array  # distances along it from its two ends (n, 2) [m], negative beyond; infinite without ends
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Segment:
         part = (points - self.begin) @ whole / length**2
         way = self.begin + part[:, None] * whole - points
         normals = np.broadcast_to(self.normals, (len(points), 2, 3))
-        return Nearest(way, normals, length * np.minimum(part, 1 - part))
+        return Nearest(way, normals, length * np.column_stack((part, 1 - part)))
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Circle:
         flat[on_axis], from_axis[on_axis] = _across(self.normal), 1
         away = flat / from_axis[:, None]
         normals = self.slopes[:, None] * self.normal + self.outwards[:, None] * away[:, None]
-        return Nearest(self.radius * away - from_center, normals, np.full(len(points), np.inf))
+        return Nearest(self.radius * away - from_center, normals, np.full((len(points), 2), np.inf))
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class Rim:
     def nearest(self, points: Array) -> Nearest:
         """Return its places nearest to points (n, 3) [m], with faces that are flat there."""
         way, normals = np.full(points.shape, np.inf), np.zeros((len(points), 2, 3))
-        endless = np.full(len(points), np.inf)
+        endless = np.full((len(points), 2), np.inf)
         level = self._levels(points)
         near = np.flatnonzero((np.abs(level) < _NEAR * self.spacing).all(axis=1))
         if not len(near):
