@@ -15,18 +15,18 @@ from __future__ import annotations
 import itertools
 import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, vstack
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from autdtorch.fdtd.grid import Grid
-from autdtorch.fdtd.stencil import OFFSETS, Stencil, flat_offsets, flat_strides
+from autdtorch.fdtd.stencil import OFFSETS, Stencil, flat_strides, places_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.process import cached_property, parts_of_size, spread
 from autdtorch.utils.spatial import places_among
@@ -35,7 +35,8 @@ from autdtorch.utils.spatial import places_among
 # above 1: waves that decay
 _FARTHEST, _DECAYING = 1.2, 0.1
 _SIZES, _TURNS = 61, 9  # Wavenumbers of the fit: sizes, and directions in an eighth of a turn
-_ROWS = 8192  # Rows that are built together, which stay in the cache
+_CELLS = 2**15  # Cells that are looked at together
+_ALIKE = 19  # Cells along an axis, the middle one of which has the weights of all farther from the ends
 _DISTANCE = np.abs(np.array(OFFSETS)).sum(axis=1)
 _STRAIGHT = np.flatnonzero(_DISTANCE == 1)  # neighbours across faces, in the order of `OFFSETS`
 # Places along a face of the weights, up to symmetry: those among the neighbours, and those farther away
@@ -53,34 +54,25 @@ class HuygensSurface:
     @classmethod
     def of(cls, grid: Grid, stencil: Stencil, scale: float, steps_per_period: float) -> Self:
         """Return the surface of a grid; `scale` is the ratio of its coefficients in air to the stencil's."""
-        radiating, chi = np.zeros(grid.shape, bool), np.zeros(grid.shape, np.int8)
-        radiating[grid.deeper(2)], radiating[grid.deeper(4)] = True, False
-        chi[grid.deeper(3)] = 1
-        cells = np.flatnonzero(radiating)
+        cells = _radiating(grid)
         place = places_among(cells, math.prod(grid.shape))
-        near, beside = flat_offsets(grid.shape), _farther_beside(grid.shape)
-        flat_weights = face_weights(stencil)
-        on_face = np.append(0.0, flat_weights[: len(_NEAR)])[_DISTANCE]
-        farther = np.repeat(flat_weights[len(_NEAR) :], [len(_alike(each)) for each in _FAR])
+        x, y, z = (min(count, _ALIKE) for count in grid.interior)
+        small = replace(grid, interior=(x, y, z))
+        weight, offset = _rows(small, stencil, flat_strides(grid.shape))
+        alike = _among_rows(grid, small, cells)
+        width = np.count_nonzero(weight, axis=1)
 
-        def rows(ends: tuple[int, int]) -> csr_array:
-            index = cells[slice(*ends)]
-            around = index[:, None] + near
-            step = chi.ravel()[around] - chi.ravel()[index, None]
-            straight = step[:, _STRAIGHT]
-            far = index[:, None] + beside[np.abs(straight).argmax(axis=1)]
-            ahead = chi.ravel()[far] - chi.ravel()[index, None]
-            flat = (np.count_nonzero(step, axis=1) == 9) & radiating.ravel()[far].all(axis=1)
-            flat &= (ahead == straight.sum(axis=1)[:, None]).all(axis=1)
-            weight = np.where(flat[:, None], on_face, stencil.weights) * step
-            further = np.where(flat[:, None], farther * ahead, 0.0)
-            both = place[np.concatenate((around, far), axis=1)]
-            part = row_matrix(np.concatenate((weight, further), axis=1), both, len(cells))
-            part.eliminate_zeros()
-            return part
+        def taken(ends: tuple[int, int]) -> tuple[NDArray[np.int32], Array]:
+            rows = alike[slice(*ends)]
+            some = np.arange(weight.shape[1]) < width[rows, None]
+            beside = (cells[slice(*ends), None] + offset[rows])[some]
+            return place[beside], weight[rows][some]
 
-        matrix = vstack(spread(rows, parts_of_size(len(cells), _ROWS)), format="csr")
-        return cls(cells, matrix, scale * grid.spacing / stencil.source_factor(steps_per_period))
+        places, weights = zip(*spread(taken, parts_of_size(len(cells), _CELLS)), strict=True)
+        first_of_row = np.concatenate(([0], np.cumsum(width[alike]))).astype(place.dtype)
+        parts = np.concatenate(weights), np.concatenate(places), first_of_row
+        factor = scale * grid.spacing / stencil.source_factor(steps_per_period)
+        return cls(cells, csr_array(parts, (len(cells), len(cells))), factor)
 
     def of_phasors(self, phasors: Tensor) -> Tensor:
         """Return amplitudes (n, R) [Pa m] from the phasors (n, R) [Pa] of the cells, on their device."""
@@ -99,6 +91,48 @@ class HuygensSurface:
         with warnings.catch_warnings():  # that PyTorch may change its sparse matrices
             warnings.simplefilter("ignore", UserWarning)
             return torch.sparse_csr_tensor(first_of_row, place, weight, self.weights.shape)
+
+
+def _radiating(grid: Grid) -> Index:
+    """Return the flat indices (n,) of the cells two and three from the rim of the interior."""
+    radiating = np.zeros(grid.shape, bool)
+    radiating[grid.deeper(2)], radiating[grid.deeper(4)] = True, False
+    return np.flatnonzero(radiating)
+
+
+def _rows(grid: Grid, stencil: Stencil, strides: Index) -> tuple[Array, Index]:
+    """Return weights (n, w) of the cells about each one that radiates, zeros last, and where they are (n, w).
+
+    These are flat offsets in a grid of other `strides`.
+    """
+    cells, chi = _radiating(grid), np.zeros(grid.shape, np.int8)
+    chi[grid.deeper(3)] = 1
+    radiating, flat, among = np.isin(np.arange(chi.size), cells), chi.ravel(), flat_strides(grid.shape)
+    near, beside = np.array(OFFSETS), _farther_beside()
+    step = flat[cells[:, None] + near @ among] - flat[cells, None]
+    straight = step[:, _STRAIGHT]
+    farther = beside[np.abs(straight).argmax(axis=1)]
+    far = cells[:, None] + farther @ among
+    ahead = flat[far] - flat[cells, None]
+    on_face = (np.count_nonzero(step, axis=1) == 9) & radiating[far].all(axis=1)
+    on_face &= (ahead == straight.sum(axis=1)[:, None]).all(axis=1)
+    of_face = face_weights(stencil)
+    on_near = np.append(0.0, of_face[: len(_NEAR)])[_DISTANCE]
+    on_far = np.repeat(of_face[len(_NEAR) :], [len(_alike(each)) for each in _FAR])
+    weight = np.where(on_face[:, None], on_near, stencil.weights) * step
+    weight = np.concatenate((weight, np.where(on_face[:, None], on_far * ahead, 0.0)), axis=1)
+    offset = np.concatenate((np.tile(near @ strides, (len(cells), 1)), farther @ strides), axis=1)
+    order = np.argsort(weight == 0, axis=1, kind="stable")[:, : np.count_nonzero(weight, axis=1).max()]
+    return np.take_along_axis(weight, order, axis=1), np.take_along_axis(offset, order, axis=1)
+
+
+def _among_rows(grid: Grid, small: Grid, cells: Index) -> NDArray[np.int32]:
+    """Return for each cell of a grid its like (n,) among those of a `small` one, cut in the middle."""
+    shape, fewer = np.array(grid.shape), np.array(small.shape)
+    places = places_of(cells, grid.shape)
+    folded = np.minimum(places, np.maximum(fewer // 2, places - (shape - fewer)))
+    place = places_among(_radiating(small), math.prod(small.shape))
+    return np.asarray(place[folded @ flat_strides(small.shape)], np.int32)
 
 
 @lru_cache(maxsize=64)
@@ -132,13 +166,12 @@ def _alike(place: tuple[int, int]) -> list[tuple[int, int]]:
     return sorted({(a * x, b * y) for (x, y), a, b in images})
 
 
-def _farther_beside(shape: tuple[int, int, int]) -> Index:
-    """Return the flat offsets (6, n), by `_STRAIGHT` neighbour, of the cells at `_FAR` places beside it."""
-    strides, offsets = flat_strides(shape), np.array(OFFSETS)[_STRAIGHT]
+def _farther_beside() -> Index:
+    """Return the offsets (6, n, 3), by `_STRAIGHT` neighbour, of the cells at `_FAR` places beside it."""
+    offsets = np.array(OFFSETS)[_STRAIGHT]
     beside = np.array([each for place in _FAR for each in _alike(place)])
     lateral = [np.eye(3, dtype=np.int64)[offset == 0] for offset in offsets]
-    far = [offset + beside @ each for offset, each in zip(offsets, lateral, strict=True)]
-    return np.asarray(np.stack(far) @ strides, np.int64)
+    return np.stack([offset + beside @ each for offset, each in zip(offsets, lateral, strict=True)])
 
 
 def row_matrix(weight: Array, place: NDArray[np.int32], count: int) -> csr_array:

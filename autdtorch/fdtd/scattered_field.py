@@ -170,12 +170,11 @@ class ScatteredField:
         nodes = targets.positions[~far]
         within = self.inside(nodes)
         inner = self.assembly.interpolation(self._on_axes(nodes[within]))
-        read = np.concatenate((surface, inner.index.ravel()))
-        cells = distinct_cells(read, math.prod(self.assembly.grid.shape))
-        outward = slice(None) if len(cells) == len(surface) else np.searchsorted(cells, surface)
         around = np.unique(inner.index)
-        read = np.searchsorted(cells, around)
-        return NearToFar(self, targets, far, within, cells, outward, read, inner.matrix(around))
+        cells = distinct_cells(np.concatenate((surface, around)), math.prod(self.assembly.grid.shape))
+        outward = slice(None) if len(cells) == len(surface) else np.searchsorted(cells, surface)
+        read, matrix = np.searchsorted(cells, around), inner.matrix(around)
+        return NearToFar(self, targets, far, within, cells, outward, read, matrix)
 
     def radiated(
         self, amplitude: Tensor, points: Tensor | Discs, images: Sequence[Image] | None = None
@@ -330,10 +329,7 @@ class NearToFar:
         return mean
 
     def amplitudes(self, phasors: Tensor) -> Tensor:
-        """Return amplitudes (n, R) [Pa m] of the Huygens surface, from the cells' phasors (k, R).
-
-        They are on the device of these.
-        """
+        """Return amplitudes (n, R) [Pa m] of the Huygens surface on the device of the phasors (k, R)."""
         return self.box.surface.of_phasors(phasors[self.outward])
 
     def matrices(self, every: int) -> FieldMatrices:
@@ -342,8 +338,7 @@ class NearToFar:
         far = self.far[chosen]
         near = (torch.cumsum(~self.far, 0) - 1)[chosen[~far]]  # their numbers among all near targets
         within, some = self.within[near], self.targets.chosen(chosen[~far])
-        single = self.box.assembly.dtype == torch.float32
-        kind = torch.complex64 if single else torch.complex128
+        kind = torch.complex64 if self.box.assembly.dtype == torch.float32 else torch.complex128
         nodes = self.box.nodes_for(self.targets.chosen(chosen).positions.flatten(0, 1))
         radiating = self.box.radiating if nodes is None else self.box.places_of(nodes)
         received = torch.zeros((len(radiating), len(far)), dtype=kind, device="cpu")
