@@ -288,6 +288,22 @@ def test_a_bore_that_a_later_fluid_cuts_is_that_of_a_mesh():
     assert relative_error(matrix(tube, bore), matrix(mesh)) < 0.03
 
 
+@pytest.mark.filterwarnings("ignore::autdtorch.OverlapWarning")
+def test_the_mouth_of_a_bore_with_a_dense_fluid_lets_through_what_it_does_on_a_finer_grid():
+    """Elements at its rim averaged the mobility of fluid and air: 19 % off at 0.8 mm, 14 % from 0.5 mm."""
+    outer, inner, long, axis = 6.3e-3, 2.9e-3, 14e-3, np.array((0.3, 0.2, 1.0))
+    axis /= np.linalg.norm(axis)
+    cup = Cylinder(CENTER, outer, long, axis, rigid=True)
+    bottom = 3.4e-3
+    dense = {"density": 4 * AIR.density, "sound_speed": AIR.sound_speed}
+    within = Cylinder(np.array(CENTER) + bottom / 2 * axis, inner, long - bottom, axis, **dense)
+    sources = TransducerArray([(26e-3, 14e-3, 22e-3), (13e-3, 27e-3, 16e-3)], (1, 0, 0), radius=0.0)
+    points = [(-6e-3, 3e-3, 25e-3), (3e-3, -7e-3, 2e-3), (16e-3, 14e-3, 22e-3)]
+    scene = Scene(sources, AIR, 40e3, points, [cup, within])
+    coarse, fine = (make_propagator(scene, "box", spacing, 5e-3) for spacing in (0.8e-3, 0.5e-3))
+    assert relative_error(coarse.transfer_matrix(), fine.transfer_matrix()) < 0.09
+
+
 @pytest.mark.parametrize(
     ("method", "material"),
     [("box", {"rigid": True}), ("full", {"rigid": True}), ("box", {"density": 50.0, "sound_speed": 600.0})],

@@ -6,7 +6,8 @@ In an element of one material both are those of the tuned stencil. An interface 
 - for axis-aligned faces, a product of the direction across the faces and the two others;
 - for other surfaces of fluids, the forces or the energies of local fields (`smooth_faces.py`);
 - masses on their side of the surface, except for the share of a flow through it which reaches the other side;
-- at other surfaces of rigid bodies, and tilted edges of dense fluids, finite elements.
+- at other surfaces of rigid bodies, and tilted edges of dense fluids, finite elements; where fluids meet at a
+  rigid body, these are softer across their surface than along it.
 
 Finite elements have trilinear functions, integrated over the part that is no such body (a cut finite element
 method, Burman et al. 2015, doi:10.1002/nme.4823). Vertices in the body have a pressure, which continues the
@@ -55,6 +56,7 @@ from autdtorch.utils.array_types import Array, Index
 # rigid face, and the ratio of densities that halves it: the mean phase of tilted half-spaces is then exact
 _SHRUNK, _SHRUNK_RATIO = 0.5, 12.0
 _ABSENT_SHARE = 1e-4  # Share of an element's volume below which a material counts as absent
+_TINY = 1e-12  # Least length of a normal
 
 
 class Bodies(NamedTuple):
@@ -211,13 +213,20 @@ def _finite_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -> 
     hard = bodies.finite & materials.rigid[bodies.material, None]
     cutting = ~bodies.finite & (np.cumsum(hard, axis=0) > 0)
     grown = np.where(cutting, -1, contrast[bodies.material, None] * bodies.finite)
-    values = np.stack((1 / materials.density, materials.mass)) * ~materials.rigid / SUBCELLS**3
-    mobility, weight = _mixed(bodies, _added_thickness(stencil.kappa) * grown, values)
+    grown *= _added_thickness(stencil.kappa)
+    fluid = ~materials.rigid
+    several = (materials.density[fluid] > 1).any() and not fluid.all()
+    values = [1 / materials.density, materials.mass]
+    values += [np.ones(len(fluid)), materials.density] if several else []
+    mobility, weight, *others = _mixed(bodies, grown, np.stack(values) * fluid / SUBCELLS**3)
     coupling, mass = np.zeros((len(weight), 28)), np.zeros((len(weight), 8))
     for side in bodies.sides:
         here = np.flatnonzero(side.share.any(axis=1))
         share, out = side.share[here], side.out[here]
-        added = _cut_coupling(mobility[here] * share, bodies.reductions[here], stencil)
+        part, reductions = mobility[here] * share, bodies.reductions[here]
+        if several:
+            reductions = _across_fluids(reductions, part, *(other[here] * share for other in others))
+        added = _cut_coupling(part, reductions, stencil)
         parted = np.flatnonzero(out.any(axis=1))
         added[parted], _ = without_vertices(added[parted], out[parted])
         coupling[here] += added
@@ -264,6 +273,36 @@ def _moved_shares(surface: Surface, pair: Index, thickness: float, count: int) -
     np.put_along_axis(share, pair[:, None, :1], (1 - part)[:, :, None], axis=2)
     np.put_along_axis(share, pair[:, None, 1:], part[:, :, None], axis=2)
     return share
+
+
+def _across_fluids(reductions: Array, mobility: Array, share: Array, density: Array) -> Array:
+    """Return reductions of the stiffness (n, 3, 3) with those across dense fluids' surfaces at rigid bodies.
+
+    Mobilities average along the surface, and densities across it. Its normal is that of all faces between
+    sub-cells, each by the change of mobility there. Mobilities, densities and the share of fluids (n, 64) are
+    parts of an element.
+    """
+    filled, dense, mobile = (part.sum(axis=1) for part in (share, density, mobility))
+    # without a rigid body it is the edge of a fluid, at which no normal serves; light fluids err more with it
+    several = np.flatnonzero(
+        (filled < 1 - _ABSENT_SHARE)
+        & (dense > (1 + _ABSENT_SHARE) * filled)
+        & (dense * mobile > (1 + _ABSENT_SHARE) * filled**2)
+    )
+    parts = [part[several].reshape(-1, *(SUBCELLS,) * 3) for part in (mobility, share)]
+    normal = np.zeros((len(several), 3))
+    for axis in range(3):
+        (here, filled_here), (there, filled_there) = (
+            [np.moveaxis(part, axis + 1, 1)[:, some] for part in parts]
+            for some in (slice(-1), slice(1, None))
+        )
+        normal[:, axis] = (there * filled_here - here * filled_there).sum(axis=(1, 2, 3))
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), _TINY)
+    less = 1 - filled[several] / np.sqrt(dense[several] * mobile[several])
+    left = np.eye(3) - less[:, None, None] * normal[:, :, None] * normal[:, None, :]  # root of what is left
+    reductions = reductions.copy()
+    reductions[several] = np.eye(3) - left @ (np.eye(3) - reductions[several]) @ left
+    return reductions
 
 
 _MOST_TAKEN = 0.8  # Largest share of a vertex's mass that is taken away
