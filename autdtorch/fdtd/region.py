@@ -16,7 +16,15 @@ from typing import NamedTuple, Self
 import numpy as np
 import torch
 
-from autdtorch.fdtd.shapes import Shape, Solids, bounds, is_turned, turned_shape, with_image
+from autdtorch.fdtd.shapes import (
+    Shape,
+    Solids,
+    bounds,
+    distance_from,
+    is_turned,
+    turned_shape,
+    with_image,
+)
 from autdtorch.fdtd.turning import FlatFaces, flat_faces, slender_faces
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.images import Image, Mirror, images_of
@@ -43,6 +51,7 @@ _AS_HEAVY = 1.1
 """Ratio of densities up to which cells on both sides of a surface interpolate better than those on one."""
 
 _PLACES = 400  # Places of a surface where bodies of air may cut it
+_HELD = 0.5  # Share of a fluid's surface from which rigid bodies hold it
 _SKIN = 1e-6  # Distance [m] in front of and behind a surface where air is looked for
 
 MIN_CELLS_PER_WAVELENGTH = 3.0  # Fewest cells per wavelength; coarser grids are refused
@@ -187,6 +196,24 @@ class Region:
         compressibility = (self.fluid.phase_speed / fluid.phase_speed) ** 2 / density
         kinked, smooth = (abs(ratio - 1) / (ratio + 1) for ratio in (density, compressibility))
         return 2 * kinked / (kinked + smooth) if kinked else 0.0
+
+    @cached_property
+    def held_contrast(self) -> float:
+        """The largest ratio of densities, from 1, of the air and of a fluid that is mostly in rigid bodies.
+
+        A column of it resonates more sharply by this ratio than one of air.
+        """
+        largest = 1.0
+        for number, body in enumerate(self.bodies):
+            before = [each.shape for each in self.bodies[:number] if each.fluid is None]
+            if body.fluid is None or body.continued or not before:
+                continue
+            vertices, triangles = (part.numpy() for part in body.shape.surface())
+            places = torch.from_numpy(places_on(vertices[triangles], _PLACES))
+            if float((distance_from(before, places) < 0).double().mean()) > _HELD:
+                ratio = body.fluid.inertia / self.fluid.inertia
+                largest = max(largest, ratio, 1 / ratio)
+        return largest
 
     @property
     def _surfaces(self) -> list[tuple[Array, Index]]:

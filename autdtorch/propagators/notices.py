@@ -23,6 +23,10 @@ _RINGING = 100
 """Periods from which a run indicates a resonance. Runs of bodies without any take 15 to 60; a quality factor
 is about half the periods, and a grid of 1.3 mm shifts frequencies by 0.2 %."""
 
+_SHARP = 2.0
+"""Ratio of densities from which a fluid in a rigid body resonates so much more sharply than air that claims
+of error were down to 0.3 of it."""
+
 _FAINT = 1e-7
 """Pressure relative to that in free space, -140 dB, which is rounding in single precision."""
 
@@ -91,6 +95,11 @@ def warn_of_scene(plan: Plan) -> None:
     if plan.method == "tmatrix":  # each body has a grid along its faces
         grids = [([body.number], axes_along([body.faces])) for body in region.bodies]
     warn_of_thin_walls(region, spacing, grids)
+    if region.held_contrast > _SHARP:
+        logger.warning(
+            "a fluid in a rigid obstacle is %.2g times as dense as the air, or as light: it resonates"
+            " sharply, and the error may be larger than estimated", region.held_contrast,
+        )  # fmt: skip
     warn_of_near_points(scene, "array.positions", scene.array.positions, spacing)
     warn_of_near_points(scene, "control_points", scene.control_points, spacing)
 

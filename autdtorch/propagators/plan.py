@@ -157,7 +157,8 @@ class Plan:
     def law(self) -> Law:
         """The growth of its errors with the spacing."""
         region, aligned = self.region, self.grouping.aligned
-        law = Law(region.shortest_wavelength, aligned, region.wavelength, region.mean_thickness, region.kink)
+        around = region.wavelength, region.mean_thickness, region.kink, region.held_contrast
+        law = Law(region.shortest_wavelength, aligned, *around)
         if aligned:
             law = replace(law, edges=region.edges_per_area, extent=region.largest_extent)
         return law

@@ -160,6 +160,24 @@ def test_boxes_have_twelve_edges_each(count):
 
 
 @pytest.mark.filterwarnings("ignore::autdtorch.OverlapWarning")
+def test_a_fluid_in_a_rigid_body_counts_by_its_density_and_one_beside_it_does_not(caplog):
+    tube = Cylinder(CENTER, 3e-3, 9e-3, (1, 1, 0), rigid=True)
+    heavy, light = (
+        Cylinder(CENTER, 2e-3, 9e-3, (1, 1, 0), density=ratio * AIR.density, sound_speed=AIR.sound_speed)
+        for ratio in (4.0, 1 / 3)
+    )
+    beside = at.Box(np.add(CENTER, (0, 0, 5e-3)), (4e-3,) * 3, density=4 * AIR.density, sound_speed=400.0)
+    scenes = [small_scene((tube, *bodies)) for bodies in ((heavy,), (light,), (beside,), ())]
+    assert [region_of(scene).held_contrast for scene in scenes] == pytest.approx([4, 3, 1, 1])
+    law = plan(scenes[0], "box", 1e-3).law
+    assert law.usual(1e-3) == pytest.approx(4 * replace(law, held=1.0).usual(1e-3))
+    make_propagator(scenes[2], "box", 1e-3)
+    assert "resonates sharply" not in caplog.text
+    make_propagator(scenes[0], "box", 1e-3)
+    assert "resonates sharply" in caplog.text
+
+
+@pytest.mark.filterwarnings("ignore::autdtorch.OverlapWarning")
 def test_the_thickness_of_a_tube_is_that_of_its_wall():
     outer, wall, long = 3e-3, 0.5e-3, 9e-3
     air = {"density": AIR.density, "sound_speed": AIR.sound_speed}
