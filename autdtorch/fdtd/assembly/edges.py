@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.shapes import Shape, Solids
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.spatial import connected_parts, doubled_normals, sides_of
+from autdtorch.utils.spatial import connected_parts, distinct_rows, doubled_normals, sides_of
 
 _SHARP = np.radians(20)  # Smallest angle between the normals of two faces that meet in an edge
 _SLIT = 1e-3  # Angle of two faces [rad] up to which they are those of a slit without width
@@ -241,14 +241,15 @@ def _circle(corners: Array, ends: Array, normals: Array) -> Circle | None:
 
 def _sharp_sides(vertices: Array, triangles: Index) -> tuple[Array, Array]:
     """Return the ends (n, 2, 3) [m] of the sides at convex edges of a surface, and their faces' normals."""
-    _, number = np.unique(vertices.round(9), axis=0, return_inverse=True)  # corners may be listed twice
-    corners, place = vertices[triangles], number.ravel()[triangles]
+    _, number = distinct_rows(vertices.round(9) + 0.0)  # corners may be listed twice
+    corners, place = vertices[triangles], number[triangles]
     normal = doubled_normals(corners)
     double = np.linalg.norm(normal, axis=1)
     normal = normal / np.where(double > 0, double, 1)[:, None]
     sides, ends = np.sort(sides_of(place), axis=1), vertices[sides_of(triangles)]
-    order = np.lexsort(sides.T)
-    pairs = np.flatnonzero((sides[order][1:] == sides[order][:-1]).all(axis=1))  # of two triangles each
+    side = sides[:, 1] * len(vertices) + sides[:, 0]
+    order = np.argsort(side, kind="stable")
+    pairs = np.flatnonzero(side[order][1:] == side[order][:-1])  # of two triangles each
     one, other = order[pairs] % len(triangles), order[pairs + 1] % len(triangles)
     angle = np.arccos(np.clip(np.einsum("ij,ij->i", normal[one], normal[other]), -1, 1))
     towards = corners[other].mean(axis=1) - corners[one].mean(axis=1)

@@ -36,6 +36,7 @@ from autdtorch.fdtd.assembly.neighbours import (
 from autdtorch.fdtd.stencil import Stencil, flat_offsets, flat_strides, places_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.process import parts_of_size, spread
+from autdtorch.utils.spatial import places_among
 
 logger = logging.getLogger(__name__)
 
@@ -274,9 +275,7 @@ def _without_rigid(
         number.ravel()[vertices[some, 0]] = len(sums.least) + other
         needed = np.concatenate((sums.least, _least_mass(less.coupling, largest)))
         sums = _ElementSums(number, InterfaceElements.joined([sums.kinds, less]), needed)
-        beside = np.zeros_like(hard)
-        beside[neighbours(touched[new[touched]], shape)] = beside[vertices[some]] = True
-        changed = np.flatnonzero(beside[touched])
+        changed = np.flatnonzero(with_neighbours(new.reshape(shape)).ravel()[touched])
         for whole, part in zip(rows, sums.rows(touched[changed], hard), strict=True):
             whole[changed] = part
     return sums, hard, rows
@@ -342,13 +341,13 @@ def _transferred_mass(coupling: Array, mass: Array, need: Array, touched: Index,
     A light cell with strong coupling, in a heavy obstacle just below its surface, moves with the air. Mass is
     transferred to it from the cells it is coupled to.
     """
-    mass, before = mass.copy(), mass.sum()
+    mass, before, places = mass.copy(), mass.sum(), places_among(touched, math.prod(shape))
     for _ in range(_MASS_TRANSFERS):
         light = np.flatnonzero(need > mass)
         if len(light) == 0:
             break
         neighbour = neighbours(touched[light], shape)
-        place = np.searchsorted(touched, neighbour).clip(max=len(touched) - 1)
+        place = places[neighbour]
         spare = np.maximum(mass - need, 0)
         offer = np.abs(coupling[light]) * np.where(touched[place] == neighbour, spare[place], 0)
         whole = offer.sum(axis=1, keepdims=True)
