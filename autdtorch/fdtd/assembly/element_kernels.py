@@ -114,3 +114,108 @@ def survey_lattices(distance, most_variation, least, most, layered):  # type: ig
                         low, high = min(low, value), max(high, value)
                     flat = high - low < most_variation
                 layered[body, row, axis] = flat
+
+
+@njit(**INNER)
+def _cut(depth, outer, inner):  # type: ignore[no-untyped-def]
+    """Write the centres (3,) of the parts of a triangle outside a body and inside, and return their shares.
+
+    Centres are barycentric, and arbitrary for a part of no area. `depth` (3,) are the signed distances of its
+    corners.
+    """
+    count = 0
+    for corner in range(3):
+        outer[corner] = inner[corner] = 1 / 3
+        count += 1 if depth[corner] < 0.0 else 0
+    if count == 0 or count == 3:
+        return 1.0 - count // 3, float(count // 3)
+    tip, rest = (inner, outer) if count == 1 else (outer, inner)
+    area, alone = 1.0, 0
+    for corner in range(3):
+        alone = corner if (depth[corner] < 0.0) == (count == 1) else alone
+    tip[alone] = 1.0
+    for corner in range(3):
+        if corner != alone:
+            share = depth[alone] / (depth[alone] - depth[corner])
+            area *= share
+            tip[corner] = share / 3
+            tip[alone] -= share / 3
+    for corner in range(3):
+        rest[corner] = (1 / 3 - area * tip[corner]) / max(1 - area, _LEAST_WIDTH)
+    return (1 - area, area) if count == 1 else (area, 1 - area)
+
+
+@njit(**INNER)
+def _set_fields(place, depth, side, axis, normal, tangents, bend, density, local, flow):  # type: ignore[no-untyped-def]
+    """Write the local fields (3,) at a place, and their flow along an axis; see `smooth_faces.fields`."""
+    along = (0.0, 0.0)
+    for space in range(3):
+        along = (along[0] + place[space] * tangents[0, space], along[1] + place[space] * tangents[1, space])
+    flow[2], local[2] = normal[axis], density[side] * depth
+    for field in range(2):
+        turn = along[0] * bend[0, field] + along[1] * bend[1, field]  # of the normal
+        bent = bend[field, 0] * tangents[0, axis] + bend[field, 1] * tangents[1, axis]
+        local[field] = along[field] - depth * turn
+        flow[field] = (tangents[field, axis] - depth * bent - turn * normal[axis]) / density[side]
+        flow[2] += turn * tangents[field, axis]
+
+
+@njit(**INNER)
+def _set_hats(place, axis, ends, inner, side, beside, hats):  # type: ignore[no-untyped-def]
+    """Write the weights (4,) of the vertices of a face for the flow at a place; their sum is one."""
+    total = 0.0
+    for vertex in range(4):
+        hats[vertex] = beside if inner[vertex] != (side == 1) else 1.0
+        for space in range(3):
+            if space != axis:
+                hats[vertex] *= 0.5 + place[space] if ends[vertex, space] == 1 else 0.5 - place[space]
+        total += hats[vertex]
+    for vertex in range(4):
+        hats[vertex] /= total
+
+
+@entry()
+def face_flows(face, surface, middle, inner, beside, near, moments, share):  # type: ignore[no-untyped-def]
+    """Write sums over the flow of the local fields through a face of elements.
+
+    Args:
+        face: axis, direction, vertices (4, 3), corners (t, 3) of its triangles among the places (p, 3) of the
+            lattice, and these places from the element's centre.
+        surface: level (n, p), normal (n, 3), tangents (n, 2, 3), bend (n, 2, 2) and density (n, 2).
+        middle: mean of the local fields at the vertices (n, 3).
+        inner: whether the vertices are in the inner material (n, 4).
+        beside: weights of vertices on the other side (n,).
+        near: parts of the flow for the vertices (n, 4, 3), to be written.
+        moments: of the flow of each field with each field (n, 3, 3), to be written.
+        share: of the face in the inner material (n,), to be written.
+    """
+    axis, outward, ends, triangles, places = face
+    level, normal, tangents, bend, density = surface
+    depth, centers, place = np.empty(3), np.empty((2, 3)), np.empty(3)
+    local, flow, hats = np.empty(3), np.empty(3), np.empty(4)
+    for row in range(len(level)):
+        near[row], moments[row], share[row] = 0.0, 0.0, 0.0
+        for triangle in triangles:
+            for corner in range(3):
+                depth[corner] = level[row, triangle[corner]]
+            areas = _cut(depth, centers[0], centers[1])
+            for side in range(2):
+                area = areas[side] / len(triangles)
+                if area <= 0.0:
+                    continue
+                place[:], deep = 0.0, 0.0
+                for corner in range(3):
+                    deep += centers[side, corner] * depth[corner]
+                    for space in range(3):
+                        place[space] += centers[side, corner] * places[triangle[corner], space]
+                _set_fields(
+                    place, deep, side, axis, normal[row], tangents[row], bend[row], density[row], local, flow
+                )
+                _set_hats(place, axis, ends, inner[row], side, beside[row], hats)
+                share[row] += area if side == 1 else 0.0
+                for field in range(3):
+                    passed = outward * area * flow[field]
+                    for vertex in range(4):
+                        near[row, vertex, field] += hats[vertex] * passed
+                    for other in range(3):
+                        moments[row, other, field] += (local[other] - middle[row, other]) * passed

@@ -175,20 +175,14 @@ def _curvature(fit: Array, tangents: Array) -> Array:
 
 
 def fields(surface: Surface) -> Array:
-    """Return the local fields (n, 8, 3) at the vertices."""
-    depth = surface.level[:, CORNERS]
-    return local_fields(surface, VERTICES - 0.5, depth, np.where(depth < 0, 1, 0))
+    """Return the local fields (n, 8, 3) at the vertices.
 
-
-def local_fields(surface: Surface, places: Array, depth: Array, side: Index) -> Array:
-    """Return the fields (n, q, 3): coordinates of the foot of a place along the surface, and the kinked one.
-
-    `places` ((n,) q, 3) are relative to the centre, `depth` (n, q) are their signed distances, and `side`
-    ((n,) q) is 1 in the inner material.
+    They are the coordinates of the foot of a place along the surface, and the kinked field.
     """
-    along = places @ surface.tangents.transpose(0, 2, 1)
+    depth = surface.level[:, CORNERS]
+    along = (VERTICES - 0.5) @ surface.tangents.transpose(0, 2, 1)
     along = along - depth[:, :, None] * (along @ surface.bend)
-    kinked = np.where(side == 1, surface.density[:, 1:], surface.density[:, :1]) * depth
+    kinked = np.where(depth < 0, surface.density[:, 1:], surface.density[:, :1]) * depth
     return np.concatenate((along, kinked[:, :, None]), axis=2)
 
 
@@ -269,67 +263,30 @@ def forces(surface: Surface) -> Array:
 
 
 def face_forces(surface: Surface, face: int) -> Array:
-    """Return the forces (n, 4, 3) of the fields' flow through a face at its vertices."""
-    vertices, axis = _FACE_VERTICES[face], _AXIS[face]
-    area, place, depth = _parts(surface.level, _TRIANGLES[face])
-    side = np.repeat((0, 1), area.shape[1] // 2)
-    flow = area[:, :, None] * _OUTWARD[face] * _flow(surface, axis, place, depth, side)
-    corners = fields(surface)[:, vertices]
-    middle = corners.mean(axis=1, keepdims=True)
-    local = local_fields(surface, place, depth, side) - middle
+    """Return the forces (n, 4, 3) of the fields' flow through a face at its vertices.
 
+    Flow is summed over the parts of triangles on both sides of the surface, at the centre of each.
+    """
+    from autdtorch.fdtd.assembly.element_kernels import face_flows  # loads numba
+
+    vertices, count = _FACE_VERTICES[face], len(surface.level)
+    corners = fields(surface)[:, vertices]
+    middle = corners.mean(axis=1)
     light, dense = surface.density.min(axis=1), surface.density.max(axis=1)
     inner = surface.level[:, CORNERS[vertices]] < 0
-    hats = np.where(VERTICES[vertices] == 1, 0.5 + place[:, :, None], 0.5 - place[:, :, None])
-    beside = inner[:, None] != (side == 1)[:, None]
-    near = np.delete(hats, axis, axis=3).prod(axis=3)
-    near *= np.where(beside, ((light / dense) ** _BESIDE)[:, None, None], 1)
-    near /= near.sum(axis=2, keepdims=True)
+    near, moments, share = np.empty((count, 4, 3)), np.empty((count, 3, 3)), np.empty(count)
+    plane = _AXIS[face], _OUTWARD[face], VERTICES[vertices], _TRIANGLES[face], LATTICE - 0.5
+    parts = tuple(map(np.ascontiguousarray, surface))
+    face_flows(plane, parts, middle, inner, (light / dense) ** _BESIDE, near, moments, share)
 
     # in units in which the three fields have similar energies
-    share = area[:, side == 1].sum(axis=1)
     shares = np.stack((1 - share, share), axis=1)
     mobility, density = (shares / surface.density).sum(axis=1), (shares * surface.density).sum(axis=1)
     scale = np.sqrt(np.stack((mobility, mobility, density), axis=1))[:, None]
     weight = np.where(inner, surface.density[:, 1:], surface.density[:, :1]) / light[:, None]
-    flow, local = flow / scale, local / scale
-    moments = local.transpose(0, 2, 1) @ flow
-    near = near.transpose(0, 2, 1) @ flow
-    return np.asarray(
-        scale * _distributed(near, moments, flow.sum(axis=1), (corners - middle) / scale, weight)
-    )
-
-
-def _parts(level: Array, triangles: Index) -> tuple[Array, Array, Array]:
-    """Return area (n, 32), place (n, 32, 3) and depth (n, 32) of the two parts of triangles (16, 3).
-
-    The first half are outside the inner material. Places are relative to the element's centre.
-    """
-    depth = level[:, triangles]
-    count = (depth < 0).sum(axis=2, keepdims=True)
-    cut = count % 3 != 0
-    lone = cut & ((depth < 0) == (count == 1))  # the vertex that is alone on its side
-    gap = np.where(lone, depth, 0).sum(axis=2, keepdims=True)
-    share = np.where(lone | ~cut, 1, gap / np.where(gap != depth, gap - depth, 1))
-    area = np.where(cut, share.prod(axis=2, keepdims=True), 0)
-    tip = np.where(lone, 1 - np.where(lone, 0, share / 3).sum(axis=2, keepdims=True), share / 3)
-    rest = (1 / 3 - area * tip) / np.maximum(1 - area, 1e-12)
-    outer = np.where(count == 1, 1 - area, np.where(count == 3, 0, np.where(cut, area, 1)))[:, :, 0]
-    centers = np.where(count == 2, tip, rest), np.where(count == 2, rest, tip)
-    place = LATTICE[triangles] - 0.5
-    areas = np.concatenate((outer, 1 - outer), axis=1) / len(triangles)
-    places = np.concatenate([np.einsum("nqv,qvx->nqx", each, place) for each in centers], axis=1)
-    return areas, places, np.concatenate([(each * depth).sum(axis=2) for each in centers], axis=1)
-
-
-def _flow(surface: Surface, axis: int, place: Array, depth: Array, side: Index) -> Array:
-    """Return the flow (n, q, 3) of the fields along an axis: mobility times gradient."""
-    tangents = surface.tangents[:, :, axis]
-    turn = place @ surface.tangents.transpose(0, 2, 1) @ surface.bend  # of the normal
-    across = surface.normal[:, None, axis] + (turn * tangents[:, None]).sum(axis=2)
-    bent = (surface.bend @ tangents[:, :, None])[:, None, :, 0]
-    along = tangents[:, None] - depth[:, :, None] * bent - turn * surface.normal[:, None, None, axis]
-    return np.concatenate((along / surface.density[:, side, None], across[:, :, None]), axis=2)
+    near, moments = near / scale, moments / scale / scale.transpose(0, 2, 1)
+    local = (corners - middle[:, None]) / scale
+    return np.asarray(scale * _distributed(near, moments, near.sum(axis=1), local, weight))
 
 
 def _distributed(near: Array, moments: Array, total: Array, local: Array, weight: Array) -> Array:

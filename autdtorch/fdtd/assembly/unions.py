@@ -64,8 +64,8 @@ class Union:
         distance = distance_from(self.shapes, torch.from_numpy(places)).numpy() / grid.spacing - _CONTACT_GAP
         if self.continued:
             return np.asarray(distance)
-        beyond = np.maximum(np.array(grid.first) - cell, cell - np.array(grid.last) + 1).max(axis=-1) + 0.5
-        return np.asarray(np.maximum(distance, beyond))
+        x, y, z = np.moveaxis(np.maximum(np.array(grid.first) - cell, cell - np.array(grid.last) + 1), -1, 0)
+        return np.asarray(np.maximum(distance, np.maximum(np.maximum(x, y), z) + 0.5))
 
     def faces(self, grid: Grid) -> list[Array]:
         """Return the places [cells] of its faces along each axis, up to its end on a grid."""
