@@ -41,6 +41,8 @@ _STEEPER = 1.7  # Weight of larger distances: edges at 0.74 cells miss 1.5 to 2.
 _CLOSED = 1.0  # Square error of the faces of a slit without a centre in it
 _SAMPLES = 16  # Places along each side of a face at which bodies beside it are looked up
 _ROOM = 0.08  # Most by which a spacing is changed for the faces, relative to it
+# Square error of the faces [cells^2] below which spacings are equally good: waves err by more than 0.05 cells
+_WELL = 0.05**2
 _TRIED, _MOST_TRIED = 8, 256  # Spacings tried for each cell by which the longest body changes; most in all
 
 
@@ -59,8 +61,9 @@ def grid_offset(
 def fitting_spacing(regions: Sequence[Region], spacing: float, coarsest: float = math.inf) -> float:
     """Return the spacing [m] near one, not above a limit, with which the faces of regions fall best.
 
-    Each region has a grid. Without flat faces it is the spacing itself. Behind large bodies, where little
-    arrives past their edges, errors at equal spacings differ up to tenfold with the place of the faces.
+    Each region has a grid. Without flat faces it is the spacing itself, and of several where they fall well
+    the nearest. Behind large bodies, where little arrives past their edges, errors at equal spacings differ
+    up to tenfold with the place of the faces.
     """
     faces = []
     for region in regions:
@@ -72,11 +75,12 @@ def fitting_spacing(regions: Sequence[Region], spacing: float, coarsest: float =
     longest = max(float(np.ptp(place)) for place, _, _ in faces)
     count = min(_TRIED * (1 + math.ceil(2 * _ROOM * longest / spacing)), _MOST_TRIED)
     tried = np.linspace((1 + _ROOM) * spacing, (1 - _ROOM) * spacing, count).clip(max=coarsest)
+    tried = tried[np.abs(tried - spacing).argsort(kind="stable")]
     missed = [
         sum(_placements(place / choice, first, area, 0.0)[1].min() for place, first, area in faces)
         for choice in tried
     ]
-    return float(tried[int(np.argmin(missed))])
+    return float(tried[int(np.maximum(missed, _WELL).argmin())])
 
 
 def _flat_surface(shape: Shape, spacing: float) -> tuple[Array, Array]:

@@ -250,6 +250,8 @@ def test_a_spacing_is_moved_until_opposite_faces_fall_alike(side, spacing):
     reached = any(abs(side / (cells + 0.04) / spacing - 1) < 0.08 for cells in range(100))
     assert not reached or abs((side / fitting - 0.04 + 0.5) % 1 - 0.5) < 0.13  # of spacings an eighth apart
     assert fitting_spacing([region.unbounded], spacing * 1e-3, spacing * 1e-3) <= spacing * 1e-3
+    large = region_of(scene(box((20, 20, 20), (300 + side,) * 3)))  # suits a spacing in each 0.2 to 0.7 %
+    assert fitting_spacing([large.unbounded], spacing * 1e-3) == pytest.approx(spacing * 1e-3, rel=0.02)
     sphere = Sphere((20e-3, 20e-3, 20e-3), 5e-3, rigid=True)
     assert fitting_spacing([region_of(scene(sphere))], SPACING) == SPACING
 
