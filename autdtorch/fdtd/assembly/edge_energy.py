@@ -36,8 +36,8 @@ _BESIDE = 5.0
 # is an eighth of what an unchanged stiffness adds. Tilted rigid boxes of 8 to 15 mm have errors of 0.5 to 0.9
 # and 0.15 to 0.23 % at 1 and 0.6 mm, with a reduction by the distance alone 0.7 to 1.4 and 0.36 to 0.54 %.
 _SHARE = 0.85
-# Weight of other edges near an edge, where they meet. With 0.5 and 4, cubes of 8 mm turned by 45 degrees have
-# errors of 3.1 and 2.7 % at 1.4 mm, and plates of 0.6 and 2 mm turned so 1.8 and 2.2 % at 1 mm.
+# Weight of other edges near an edge, where they meet. With 1 and 4, cubes of 8 mm turned by 45 degrees have
+# errors of 3.4 and 2.7 % at 1.4 mm, and plates of 0.6 and 2 mm turned so 1.9 and 2.2 % at 1 mm.
 _MEETING = 2.5
 _MOST = 0.7  # Largest relative reduction
 _LEAST = -0.5  # and least: an increase
