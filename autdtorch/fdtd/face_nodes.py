@@ -31,8 +31,8 @@ class FaceNodes:
 
     Attributes:
         positions: along the axes of the grid (m, 3) [m].
-        faces: of each layer of a face, the cells (A, B) by their place in the surface, and the weights (a, A)
-            and (b, B) that move amplitudes to its nodes (a, b), on a device.
+        faces: of each layer of a face, the cells (A, B) by their place in the surface, on a device. Weights
+            (a, A) and (b, B) move amplitudes to its nodes (a, b).
         bounds: lower and upper corner of the surface, along the axes of the grid [m].
         clearance: least distance of receivers from the surface [m].
     """

@@ -24,7 +24,7 @@ _LEAST = 0.37  # Least error that is claimed, relative to the usual one
 _COMPARED = 2  # Last other grids that count: earlier ones may be too coarse for the scene
 _BESIDE = 0.6  # Width of the strip along an edge that its errors are relative to [wavelengths]
 _EQUAL = 0.28  # Spacing [wavelengths] at which the parts of second and sixth order are equal at cut faces
-# The part of second order at edges of faces along the grid, relative to that of cut faces. From 4 to 6.5
+# The part of second order at edges of faces along the grid, relative to the part at cut faces. From 4 to 6.5
 # cells per wavelength, errors of 26 scenes fell with the power of 3.6 in the median, in shadows of 5.
 _ALONG = 0.4
 # Error of points on a rigid surface, relative to the scattered field and the square of a cell in wavelengths.

@@ -2,9 +2,9 @@
 
 Elements at faces and edges are accurate to second order wherever these fall (`assembly/prisms.py`). The
 remaining error is least for a face half-way, as rigid faces there are mirrors of the stencil. At 8.5 cells
-per wavelength, a rigid strip with faces half-way errs by 0.02 %, with faces 0.3 cells behind the last centre
-by 0.5 %, at 0.9 by 6 % (measured once). A slit narrower than a cell is open only if it contains a layer of
-centres. Among similar placements the grid takes a symmetric one: a symmetric scene needs fewer runs
+per wavelength, a rigid strip with faces half-way errs by 0.02 %. With faces 0.3 cells behind the last centre
+it errs by 0.5 %, at 0.9 by 6 % (measured once). A slit narrower than a cell is open only if it contains a
+layer of centres. Among similar placements the grid takes a symmetric one: a symmetric scene needs fewer runs
 (`symmetry.py`).
 """
 
@@ -131,8 +131,8 @@ def _joined(place: Array, side: Array, area: Array) -> Array:
 def _weights(region: Region, number: int, axis: int, place: float, outward: float) -> tuple[float, float]:
     """Return the weights of a body's face where the body is heavier than what is in front, and lighter.
 
-    The `place` [m] is along an axis. In front of air the weight is 1, of another body the contrast of both,
-    so that the seam of two bodies of one material has none, and inside a later body 0.
+    The `place` [m] is along an axis. In front of air the weight is 1, inside a later body 0. In front of
+    another body it is the contrast of both: the seam of two bodies of one material has none.
     """
     body = region.bodies[number]
     lower, upper = np.array(body.shape.lower), np.array(body.shape.upper)

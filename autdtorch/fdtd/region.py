@@ -182,7 +182,7 @@ class Region:
 
     @property
     def kink(self) -> float:
-        """The share of the density's contrast in what a body scatters, over that of a rigid one; the largest.
+        """The largest share of the density's contrast in what a body scatters, relative to a rigid body.
 
         The pressure gradient jumps where densities differ; the rest is by the compressibility, which leaves
         it smooth. 34 balls of ratios from 0.01 to 1e4 have 0.2 to 2 times the usual error with this share.

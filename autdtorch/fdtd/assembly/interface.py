@@ -278,9 +278,9 @@ def _moved_shares(surface: Surface, pair: Index, thickness: float, count: int) -
 def _across_fluids(reductions: Array, mobility: Array, share: Array, density: Array) -> Array:
     """Return reductions of the stiffness (n, 3, 3) with those across dense fluids' surfaces at rigid bodies.
 
-    Mobilities average along the surface, and densities across it. Its normal is that of all faces between
-    sub-cells, each by the change of mobility there. Mobilities, densities and the share of fluids (n, 64) are
-    parts of an element.
+    Mobilities average along the surface, and densities across it. Its normal is the sum of those of
+    faces between sub-cells, times the change of mobility there. Mobilities, densities and the share of
+    fluids (n, 64) are parts of an element.
     """
     filled, dense, mobile = (part.sum(axis=1) for part in (share, density, mobility))
     # without a rigid body it is the edge of a fluid, at which no normal serves; light fluids err more with it

@@ -224,7 +224,7 @@ class Calculator:
             yield replace(result, volume=volume, seconds=time.monotonic() - begun)
 
     def _propagator(self, situation: Situation, fine: bool) -> Propagator:
-        """Return the propagator of a situation: that of one of the last scenes, if it is the same."""
+        """Return the propagator of a situation; those of the last scenes are at hand."""
         scene, last = situation.scene, self._propagators.get(fine, [])
         propagator = next((each for each in last if each.scene is scene), None)
         if propagator is None:
