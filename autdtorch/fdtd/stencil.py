@@ -69,7 +69,10 @@ class Stencil:
 
     def differs_from(self, rows: Array) -> NDArray[np.bool_]:
         """Return which stencil rows (n, 27) are not those of air."""
-        return np.asarray((np.abs(rows - self.weights) > ROW_ROUNDING).any(axis=1))
+        differs = np.abs(rows[:, 0] - self.corner) > ROW_ROUNDING  # at surfaces, nearly all
+        rest = np.flatnonzero(~differs)
+        differs[rest] = (np.abs(rows[rest] - self.weights) > ROW_ROUNDING).any(axis=1)
+        return np.asarray(differs)
 
     @property
     def total(self) -> float:

@@ -251,22 +251,23 @@ def _without_rigid(
     kind = len(materials.density) + elements.kind
     hard = materials.rigid[_cell_material(elements)]
     hard[vertices] = materials.rigid[every.material][kind]
-    inside = hard[touched]
-    densest = _densest(elements)
+    inside, densest = touched[hard[touched]], _densest(elements)
     sliver = np.zeros(len(hard), bool)
     sliver[vertices[every.finite[kind]]] = True
-    enough = np.where(sliver[touched], max(_SLIVER_COUPLING / densest, _LEAST_COUPLING), _RIGID_COUPLING)
+    enough = np.where(sliver[inside], max(_SLIVER_COUPLING / densest, _LEAST_COUPLING), _RIGID_COUPLING)
     enough *= stencil.total
     hard[touched] = False
     number, least = np.zeros(shape, np.int32), _least_mass(every.coupling, largest)
     number[:-1, :-1, :-1] = elements.material
     number.ravel()[vertices[:, 0]] = kind
     sums = _ElementSums(number, every, least)
-    rows, before = sums.rows(touched, hard), np.zeros_like(hard)
-    while inside.any():
-        hard[touched] |= inside & (rows.total <= enough)
+    before = np.zeros_like(hard)
+    while len(inside):
+        loose = sums.rows(inside, hard).total <= enough
+        hard[inside[loose]] = True
         if not (new := hard & ~before).any():
             break
+        inside, enough = inside[~loose], enough[~loose]
         some, before = np.flatnonzero(new[vertices].any(axis=1)), hard.copy()
         out = hard[vertices[some]]
         both = kind[some] << 8 | np.packbits(out, axis=1)[:, 0]
@@ -275,10 +276,7 @@ def _without_rigid(
         number.ravel()[vertices[some, 0]] = len(sums.least) + other
         needed = np.concatenate((sums.least, _least_mass(less.coupling, largest)))
         sums = _ElementSums(number, InterfaceElements.joined([sums.kinds, less]), needed)
-        changed = np.flatnonzero(with_neighbours(new.reshape(shape)).ravel()[touched])
-        for whole, part in zip(rows, sums.rows(touched[changed], hard), strict=True):
-            whole[changed] = part
-    return sums, hard, rows
+    return sums, hard, sums.rows(touched, hard)
 
 
 def _uniform_elements(materials: Materials, stencil: Stencil) -> InterfaceElements:
