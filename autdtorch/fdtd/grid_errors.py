@@ -54,6 +54,7 @@ class Law:
     air: float = math.inf  # wavelength around bodies [m]
     thickness: float = math.inf  # their mean thickness [m]
     kink: float = 1.0  # how much of what they scatter is due to kinks of the pressure; see `Region.kink`
+    rigid: bool = False  # whether some of them are rigid
     held: float = 1.0  # ratio of densities of the air and a fluid in rigid bodies; see `Region.held_contrast`
     # length of their edges over their area [1/m], and the largest extent of one [m], for aligned faces alone
     edges: float = math.inf
@@ -84,6 +85,16 @@ class Law:
         """Return the error of a spacing [m] relative to those of others."""
         share = spacing / self.wavelength
         return share**2 * (self._at_surfaces + (share / _EQUAL) ** 4)
+
+    def ratio(self, other: float, spacing: float) -> float:
+        """Return the error of another spacing [m] relative to that of a spacing [m].
+
+        Of rigid bodies that are thinner than a cell, cells see another thickness, which falls with the cells.
+        """
+        ratio = self.growth(other) / self.growth(spacing)
+        if self.rigid and not self.aligned:
+            ratio *= max(self.thickness, spacing) / max(self.thickness, other)
+        return ratio
 
     def spacing_of(self, wanted: float) -> float:
         """Return the spacing [m] whose `growth` is `wanted`."""
@@ -124,7 +135,7 @@ def errors_by_grids(
     """Return the errors (P,) from other grids alone; see `grid_errors`."""
     size, compared = sizes(matrix, free), others[-_COMPARED:]
     changes = torch.stack([(other - matrix).norm(dim=1) / size for other, _ in compared], dim=1)
-    grown = [abs(law.growth(other) / law.growth(spacing) - 1) for _, other in compared]
+    grown = [abs(law.ratio(other, spacing) - 1) for _, other in compared]
     return (changes / torch.tensor(grown, **REAL)).clamp(min=_TINY).log().mean(dim=1).exp()
 
 

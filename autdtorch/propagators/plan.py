@@ -157,7 +157,8 @@ class Plan:
     def law(self) -> Law:
         """The growth of its errors with the spacing."""
         region, aligned = self.region, self.grouping.aligned
-        around = region.wavelength, region.mean_thickness, region.kink, region.held_contrast
+        rigid = any(body.fluid is None for body in region.bodies)
+        around = region.wavelength, region.mean_thickness, region.kink, rigid, region.held_contrast
         law = Law(region.shortest_wavelength, aligned, *around)
         if aligned:
             law = replace(law, edges=region.edges_per_area, extent=region.largest_extent)
