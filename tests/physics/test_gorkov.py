@@ -42,6 +42,7 @@ def test_force_and_stiffness_are_derivatives_of_the_potential(bodies):
     assert relative(torch.stack(each, dim=1), field.stiffness[0]) < 1e-7
 
 
+@pytest.mark.filterwarnings("ignore::autdtorch.ScaleWarning")  # of transducers so far apart
 def test_a_standing_wave_holds_a_bead_as_theory_says():
     # 2 A cos(k z) from two far transducers: F = 4 pi a^3 k E Phi sin(2 k z), E = A^2 / (rho c^2) (Bruus 2012)
     far, k = 0.3, 2 * math.pi * 40e3 / 343
