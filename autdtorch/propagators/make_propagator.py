@@ -212,7 +212,7 @@ def _refined(pilot: Plan, budget: _Budget, store: Store) -> SimulatedPropagator:
         wanted = aim / grid_error * law.growth(plan.spacing)
         step = min(max(plan.spacing / law.spacing_of(wanted), _SMALLEST_STEP), _LARGEST_STEP)
         for ratio in (step, _SMALLEST_STEP):
-            finer = plan.fitted(plan.spacing / ratio, plan.tolerance)
+            finer = plan.fitted(plan.spacing / ratio, plan.tolerance, plan.spacing / _SMALLEST_STEP)
             if budget.fits(finer, plan, taken):
                 break
         else:
