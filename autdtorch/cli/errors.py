@@ -19,7 +19,7 @@ from autdtorch import hardware
 from autdtorch.cli.arguments import COMMANDS
 from autdtorch.cli.config_files import GROUPS
 from autdtorch.io.yaml_file import TARGET
-from autdtorch.utils.hints import did_you_mean, with_extra
+from autdtorch.utils.hints import did_you_mean, nearest_name, with_extra
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 """Environment variable that asks for tracebacks."""
@@ -122,10 +122,12 @@ def _of_hydra(error: BaseException, text: str) -> str:
             return f"{unknown[1]}: there is no {key}; must be chosen, as {key}=NAME"
         keys = _siblings(error.__cause__)
         parent, _, name = key.rpartition(".")
-        hint = did_you_mean(name, keys if parent else [*keys, *GROUPS])
+        alike = nearest_name(name, keys if parent else [*keys, *GROUPS])
         elsewhere = _in_groups(error.__cause__, unknown[1].rpartition(".")[2])
-        if elsewhere and not (hint and "." in unknown[1]):
-            hint = f" (did you mean {elsewhere[0]!r}?)"
+        if alike and "." in unknown[1]:
+            elsewhere = []
+        hints = [repr(hint) for hint in (*elsewhere[:1], alike) if hint]
+        hint = f" (did you mean {' or '.join(hints)}?)" if hints else ""
         listed = ""
         if "." in key:  # others are all set, and Hydra's advice to add one would then be refused
             added = re.search(r"To append to your config use (\+.+)", text)
