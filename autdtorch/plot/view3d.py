@@ -138,7 +138,8 @@ def view3d(
         The plotter, for changes or ``show()``; close it when done.
 
     Raises:
-        RuntimeError: this machine cannot render, or cannot write HTML; the message names the cause.
+        ImportError: HTML is asked for, and the extra ``notebook`` is not installed.
+        RuntimeError: this machine cannot render; the message names the cause.
         ValueError: `drive`, `field` or `volume` does not fit the scene, or another argument is out of range.
     """
     require_kind("scene", scene, Scene)
@@ -234,7 +235,7 @@ def _export_path(name: str, value: str | Path) -> Path:
     """Return the path of a file that can be written."""
     path = path_of(name, value, suffixes=(".png", ".html", ".gltf"))
     if path.suffix.lower() == ".html" and importlib.util.find_spec("trame_pyvista") is None:
-        raise RuntimeError(f"{name}: {str(path)!r} needs trame-pyvista: {with_extra('notebook')}")
+        raise ImportError(f"{name}: {str(path)!r} needs trame-pyvista: {with_extra('notebook')}")
     return path
 
 

@@ -98,7 +98,7 @@ def test_bad_input_is_refused_before_anything_is_rendered(
         with pytest.raises(ValueError, match=message):
             call()
     monkeypatch.setitem(sys.modules, "trame_pyvista", None)
-    with pytest.raises(RuntimeError, match=r"save: 'scene.html' needs trame-pyvista"):
+    with pytest.raises(ImportError, match=r"save: 'scene.html' needs trame-pyvista"):
         view3d(scene, save="scene.html")
 
 

@@ -53,8 +53,8 @@ def explore(
 
     Raises:
         ValueError: an argument is out of range, `drive` does not fit the array, or `trial` is no folder.
-        RuntimeError: this machine cannot render in 3D, or the extra ``explore`` is not installed; the message
-            names the cause.
+        ImportError: the extra ``explore`` is not installed.
+        RuntimeError: this machine cannot render in 3D; the message names the cause.
         OSError: the port is taken.
     """
     require_kind("scene", scene, Scene)
@@ -67,7 +67,7 @@ def explore(
     if folder is not None and not folder.is_dir():
         raise invalid("trial", str(trial), "must be the folder of a trial, which exists")
     if importlib.util.find_spec("trame_rca") is None:
-        raise RuntimeError(f"explore: needs trame: {with_extra('explore')}")
+        raise ImportError(f"explore: needs trame: {with_extra('explore')}")
     with _OPENING:
         require_rendering()
         from autdtorch.plot.explore.explorer import Explorer
