@@ -3,7 +3,7 @@
 Fields between places apart have few degrees of freedom: about the product of the two areas over the square
 of wavelength times distance (Miller 2000, doi:10.1364/AO.39.001681). Both sides are split into parts, and
 adaptive cross approximation (Bebendorf 2000, doi:10.1007/PL00005410) finds the freedom of each pair from
-some rows and columns.
+some rows and columns, a block of them at a time.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.linalg import lu, solve_triangular
 from scipy.spatial.distance import cdist
 from torch import Tensor
 
@@ -39,8 +40,9 @@ _NEAREST = 0.5
 _RATIO = 4.0
 """Ratio of the distances of images whose waves are summed in one matrix."""
 
-_SEVERAL = 3
-"""Successive terms that must be small: a single one may be so by chance."""
+_BLOCK, _SEVERAL = 8, 3
+"""Rows and columns that are computed at once, and the terms of them that must be small in the end: a single
+one may be so by chance. Larger blocks take fewer calls and more waves."""
 
 _USUAL_RANK = 55
 """Usual rank of a pair of parts, for estimates."""
@@ -124,42 +126,33 @@ def _pairs(
 
     Their numbers are of a `kind`: a run applies them every block, in the time that memory takes.
     """
+    from autdtorch.fdtd.kernels.cpu_waves import wave_matrix  # loads numba
+
     weights = torch.tensor([image.weight for image in images], **COMPLEX)
     matrices = torch.stack([image.matrix for image in images])
-    offsets = torch.stack([image.offset for image in images])
+    offsets = torch.stack([image.offset for image in images])[:, None]
     most = _MOST_RANK * min(len(images), _MOST_SIDES)
+
+    def waves(places: Tensor, images: Tensor) -> AnyArray:  # (n, 3) from images (i, b, 3) of places: (n, b)
+        amplitude = weights.repeat_interleave(images.shape[1])
+        return wave_matrix(places, images.flatten(0, 1), amplitude, images.shape[1], wavenumber).numpy()
 
     def approximated(pair: tuple[Index, Index]) -> Pair | None:
         ends, starts = points[pair[0]], surface[pair[1]]
 
-        def row(number: int) -> AnyArray:  # distances to an image are those from the place that it is of
-            places = ((ends[number] - offsets)[:, None] @ matrices)[:, 0]
-            return _waves(starts, places, weights, wavenumber)
+        def rows(numbers: Index) -> AnyArray:  # distances to an image are those from the place that it is of
+            return waves(starts, (ends[numbers] - offsets) @ matrices).T
 
-        def column(number: int) -> AnyArray:
-            return _waves(ends, matrices @ starts[number] + offsets, weights, wavenumber)
+        def columns(numbers: Index) -> AnyArray:
+            return waves(ends, starts[numbers] @ matrices.mT + offsets)
 
-        factors = cross_approximation(row, column, (len(ends), len(starts)), most)
+        factors = cross_approximation(rows, columns, (len(ends), len(starts)), most)
         return None if factors is None else Pair(*pair, *(factor.astype(kind) for factor in factors))
 
     parts = itertools.product(_parts(points.numpy(), edge), _parts(surface.numpy(), edge))
     pairs = spread(approximated, list(parts), thread_count())
     whole = [pair for pair in pairs if pair is not None]
     return whole if len(whole) == len(pairs) else None
-
-
-def _waves(points: Tensor, sources: Tensor, amplitude: Tensor, wavenumber: complex) -> AnyArray:
-    """Return the field (n,) at points (n, 3) of sources (m, 3) with amplitudes (m,)."""
-    if len(sources) > 1:
-        from autdtorch.fdtd.kernels.cpu_waves import superposition  # loads numba
-
-        return superposition(points, sources, amplitude[:, None], wavenumber)[:, 0].numpy()
-    x, y, z = (points - sources).mT.numpy()
-    distance = np.sqrt(x * x + y * y + z * z)
-    size, turn = np.exp(-wavenumber.imag * distance) / distance, wavenumber.real * distance
-    waves = np.empty(len(distance), complex)
-    waves.real, waves.imag = size * np.cos(turn), size * np.sin(turn)
-    return np.asarray(amplitude.item() * waves)
 
 
 def _balls(places: Array, edge: float) -> tuple[Tensor, Array]:
@@ -185,30 +178,35 @@ def _parts(places: Array, edge: float) -> list[Index]:
 
 
 def cross_approximation(
-    row: Callable[[int], AnyArray], column: Callable[[int], AnyArray], shape: tuple[int, int], most: int
+    rows: Callable[[Index], AnyArray], columns: Callable[[Index], AnyArray], shape: tuple[int, int], most: int
 ) -> tuple[AnyArray, AnyArray] | None:
-    """Return factors (n, rank) and (rank, m) of a matrix of `shape` from its rows and columns.
+    """Return factors (n, rank) and (rank, m) of a matrix of `shape` from blocks of its rows and columns.
 
-    Each term removes a row and a column of what is left; the next row goes through the largest entry of the
-    column. The result is None if the rank is larger than `most`.
+    The terms of a block remove its rows from what is left of the matrix, and the columns of their pivots. The
+    next rows are the pivots of these columns. The result is None if the rank is larger than `most`.
     """
-    most = min(most, *shape)
-    lefts, rights = np.zeros((most, shape[0]), complex), np.zeros((most, shape[1]), complex)
-    unused, pivot, square, small = np.ones(shape[0], bool), 0, 0.0, 0
-    for rank in range(most):
-        unused[pivot] = False
-        right = row(pivot) - lefts[:rank, pivot] @ rights[:rank]
-        place = int(np.abs(right).argmax())
-        if right[place] == 0:
-            return np.ascontiguousarray(lefts[:rank].T), rights[:rank]
-        right = right / right[place]
-        left = column(place) - rights[:rank, place] @ lefts[:rank]
-        lefts[rank], rights[rank] = left, right
-        size = float((np.abs(left) ** 2).sum() * (np.abs(right) ** 2).sum())
-        across = (lefts[:rank] @ left.conj()) * (rights[:rank] @ right.conj())
-        square += size + 2 * float(across.real.sum())
-        small = small + 1 if size <= _ERROR**2 * square else 0
-        if small == _SEVERAL or rank + 1 == min(shape):
-            return np.ascontiguousarray(lefts[: rank + 1].T), rights[: rank + 1]
-        pivot = int(np.where(unused, np.abs(left), -1).argmax())
+    lefts, rights = np.zeros((shape[0], 0), complex), np.zeros((0, shape[1]), complex)
+    row = np.linspace(0, shape[0] - 1, min(_BLOCK, shape[0])).astype(int)
+    unused, square = np.ones(shape[0]), 0.0
+    for _ in range(0, most, _BLOCK):
+        unused[row] = 0
+        column, right = _eliminated((rows(row) - lefts[row] @ rights).T)
+        left = columns(column) - lefts @ rights[:, column]
+        left = solve_triangular(right[column], left.T, lower=True, unit_diagonal=True, check_finite=False).T
+        lefts, rights = np.hstack((lefts, left)), np.vstack((rights, right.T))
+        products = (left.conj().T @ lefts) * (rights @ right.conj()).T  # of the new terms with all
+        among = products[:, -len(column) :].real
+        square += 2 * float(products.real.sum()) - float(among.sum())
+        if among.diagonal()[-_SEVERAL:].max() <= _ERROR**2 * square or len(rights) >= min(shape):
+            return lefts, rights
+        row, _ = _eliminated(left * unused[:, None])
     return None
+
+
+def _eliminated(matrix: AnyArray) -> tuple[Index, AnyArray]:
+    """Return the pivots (k,) of columns (n, k) in turn, by rows, and the columns (n, k) in units of them.
+
+    They are the largest entries of what Gaussian elimination leaves of each column.
+    """
+    order, lower, _ = lu(matrix, p_indices=True, check_finite=False)
+    return np.argsort(order)[: lower.shape[1]], lower[order]

@@ -44,18 +44,20 @@ _TERMS = 13  # Terms of the Taylor series; the next one is below 1e-16 for argum
 _SHIFT = 1.5 * 2.0**52  # Constant that rounds to the nearest integer when added and subtracted
 
 
-def _room(dtype: type) -> tuple[AnyArray, ...]:
-    """Return Taylor coefficients and workspace for `_set_waves`.
+_SERIES = np.array(
+    [
+        [(-1) ** n * (2 * math.pi) ** (2 * n + 1) / math.factorial(2 * n + 1) for n in range(_TERMS)],
+        [(-1) ** n * (2 * math.pi) ** (2 * n) / math.factorial(2 * n) for n in range(_TERMS)],
+        [(-math.log(2)) ** n / math.factorial(n) for n in range(_TERMS)],
+    ]
+)  # Taylor coefficients of sin(2 pi u) / u and cos(2 pi u) in u^2, and of 2^-u in u
 
-    The series are those of sin(2 pi u) / u and cos(2 pi u) in u^2, and of 2^-u in u.
-    """
-    turn, log = 2 * math.pi, math.log(2)
-    sine = [(-1) ** n * turn ** (2 * n + 1) / math.factorial(2 * n + 1) for n in range(_TERMS)]
-    cosine = [(-1) ** n * turn ** (2 * n) / math.factorial(2 * n) for n in range(_TERMS)]
-    power = [(-log) ** n / math.factorial(n) for n in range(_TERMS)]
+
+def _room(dtype: type) -> tuple[AnyArray, ...]:
+    """Return Taylor coefficients and workspace for `_set_waves`."""
     lanes: AnyArray = np.zeros(NUMBERS * LANES, dtype)
     bits = lanes.view(np.int32 if dtype is np.float32 else np.int64)
-    return np.array((sine, cosine, power), dtype), lanes, bits
+    return _SERIES.astype(dtype), lanes, bits
 
 
 @njit(**INNER)
@@ -275,6 +277,10 @@ def _rows(places: Tensor | Discs) -> AnyArray:
 
 
 def _filled(rows: AnyArray, mode: Literal["edge", "constant"]) -> AnyArray:
-    """Pad rows (..., N) to whole blocks by their last entry or by zeros."""
-    ends = (*((0, 0),) * (rows.ndim - 1), (0, -rows.shape[-1] % LANES))
-    return np.ascontiguousarray(np.pad(rows, ends, mode))  # numba compiles again for another order
+    """Return rows (..., N) in whole blocks, filled up by the last entry of each or by zeros."""
+    count = rows.shape[-1]
+    # `np.pad` takes as long as 2000 waves; numba compiles again for another order
+    filled = np.empty((*rows.shape[:-1], count + -count % LANES), rows.dtype)
+    filled[..., :count] = rows
+    filled[..., count:] = rows[..., -1:] if mode == "edge" else 0
+    return filled
