@@ -52,6 +52,20 @@ def test_means_over_materials_are_those_by_their_shares(seed, bodies):
     assert np.abs(np.moveaxis(mixed, 0, -1) - share @ values.T).max() < ROUNDING
 
 
+@given(SEEDS)
+@settings(max_examples=20)
+def test_flush_bodies_have_shares_in_any_order(seed):
+    """The later one had more of the sub-cells that the seam cuts, of two halves 2/3."""
+    random = np.random.default_rng(seed)
+    normal = random.normal(size=3)
+    level = (LATTICE - random.uniform(0.3, 0.7, 3)) @ (normal / np.linalg.norm(normal))
+    flush, numbers = np.stack((level, -level))[:, None], np.array([1, 2])
+    one, other = (shares(volume_coverage, flush[::turn], numbers[::turn], 3) for turn in (1, -1))
+    # seen from both sides, the union is less than one in sub-cells whose corners show only distances from it
+    assert np.abs(one - other).max() < 0.1
+    assert np.abs(one.mean(axis=1) - other.mean(axis=1)).max() < 0.02
+
+
 def test_distances_that_vary_along_one_axis_are_layered_along_it():
     random = np.random.default_rng(0)
     across = random.normal(size=(3, 5))

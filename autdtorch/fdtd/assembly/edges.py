@@ -125,7 +125,9 @@ class Rim:
         ways = (part[:, :, None] * normal).sum(axis=1)
         places = points[near] + ways
         off = np.abs(np.column_stack((self._levels(places), self.bodies.distance(places)))).max(axis=1)
-        real = off < _ON * self.spacing
+        # in front of each face and below the other is no body: at the seam of two fluids one of both is rigid
+        beside = places[:, None] + 2 * _ON * self.spacing * (normal - 2 * normal[:, ::-1])
+        real = (off < _ON * self.spacing) & (self.bodies.distance(beside) > 0).all(axis=1)
         way[near[real]], normals[near] = ways[real], normal
         return Nearest(way, normals, endless)
 

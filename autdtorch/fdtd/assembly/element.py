@@ -227,16 +227,17 @@ def line_coverage(distance: Array) -> Array:
 def shares(coverage: Callable[[Array], Array], distance: Array, material: Index, count: int) -> Array:
     """Return the share of each material (n, q, count) in the q parts that `coverage` divides an element into.
 
-    Distances are (K, n, 125) [cells]. Bodies that touch leave no air between them: the union of all decides
-    the share of air.
+    Distances are (K, n, 125) [cells]. A later body replaces the earlier ones where it is, as far as the union
+    of all does not grow: of bodies that touch it replaces nothing, and no air is left between them.
     """
     covered = coverage(distance)
     share = np.zeros((*covered.shape[1:], count))
-    for cover, number in zip(covered, material, strict=True):
-        share *= 1 - cover[..., None]
+    union = np.zeros(covered.shape[1:])
+    for body, (cover, number) in enumerate(zip(covered, material, strict=True)):
+        joint = coverage(distance[: body + 1].min(axis=0)) if body else cover
+        both = np.maximum(np.maximum(joint, cover), union)
+        share *= np.divide(both - cover, union, out=np.zeros_like(union), where=union > 0)[..., None]
         share[..., number] += cover
-    solid = share.sum(axis=2)
-    union = covered[0] if len(covered) == 1 else coverage(distance.min(axis=0))
-    share *= np.divide(union, solid, out=np.zeros_like(solid), where=solid > 0)[..., None]
+        union = both
     share[..., 0] += 1 - union
     return share

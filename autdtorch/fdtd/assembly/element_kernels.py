@@ -47,10 +47,7 @@ def cover_subcells(distance, covered):  # type: ignore[no-untyped-def]
 
 @entry()
 def mix_materials(distance, grown, material, values, mixed):  # type: ignore[no-untyped-def]
-    """Write the means of values over the materials in each sub-cell.
-
-    Bodies that touch leave no air between them: the union of all decides the share of air, the last one the
-    material.
+    """Write the means of values over the materials in each sub-cell; see `element.shares`.
 
     Args:
         distance: signed distances of bodies at the lattices of elements (K, n, 125).
@@ -60,9 +57,10 @@ def mix_materials(distance, grown, material, values, mixed):  # type: ignore[no-
         mixed: the means (v, n, 64), to be written.
     """
     rows, planes = np.empty((2, 4, 25)), np.empty((3, 4, 4, 5))
-    level, nearest, covered, solid = np.empty(125), np.empty(125), np.empty(64), np.empty(64)
+    level, nearest = np.empty(125), np.empty(125)
+    covered, united, union = np.empty(64), np.empty(64), np.empty(64)
     for row in range(distance.shape[1]):
-        nearest[:], solid[:], mixed[:, row] = _BEYOND, 0.0, 0.0
+        nearest[:], union[:], mixed[:, row], bodies = _BEYOND, 0.0, 0.0, 0
         for body in range(len(distance)):
             if distance[body, row, 0] > _BEYOND:
                 continue
@@ -70,17 +68,19 @@ def mix_materials(distance, grown, material, values, mixed):  # type: ignore[no-
                 level[point] = distance[body, row, point] - grown[body, row]
                 nearest[point] = min(nearest[point], level[point])
             _cover(level, rows, planes, covered)
+            bodies += 1
+            if bodies > 1:
+                _cover(nearest, rows, planes, united)
             for cell in range(64):
-                solid[cell] += covered[cell] * (1 - solid[cell])
+                both = max(united[cell], covered[cell], union[cell]) if bodies > 1 else covered[cell]
+                left = (both - covered[cell]) / union[cell] if union[cell] > 0.0 else 0.0
                 for number in range(len(values)):
-                    mixed[number, row, cell] *= 1 - covered[cell]
+                    mixed[number, row, cell] *= left
                     mixed[number, row, cell] += covered[cell] * values[number, material[body]]
-        _cover(nearest, rows, planes, covered)
+                union[cell] = both
         for cell in range(64):
-            union = covered[cell] / solid[cell] if solid[cell] > 0.0 else 0.0
             for number in range(len(values)):
-                solids = mixed[number, row, cell] * union
-                mixed[number, row, cell] = solids + (1 - covered[cell]) * values[number, 0]
+                mixed[number, row, cell] += (1 - union[cell]) * values[number, 0]
 
 
 @entry()

@@ -43,7 +43,7 @@ from autdtorch.fdtd.assembly.unions import (
 )
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Region
-from autdtorch.fdtd.shapes import bounds
+from autdtorch.fdtd.shapes import Shape, bounds
 from autdtorch.fdtd.stencil import Stencil, flat_strides, places_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.process import one_library_thread, spread
@@ -59,6 +59,9 @@ _ROUGH = 0.01
 # Change of the stiffness at edges of fluids over that at rigid edges. With 0.15 and 0.3, tilted cubes of
 # density ratio 77 have errors of up to 2.4 and 2.7 % (15 mm) and 2.8 and 2.1 % (8 mm) at 1 mm.
 _FLUID_SHARE = 0.3
+# Relative density from which a fluid in front of a rigid face leaves no edge there. Of a rigid tube of slabs
+# around a fluid of three times the density of air, errors at 1.2 mm are 3 to 12 %, not 4 to 18 %.
+_DENSE = 10.0
 _SAME = 1e-9  # Difference of distances [cells] up to which elements are alike
 _GROUND_GRADIENT = 0.3  # Least mean gradient of a signed distance in an element with one surface
 
@@ -282,13 +285,12 @@ def _interface(
     if not len(index):
         return []
     numbers = np.array([body.material for body in bodies], np.int64)
-    shapes = [shape for body in bodies for shape in body.shapes]
     edges: list[Edge] = [
         edge if body.rigid else replace(edge, share=_FLUID_SHARE)
         for body in bodies
         if body.finite
         for shape in body.shapes
-        for edge in edges_of(shape, [each for each in shapes if each is not shape])
+        for edge in edges_of(shape, _covering(shape, body, bodies, materials))
     ]
     carved = [(shape, body) for body in bodies if body.finite or not body.rigid for shape in body.shapes]
     edges += rims_of(
@@ -317,6 +319,13 @@ def _interface(
 
     with show_progress(len(index), "measuring surfaces") as progress:
         return spread(chunk, range(0, len(index), _CHUNK))
+
+
+def _covering(shape: Shape, body: Union, bodies: list[Union], materials: Materials) -> list[Shape]:
+    """Return the shapes that leave no edge where they touch a shape of a body: more like it than like air."""
+    enough = min(math.sqrt(materials.density[body.material]), _DENSE)
+    covering = [each for each in bodies if materials.density[each.material] >= enough]
+    return [each for other in covering for each in other.shapes if each is not shape]
 
 
 # Returns the signed distances (...) [cells] of places (..., 3) [cells]
