@@ -151,7 +151,9 @@ def _weights(region: Region, number: int, axis: int, place: float, outward: floa
     share = np.stack(np.meshgrid(*along, indexing="ij"), axis=-1).reshape(-1, 3)
     places = torch.from_numpy(lower + share * (upper - lower))
     step = torch.from_numpy(outward * LENGTH_TOLERANCE * np.eye(3)[axis])
-    of_body = body.shape.signed_distance(places - step) < 0
+    of_body, beyond = (body.shape.signed_distance(places + side * step) < 0 for side in (-1, 1))
+    if (of_body & ~beyond).any():  # else a face smaller than the distance of the places
+        of_body &= ~beyond
     shown, front = of_body.clone(), torch.full(of_body.shape, -1, dtype=torch.int64, device="cpu")
     for index, other in others:
         front[other.shape.signed_distance(places + step) < 0] = index
