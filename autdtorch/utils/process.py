@@ -237,20 +237,22 @@ def one_library_thread() -> Iterator[None]:
 def spread(function: Callable[[T], R], items: Iterable[T], most: int | None = None) -> list[R]:
     """Return the values of a function for all items, computed on `most` threads, by default `thread_count()`.
 
-    The function should release the interpreter lock most of the time; nested calls of `spread` use one
-    thread. Each item goes to the next free thread, so that a delayed thread costs at most one item.
+    The function should release the interpreter lock most of the time; nested calls of `spread` share the
+    threads that are left. Each item goes to the next free thread, so that a delayed thread costs at most one
+    item.
     """
     items = list(items)
     threads = min(thread_count() if most is None else most, len(items))
     if threads < 2:
         return [function(item) for item in items]
+    each = max(1, thread_count() // threads)
 
-    def alone(item: T) -> R:
-        _count.set(1)
+    def with_its_share(item: T) -> R:
+        _count.set(each)
         return function(item)
 
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(alone, items))
+        return list(pool.map(with_its_share, items))
 
 
 def even_parts(count: int, parts: int) -> list[tuple[int, int]]:

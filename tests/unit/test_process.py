@@ -12,6 +12,8 @@ from small_scenes import CUBE, small_scene
 from threadpoolctl import threadpool_info
 
 import autdtorch as at
+from autdtorch.fdtd.kernels import cpu
+from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.propagators import Propagator
 from autdtorch.study.run_study import run_study
 from autdtorch.utils import process
@@ -29,6 +31,25 @@ def in_new_thread() -> int:
     new.start()
     new.join()
     return found[0]
+
+
+def test_work_within_work_shares_the_threads(four_threads: None) -> None:
+    def inner(_: int) -> int:
+        return process.thread_count()
+
+    assert [process.spread(inner, range(count)) for count in (1, 2, 3, 9)] == [[4], [2] * 2, [1] * 3, [1] * 9]
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3, 4, 7, 8, 16, 64])
+@pytest.mark.parametrize("edge", [40, 130, 250, 500])
+def test_runs_at_once_occupy_the_threads_and_limited_memory(threads, edge, monkeypatch) -> None:
+    """Four runs of one thread each left most of many processors idle on large grids."""
+    monkeypatch.setattr(cpu, "thread_count", lambda: threads)
+    kernel, shape = CpuKernel(), (edge,) * 3
+    chunks, runs = len(cpu._cuts(shape)) - 1, kernel.at_once(shape)
+    busy = runs * min(chunks, threads // runs)
+    assert min(threads, chunks) * 0.75 <= busy <= threads
+    assert runs <= max(1, threads // chunks) or runs * edge**3 <= 2**27
 
 
 @pytest.mark.usefixtures("four_threads")

@@ -3,7 +3,7 @@
 The shape of the grid alone determines its chunks of planes (`_cuts`), so that results do not depend on the
 number of threads. A step sweeps each chunk once (`cpu_sweep.py`). Then the outermost planes of a chunk
 receive the terms of its neighbours, and single cells are corrected. A small grid is one chunk, stepped by one
-thread. Several runs are stepped concurrently, each by one thread.
+thread. Several runs are stepped concurrently, and share the threads.
 
 Workers do these tasks, which are numbered phase by phase. A worker claims the next task, waits until all
 tasks of earlier phases are finished, and does it. A suspended worker delays the others by one task, and
@@ -47,9 +47,9 @@ _FLAT_PLANES = 12  # Fewest planes of two chunks of large planes
 # Shares of the processors' time that workers got: below the first a single worker continues, above the second
 # several again
 _CROWDED, _FREE = 0.75, 0.9
-# Most runs of a large grid at once, each of up to a gigabyte. What a run does beside its steps, up to half of
-# its time, takes one thread.
-_FEW = 4
+# Most runs of a large grid at once, and most cells of their grids, of 10 bytes each. What a run does beside
+# its steps, up to half of its time, takes one thread.
+_FEW, _MOST_CELLS = 4, 2**27
 _UNROLLED = 32  # Cells that a compiled loop computes at once: the lanes of four vectors
 _TICKS = 10  # Fewest ticks of the thread clock for a meaningful time
 
@@ -171,8 +171,9 @@ class CpuKernel:
         self._crowded = False
 
     def at_once(self, shape: tuple[int, int, int]) -> int:
-        """Return as many as threads allow with one for each chunk, or a few, each by one thread."""
-        return max(thread_count() // (len(_cuts(shape)) - 1), min(thread_count(), _FEW))
+        """Return as many as threads allow with one for each chunk, or a few that share the threads evenly."""
+        threads, few = thread_count(), min(_FEW, max(1, _MOST_CELLS // math.prod(shape)))
+        return max(threads // (len(_cuts(shape)) - 1), threads // math.ceil(threads / few))
 
     def threads(self, shape: tuple[int, int, int]) -> int:
         """Return a thread for each chunk, as far as there are any."""
