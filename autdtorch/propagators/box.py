@@ -324,7 +324,7 @@ class BoxSimulation(Simulation):
     @cached_property
     def _in_one_box(self) -> BoxSimulation:
         grouping = one_box(self.plan.region, self.plan.spacing)
-        return BoxSimulation(replace(self.plan, grouping=grouping), self._store)
+        return BoxSimulation(replace(self.plan, grids=grouping), self._store)
 
 
 def _images(box: ScatteredField, symmetry: Symmetry) -> Index:

@@ -64,9 +64,9 @@ class Plan:
     Attributes:
         spacing: edge of a cell [m]; of no effect in free space.
         time_step: upper limit of the time step [s]; None for the largest stable one.
-        grouping: the grids, and the obstacles on each; no grids in free space.
         runs: number of simulations of the control points' transfer matrix, or of the T-matrices;
             `plan` neglects symmetries.
+        grids: the grids, and the obstacles on each; None for the cheapest. See `grouping`.
         is_short: whether runs are of `max_periods`, steady or not; see `short_runs`.
     """
 
@@ -79,16 +79,21 @@ class Plan:
     dtype: torch.dtype
     max_periods: int
     time_step: float | None
-    grouping: Grouping
     runs: int
+    grids: Grouping | None = None
     is_short: bool = False
+
+    @cached_property
+    def grouping(self) -> Grouping:
+        """The grids, and the obstacles on each; no grids in free space."""
+        if self.grids is not None:
+            return self.grids
+        _, grouping = choose_grids(self.region, self.method, self.spacing, self.tolerance, self.runs)
+        return grouping.with_layer(THIN_LAYER) if self.is_short else grouping
 
     def at(self, spacing: float, tolerance: float, time_step: float | None = None) -> Self:
         """Return a plan of the same method with another spacing [m], tolerance and time step [s]."""
-        _, grouping = choose_grids(self.region, self.method, spacing, tolerance, self.runs)
-        if self.is_short:
-            grouping = grouping.with_layer(THIN_LAYER)
-        return replace(self, spacing=spacing, tolerance=tolerance, time_step=time_step, grouping=grouping)
+        return replace(self, spacing=spacing, tolerance=tolerance, time_step=time_step, grids=None)
 
     def fitted(self, spacing: float, tolerance: float, coarsest: float = math.inf) -> Self:
         """Return the plan at a spacing [m] near one, not above a limit, with which flat faces fall best."""
@@ -98,8 +103,7 @@ class Plan:
     def of(self, scene: Scene) -> Self:
         """Return a plan of a changed scene with these settings, which takes the same bodies as rigid."""
         rigid = _SLACK * max((body.rigid_error for body in self.region.bodies), default=0.0)
-        plan = replace(self, scene=scene, region=with_rigid(region_of(scene), rigid))
-        return plan.at(self.spacing, self.tolerance, self.time_step)
+        return replace(self, scene=scene, region=with_rigid(region_of(scene), rigid), grids=None)
 
     def around(self, scene: Scene) -> Self:
         """Return the plan of a scene with these obstacles, and another array, on the same grids.
@@ -109,7 +113,7 @@ class Plan:
         if self.region.mirrors:
             return self.of(scene)
         region = replace(self.region, domain=scene.domain, sources=scene.array.positions.numpy())
-        return replace(self, scene=scene, region=region)
+        return replace(self, scene=scene, region=region, grids=self.grouping)
 
     def short(self, spacing: float, periods: int) -> Self:
         """Return the plan of short runs of so many periods at another spacing [m].
@@ -122,8 +126,7 @@ class Plan:
     @property
     def with_materials(self) -> Self:
         """The plan without bodies that are taken as rigid; see `with_rigid`."""
-        plan = replace(self, region=with_rigid(region_of(self.scene), 0.0))
-        return plan.at(self.spacing, self.tolerance, self.time_step)
+        return replace(self, region=with_rigid(region_of(self.scene), 0.0), grids=None)
 
     @property
     def hides_losses(self) -> bool:
@@ -142,6 +145,7 @@ class Plan:
         scene = {entry.name: getattr(self.scene, entry.name) for entry in fields(self.scene)}
         settings = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         settings |= {"scene": None, "region": None, "runs": None, "dtype": str(self.dtype)}
+        settings["grids"] = self.grouping
         rigid = [body.fluid is None for body in self.region.bodies]
         affecting = {name: part for name, part in scene.items() if name not in _NO_EFFECT}
         array = self.scene.array
@@ -260,7 +264,7 @@ def plan(
             logger.debug("method auto: tmatrix; %d waves, where %s takes %d runs", by_waves, chosen, runs)
         method, runs = (chosen, runs) if by_waves is None else ("tmatrix", by_waves)
     return Plan(
-        scene, region, method, spacing, tolerance, kernel, precision, max_periods, time_step, grouping, runs
+        scene, region, method, spacing, tolerance, kernel, precision, max_periods, time_step, runs, grouping
     )
 
 

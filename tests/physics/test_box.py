@@ -193,7 +193,7 @@ POINTS = [[61e-3, 52e-3, 55e-3]]
 def boxes(scene, spacing=SPACING, grouping=None):
     """A propagator with the cheapest boxes, or with those of a grouping."""
     planned = plan(scene, "box", spacing, TOLERANCE)
-    return SimulatedPropagator(dataclasses.replace(planned, grouping=grouping or planned.grouping))
+    return SimulatedPropagator(dataclasses.replace(planned, grids=grouping or planned.grouping))
 
 
 def together(scene, spacing=SPACING):

@@ -175,7 +175,7 @@ class StillBody:
 
     @cached_property
     def _box(self) -> ScatteredField:
-        return BoxSimulation(replace(self._plan, grouping=self._grouping), Store()).boxes[0]
+        return BoxSimulation(replace(self._plan, grids=self._grouping), Store()).boxes[0]
 
     @cached_property
     def _kinds(self) -> torch.Tensor:
