@@ -5,6 +5,7 @@ import numpy as np
 import torch
 
 from autdtorch.scene.obstacles import Box
+from autdtorch.utils.spatial import areas_of
 
 
 def box(lower, upper):
@@ -54,6 +55,11 @@ def tube(path, radius=0.2, sides=12):
 def volume(mesh):
     vertices, faces = mesh.surface()
     return float(torch.linalg.det(vertices[faces] - vertices.mean(dim=0)).sum() / 6)
+
+
+def area(mesh):
+    vertices, faces = mesh.surface()
+    return float(areas_of(vertices[faces].numpy()).sum())
 
 
 CUBE = box((0, 0, 0), (1, 1, 1))

@@ -13,14 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion
 
+from autdtorch.scene.obstacles.mesh_part import place_of, winding_number, without_sheets
 from autdtorch.scene.obstacles.mesh_solid import (
     Triangles,
     joined,
     open_edges,
-    place_of,
     require_triangles,
     solid_of,
-    winding_number,
 )
 from autdtorch.scene.obstacles.polygons import Polygons, triangulated
 from autdtorch.utils.array_types import Array, Index
@@ -52,6 +51,7 @@ def repaired(corners: Array, triangles: Index) -> Repaired:
         return Repaired(*solid_of(corners, triangles), [])
     done: list[str] = []
     vertices, faces = joined(corners, triangles, _FARTHEST)
+    faces = without_sheets(faces)
     if not len(faces):
         raise ValueError("no triangle has an area; must enclose a volume")
     faces = _without_doubles(faces, done)
