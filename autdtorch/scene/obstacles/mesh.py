@@ -50,7 +50,8 @@ class Mesh(Obstacle):
     """The inside of a watertight triangle mesh, from an STL, OBJ or PLY file or by `from_surface`.
 
     A point r of the file has the position R(rotation) scale r + offset in the scene. Triangles may enclose
-    cavities, and several parts, which become one body where they overlap. A part must not cross itself.
+    cavities, and several parts, which become one body where they overlap or touch: slits up to 2e-5 of the
+    extent close. A part must not cross itself.
 
     Attributes:
         path: of the file, empty without one. It is read once; `dataclasses.replace` keeps the triangles.
