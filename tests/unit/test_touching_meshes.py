@@ -94,13 +94,16 @@ def folder(tmp_path_factory):
     size=st.tuples(*[st.floats(0.01, 0.1)] * 3),
     normal=st.sampled_from([(1.0, 0.0, 0.0), (1.0, 1.0, 0.0)])
     | st.tuples(*[st.floats(0.2, 1.0) | st.floats(-1.0, -0.2)] * 3),
+    diagonal=st.booleans(),
     share=st.floats(-0.7, 0.7),
     starts=st.tuples(*[st.integers(0, 5)] * 2),
     angles=ANGLES,
     place=PLACES,
     kind=st.sampled_from(["stl", "ply", "surface"]),
 )
-def test_parts_of_a_box_are_the_whole_box(folder, size, normal, share, starts, angles, place, kind):
+def test_parts_of_a_box_are_the_whole_box(folder, size, normal, diagonal, share, starts, angles, place, kind):
+    if diagonal:  # the seam ends at edges of the box, or at three corners
+        normal, share = np.sign(normal) / size, 0.0 if normal[2] == 0 else 1 / 3
     parts = placed(halves(np.array(size), normal, share, starts), angles, place)
     mesh = read(parts, kind, folder)
     a, b, c = size
