@@ -42,6 +42,11 @@ logger = logging.getLogger(__name__)
 _TAKEN_AS_RIGID = 0.25
 """Share of the error asked for up to which bodies are taken as rigid, where the spacing is chosen by it."""
 
+_RIGID_ON_CELLS, _MOST_RIGID = 0.5, 2.5
+"""Difference up to which bodies are taken as rigid on given cells, as their errors are larger: relative to
+the square of a cell in wavelengths, and at most to the tolerance. Cylinders of water err by 7 % at 1 mm,
+rigid ones by 0.5 %."""
+
 _SLACK = 1.05
 """Room for the change of a body's difference from a rigid one, where a scene changes a little."""
 
@@ -240,8 +245,12 @@ def plan(
     tolerance = positive("tolerance", tolerance)
     if tolerance >= 1:
         raise invalid("tolerance", tolerance, "must be in (0, 1)")
-    most = _TAKEN_AS_RIGID * tolerance if spacing is None else tolerance
-    spacing = region.coarsest_spacing if spacing is None else positive("spacing", spacing, "m")
+    if spacing is None:
+        spacing, most = region.coarsest_spacing, _TAKEN_AS_RIGID * tolerance
+    else:
+        spacing = positive("spacing", spacing, "m")
+        on_cells = _RIGID_ON_CELLS * (spacing / region.wavelength) ** 2
+        most = tolerance * min(max(on_cells / tolerance, 1.0), _MOST_RIGID)
     region = with_rigid(region, most)
     max_periods = integer_at_least("max_periods", max_periods, 1)
     time_step = None if time_step is None else positive("time_step", time_step, "s")

@@ -87,7 +87,7 @@ def test_a_squeue_that_fails_for_good_ends_the_wait_in_a_line_that_says_what_to_
     with caplog.at_level(logging.INFO):
         for _ in range(slurm._MOST_FAILURES - 1):
             assert not watcher.is_done("7_0")
-    (told,) = caplog.messages
+    (told,) = (each.getMessage() for each in caplog.records if each.name == slurm.logger.name)
     assert reason in told
     with pytest.raises(OSError, match=rf"{reason}.* jobs 7 may still run; .* the same command") as caught:
         watcher.is_done("7_0")
