@@ -105,7 +105,7 @@ def symmetric_rows(first, last, rows, place, weight, air, neighbours, values, co
         rows: flat indices of the cells (n,).
         place: of each cell of the grid among these, negative for others.
         weight: stencil rows of the cells (n, 27).
-        air: that of all others (27,).
+        air: stencil row of the others (27,).
         neighbours: offsets (27,).
         values: of the matrix, those that are not zero one after the other, to be written; maybe none.
         columns: of these, to be written.

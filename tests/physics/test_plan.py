@@ -1,0 +1,97 @@
+"""What a plan chooses, and counts."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_scenes import CUBE, relative_error, small_scene
+
+import autdtorch as at
+from autdtorch.propagators import FreeSpacePropagator
+from autdtorch.propagators import estimate as simulation_estimate
+from autdtorch.propagators.plan import plan
+
+CENTER, RADIUS = (12.2e-3, 11.9e-3, 12.1e-3), 3.3e-3
+
+
+BALL = at.Sphere((12e-3, 20e-3, 5e-3), 3e-3, density=0.2, sound_speed=900.0)
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "method"),
+    [
+        (CUBE, "box"),
+        (at.Box((11e-3, 12e-3, 12e-3), (15e-3, 23.8e-3, 23.8e-3), rigid=True), "box"),
+        (at.Box((12e-3,) * 3, (2e-3, 30e-3, 30e-3), rigid=True), "full"),
+        (at.Box((12e-3,) * 3, (2e-3, 8e-3, 30e-3), rigid=True), "box"),
+        (at.Sphere((14e-3, 12e-3, 2e-3), 4e-3, rigid=True), "tmatrix"),
+        (at.VoxelMask(np.ones((4, 4, 4), bool), 1e-3, (14e-3, 12e-3, 0.0), rigid=True), "box"),
+    ],
+    ids=["small", "filling the domain", "wall", "post", "sphere", "at the rim"],
+)
+def test_the_cheapest_accurate_method_is_chosen(obstacle, method):
+    assert plan(small_scene((obstacle,))).method == method
+
+
+def test_the_domain_of_a_box_may_be_too_large_for_full():
+    scene = replace(small_scene((CUBE,)), domain=((-2, -2, -2), (2, 2, 2)))
+    assert at.make_propagator(scene, spacing=2e-3).method == "box"  # 8e9 cells
+
+
+def test_a_plan_counts_what_is_simulated():
+    scene = small_scene((replace(CUBE, center=(12e-3, 12.7e-3, 11.6e-3)),))  # without symmetries
+    planned, propagator = plan(scene), at.make_propagator(scene)
+    matrix = propagator.transfer_matrix()
+    assert planned.runs == len(propagator.runs)
+    assert planned.work < plan(scene, "full").work
+    steps_per_period = 1 / (scene.frequency * propagator.time_step)
+    # a lower limit: blocks are completed, resonances take longer, and the time step is rounded
+    (grid,) = planned.grouping.grids
+    assert grid.steps < 1.05 * steps_per_period * min(run.periods for run in propagator.runs)
+    full = at.make_propagator(scene, "full").transfer_matrix()
+    assert relative_error(matrix, full) < 3e-3  # as in test_box.py: the grid's error in air
+
+
+@pytest.mark.parametrize("method", ["box", "full"])
+@pytest.mark.parametrize("spacing", [1.4e-3, 0.9e-3])
+def test_cells_and_runs_are_those_of_the_simulation(method, spacing):
+    scene = small_scene((CUBE, BALL))
+    cost = at.estimate(scene, spacing, method=method)
+    propagator = at.make_propagator(scene, method, spacing)
+    propagator.transfer_matrix()
+    (assembly,) = propagator.simulation.assemblies
+    assert cost.method == method
+    # a grid may be placed so that an axis has a cell more
+    shape = assembly.grid.shape
+    assert math.prod(shape) == pytest.approx(cost.cells, rel=4 / min(shape))
+    assert cost.runs == len(propagator.runs)
+
+
+def test_symmetric_points_share_a_run_unless_memory_is_short(monkeypatch):
+    points = [(20e-3, 12e-3 + y, 12e-3 + z) for y in (-4e-3, 4e-3) for z in (-3e-3, 3e-3)]
+    scene = replace(small_scene((CUBE,)), control_points=points)
+    assert at.estimate(scene, 2e-3, method="box").runs == 1
+    monkeypatch.setattr(simulation_estimate, "available_memory", lambda: 0)  # for a coarse grid
+    assert at.estimate(scene, 2e-3, method="box").runs == 4
+
+
+def test_memory_and_time_grow_with_the_cells(monkeypatch):
+    monkeypatch.setattr(simulation_estimate, "_rate", lambda *_: 1e9)  # whatever else the machine does
+    scene = small_scene()
+    coarse, fine = (at.estimate(scene, spacing, method="full") for spacing in (0.3e-3, 0.1e-3))
+    assert fine.cells > 5 * coarse.cells
+    assert 8 < fine.memory / fine.cells < 24  # two fields of four bytes a cell, and what else is held
+    assert fine.seconds > 1.2 * fine.cells / coarse.cells * coarse.seconds  # with three times the steps
+    double = at.estimate(scene, 0.3e-3, method="full", dtype="float64")
+    assert 1.3 < double.memory / coarse.memory < 2  # less than twice: what is recorded is in double anyway
+
+
+def test_free_space_takes_no_cells_and_infeasible_simulations_are_estimated():
+    assert isinstance(at.make_propagator(small_scene()), FreeSpacePropagator)
+    cost = at.estimate(small_scene())
+    assert (cost.method, cost.spacing, cost.cells, cost.runs) == ("free_space", None, 0, 0)
+    assert 0 < cost.seconds < 1e-3
+    cost = at.estimate(small_scene((CUBE,), extent=0.1), 1.8e-5, method="full")
+    assert cost.memory > 50e9
+    assert cost.seconds > 3600
