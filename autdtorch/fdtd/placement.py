@@ -109,13 +109,14 @@ def _faces(region: Region, surfaces: list[tuple[Array, Array]], axis: int, origi
     The side is 1 where the lighter material comes first, and -1 where the heavier does.
     """
     low, high = (corner[axis] for corner in region.domain)
+    boxes = np.array([(body.shape.lower, body.shape.upper) for body in region.bodies]).reshape(-1, 2, 3)
     parts = [np.zeros((3, 0))]
     for number, (corner, normal) in enumerate(surfaces):
         double = np.linalg.norm(normal, axis=1)
         aligned = np.abs(normal[:, axis]) > ALIGNED * double
         faces = _joined(corner[aligned, axis], np.sign(normal[aligned, axis]), double[aligned] / 2)
         for place, outward, area in faces[:, (faces[0] > low) & (faces[0] < high)].T.tolist():
-            heavier, lighter = _weights(region, number, axis, place, outward)
+            heavier, lighter = _weights(region, boxes, number, axis, place, outward)
             both = [[place - origin] * 2, [-outward, outward], [heavier * area, lighter * area]]
             parts.append(np.array(both))
     place, first, area = np.concatenate(parts, axis=1)
@@ -128,22 +129,20 @@ def _joined(place: Array, side: Array, area: Array) -> Array:
     return np.vstack((faces, np.bincount(number.ravel(), area, faces.shape[1])))
 
 
-def _weights(region: Region, number: int, axis: int, place: float, outward: float) -> tuple[float, float]:
+def _weights(
+    region: Region, boxes: Array, number: int, axis: int, place: float, outward: float
+) -> tuple[float, float]:
     """Return the weights of a body's face where the body is heavier than what is in front, and lighter.
 
-    The `place` [m] is along an axis. In front of air the weight is 1, inside a later body 0. In front of
-    another body it is the contrast of both: the seam of two bodies of one material has none.
+    The `place` [m] is along an axis; `boxes` (n, 2, 3) [m] are the bounds of all bodies. In front of air the
+    weight is 1, inside a later body 0. In front of another body it is the contrast of both: the seam of two
+    bodies of one material has none.
     """
     body = region.bodies[number]
-    lower, upper = np.array(body.shape.lower), np.array(body.shape.upper)
+    lower, upper = boxes[number].copy()
     lower[axis] = upper[axis] = place
-    others = [
-        (index, other)
-        for index, other in enumerate(region.bodies)
-        if index != number
-        and (lower < np.array(other.shape.upper) + LENGTH_TOLERANCE).all()
-        and (upper > np.array(other.shape.lower) - LENGTH_TOLERANCE).all()
-    ]
+    beside = ((lower < boxes[:, 1] + LENGTH_TOLERANCE) & (upper > boxes[:, 0] - LENGTH_TOLERANCE)).all(axis=1)
+    others = [(index, region.bodies[index]) for index in np.flatnonzero(beside).tolist() if index != number]
     if not others:
         return (1.0, 0.0) if _inertia(body.fluid) >= region.fluid.inertia else (0.0, 1.0)
     along = [(np.arange(_SAMPLES) + 0.5) / _SAMPLES] * 3
