@@ -87,7 +87,7 @@ class Law:
         return share**2 * (self._at_surfaces + (share / _EQUAL) ** 4)
 
     def ratio(self, other: float, spacing: float) -> float:
-        """Return the error of another spacing [m] relative to that of a spacing [m].
+        """Return the error at another spacing [m] over the error at a spacing [m].
 
         Of rigid bodies that are thinner than a cell, cells see another thickness, which falls with the cells.
         """
