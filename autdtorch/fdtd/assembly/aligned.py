@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from autdtorch.fdtd.assembly.element import VERTICES, InterfaceElements, Materials, uniform_coupling
+from autdtorch.fdtd.assembly.element import (
+    VERTICES,
+    InterfaceElements,
+    Materials,
+    tend_to_mean,
+    uniform_coupling,
+)
 from autdtorch.fdtd.assembly.layers import layered_elements
 from autdtorch.fdtd.assembly.prisms import Prisms, prisms, stacked
 from autdtorch.fdtd.assembly.sections import MaterialKey, Section
@@ -172,16 +178,12 @@ def aligned_elements(
     """Return elements of each of the kinds (k, 3)."""
     coupling, mass = _coupling_and_mass(kinds, blocks, materials, stencil)
     for pair, some, part in _seams(kinds, blocks, materials):
-        alike = materials.alike(*pair)
-        coupling[some] *= 1 - alike
-        mass[some] *= 1 - alike
-        for number, weight in zip(pair, alike * part.T[:, :, None], strict=True):
-            single = replace(
-                blocks, material=np.where(np.isin(blocks.material, pair), number, blocks.material)
-            )
-            added = _coupling_and_mass(kinds[some], single, materials, stencil)
-            coupling[some] += weight * added[0]
-            mass[some] += weight * added[1]
+        of_pair = np.isin(blocks.material, pair)
+        singles = []
+        for number in pair:
+            single = replace(blocks, material=np.where(of_pair, number, blocks.material))
+            singles.append(_coupling_and_mass(kinds[some], single, materials, stencil))
+        tend_to_mean((coupling, mass), some, singles, part, materials.alike(*pair))
     first = np.stack([each.begin[kind] for each, kind in zip(blocks.planes, kinds.T, strict=True)], axis=-1)
     vertex = blocks.at_vertices(first[:, None] + VERTICES)
     nothing = np.zeros(len(kinds), bool), np.zeros((len(kinds), 0))

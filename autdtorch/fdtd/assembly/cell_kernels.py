@@ -113,16 +113,16 @@ def symmetric_rows(first, last, rows, place, weight, air, neighbours, values, co
     """
     bound, count = 0.0, 0
     for row in range(first, last):
-        total, own = 0.0, 0.0
+        total, diagonal = 0.0, 0.0
         for number in range(27):
-            own += weight[row, number]
+            diagonal += weight[row, number]
         for number in range(27):
             near, ahead = place[rows[row] + neighbours[number]], weight[row, number]
             back = air[number] if near < 0 else weight[near, 26 - number]
             total += max(ahead + back, 0.0)
             # zeros by rounding may differ in sign
             value = -np.copysign(np.sqrt(max(ahead * back, 0.0)), ahead)
-            value = own if number == 13 else value
+            value = diagonal if number == 13 else value
             if near >= 0 and value != 0.0 and count < len(values):
                 values[count], columns[count] = value, near
                 count += 1

@@ -128,6 +128,24 @@ def uniform_coupling(stencil: Stencil) -> Array:
     return np.asarray(coupling_by_edges(stencil)[EDGES_BETWEEN.sum(axis=1)])
 
 
+def tend_to_mean(
+    values: Sequence[Array], some: Index, singles: Sequence[Sequence[Array]], part: Array, alike: float
+) -> None:
+    """Change values of elements at the seam of two fluids towards the mean of elements of each of the two.
+
+    Args:
+        values: arrays of all elements, to be changed.
+        some: the rows of these that change (k,).
+        singles: of each fluid, these rows of the elements with it in place of both.
+        part: of each fluid in the elements (k, 2).
+        alike: how much the fluids are alike; see `Materials.alike`.
+    """
+    for number, value in enumerate(values):
+        value[some] *= 1 - alike
+        for weight, single in zip(alike * part.T[:, :, None], singles, strict=True):
+            value[some] += weight * single[number]
+
+
 def stiffness_matrix(coupling: Array, pairs: Index = PAIRS) -> Array:
     """Return the stiffness matrices (..., v, v) of coupling coefficients (..., k) of pairs of vertices."""
     size = int(pairs.max()) + 1

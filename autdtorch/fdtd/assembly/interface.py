@@ -41,6 +41,7 @@ from autdtorch.fdtd.assembly.element import (
     line_coverage,
     shares,
     subcell_means,
+    tend_to_mean,
     tuning_of,
     uniform_coupling,
     volume_coverage,
@@ -146,16 +147,12 @@ def _oblique_elements(bodies: Bodies, materials: Materials, stencil: Stencil) ->
         part = volumes[:, pair] / np.maximum(volumes[:, pair].sum(axis=1, keepdims=True), 1e-12)
         distance[of_pair] = FAR
         distance[of_pair.argmax()] = joint
-        alike = materials.alike(*pair)
-        coupling[some] *= 1 - alike
-        mass[some] *= 1 - alike
-        for number, weight in zip(pair, alike * part.T[:, :, None], strict=True):
-            single = bodies.chosen(some)._replace(
-                distance=distance, material=np.where(of_pair, number, bodies.material)
-            )
-            added = _elements_in_series(single, materials, stencil)
-            coupling[some] += weight * added[0]
-            mass[some] += weight * added[1]
+        singles = []
+        for number in pair:
+            material = np.where(of_pair, number, bodies.material)
+            single = bodies.chosen(some)._replace(distance=distance, material=material)
+            singles.append(_elements_in_series(single, materials, stencil))
+        tend_to_mean((coupling, mass), some, singles, part, materials.alike(*pair))
     return coupling, mass
 
 
