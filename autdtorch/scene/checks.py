@@ -27,6 +27,7 @@ _LEAST_EXTENT = 15.0  # [wavelengths], for arrays and control points that are cl
 _FAR = 10.0  # [m]; nearer walls and wider domains may be meant
 _HIGHEST, _DENSEST_GAS = 1e6, 20.0  # [Hz, kg/m^3]; a gas absorbs what is higher within millimetres
 _WIDEST, _WIDEST_WAVES = 0.5, 30.0  # [m, wavelengths] between neighbours of an array; 10 mm in cm are 1.0
+_FARTHEST_FOCI, _FARTHEST_EXTENTS = 5.0, 25.0  # [m, extents of the array] from the array; 15 cm are no 15 m
 _FEWEST = 4  # transducers that make an array, whose normal counts
 _SAME_FREQUENCY = 0.01  # relative difference, for which the absorption changes by 2 %
 _PAIRS = 2**20  # of points and normals that are held at once
@@ -218,6 +219,9 @@ def _warn_of_implausible(scene: SceneContents) -> None:
         warn_user(f"Scene: {size} {wavelength:.4g} m; {ask}")
     elif len(places) > 1 and (pitch := closest_pair(places)[0]) > max(_WIDEST, _WIDEST_WAVES * wavelength):
         warn_user(f"Scene.array: neighbours are {pitch:.4g} m apart; are positions in m, 10 mm as 10e-3?")
+    elif len(places) >= _FEWEST and (gap := _gap(places, scene.control_points)) > _farthest_foci(scene):
+        shown = f"{gap:.4g} m from an array of {_diagonal(places):.3g} m"
+        warn_user(f"Scene.control_points: {shown}, too far for foci; are they in m, 150 mm as 150e-3?")
     for name, hint in _too_large(scene):
         warn_user(f"Scene.{name}{hint}")
     _warn_of_foci_behind(scene)
@@ -277,6 +281,18 @@ def _is_too_large(scene: SceneContents, points: torch.Tensor, part: torch.Tensor
 
 def _usual_reach(scene: SceneContents, points: torch.Tensor) -> float:
     return _USUAL_RATIO * max(_diagonal(points), _LEAST_EXTENT * scene.wavelength)
+
+
+def _gap(places: torch.Tensor, points: torch.Tensor) -> float:
+    """Return the least distance [m] of points (P, 3) to the bounding box of places (M, 3)."""
+    nearest = torch.minimum(torch.maximum(points, places.amin(dim=0)), places.amax(dim=0))
+    return float((points - nearest).norm(dim=1).min())
+
+
+def _farthest_foci(scene: SceneContents) -> float:
+    """Return the usual limit [m] of distances of foci; sound of an array spreads far before."""
+    extent = max(_diagonal(scene.array.positions), _LEAST_EXTENT * scene.wavelength)
+    return max(_FARTHEST_FOCI, _FARTHEST_EXTENTS * extent)
 
 
 def _without_slabs(corners: torch.Tensor, points: torch.Tensor) -> torch.Tensor:

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import complex_number, invalid, number_between, positive
 
 _DENSITIES = 1e-9, 1e9  # [kg/m^3]; far beyond all materials, and squares of their ratios do not overflow
 _SOUND_SPEEDS = 1e-3, 1e6  # [m/s]
+_IN_GRAMS, _DENSE_SPEEDS = (0.5, 23.0), (1100.0, 15e3)
+"""Densities [g/cm^3] and sound speeds [m/s] of liquids and solids. Foam and gases have others, but for
+compressed hydrogen."""
 _ROUNDING = 1e-12  # relative rounding of a bulk modulus, in its imaginary part
 
 
 def fluid(kind: str, density: object, sound_speed: object) -> tuple[float, float]:
-    """Return density [kg/m^3] and sound speed [m/s] of a fluid, checked as fields of `kind`."""
+    """Return density [kg/m^3] and sound speed [m/s] of a fluid, checked as fields of `kind`.
+
+    A density that seems to be in g/cm^3 brings a warning.
+    """
     rho = positive(f"{kind}.density", density, "kg/m^3")
     c = positive(f"{kind}.sound_speed", sound_speed, "m/s")
+    if _IN_GRAMS[0] <= rho <= _IN_GRAMS[1] and _DENSE_SPEEDS[0] <= c <= _DENSE_SPEEDS[1]:
+        odd = f"{kind}.density: {rho:g} kg/m^3 at {c:g} m/s, as of no solid or liquid"
+        warn_user(f"{odd}; is it in kg/m^3, 1 g/cm^3 as 1000?")
     return (
         number_between(f"{kind}.density", rho, *_DENSITIES, "kg/m^3"),
         number_between(f"{kind}.sound_speed", c, *_SOUND_SPEEDS, "m/s"),
