@@ -110,7 +110,7 @@ def make_propagator(
         cache: folder for simulated transfer matrices, which are used again for the same scene, points,
             settings and version of this package. By default the environment variable AUTDTORCH_CACHE_DIR,
             or no cache if it is not set; False: no cache. Several processes may share the folder. Matrices
-            used last are kept, up to 1 GB.
+            used last are kept, up to about 1 GB, or as many GB as AUTDTORCH_CACHE_GB says.
 
     Returns:
         A propagator of the scene.

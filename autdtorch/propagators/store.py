@@ -7,9 +7,11 @@ The first line of a file is a checksum of its name, its shape and its content.
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import logging
 import os
+import time
 import uuid
 from collections.abc import Callable
 from pathlib import Path
@@ -21,14 +23,23 @@ import torch
 from autdtorch.utils.array_types import AnyArray, ComplexArray
 from autdtorch.utils.digest import digest_of, package_versions, source_digest
 from autdtorch.utils.files import path_of, replace_file
-from autdtorch.utils.validation import invalid
+from autdtorch.utils.validation import invalid, positive
 
 logger = logging.getLogger(__name__)
 
 SUFFIX = ".matrix"
 CACHE_VARIABLE = "AUTDTORCH_CACHE_DIR"
+LIMIT_VARIABLE = "AUTDTORCH_CACHE_GB"
 MOST_BYTES = 1_000_000_000
-"""Limit of a store's memory and of its folder [bytes]: Huygens amplitudes of 256 transducers take 300 MB."""
+"""Limit of a store's memory, and by default of its folder [bytes]: Huygens amplitudes of 256 transducers take
+300 MB."""
+
+_OVERRUN = 1 / 64
+"""Part of its limit by which a folder exceeds it on average: it is listed once for so many bytes, since a
+folder of 10,000 matrices takes 0.1 s."""
+
+_IN_USE = 86400.0
+"""Time [s] after which a removed matrix is taken for one of an earlier study."""
 
 
 class StoredResult(Protocol):
@@ -50,9 +61,14 @@ class Store:
         folder: made with the first matrix; None for memory alone.
     """
 
-    def __init__(self, folder: Path | None = None, most_bytes: int = MOST_BYTES) -> None:
-        """Start with none; nothing is read or made here. A result of more than `most_bytes` is not kept."""
-        self.folder, self._most_bytes = folder, most_bytes
+    def __init__(
+        self, folder: Path | None = None, most_bytes: int = MOST_BYTES, most_saved: int = MOST_BYTES
+    ) -> None:
+        """Start with none; nothing is read or made here.
+
+        A result of more than `most_bytes` is not kept, and one of more than `most_saved` not in the folder.
+        """
+        self.folder, self._most_bytes, self._most_saved = folder, most_bytes, most_saved
         self._results: dict[str, Any] = {}
 
     @property
@@ -111,13 +127,16 @@ class Store:
         if self.folder is None:
             return
         body = np.append(matrix, numbers).astype(np.complex128).tobytes()
-        path = self._path(self.folder, key)
+        if len(body) > self._most_saved:
+            return
+        path, content = self._path(self.folder, key), _with_checksum(key, matrix.shape, body)
         try:
-            if len(body) <= self._most_bytes:
-                replace_file(path, _with_checksum(key, matrix.shape, body))
+            replace_file(path, content)
         except OSError as error:
             logger.warning("%s cannot be written (%s): not kept", path, error.strerror)
-        _remove_oldest(self.folder, self._most_bytes)
+        share = int(content[:8], 16) / 16**8  # of the checksum, as good as random
+        if share * self._most_saved * _OVERRUN <= len(content):
+            _remove_oldest(self.folder, self._most_saved)
 
     @staticmethod
     def _path(folder: Path, key: str) -> Path:
@@ -154,7 +173,16 @@ def store_in(folder: str | os.PathLike[str] | Literal[False] | None) -> Store:
     if not os.path.isdir(there) or (there != path and not os.access(there, os.W_OK | os.X_OK)):
         accepted = f"must be a folder, or one that can be made, but {there} is no folder to write in"
         raise invalid(name, str(path), accepted)
-    return Store(path)
+    return Store(path, most_saved=_saved_limit())
+
+
+def _saved_limit() -> int:
+    """Return the limit of a folder [bytes], by default `MOST_BYTES`."""
+    text = os.environ.get(LIMIT_VARIABLE) or str(MOST_BYTES / 1e9)
+    try:
+        return round(1e9 * positive(LIMIT_VARIABLE, float(text), "GB"))
+    except (ValueError, OverflowError):
+        raise invalid(LIMIT_VARIABLE, text, "must be a number > 0, such as 10", "GB") from None
 
 
 def _remove_oldest(folder: Path, most_bytes: int) -> None:
@@ -164,13 +192,22 @@ def _remove_oldest(folder: Path, most_bytes: int) -> None:
         with contextlib.suppress(OSError):  # another process removes it too
             status = path.stat()
             matrices.append((status.st_mtime_ns, status.st_size, path))
-    total = sum(size for _, size, _ in matrices)
-    for _, size, path in sorted(matrices):
+    total, in_use = sum(size for _, size, _ in matrices), time.time_ns() - 1e9 * _IN_USE
+    for used, size, path in sorted(matrices):
         if total <= most_bytes:
             break
+        if used > in_use:
+            _warn_of_limit(folder, most_bytes)
         with contextlib.suppress(OSError):  # or another user owns it
             path.unlink()
             total -= size
+
+
+@functools.cache
+def _warn_of_limit(folder: Path, most_bytes: int) -> None:
+    """Log, once, that matrices in use are removed: a study that is repeated would need them first."""
+    full = f"is full: its limit of {most_bytes / 1e9:g} GB is less than what was used within a day"
+    logger.warning("%s %s, and is computed again; %s=10 allows 10 GB", folder, full, LIMIT_VARIABLE)
 
 
 def _with_checksum(key: str, shape: tuple[int, ...], body: bytes) -> bytes:

@@ -15,7 +15,7 @@ from small_scenes import AIR, CORNER, CUBE, small_scene
 
 from autdtorch.propagators import SteadyStateWarning, make_propagator
 from autdtorch.propagators.plan import plan
-from autdtorch.propagators.store import SUFFIX, Store, _with_checksum
+from autdtorch.propagators.store import SUFFIX, Store, _with_checksum, store_in
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Mesh, Sphere, VoxelMask
 from autdtorch.scene.scene import Medium, Scene
@@ -242,7 +242,7 @@ def test_a_folder_that_cannot_be_used_costs_no_result(tmp_path):
 
 def test_a_folder_keeps_what_was_used_last(tmp_path):
     """Four matrices of 200 numbers fit, of the bytes that five take; a larger one is not kept."""
-    cache = Store(tmp_path, most_bytes=5 * 200 * 16)
+    cache = Store(tmp_path, most_saved=5 * 200 * 16)
     (tmp_path / "mine.npz").write_bytes(bytes(100_000))  # other files neither count nor go
     for number, name in enumerate("abcd"):
         cache.save(name, np.full(199, number), number)
@@ -252,6 +252,43 @@ def test_a_folder_keeps_what_was_used_last(tmp_path):
     cache.save("whole", np.ones(1000), 0)
     assert [path.stem for path in files(tmp_path)] == ["a", "c", "d", "e"]
     assert (tmp_path / "mine.npz").exists()
+
+
+def test_a_folder_that_is_too_small_for_a_study_is_told_once(tmp_path, monkeypatch, caplog):
+    """Matrices of 200 numbers, of which 12 fit into 40 kB; a day later none is missed."""
+    monkeypatch.setenv("AUTDTORCH_CACHE_GB", "4e-5")
+    for number in range(16):
+        store_in(tmp_path).save(str(number), np.full(199, number), number)
+        if number == 11:
+            assert len(files(tmp_path)) == 12
+            assert not caplog.messages
+    assert len(files(tmp_path)) == 12
+    (told,) = caplog.messages
+    assert str(tmp_path) in told
+    assert "limit of 4e-05 GB" in told
+    assert "AUTDTORCH_CACHE_GB=10" in told
+    other, long_ago = tmp_path / "other", time.time() - 1e5
+    caplog.clear()
+    for number in range(16):
+        store_in(other).save(str(number), np.full(199, number), number)
+        os.utime(other / f"{number}{SUFFIX}", (long_ago, long_ago + number))
+    assert not caplog.messages
+    for refused in ("ten", "0", "-1", "nan", "inf"):
+        monkeypatch.setenv("AUTDTORCH_CACHE_GB", refused)
+        with pytest.raises(ValueError, match=r"AUTDTORCH_CACHE_GB: .* must be a number > 0"):
+            store_in(tmp_path)
+
+
+def test_small_matrices_seldom_list_a_folder(tmp_path, monkeypatch):
+    """Once for a 64th of the limit: 400 of 64 kB for 1 GB are expected 1.6 times, and 9 times once in 1e4."""
+    listed = []
+    monkeypatch.setattr("autdtorch.propagators.store._remove_oldest", lambda *_: listed.append(1))
+    cache, random = Store(tmp_path), np.random.default_rng(0)
+    for number in range(400):
+        cache.save(str(number % 4), random.random(4000), 0.0)
+    assert len(listed) < 9
+    cache.save("large", np.zeros(1_000_000), 0.0)
+    assert listed
 
 
 @needs_fork
