@@ -94,7 +94,7 @@ WARNED = {
     "mm of pitch": (lambda: scene(array=grid(1e-3, pitch=10)), "array.*10 m apart.*in m"),
     "cm of all": (lambda: scene(array=grid(0.1, pitch=1.0), control_points=100 * FOCI), "1 m apart.*in m"),
     "mm of all": (lambda: scene(array=grid(1.0, pitch=10.0), control_points=1e3 * FOCI), "lengths in m"),
-    "cm of foci": (lambda: scene(control_points=100 * FOCI), "control_points: 9.596 m from an array of.*in m"),
+    "cm of foci": (lambda: scene(control_points=100 * FOCI), "points: 9.596 m from an array of.*in m"),
     "g/cm^3 of an obstacle": (
         lambda: at.Sphere(MIDDLE, 8e-3, density=7.8, sound_speed=5900.0),
         r"Sphere\.density.*1 g/cm\^3",
