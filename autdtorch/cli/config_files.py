@@ -10,11 +10,12 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, TypeAlias
 
 from hydra._internal.core_plugins import file_config_source
 from hydra._internal.hydra import Hydra
 from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.object_type import ObjectType
 from hydra.plugins.config_source import ConfigResult
 
 from autdtorch.io.yaml_file import load_yaml, unresolved
@@ -25,6 +26,11 @@ CONFIGS = next(folder / "configs" for folder in (_PACKAGE, _PACKAGE.parent) if (
 
 GROUPS = sorted(folder.name for folder in CONFIGS.iterdir() if folder.is_dir())
 """GROUPS: folders of configs, of which a setting chooses one; some are not chosen by default."""
+
+_UNLISTED = {"hardware": "base"}
+"""Configs that are no options but what options of a group begin with."""
+
+_Names: TypeAlias = list[str]  # in a class that has a method of this name
 
 _TRUSTED = "hydra.searchpath in command-line"  # what Hydra calls a folder that this override adds
 
@@ -52,6 +58,11 @@ class FileConfigSource(file_config_source.FileConfigSource):
         if PurePosixPath(config_path).parts[:1] == ("scene",):
             _begin_paths(config, os.path.dirname(path))
         return ConfigResult(self.provider, self.full_path(), config, header)
+
+    def list(self, config_path: str, results_filter: ObjectType | None) -> _Names:
+        """Return the options in a folder."""
+        names: _Names = super().list(config_path, results_filter)
+        return [name for name in names if name != _UNLISTED.get(config_path)]
 
     def is_group(self, config_path: str) -> bool:
         """Return whether the source has such a folder."""

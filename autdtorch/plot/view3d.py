@@ -51,6 +51,10 @@ if not plotter.screenshot(return_img=True).std():
 _PROBE_TIMEOUT = 120.0  # s; a first import of PyVista can take tens of seconds
 
 
+class RenderingError(RuntimeError, ImportError):
+    """This machine cannot render in 3D, since it lacks a driver; the message names what to install."""
+
+
 @functools.cache
 def rendering_problem() -> str | None:
     """Return why this machine cannot render in 3D, or None if it can; checked once per process.
@@ -76,13 +80,13 @@ def rendering_problem() -> str | None:
 
 
 def require_rendering() -> None:
-    """Check that rendering is safe, and import Triton if it is installed.
+    """Raise a `RenderingError` unless rendering is safe, and import Triton if it is installed.
 
     Triton contains an LLVM. If it is imported after Mesa's software driver, which loads another LLVM, the
     process ends. PyTorch's optimisers import Triton, so it is imported here first.
     """
     if problem := rendering_problem():
-        raise RuntimeError(problem)
+        raise RenderingError(problem)
     if importlib.util.find_spec("triton") is not None:
         importlib.import_module("triton")
 

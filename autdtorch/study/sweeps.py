@@ -104,8 +104,9 @@ def collect_results(folder: str | os.PathLike[str], modules: Collection[str] = (
         if (other := first.setdefault(study.provenance.origin, path)) != path:
             logger.warning("%s: a copy of the study in %s, counted once", path, other)
     parts: list[_Part] = []
+    settings = {path: _settings_of(path, study) for path, study in studies.items()}
     for path, study in studies.items():
-        finished, missing = _parts(path, study)
+        finished, missing = _parts(path, study, settings[path])
         parts += finished
         unfinished += [f"{path}: {scene}" for scene in missing]
     groups, swept = _groups(parts)
@@ -113,8 +114,7 @@ def collect_results(folder: str | os.PathLike[str], modules: Collection[str] = (
     sections = {scene: next(iter(methods.values()))[0].section for scene, methods in groups.items()}
     scenes = {scene: load_scene(section, modules) for scene, section in sections.items()}
     origin = next(iter(studies.values())).provenance
-    texts = (f"# {path}\n{study.provenance.config.strip()}" for path, study in studies.items())
-    merged = StudyResult(replace(origin, config="\n\n".join(texts)), results)
+    merged = StudyResult(replace(origin, config=_text_of(studies, settings)), results)
     seeds = sorted({part.seed for part in parts})
     return Sweep(merged, scenes, swept, len(studies), tuple(seeds), tuple(unfinished))
 
@@ -124,10 +124,26 @@ def _files(folder: Path, name: str) -> list[Path]:
     return sorted(file for file in folder.rglob(name) if not file.parent.name.startswith(PREVIOUS))
 
 
-def _parts(path: Path, study: StudyResult) -> tuple[list[_Part], list[str]]:
-    """Return the parts of a study, and the scenes that it has not finished."""
+def _settings_of(path: Path, study: StudyResult) -> Any:
+    """Return the settings of the study in a folder, as its file has them."""
+    where = f"{path / RESULTS_FILE}: settings"
+    return unresolved(parse_yaml(study.provenance.config, where), where)
+
+
+def _text_of(studies: Mapping[Path, StudyResult], settings: Mapping[Path, Any]) -> str:
+    """Return the settings of the first study as its file has them, and of the others what differs."""
+    (first, of_first), *others = ((path, dict(_flat(each))) for path, each in settings.items())
+    texts = [f"# {first}\n{studies[first].provenance.config.strip()}"]
+    for path, each in others:
+        keys = [key for key in {**of_first, **each} if of_first.get(key, ...) != each.get(key, ...)]
+        lines = [f"{key}: {each.get(key, '(left out)')}" for key in keys]
+        texts.append("\n".join([f"# {path}, otherwise like {first}", *lines]))
+    return "\n\n".join(texts)
+
+
+def _parts(path: Path, study: StudyResult, settings: Any) -> tuple[list[_Part], list[str]]:
+    """Return the parts of a study of some settings, and the scenes that it has not finished."""
     file = path / RESULTS_FILE
-    settings = unresolved(parse_yaml(study.provenance.config, f"{file}: settings"), f"{file}: settings")
     try:
         if missing := [name for name in settings.get("scenes", ()) if name not in study.scenes]:
             logger.warning("%s: unfinished scenes are left out: %s", path, ", ".join(missing))

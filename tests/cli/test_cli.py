@@ -267,6 +267,7 @@ def test_help_tells_what_there_is_with_the_defaults(run, tmp_path, capsys):
     text = capsys.readouterr().out
     assert "autdtorch experiment=paper" in text
     assert f"scene: {', '.join(CONFIG_NAMES['scene'])}" in text
+    assert re.search(r"^hardware: autd3, (?!.*base)", text, re.MULTILINE)
     assert len(text.splitlines()) <= 48
     rows = re.findall(r"^  ([a-z_.]+) +\S.* \[(.*)\]$", text, re.MULTILINE)
     assert len(rows) >= 8
@@ -349,6 +350,12 @@ def test_a_path_of_the_obstacles_is_a_study_of_its_poses(run, tmp_path, refused,
     monkeypatch.setattr("autdtorch.study.report.study_report.rendering_problem", lambda: "not tried")
     assert run("collect", "path") == 0
     assert "count: 1; must be an integer >= 2" in refused(*coarse, "poses={count: 1}")
+
+
+def test_explore_without_a_driver_names_what_to_install(run, monkeypatch, capsys):
+    monkeypatch.setattr("autdtorch.plot.view3d.rendering_problem", lambda: "no driver; it needs libegl1")
+    assert run("explore", "scene=homogeneous", "explore.browser=false") == 2
+    assert capsys.readouterr().err == "autdtorch: no driver; it needs libegl1\n"
 
 
 def test_explore_shows_the_scene_and_drive_of_the_settings(run, write, monkeypatch, capsys):

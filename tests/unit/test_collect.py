@@ -86,6 +86,20 @@ def test_a_swept_list_is_one_setting_in_the_order_of_its_values(study, tmp_path)
     assert sweep.swept[names(sweep)[0], "gabs"] == {"scene.array.pitch": 0.009, "scene.array.shape": [2, 3]}
 
 
+def test_common_settings_are_written_once(study, tmp_path):
+    study()
+    study({**SCENE, "frequency": 41e3, "name": "lab"})
+    study(method="lssg")
+    text = collect_results(tmp_path).results.provenance.config
+    first, second, third = text.split("\n\n")
+    settings = yaml.safe_load(first)
+    assert settings["scene"] == SCENE
+    assert yaml.safe_load(second) == {"scene.frequency": 41e3, "scene.name": "lab"}
+    assert yaml.safe_load(third) == {"method._target_": "autdtorch.lssg"}
+    assert first.startswith(f"# {tmp_path / '0'}\n")
+    assert second.startswith(f"# {tmp_path / '1'}, otherwise like {tmp_path / '0'}\n")
+
+
 def test_names_that_would_be_equal_get_a_digest(study, tmp_path):
     # A file was changed between two jobs.
     study(files=("11",))
