@@ -13,7 +13,8 @@ from autdtorch.fdtd.grouping import domain_grid
 from autdtorch.fdtd.kernels import make_kernel
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stepping import assemble, drive_signal
-from autdtorch.propagators.plan import plan
+from autdtorch.propagators.plan import Plan, plan
+from autdtorch.propagators.refinement import first_plan, usual_plans
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.scene import Scene
@@ -28,6 +29,9 @@ _AIR_SPACING, _AIR_RIM = 1e-3, 28
 
 _PILOT_CELLS = 6
 """Cells per wavelength of the coarse grid that symmetries are found on."""
+
+_PILOT_POINTS, _PILOT_TOLERANCE = 4, 0.05
+"""Most points whose scattered field is simulated on the first grid, and where their runs end."""
 
 _PAIR_SECONDS = 1e-8
 """Time [s] of a pair of a point and a transducer in free space."""
@@ -62,7 +66,7 @@ class Estimate:
 
 def estimate(
     scene: Scene,
-    spacing: float = 1e-3,
+    spacing: float | None = 1e-3,
     tolerance: float = 2e-3,
     *,
     method: str = "auto",
@@ -78,8 +82,9 @@ def estimate(
 
     Args:
         scene: the scene.
-        spacing: edge of a cell [m].
-        tolerance: relative distance to the steady state, in (0, 1).
+        spacing: edge of a cell [m]. None: that which `make_propagator` is expected to choose by `tolerance`,
+            from a run on its first grid; the time is that of all its grids.
+        tolerance: relative distance to the steady state, or without a spacing the estimated error, in (0, 1).
         method: as in `make_propagator`, as are `device`, `kernel` and `dtype`.
         device: where simulations would run.
         kernel: the kernel.
@@ -88,21 +93,43 @@ def estimate(
     Raises:
         ValueError: an argument is out of range.
     """
-    spacing = positive("spacing", spacing, "m")
+    spacing = None if spacing is None else positive("spacing", spacing, "m")
     planned = plan(scene, method, spacing, tolerance, kernel=kernel, dtype=dtype, device=device)
     if planned.method == "free_space" or not planned.runs:
         pairs = len(scene.array) * len(scene.control_points)
         return Estimate(planned.method, None, 0, 0, planned.memory, _PAIR_SECONDS * pairs)
+    before: list[Plan] = []
+    if spacing is None:
+        *before, last = _plans_by_tolerance(planned.on_grids)
+        spacing = last.spacing
+        if planned.method == "tmatrix":
+            before, last = [*before, last], planned.at(spacing, tolerance)
+        planned = last
     # a multiple of the spacing: a scene that is symmetric on one grid mostly is on the other
     factor = max(1, math.floor(planned.region.wavelength / _PILOT_CELLS / spacing))
     pilot = planned.at(spacing * factor, planned.tolerance)
     kind = TMatrixPropagator if planned.method == "tmatrix" else SimulatedPropagator
+    without_symmetries = planned.work
     if pilot.memory < available_memory():
         planned = replace(planned, runs=kind(pilot).planned_runs)
     small, large = _MEASURED_CELLS
     cells = small if max(grid.cells for grid in planned.grouping.grids) < large / 2 else large
-    seconds = planned.work / _rate(planned.kernel, planned.dtype, cells)
+    work = planned.work + planned.work / without_symmetries * sum(each.work for each in before)
+    seconds = work / _rate(planned.kernel, planned.dtype, cells)
     return Estimate(planned.method, spacing, planned.cells, planned.runs, planned.memory, seconds)
+
+
+def _plans_by_tolerance(pilot: Plan) -> list[Plan]:
+    """Return the plans of the grids that a choice by tolerance is expected to take.
+
+    Some points are simulated on the first grid, to see how much is scattered; all, if it is refused.
+    """
+    first, points = first_plan(pilot), pilot.scene.control_points
+    usual = first.law.usual(first.spacing)
+    if not first.refusal:
+        some = points[:: math.ceil(len(points) / _PILOT_POINTS)]
+        usual = SimulatedPropagator(first.at(first.spacing, _PILOT_TOLERANCE)).usual_error(some)
+    return usual_plans(first, usual, pilot.tolerance)
 
 
 @functools.cache

@@ -150,9 +150,9 @@ class SimulatedPropagator(ScenePropagator):
         return self._error(results, points) if self._coarser else math.inf, shape, rigid
 
     @one_library_thread()
-    def usual_error(self) -> float:
-        """Simulate the control points; return the error that grids of this spacing usually have."""
-        points = self.scene.control_points
+    def usual_error(self, points: ArrayLike | None = None) -> float:
+        """Simulate points, by default the control points; return the usual error of grids of this spacing."""
+        points = self._places(points)
         matrix = self._results(points, with_error=False)[0].matrix.reshape(1, -1)
         return float(usual_errors(matrix, self._free(points).reshape(1, -1), self.spacing, self.plan.law))
 

@@ -1,5 +1,6 @@
 """What a plan chooses, and counts."""
 
+import logging
 import math
 from dataclasses import replace
 
@@ -8,7 +9,7 @@ import pytest
 from small_scenes import CUBE, relative_error, small_scene
 
 import autdtorch as at
-from autdtorch.propagators import FreeSpacePropagator
+from autdtorch.propagators import FreeSpacePropagator, refinement
 from autdtorch.propagators import estimate as simulation_estimate
 from autdtorch.propagators.plan import plan
 
@@ -95,3 +96,34 @@ def test_free_space_takes_no_cells_and_infeasible_simulations_are_estimated():
     cost = at.estimate(small_scene((CUBE,), extent=0.1), 1.8e-5, method="full")
     assert cost.memory > 50e9
     assert cost.seconds > 3600
+
+
+def test_an_estimate_by_tolerance_tells_the_choice(monkeypatch):
+    """Errors are usual ones within a factor of three, of which the spacing is the root."""
+    monkeypatch.setattr(simulation_estimate, "_rate", lambda *_: 1e9)
+    scene = small_scene((replace(CUBE, rotation=(0.2, 0.3, 0.1)),))
+    costs = [at.estimate(scene, None, tolerance, method="box") for tolerance in (0.1, 0.02)]
+    for tolerance, cost in zip((0.1, 0.02), costs, strict=True):
+        chosen = at.make_propagator(scene, "box", None, tolerance).spacing
+        assert chosen / 1.75 < cost.spacing < 1.75 * chosen
+        assert cost.seconds > at.estimate(scene, cost.spacing, method="box").seconds  # coarser grids count
+    loose, tight = costs
+    assert tight.spacing < loose.spacing
+    by_waves = at.estimate(scene, None, 0.02, method="tmatrix")
+    assert (by_waves.method, by_waves.spacing) == ("tmatrix", pytest.approx(tight.spacing, rel=0.2))
+
+
+def test_a_choice_logs_its_cost_and_warns_if_it_is_long(monkeypatch, caplog):
+    caplog.set_level(logging.INFO, "autdtorch")
+    scene = small_scene((replace(CUBE, rotation=(0.2, 0.3, 0.1)),))
+    at.make_propagator(scene, "box", None, 0.01)
+    first, *_ = costs = [record for record in caplog.records if "finer grid" in record.getMessage()]
+    assert {record.levelno for record in costs} == {logging.INFO}
+    assert "for a tolerance of 0.01: about" in first.getMessage()
+    caplog.clear()
+    monkeypatch.setattr(refinement, "_LONG", 0.0)
+    at.make_propagator(scene, "box", None, 0.01)
+    assert sum("limit them by seconds=" in record.getMessage() for record in caplog.records) == 1
+    caplog.clear()
+    at.make_propagator(scene, "box", None, 0.01, seconds=1e3)
+    assert "limit them by seconds=" not in caplog.text
