@@ -55,7 +55,6 @@ PartitionName=cpu Nodes={host} Default=YES
 
 
 def main() -> None:
-    """Run the command in the arguments."""
     command = sys.argv[1:]
     if command in ([], ["-h"], ["--help"]):
         print(__doc__)

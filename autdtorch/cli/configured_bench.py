@@ -88,7 +88,6 @@ class Bench:
         return self._sensor.open(Setup(self._scene, _ask, self._bench, self._seed, self._matrix_of))
 
     def _wired(self, count: int) -> list[int]:
-        """Return the device's transducers for the scene's `count`."""
         field, chosen, most = "hardware.transducers", self._section["transducers"], self.device.transducers
         if count > most:
             accepted = f"must be at most {most}, as {self.device.name} has"

@@ -310,7 +310,6 @@ def _silence_expected() -> Iterator[None]:
 
 
 def _shown(goal: Goal, pressure: torch.Tensor) -> str:
-    """Return the score of pressures (P,) [Pa] as text, such as "weakest focus 812 Pa"."""
     return f"{score_label(goal.name)} {float(goal(pressure)):.4g} {goal.unit}".rstrip()
 
 

@@ -90,7 +90,6 @@ def play(settings: dict[str, Any], modules: list[Any], output: Any) -> None:
 def _sequence(
     section: dict[str, Any], path: dict[str, Any], scene: Scene, bench: Bench, propagator: Propagator
 ) -> Sequence:
-    """Return the sequence of a file, or of a focus on the path."""
     rate = positive("play.rate", section["rate"], "Hz")
     if (file := given_file("play.sequence", section["sequence"])) is not None:
         require_effective("a file of play.sequence", _EFFECTIVE_WITH_FILE, "path or play.sequence")

@@ -180,7 +180,6 @@ def _save_drives(results: StudyResult, scenes: Mapping[str, Scene], folder: Path
 
 
 def _draw_plane(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> None:
-    """Draw the observation plane of a single run."""
     from autdtorch.plot.pressure_maps import plot_plane
 
     (scene,) = scenes.values()
@@ -193,7 +192,6 @@ def _draw_plane(results: StudyResult, scenes: Mapping[str, Scene], folder: Path)
 
 
 def _draw_poses(results: StudyResult, poses: Poses, folder: Path) -> None:
-    """Draw the scores along the path of the obstacles."""
     from autdtorch.plot.trials import plot_poses
 
     outcomes = list(with_prefixes(results).scenes.values())
@@ -208,12 +206,10 @@ def _draw_poses(results: StudyResult, poses: Poses, folder: Path) -> None:
 
 
 def _quoted(path: Path) -> str:
-    """Return a path as a shell takes it."""
     return shlex.quote(str(path))
 
 
 def _print_table(results: StudyResult, end: str) -> None:
-    """Print the table of results and a last line."""
     rows = summary_rows(results)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]

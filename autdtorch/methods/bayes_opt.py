@@ -279,15 +279,12 @@ class BayesOpt(Method):
         return 1 if self.model == "weakest" else problem.foci
 
     def _points(self, drives: torch.Tensor) -> torch.Tensor:
-        """Return points (..., M - 1) in turns with the phases of drives (..., M)."""
         return points_of(drives, self._fixed(drives.shape[-1]))
 
     def _fixed(self, transducers: int) -> int:
-        """Return the index of the transducer whose phase stays 0."""
         return min(_PAPERS_FIXED, transducers - 1) if self.fixed_transducer is None else self.fixed_transducer
 
     def _drives(self, points: torch.Tensor) -> torch.Tensor:
-        """Return the drives (..., M) of points (..., M - 1) in turns."""
         return drives_at(points, self._fixed(points.shape[-1] + 1))
 
     def _fitted(

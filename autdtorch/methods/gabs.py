@@ -106,7 +106,6 @@ class GABS(Method):
         return 1 if problem.start is None else 0
 
     def _alone(self, problem: Problem) -> int:
-        """Return the number of transducers observed alone."""
         return problem.transducers if self.order == "strength" else 1
 
     def _begun(self, problem: Problem, orders: torch.Tensor) -> Search:

@@ -125,7 +125,6 @@ def _steps(drives: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def _area(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """Return twice the area between complex numbers."""
     return (first.conj() * second).imag
 
 

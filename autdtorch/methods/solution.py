@@ -44,7 +44,6 @@ class Solution:
         return f"Solution({', '.join(f'{name} {value}' for name, value in self._facts())})"
 
     def _repr_html_(self) -> str:
-        """Return the same facts as a table, for Jupyter."""
         return html_facts("Solution", self._facts())
 
     def _facts(self) -> list[tuple[str, str]]:

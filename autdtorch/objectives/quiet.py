@@ -66,7 +66,6 @@ class _BesideOthers(Goal):
         return matrix[self._foci(len(matrix))], matrix[list(self.points)]
 
     def _whole(self, at_foci: torch.Tensor, at_others: torch.Tensor) -> torch.Tensor:
-        """Return the values (..., P) of all control points."""
         whole = at_foci.new_zeros(*at_foci.shape[:-1], at_foci.shape[-1] + len(self.points))
         whole[..., self._foci(whole.shape[-1])] = at_foci
         whole[..., list(self.points)] = at_others

@@ -164,7 +164,6 @@ def _groups(rows: AnyArray) -> tuple[Index, list[int]]:
 
 
 def _repeats(keys: Iterable[tuple[int, int]]) -> list[int]:
-    """Return for each key how often it occurred before."""
     counts: dict[tuple[int, int], int] = {}
     repeats = []
     for key in keys:

@@ -138,7 +138,6 @@ def _name_front(ax: Axes, points: Array, names: Mapping[int, str], higher_is_bet
 
 
 def _texts(name: str, names: Mapping[str, Sequence[str]], drawn: Mapping[str, Array]) -> list[str]:
-    """Return the names of all points of a scene."""
     require_each(name, names, drawn)
     texts: list[str] = []
     for method, values in drawn.items():

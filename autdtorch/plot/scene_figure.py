@@ -35,7 +35,6 @@ _ELEVATION, _AZIMUTH = 22.0, -118.0  # of the viewer [degrees]
 
 
 def _direction(elevation: float, azimuth: float) -> Array:
-    """Return the unit vector (3,) of angles [degrees]."""
     up, around = np.radians((elevation, azimuth))
     return np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
 
@@ -117,7 +116,6 @@ def _new_axes(figure: Figure, domain: tuple[Vector, Vector], right: float) -> Ax
 
 
 def _place(ax: Axes3D, point: Array) -> Array:
-    """Return the place (2,) [inch] in the figure of a point (3,) in the axes."""
     ax.apply_aspect()
     projected = proj_transform(*point, ax.get_proj())[:2]
     place: Array = ax.transData.transform(projected) / ax.get_figure().dpi

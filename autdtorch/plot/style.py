@@ -83,7 +83,6 @@ class ShownFigure(Figure):
         super().savefig(in_folder(Path(fname)) if isinstance(fname, str | os.PathLike) else fname, **kwargs)
 
     def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
-        """Return a PNG and its width on screen [px]."""
         picture = io.BytesIO()
         self.savefig(picture)
         return picture.getvalue(), {"width": round(_SCREEN_DPI * self.get_figwidth())}

@@ -225,7 +225,6 @@ class StudyResult:
         return f"StudyResult({scenes})"
 
     def _repr_html_(self) -> str:
-        """Return the summary table, for Jupyter."""
         return html_table(f"Study of {self.provenance.date}", summary_rows(self))
 
 
@@ -281,7 +280,6 @@ def with_prefixes(results: StudyResult) -> StudyResult:
 
 
 def _largest(scene: SceneResult) -> float:
-    """Return the largest size of a score."""
     return max(float(method.solution.score.abs().max()) for method in scene.methods.values())
 
 

@@ -213,7 +213,6 @@ def _groups(
 
 
 def _order(settings: Settings) -> list[tuple[str, bool, float, str]]:
-    """Return a key for sorting: numbers by size, before all others."""
     return [
         (key, False, value, "") if isinstance(value, int | float) else (key, True, 0.0, str(value))
         for key, value in sorted(settings.items())

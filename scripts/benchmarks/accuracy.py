@@ -64,7 +64,6 @@ LIMITS = {
 
 
 def main(page: Page, spacings: Sequence[float], fine: bool, shifts: int, make_reference: bool) -> int:
-    """Measure, or make the reference."""
     if make_reference:
         store_reference()
         return 0
@@ -92,7 +91,6 @@ def store_reference() -> None:
 
 
 def measure(spacings: Sequence[float], shifts: int) -> list[Row]:
-    """Measure every case."""
     simulate(sphere_case("sphere"), 2.8)  # compiles the kernel
     swept = [cases.free_space_case(), *map(sphere_case, cases.SPHERES), *map(cube_case, cases.CUBES)]
     rows = [compare(case, "default", h, simulate(case, h)) for case in swept for h in spacings]
@@ -104,7 +102,6 @@ def measure(spacings: Sequence[float], shifts: int) -> list[Row]:
 
 
 def compare(case: Case, treatment: str, spacing: float, simulation: SimulatedCase) -> Row:
-    """Return the errors of a transfer matrix."""
     total, scattered = error_of(case, simulation.matrix)
     seconds = f"{simulation.seconds:.1f} s"
     print(f"{case.name}, {treatment}, {spacing:g} mm: {percent(total)}, {seconds}", flush=True)

@@ -133,7 +133,6 @@ def evaluations_of(budget: int, transducers: int) -> int:
 
 
 def possible(algorithm: str, transducers: int, evaluations: int) -> bool:
-    """Return whether an algorithm is among those of the table."""
     if algorithm == "identify" and evaluations < 3 * transducers:
         return False
     if algorithm == "TPE" and transducers > 16:
@@ -174,7 +173,6 @@ def goal_and_bound(transducers: int, case: str) -> tuple[at.Goal, float]:
 
 
 def measured(run: Run) -> Run:
-    """Run all trials, and write their file."""
     truth = objective(run.transducers)
     goal, bound = goal_and_bound(run.transducers, run.case)
     entry, noisy = ENTRIES[run.algorithm](run.transducers, run.evaluations), run.case == "20 dB"
@@ -211,7 +209,6 @@ Answers = dict[tuple[int, str, int, str], dict[str, Any]]
 
 
 def rows(answers: Answers) -> Iterator[list[str]]:
-    """Yield the rows of the whole table."""
     for key, answer in answers.items():
         shares = 100 * torch.tensor(answer["shares"])
         share = quartiles(shares, ".1f") if len(shares) > 1 else f"{shares.item():.1f}"
@@ -257,7 +254,6 @@ def _quartile(shares: Sequence[float], number: int) -> float:
 
 
 def data(answers: Answers) -> Iterator[dict[str, object]]:
-    """Yield the rows of the file."""
     for key, answer in answers.items():
         lower, middle, upper = (_quartile(answer["shares"], number) for number in range(3))
         yield {

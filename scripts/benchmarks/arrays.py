@@ -42,7 +42,6 @@ REPEATS = 3
 
 
 def main(page: Page) -> None:
-    """Measure, and write the block."""
     page.write(
         "Field of a drive on a plane of 101 x 101 points, 256 transducers:",
         table(["transducers", "array and scene", "plane"], printed(planes())),
@@ -57,7 +56,6 @@ def main(page: Page) -> None:
 
 
 def planes() -> Iterator[list[str]]:
-    """Time a plane of points and of discs."""
     for name, radius in (("points", None), ("discs", TRANSDUCER_RADIUS)):
         scene, preparing = shortest(lambda radius=radius: scene_of((), radius), REPEATS)
         points = at.Plane((0.0, 0.0, 0.15), (1.0, 0.0, 0.0), (0.1, 0.1)).points(1e-3)

@@ -30,7 +30,6 @@ OPTIONS = {"--seeds": {"type": int, "default": 5, "help": "benches"}}
 
 
 def main(seeds: int) -> None:
-    """Measure benches, and print each and the medians."""
     scene = with_array(paper_scene("two_cubes"), autd3_array())
     propagator = at.make_propagator(scene, method="tmatrix")
     header = ["bench", "of the optimum", "before", "gains within 2 deviations", "off", "stated", "time"]
@@ -38,7 +37,6 @@ def main(seeds: int) -> None:
 
 
 def rows(propagator: at.propagators.Propagator, seeds: int) -> Iterator[list[str]]:
-    """Yield the results of each bench, and their medians."""
     results = []
     for seed in range(seeds):
         results.append(calibrated(propagator, seed))
@@ -49,7 +47,6 @@ def rows(propagator: at.propagators.Propagator, seeds: int) -> Iterator[list[str
 def row(
     name: str, share: float, before: float, within: float, off: float, stated: float, seconds: float
 ) -> list[str]:
-    """Return the results of a bench as cells."""
     lengths = (f"{1e3 * length:.2f} mm" for length in (off, stated))
     return [name, f"{share:.3f}", f"{before:.3f}", f"{within:.0%}", *lengths, f"{seconds:.0f} s"]
 

@@ -63,7 +63,6 @@ class Bench:
         self._inversions: dict[Screen, HeatInversion] = {}
 
     def picture(self, case: Case) -> Picture:
-        """Return the picture of noisy frames."""
         screen = self.view.screen = Screen.of_thickness(case.thickness)
         times = np.arange(-BEFORE, case.duration, 1 / RATE) + self.phase
         if (screen, case.duration) not in self._heat:
@@ -176,7 +175,6 @@ def main(page: Page, seeds: int) -> None:
 
 
 def summary(pressure: float, errors: dict[str, np.ndarray]) -> list[str]:
-    """Return a row of the table."""
     ratios = [f"{math.sqrt(errors[name].mean()):.2f}" for name in ("ratio", "loud", "dark", "edge")]
     stated = f"{100 * np.median(errors['stated']):.2g}"
     return [

@@ -75,7 +75,6 @@ def main(page: Page, methods: list[str], seeds: int, bo_seeds: int, logs: Path, 
 
 
 def blocks_of(seeds: int) -> list[range]:
-    """Return the numbers of trials that run together."""
     return [range(first, min(first + BLOCK, seeds)) for first in range(0, seeds, BLOCK)]
 
 

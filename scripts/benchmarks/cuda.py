@@ -35,7 +35,6 @@ PHONE = at.Box((40e-3, 50e-3, 50e-3), (8e-3, 70e-3, 140e-3), rotation=(0.1, 0.2,
 
 
 def main(page: Page, seconds: float) -> None:
-    """Measure, and write the block."""
     if not torch.cuda.is_available():
         raise SystemExit("cuda: needs an NVIDIA GPU")
     copied = bandwidth(seconds)
@@ -87,7 +86,6 @@ def rates(copied: float, seconds: float) -> Iterator[list[str]]:
 
 @contextmanager
 def threads(most: int) -> Iterator[None]:
-    """Compute on at most so many threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(most)
     yield
@@ -103,7 +101,6 @@ def phone_scene(points: int) -> at.Scene:
 
 
 def matrices() -> Iterator[list[str]]:
-    """Time transfer matrices on the CPU and on the GPU."""
     cubes, discs = paper_scene("three_cubes"), at.TransducerArray.autd3((0.0, 0.0, 0.0), UP)
     hand_scene = at.Scene(discs, AIR, 40e3, FOCI, [hand()], domain=DOMAIN)
     cases: list[tuple[str, at.Scene, str, float, float]] = [

@@ -28,7 +28,6 @@ TRIALS = 25
 
 
 def main(device: str) -> None:
-    """Print the tables."""
     if not torch.cuda.is_available():
         raise SystemExit("cuda_methods: needs an NVIDIA GPU")
     header = ["task", "CPU", "GPU", "ratio", "difference"]

@@ -98,7 +98,6 @@ def places(middle: float) -> Iterator[str]:
 
 
 def row_of(spent: list[float]) -> list[str]:
-    """Return the median and the 95th percentile of times [s]."""
     shares = statistics.quantiles(spent, n=20, method="inclusive")
     return [f"{shares[9]:.2f} s", f"{shares[18]:.2f} s"]
 

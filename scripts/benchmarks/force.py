@@ -40,7 +40,6 @@ WINDOWS = 6e-3, 18e-3, 60e-3, 300e-3  # [m]
 
 
 def main(page: Page) -> None:
-    """Measure, and write the block."""
     plane, standing, *limits = np.max([from_series(material) for material in MATERIALS], axis=0)
     gorkov = ", ".join(
         f"{100 * limit:.2g} % at ka {size:g}" for limit, size in zip(limits, SIZES[:3], strict=True)
@@ -94,17 +93,14 @@ def contrast(material: str) -> float:
 
 
 def sphere_array() -> at.TransducerArray:
-    """Return 16 discs below the bodies."""
     return at.TransducerArray.grid((4, 4), 10e-3, (0, 0, 0), (0, 0, 1.0), radius=4.5e-3)
 
 
 def focused(array: at.TransducerArray, focus: tuple[float, float, float]) -> torch.Tensor:
-    """Return the drive that focuses."""
     return at.drive_from_phases(at.focus_phases(array.positions, focus, WAVENUMBER))
 
 
 def around_bodies() -> Iterator[list[str]]:
-    """Yield the cells of bodies among others."""
     array, center = sphere_array(), (4e-3, -3e-3, 60e-3)
     body = at.Sphere(center, 5e-3, density=5.0, sound_speed=600.0, absorption=300.0)
     other = at.Sphere((-12e-3, 6e-3, 63e-3), 6e-3, rigid=True)

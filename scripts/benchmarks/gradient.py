@@ -26,7 +26,6 @@ def main(cases: list[str]) -> None:
 
 
 def row(case: str) -> list[str]:
-    """Return the cells of a case."""
     cost = in_new_process(measure, case)
     return [
         CASES[case],
@@ -61,7 +60,6 @@ def medium(case: str, spacing: float) -> tuple[at.Scene, dict[str, torch.Tensor]
 
 
 def gradient(case: str, spacing: float, periods: int) -> Cost:
-    """Measure a case in this process."""
     scene, materials = medium(case, spacing)
     drive = torch.ones(len(scene.array), dtype=torch.complex128)
     settings = {"spacing": spacing, "periods": periods, "time_step": 1 / (scene.frequency * STEPS_PER_PERIOD)}

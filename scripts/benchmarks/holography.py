@@ -27,7 +27,6 @@ ALGORITHMS = ("naive", "gs", "wgs", "gs_pat")
 
 
 def main(page: Page) -> None:
-    """Measure, and write the block."""
     page.write(
         f"Sets of {POINTS} points a second, {ITERATIONS} iterations, {TRANSDUCERS} transducers, "
         "amplitudes 1:",
@@ -55,14 +54,12 @@ def theirs(matrix: torch.Tensor) -> dict[str, Callable[[], object]]:
 
 
 def rate(solve: Callable[[], object]) -> float:
-    """Return the sets a second."""
     solve()
     time.sleep(SETTLED)  # until threads of the solver before no longer spin
     return SETS / shortest(solve, REPEATS)[1]
 
 
 def rates() -> Iterator[list[str]]:
-    """Yield a row for each algorithm."""
     generator = torch.Generator().manual_seed(POINTS)
     matrix = torch.randn(SETS, POINTS, TRANSDUCERS, dtype=torch.complex64, generator=generator)
     others = theirs(matrix)

@@ -18,13 +18,11 @@ OPTIONS = {"--trials": {"type": int, "default": 40, "help": "trials of each case
 
 
 def main(trials: int) -> None:
-    """Print the table."""
     header = ["scene", "SNR [dB]", "evaluations", "median", "least", "within 1 %", "seconds"]
     print("", table(header, printed(rows(trials))), sep="\n")
 
 
 def rows(trials: int) -> Iterator[list[str]]:
-    """Yield a row for each scene and case."""
     for name, objective in paper_objectives().items():
         best = at.gradient_ascent(objective).score
         for snr, evaluations in CASES:

@@ -32,7 +32,6 @@ REPEATS = 5
 
 
 def main(seconds: float) -> None:
-    """Measure and print."""
     for numbers, where in ((LARGE, "beyond the caches"), (SIDE**3, f"at {SIDE}^3")):
         print(f"memory (triad) allows {bandwidth(numbers, seconds) / 12e9:.2f} Gcell/s {where}")
     printed(rates(seconds))

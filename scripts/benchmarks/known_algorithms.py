@@ -44,7 +44,6 @@ class Losses:
     """
 
     def __init__(self, objective: at.Objective, goal: at.Goal, evaluations: int) -> None:
-        """Begin with all evaluations."""
         self.transducers = len(objective.scene.array)
         self.left = evaluations
         self.best, self._least = np.zeros(self.transducers), math.inf

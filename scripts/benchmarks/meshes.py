@@ -26,7 +26,6 @@ Pose = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 def main() -> None:
-    """Measure and print."""
     printed(rows())
 
 
@@ -71,7 +70,6 @@ def drawn(count: int) -> list[Pose]:
 
 
 def rows() -> Iterator[list[str]]:
-    """Measure all bodies."""
     array = at.TransducerArray.autd3((0.0, 0.0, 0.0), UP)
     phone = at.Box(PLACE, (0.15, 0.075, 0.008), rigid=True, rotation=(0.1, 0.2, 0.3))
     cube = at.Box(PLACE, (0.03, 0.03, 0.03), rigid=True)

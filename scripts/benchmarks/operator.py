@@ -32,7 +32,6 @@ PATH, STARTS = 200, 8
 
 
 def main(page: Page, shifts: int, turns: int) -> None:
-    """Measure, and write the block."""
     head = ["body", "waves", "built [s]", "reciprocity, energy", "from `box`, median and largest [%]"]
     head += ["turned, from `box` at 0.4 mm [%]", "pose [ms]", "pose, discs [ms]", "matrices/s", "plane [s]"]
     page.write(
@@ -45,7 +44,6 @@ def main(page: Page, shifts: int, turns: int) -> None:
 
 
 def by_box(scene: at.Scene, spacing: float) -> torch.Tensor:
-    """Return the transfer matrix of the box solver."""
     return at.make_propagator(scene, "box", spacing, cache=False).transfer_matrix()
 
 
@@ -56,7 +54,6 @@ def build(obstacles: at.Obstacle | tuple[at.Obstacle, ...]) -> tuple[at.TMatrix,
 
 
 def row(name: str, shifts: int, turns: int) -> list[str]:
-    """Return the cells of one scene."""
     scene, generator = paper_scene(name), np.random.default_rng(0)
     body, seconds = build(scene.obstacles)
 

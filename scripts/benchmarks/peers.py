@@ -76,7 +76,6 @@ OPTIONS = {
 
 
 def main(page: Page, coarse: bool, venvs: Path) -> None:
-    """Measure and report."""
     logging.getLogger("autdtorch").setLevel(logging.ERROR)  # grids are coarse on purpose
     settings = [setting for setting in SETTINGS if setting.spacing == 2 or not coarse]
     points: list[Point] = []
@@ -237,7 +236,6 @@ def peer_points(setting: Setting, venvs: Path) -> Iterator[Point | Refusal]:
 
 
 def our_points(name: str) -> Iterator[Point]:
-    """Measure our solver in a case."""
     case = CASES[name]()
     simulate(case, OUR_SPACINGS[0])  # compiles the kernel
     for spacing in OUR_SPACINGS:
@@ -248,7 +246,6 @@ def our_points(name: str) -> Iterator[Point]:
 
 
 def measure(settings: Sequence[Setting], venvs: Path) -> Iterator[Point | Refusal]:
-    """Measure our solver and the peers."""
     for name in CASES:
         yield from our_points(name)
     for setting in settings:
@@ -256,7 +253,6 @@ def measure(settings: Sequence[Setting], venvs: Path) -> Iterator[Point | Refusa
 
 
 def write_report(points: Sequence[Point], refusals: Sequence[Refusal], page: Page) -> None:
-    """Write the block and peers.png."""
     steady = list(settled(points))
     parts = [
         "![Error over run time](peers.png)",

@@ -49,7 +49,6 @@ OPTIONS = {
 
 
 def main(trials: int, processes: int, noise: float) -> None:
-    """Print the table."""
     header = ["read", "drives", "weakest over optimum", "rms off equal [%]", "largest [%]", "CPU time"]
     print("", table(header, printed(rows(noise, trials, processes))), sep="\n")
 
@@ -64,7 +63,6 @@ class Result(NamedTuple):
 
 
 def rows(noise: float, trials: int, processes: int) -> Iterator[list[str]]:
-    """Yield a row for each case, with quartiles."""
     two_cubes()  # processes that are forked have it then
     with ProcessPoolExecutor(processes) if processes > 1 else contextlib.nullcontext() as pool:
         side_by_side = map if pool is None else pool.map
@@ -81,7 +79,6 @@ def trial(case: tuple[str, int, int], noise: float, seed: int) -> Result:
 
 @functools.cache
 def two_cubes() -> Propagator:
-    """Return the propagator of the scene."""
     return at.make_propagator(scene_of(16), "tmatrix", 1.5e-3, tolerance=1e-2)
 
 

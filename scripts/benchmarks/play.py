@@ -24,7 +24,6 @@ PAIR_FRAMES, PHASE_STEP, APART = 200, 0.8, 10e-3
 
 
 def main(page: Page) -> None:
-    """Measure, and write the block."""
     page.write(
         "One focus on a circle of 5 mm, 10 laps a second, 1000 frames/s. Share: the least, over frames, of "
         "the highest pressure that the frame could have (`focus_bound`). Frames/s: of a core.",
@@ -53,7 +52,6 @@ def scenes() -> Iterator[at.Scene]:
 
 
 def circles() -> Iterator[list[str]]:
-    """Yield rows of sequences behind each obstacle."""
     for scene in scenes():
         matrix = at.make_propagator(scene, cache=False, tolerance=1e-2).transfer_matrix()[:, None]
         alone = dataclasses.replace(scene, obstacles=())
@@ -81,7 +79,6 @@ def solved(matrix: torch.Tensor, phase_step: float, even: bool = True) -> tuple[
 def row(
     scene: str, name: str, matrix: torch.Tensor, drives: torch.Tensor, bounds: torch.Tensor, rate: str
 ) -> list[str]:
-    """Return a row of a sequence."""
     pressure = weakest(matrix, drives)
     most, least = float(pressure.max()), float(pressure.min())
     ripple = (most - least) / (most + least)
@@ -90,7 +87,6 @@ def row(
 
 
 def pairs() -> Iterator[list[str]]:
-    """Yield rows of two foci that move on circles."""
     array = at.TransducerArray.autd3((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
     for radius in (5e-3, 30e-3):
         angles = 0.0, 2 * math.asin(APART / 2 / radius)

@@ -31,7 +31,6 @@ OPTIONS = {
 
 
 def main(trials: int, snr: float) -> None:
-    """Print the table."""
     scene = with_array(paper_scene("two_cubes"), autd3_array())
     header = ["drive", "evaluations", "share of the optimum", "least", "time"]
     print("", table(header, printed(rows(scene, trials, snr))), sep="\n")

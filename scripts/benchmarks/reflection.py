@@ -24,7 +24,6 @@ IMPEDANCES = (100.0, 20.0, 5.0, 1.5 + 1j)
 
 
 def main(page: Page) -> None:
-    """Write the block."""
     page.write(
         "Error of the transfer matrix of 16 x 16 transducers [%] with the factor of the normal, by "
         "the impedance of the plane:",

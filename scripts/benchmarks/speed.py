@@ -28,7 +28,6 @@ REPEATS = 3
 
 
 def main(page: Page) -> None:
-    """Measure, and write the block."""
     first = first_calls()
     page.write(
         "Transfer matrix of four foci and 16 transducers by the box method, to 1e-3 from the steady state:",

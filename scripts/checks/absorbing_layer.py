@@ -37,7 +37,6 @@ OPTIONS = {
 
 
 def main(cells_per_wavelength: float, distance: int, aside: int) -> None:
-    """Print the table."""
     rows = []
     for cells in (6, 8, 10):
         _, magnitude = measured_reflection(cells_per_wavelength, cells, np.array(DEGREES), distance, aside)

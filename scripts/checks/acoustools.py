@@ -37,7 +37,6 @@ REPETITIONS = 3
 
 
 def main(page: Page) -> None:
-    """Compare, and write the block."""
     sphere, cubes = sphere_case("rigid sphere"), rigid_cubes(3)
     meshes = [
         (sphere, [sphere_mesh(sphere.scene, n) for n in SPHERE_SUBDIVISIONS]),
@@ -93,7 +92,6 @@ def boundary_elements(case: Case, mesh: vedo.Mesh) -> torch.Tensor:
 
 
 def rows(case: Case, meshes: Sequence[vedo.Mesh]) -> Iterator[list[str]]:
-    """Yield the errors and run times of both programs."""
     for mesh in meshes:
         matrix, seconds = shortest(lambda m=mesh: boundary_elements(case, m), REPETITIONS)
         error = percent(relative_error(matrix, case.exact))

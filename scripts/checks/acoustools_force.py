@@ -32,7 +32,6 @@ AROUND = 9e-3  # radius of the surface of integration [m]
 
 
 def main(page: Page) -> None:
-    """Compare, and write the block."""
     drive = at.drive_from_phases(at.focus_phases(ARRAY.positions, (0, 0, 50e-3), WAVENUMBER))
 
     def force(body: at.Obstacle, spacing: float) -> torch.Tensor:
@@ -60,7 +59,6 @@ def main(page: Page) -> None:
 
 
 def by_elements(mesh: vedo.Mesh, drive: torch.Tensor) -> torch.Tensor:
-    """Return AcousTools' force (3,) [N]."""
     around = vedo.IcoSphere(CENTER, AROUND, subdivisions=3)
     for each in (mesh, around):
         calculate_features(each)

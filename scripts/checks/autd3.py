@@ -62,7 +62,6 @@ OPTIONS = {"--resolution": {"type": float, "default": 1.0, "help": "of the plane
 
 
 def main(page: Page, resolution: float) -> None:
-    """Compare, and write the block."""
     grid = plane(resolution)
     lines, factor = rows(grid)
     late = math.degrees(cmath.phase(factor))
@@ -103,8 +102,6 @@ def largest_shift() -> float:
 
 
 def play(geometry: Geometry, phases: PhaseBuffer, intensities: IntensityBuffer | int = 255) -> Emission:
-    """Let the emulator play a pattern."""
-
     def send(recorder: Recorder) -> None:
         recorder.send([SetSilencer.disable(), Pattern(phases, intensities)])
         recorder.tick(Duration.from_nanos(PERIODS * PERIOD.as_nanos()))

@@ -28,7 +28,6 @@ AIR = at.Medium(density=1.2, sound_speed=340.0)
 
 
 def main(scenes: int, seed: int) -> int:
-    """Run both checks."""
     check_paper_scenes()
     above = check_goals(scenes, seed)
     return int(above + check_random_scenes(scenes, seed) > 0)
@@ -42,11 +41,9 @@ class MatrixPropagator:
     matrix: torch.Tensor
 
     def transfer_matrix(self, points: torch.Tensor | None = None) -> torch.Tensor:
-        """Return the matrix."""
         return self.matrix
 
     def field(self, drive: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-        """Return the pressure at the control points."""
         return drive @ self.matrix.T
 
 

@@ -39,7 +39,6 @@ OPTIONS = {
 
 
 def main(capability: int, dtype: str) -> None:
-    """Print the table."""
     rows = []
     for name, kernel in compiled(capability, getattr(torch, dtype)).items():
         rows.append([name, str(32 * kernel.metadata.num_warps), *map(str, usage(kernel))])

@@ -45,7 +45,6 @@ OPTIONS = {
 
 
 def main(damages: int, seed: int) -> int:
-    """Damage files, and print the problems."""
     logging.getLogger("autdtorch").propagate = False  # hundreds of expected warnings
     with tempfile.TemporaryDirectory() as folder:
         counts, wrong = check(damages, seed, Path(folder))

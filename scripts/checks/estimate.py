@@ -80,7 +80,6 @@ OPTIONS = {"--scenes": {"nargs": "+", "choices": CASES, "default": list(CASES), 
 
 
 def main(scenes: list[str]) -> None:
-    """Print estimates, measurements and their ratios."""
     rows = printed(in_new_process(row, name) for name in scenes)
     header = ["scene", *["memory", "measured", "ratio"], *["time", "measured", "ratio"], "runs"]
     print("", table(header, rows), sep="\n")

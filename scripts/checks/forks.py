@@ -29,7 +29,6 @@ OPTIONS = {
 
 
 def main(forks: int, seed: int) -> int:
-    """Fork, and print what went wrong."""
     if not hasattr(os, "fork"):
         sys.exit("this system does not fork")
     warnings.filterwarnings("ignore", ".*multi-threaded", DeprecationWarning)  # of a fork, since Python 3.12

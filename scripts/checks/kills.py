@@ -104,7 +104,6 @@ OPTIONS = {
 
 
 def main(kills: int, seed: int) -> int:
-    """Check every subject."""
     failed = False
     for name in SUBJECTS:
         with tempfile.TemporaryDirectory() as folder:
@@ -115,7 +114,6 @@ def main(kills: int, seed: int) -> int:
 
 
 def calm_run(subject: Subject, folder: Path) -> Calm:
-    """Run to the end, undisturbed."""
     begin = time.monotonic()
     process = subject.start(folder)
     wait(lambda: subject.lines(folder) > 0, process)

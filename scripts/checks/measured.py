@@ -29,7 +29,6 @@ MOVES = 3000
 
 
 def main(data: Sequence[Path], page: Page) -> None:
-    """Read what is there, and write the block."""
     parts = [part for path in data for part in parts_of(path)]
     page.write(*parts)
 

@@ -43,7 +43,6 @@ OPTIONS = {
 
 
 def main(variant: str, arguments: list[str]) -> int:
-    """Run the chosen variants, and name the failed ones."""
     failed = []
     for name in VARIANTS if variant == "all" else [variant]:
         begin = time.monotonic()

@@ -87,7 +87,6 @@ class Outcome:
 
     @property
     def failed(self) -> bool:
-        """Return whether anything grew."""
         risen = any(rise > LARGEST_RISE[run] for run, rise in self.rise.items())
         return not self.finite or risen or self.wandering > WANDERING
 

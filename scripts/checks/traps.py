@@ -24,7 +24,6 @@ DRIVES, STEPS, ROUNDS = 4000, 100, 30
 
 
 def main(questions: int, seed: int) -> int:
-    """Run both checks."""
     rng = np.random.default_rng(seed)
     return int(check_bounds(questions, rng) + check_answers(questions, rng) > 0)
 

@@ -44,7 +44,6 @@ class Page:
         self._file(name).write_text(text, encoding="utf-8")
 
     def save(self, name: str, figure: object) -> None:
-        """Save a Matplotlib figure."""
         figure.savefig(self._file(name))
 
     def _file(self, name: str) -> Path:
@@ -63,7 +62,6 @@ def with_block(text: str, command: str, block: str) -> str:
 
 
 def command_line() -> str:
-    """Return the command that started this process."""
     return shlex.join(["python", f"scripts/{Path(sys.argv[0]).name}", *sys.argv[1:]])
 
 

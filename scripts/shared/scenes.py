@@ -20,7 +20,6 @@ MIDDLE = (1e-3, 50e-3, 50e-3)
 
 
 def paper_scene(name: str) -> at.Scene:
-    """Load a scene of the paper."""
     return at.load_scene(SCENES / f"{name}.yaml")
 
 

@@ -44,7 +44,6 @@ class Method:
 
     @property
     def label(self) -> str:
-        """Return the name in the report."""
         settings = (each if isinstance(each, str) else f"{each} {key}" for key, each in self.settings.items())
         return ", ".join([label_of(self.function), *settings])
 

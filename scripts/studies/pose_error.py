@@ -40,7 +40,6 @@ OPTIONS = {
 
 
 def main(page: Page, poses: int, spacing: float) -> None:
-    """Simulate, and write the figure and the block."""
     rows = []
     for name in SCENES:
         for loss in losses(name, poses, 1e-3 * spacing):

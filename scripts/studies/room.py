@@ -58,7 +58,6 @@ class Case(NamedTuple):
 
 
 def main(page: Page, spacing: float) -> None:
-    """Simulate, and write the figure and the block."""
     head = ["in the beam", "AUTD3", "matrix changes by [%]"]
     head += ["drive for free air", "drive that knows", "lost [%]"]
     page.write(
@@ -77,7 +76,6 @@ def scene_of(bodies: Sequence[at.Obstacle], room: Sequence[at.Reflector]) -> at.
 
 
 def cases(spacing: float) -> Iterator[Case]:
-    """Yield all bodies in all rooms."""
     for body, bodies in BODIES.items():
         free = at.make_propagator(scene_of(bodies, []), spacing=spacing).transfer_matrix()
         drive = at.holography(free, starts=8)
@@ -101,7 +99,6 @@ def judged(body: str, room: str, free: torch.Tensor, drive: torch.Tensor, matrix
 
 
 def cells(case: Case) -> list[str]:
-    """Return the cells of a row of the table."""
     pressures = [f"{value:.0f}" for value in (case.ignorant, case.knowing)]
     shares = [f"{abs(100 * share):.1f}" for share in (case.changed, 1 - case.ignorant / case.knowing)]
     return [case.body, case.room, shares[0], *pressures, shares[1]]

@@ -21,7 +21,6 @@ Figures = tuple[torch.Tensor, torch.Tensor]
 
 
 def main(page: Page, trials: int) -> None:
-    """Measure, and write the block."""
     figures = {scene: measure(objective, trials) for scene, objective in paper_objectives().items()}
     page.write(
         f"Weakest focus [Pa] in the paper's scenes: mean (minimum to maximum) of {trials} trials, and\n"
@@ -43,7 +42,6 @@ def best_offsets(objective: at.Objective) -> Figures:
 
 
 def measure(objective: at.Objective, trials: int) -> dict[str, Figures]:
-    """Return scores and evaluations of every search."""
     gabs = partial(at.gabs, trials=trials)
     searches = {
         "random search": partial(at.random_search, trials=trials),
@@ -59,7 +57,6 @@ def measure(objective: at.Objective, trials: int) -> dict[str, Figures]:
 
 
 def summary(figures: Mapping[str, Mapping[str, Figures]]) -> str:
-    """Return a table with a row for each search."""
     rows = []
     for name in figures[PAPER[0]]:
         evaluations = torch.cat([figures[scene][name][1] for scene in PAPER]).double().mean()

@@ -211,7 +211,6 @@ class FolderFrames:
 
 
 def _read_image(path: Path, scale: float, zero: float) -> Degrees:
-    """Return the image (H, W) [degrees C] of a file."""
     if path.suffix.lower() == ".csv":
         return _matrix(_read_csv(path))
     if path.suffix.lower() == ".npy":

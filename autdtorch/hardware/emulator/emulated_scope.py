@@ -233,7 +233,6 @@ class EmulatedInstrument(EmulatedDevice):
         return piece
 
     def _transfer(self) -> bytes:
-        """Return the next transfer of the answer."""
         if self._asked is None or not self._answer:
             raise time_out()
         tag, most = self._asked

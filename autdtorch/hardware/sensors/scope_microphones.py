@@ -130,7 +130,6 @@ class Microphone:
 
     @property
     def _volts(self) -> float:
-        """Voltage at the input for 1 Pa [V/Pa]."""
         return self.sensitivity * self.gain
 
 

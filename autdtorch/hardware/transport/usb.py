@@ -123,7 +123,6 @@ class UsbPort(Port):
         )
 
     def _ask(self, what: str, kind: int, request: int, length: int, index: int = 0) -> bytes:
-        """Return the answer of at most `length` bytes to a request."""
         transfer = self._device.ctrl_transfer
         return bytes(self._call(what, transfer, kind, request, 0, index, length, self._timeout_ms))
 

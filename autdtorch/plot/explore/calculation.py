@@ -238,12 +238,10 @@ class Calculator:
         return propagator
 
     def _cells(self, situation: Situation, fine: bool) -> float:
-        """Return the edge of a cell [m]."""
         coarse = min(_COARSER * self._spacing, _COARSEST * situation.scene.wavelength)
         return self._spacing if fine else max(self._spacing, coarse)
 
     def _steps(self, request: Request, propagator: Propagator) -> Iterator[State]:
-        """Yield the states of a method's trial."""
         assert request.method is not None
         objective = SimulatedObjective(propagator.scene, propagator)
         state = request.method.start(Problem.of(objective), request.seed)

@@ -222,7 +222,6 @@ def _rows(result: Result, reference: float) -> list[list[str]]:
 
 
 def _summary(result: Result) -> str:
-    """Return the readings as a sentence or two."""
     weakest = float(result.pressure.min())
     text = f"Weakest focus {_three_digits(weakest)} Pa"
     if result.bound is not None:

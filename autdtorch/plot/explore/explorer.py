@@ -106,7 +106,6 @@ class Explorer:
         return f"Explorer(scene {self.scene.name!r}, {self.address})"
 
     def _repr_html_(self) -> str:
-        """Return the frame that a notebook shows."""
         title = escape(f"autdtorch explore: {self.scene.name}", quote=True)
         size = f'width="100%" height="{_HEIGHT}" style="border: 0"'
         return f'<iframe src="{escape(self.address)}" title="{title}" {size}></iframe>'

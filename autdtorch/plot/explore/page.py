@@ -45,7 +45,6 @@ def _slider(
 
 
 def _position(name: str, disabled: str = "false") -> str:
-    """Return sliders for the coordinates of a body or a focus."""
     return "".join(
         _slider(f"{name}_{axis}", f"{axis} [mm]", f"range_{axis}[0]", f"range_{axis}[1]", 0.1, disabled)
         for axis in "xyz"

@@ -261,7 +261,6 @@ def _note_failure(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> N
 
 
 def _end_tasks(loop: asyncio.AbstractEventLoop) -> None:
-    """Cancel the tasks of a loop."""
     tasks = asyncio.all_tasks(loop)
     for task in tasks:
         task.cancel()

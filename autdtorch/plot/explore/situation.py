@@ -316,7 +316,6 @@ def _middle(obstacle: Obstacle) -> Vector:
 
 
 def _most_steps(situation: Situation) -> int:
-    """Return the number of steps in a history."""
     size = sum(
         obstacle.vertices.nbytes for obstacle in situation.scene.obstacles if isinstance(obstacle, Mesh)
     )

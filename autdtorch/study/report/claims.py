@@ -146,7 +146,6 @@ def _ordered(smaller: str, larger: tuple[str, ...], quantity: str) -> Compare:
 
 
 def _listed(numbers: dict[str, Interval]) -> str:
-    """Return shares and ratios by label."""
     return ", ".join(f"{label} {number:{_SHARE}}" for label, number in numbers.items())
 
 

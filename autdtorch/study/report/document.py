@@ -162,7 +162,6 @@ def _mark_headers(table: Sequence[Token]) -> None:
 
 
 def _mark_numbers(table: Sequence[Token]) -> None:
-    """Keep the numbers of a short cell in one line."""
     for token, content in itertools.pairwise(table):
         if token.type == "td_open" and re.match(r"[-\d]", content.content) and len(content.content) <= _SHORT:
             token.attrSet("class", "number")

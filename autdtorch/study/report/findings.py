@@ -185,7 +185,6 @@ def _change(share: float) -> str:
 
 
 def _verdicts(verdicts: Sequence[Verdict], claims: int) -> str:
-    """Return the sentence on the paper's claims."""
     held = sum(verdict.holds for verdict in verdicts)
     unclear = sum(not verdict.clear for verdict in verdicts)
     parts = [f"{_are(held)} reproduced", f"{_are(len(verdicts) - held)} not reproduced"]

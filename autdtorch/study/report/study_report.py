@@ -239,7 +239,6 @@ def _by_method(
 
 
 def _numbered(name: str, before: Sequence[str]) -> str:
-    """Return the name of the file of a figure after those before it."""
     return f"{name}_{len(before) + 1}.png" if before else f"{name}.png"
 
 
@@ -299,7 +298,6 @@ def _shown_score(method: MethodResult, bound: float) -> float:
 
 
 def _grouped(results: StudyResult, key: Callable[[SceneResult], _Key]) -> dict[_Key, dict[str, SceneResult]]:
-    """Return the scenes by a key, and by name."""
     groups: dict[_Key, dict[str, SceneResult]] = {}
     for name, scene in results.scenes.items():
         groups.setdefault(key(scene), {})[name] = scene

@@ -11,7 +11,6 @@ from task import Answer, Task, serve
 
 
 def simulate(task: Task) -> Answer:
-    """Run the task."""
     begin = time.perf_counter()
     # a source sample acts half a step after the pressure of the same index is recorded
     signal = task.source_weights[:, None] * task.drive(0.5)[None]

@@ -27,7 +27,6 @@ LAYER_ATTENUATION = 10.0
 
 
 def simulate(task: Task) -> Answer:
-    """Run the task."""
     begin = time.perf_counter()
     width = task.layer_cells
     density = np.pad(task.density, width, mode="edge")

@@ -15,7 +15,6 @@ from task import Answer, Task, serve
 
 
 def simulate(task: Task) -> Answer:
-    """Run the task."""
     begin = time.perf_counter()
     width = task.layer_cells
     shape = tuple(n + 2 * width for n in task.density.shape)

@@ -25,7 +25,6 @@ from kwave.kspaceFirstOrder import kspaceFirstOrder  # noqa: E402
 
 
 def simulate(task: Task) -> Answer:
-    """Run the task."""
     begin = time.perf_counter()
     width = task.layer_cells
     density = np.pad(task.density, width, mode="edge")

@@ -28,12 +28,10 @@ class Stored:
     """A dataclass of arrays and numbers, stored as an .npz file."""
 
     def save(self, path: Path) -> None:
-        """Write to `path`."""
         np.savez(path, **asdict(self))
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a file of `save`."""
         with np.load(path) as stored:
             values = {name: stored[name] for name in (field.name for field in fields(cls))}
         return cls(**{name: value if value.ndim else value.item() for name, value in values.items()})
@@ -58,7 +56,6 @@ class Task(Stored):
 
     @property
     def steps(self) -> int:
-        """The number of time steps of the run."""
         return int(self.ends[-1]) * self.steps_per_period
 
     def drive(self, delay: float = 0.0) -> NDArray[np.float64]:
