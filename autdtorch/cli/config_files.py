@@ -51,8 +51,9 @@ class FileConfigSource(file_config_source.FileConfigSource):
         config = load_yaml(shown)
         with open(path, encoding="utf-8") as file:
             header = self._get_header_dict(file.read(512))
-        if self.path == str(CONFIGS):
-            _require_no_mode(shown, config)
+        is_ours = self.path == str(CONFIGS)
+        if is_ours and isinstance(config, Mapping) and "mode" in (config.get("hydra") or {}):  # see `_mode`
+            raise ValueError(f"{shown}: hydra.mode; must be set on the command line, as hydra.mode=MULTIRUN")
         if not self._is_trusted():
             _require_harmless(shown, header["package"], unresolved(config, shown))
         if PurePosixPath(config_path).parts[:1] == ("scene",):
@@ -110,12 +111,6 @@ def _begin_paths(config: Any, folder: str) -> None:
             config[key] = os.path.join(folder, config[key])
         elif OmegaConf.is_config(config[key]):
             _begin_paths(config[key], folder)
-
-
-def _require_no_mode(where: str, config: Any) -> None:
-    """Refuse a mode of Hydra, which `_mode` would not see."""
-    if isinstance(config, Mapping) and "mode" in (config.get("hydra") or {}):
-        raise ValueError(f"{where}: hydra.mode; must be set on the command line, as hydra.mode=MULTIRUN")
 
 
 def _require_harmless(where: str, package: str | None, content: Any) -> None:

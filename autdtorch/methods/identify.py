@@ -187,7 +187,8 @@ class Identify(Method):
         read = Magnitudes.of(observed, outliers, search["ends"])
         yield from sensor_doubts(drives[:count], read.first(count), fitted[:count])
         if state.done:
-            names = [_name(number) for number in search["numbers"].tolist()]
+            numbers = search["numbers"].tolist()
+            names = [f"evaluation {n}" if n >= 0 else f"earlier reading {-1 - n}" for n in numbers]
             yield from reading_doubts(
                 names, observed, read, fitted, search["variance"].sqrt(), prior=self.prior is not None
             )
@@ -232,10 +233,6 @@ def _added(
     numbers = -1 - torch.arange(before, before + len(readings), device="cpu")
     parts = readings.drives, readings.pressure, numbers
     return _with(search, *(part.expand(trials, *part.shape) for part in parts))
-
-
-def _name(number: int) -> str:
-    return f"evaluation {number}" if number >= 0 else f"earlier reading {-1 - number}"
 
 
 def _magnitudes(fits: Sequence[MatrixFit], drives: torch.Tensor) -> torch.Tensor:

@@ -273,14 +273,10 @@ def with_prefixes(results: StudyResult) -> StudyResult:
     scenes = dict(results.scenes)
     for unit in _NEWTONS:
         of_unit = {name: scene for name, scene in scenes.items() if scene.unit == unit}
-        sizes = [_largest(scene) for scene in of_unit.values()]
-        scale = prefixed(max(sizes, default=0.0), unit)
+        scores = [method.solution.score for scene in of_unit.values() for method in scene.methods.values()]
+        scale = prefixed(max((float(score.abs().max()) for score in scores), default=0.0), unit)
         scenes |= {name: _scaled(scene, *scale) for name, scene in of_unit.items()}
     return replace(results, scenes=scenes)
-
-
-def _largest(scene: SceneResult) -> float:
-    return max(float(method.solution.score.abs().max()) for method in scene.methods.values())
 
 
 def _scaled(scene: SceneResult, factor: float, unit: str) -> SceneResult:

@@ -16,7 +16,7 @@ from concurrent.futures import ProcessPoolExecutor
 from typing import NamedTuple
 
 import torch
-from shared.document import printed, table
+from shared.document import printed, quartiles, table
 from shared.scenes import MIDDLE, paper_scene, with_array
 
 import autdtorch as at
@@ -79,25 +79,19 @@ def trial(case: tuple[str, int, int], noise: float, seed: int) -> Result:
 
 @functools.cache
 def two_cubes() -> Propagator:
-    return at.make_propagator(scene_of(16), "tmatrix", 1.5e-3, tolerance=1e-2)
+    array = at.TransducerArray.grid(
+        (16, 16), 10e-3, MIDDLE, (1, 0, 0), source_strength=at.PAPER_SOURCE_STRENGTH
+    )
+    points = torch.cat([grid(4, 60e-3), grid(PLACES, SIDE)])
+    scene = dataclasses.replace(with_array(paper_scene("two_cubes"), array), control_points=points)
+    return at.make_propagator(scene, "tmatrix", 1.5e-3, tolerance=1e-2)
 
 
 def summary(results: list[Result]) -> list[str]:
     """Return medians and quartiles of results, as cells."""
-    columns = torch.tensor(results, dtype=torch.float64).T
-    low, middle, high = columns.quantile(columns.new_tensor([0.25, 0.5, 0.75]), dim=1)
-    cells = [f"{middle[0]:.3f} ({low[0]:.3f} to {high[0]:.3f})"]
-    cells += [f"{100 * middle[n]:.1f} ({100 * low[n]:.1f} to {100 * high[n]:.1f})" for n in (1, 2)]
-    return [*cells, f"{middle[3]:.0f} s"]
-
-
-def scene_of(across: int) -> at.Scene:
-    """Return the two cubes, 16 foci behind them, and places of their plane after the foci."""
-    array = at.TransducerArray.grid(
-        (across, across), 10e-3, MIDDLE, (1, 0, 0), source_strength=at.PAPER_SOURCE_STRENGTH
-    )
-    points = torch.cat([grid(4, 60e-3), grid(PLACES, SIDE)])
-    return dataclasses.replace(with_array(paper_scene("two_cubes"), array), control_points=points)
+    weakest, rms, largest, seconds = torch.tensor(results, dtype=torch.float64).T
+    deviations = (quartiles(100 * each, ".1f") for each in (rms, largest))
+    return [quartiles(weakest), *deviations, f"{seconds.quantile(0.5):.0f} s"]
 
 
 def grid(count: int, side: float) -> torch.Tensor:
@@ -162,12 +156,8 @@ def measured(
         goal = at.SeenPoints(goal, range(foci, len(bench.matrix)))
     prior = calibration.prior_with_readings
     drive = at.identify(sensor, more, prior=prior, readings=readings, goal=goal, seed=seed).drive
-    return result_of(bench.matrix[:foci], drive[0], best, time.process_time() - start)
-
-
-def result_of(matrix: torch.Tensor, drive: torch.Tensor, best: float, seconds: float) -> Result:
-    """Return how strong and how equal the foci of a matrix (P, M) are by a drive (M,)."""
-    true = (drive @ matrix.T).abs()
+    seconds = time.process_time() - start
+    true = (drive[0] @ bench.matrix[:foci].T).abs()
     away = true / true.mean() - 1
     return Result(
         float(true.min()) / best, float(away.square().mean().sqrt()), float(away.abs().max()), seconds

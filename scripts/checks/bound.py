@@ -6,7 +6,6 @@ that it has a bound. Exits with 1 if a score is above its bound.
 """
 
 from collections import defaultdict
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -33,20 +32,6 @@ def main(scenes: int, seed: int) -> int:
     return int(above + check_random_scenes(scenes, seed) > 0)
 
 
-@dataclass
-class MatrixPropagator:
-    """A propagator with any transfer matrix (P, M)."""
-
-    scene: at.Scene
-    matrix: torch.Tensor
-
-    def transfer_matrix(self, points: torch.Tensor | None = None) -> torch.Tensor:
-        return self.matrix
-
-    def field(self, drive: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-        return drive @ self.matrix.T
-
-
 def random_objective(generator: torch.Generator, background: bool = False) -> at.SimulatedObjective:
     """Return an objective of 2 to 32 transducers and 1 to 8 foci, of either kind.
 
@@ -70,7 +55,7 @@ def random_objective(generator: torch.Generator, background: bool = False) -> at
     matrix = torch.randn(foci, transducers, dtype=torch.complex128, generator=generator)
     if physical:
         matrix = free_space_matrix(points, array, scene.wavenumber)
-    return at.SimulatedObjective(scene, MatrixPropagator(scene, matrix))
+    return at.SimulatedObjective.of_matrix(scene, matrix)
 
 
 def highest_scores(objective: at.SimulatedObjective) -> dict[str, float]:

@@ -6,7 +6,7 @@ import re
 import shlex
 import statistics
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -93,12 +93,11 @@ def percent(share: float) -> str:
     return f"{100 * share:.3g} %"
 
 
-def spread(values: Any, digits: int = 2, middle: Callable[[Any], Any] | None = None) -> str:
-    """Format the mean, or another middle, and the range of a tensor."""
+def spread(values: Any) -> str:
+    """Format the mean and the range of a tensor."""
     if len(values) == 1:
-        return f"{values.item():.{digits}f}"
-    center = middle(values) if middle else values.mean()
-    return f"{center:.{digits}f} ({values.min():.{digits}f} to {values.max():.{digits}f})"
+        return f"{values.item():.2f}"
+    return f"{values.mean():.2f} ({values.min():.2f} to {values.max():.2f})"
 
 
 def quartiles(values: Any, form: str = ".3f") -> str:

@@ -16,6 +16,7 @@ FREQUENCY, WAVELENGTH = 40e3, 343.0 / 40e3
 _SPACING, _STEP = 0.8e-3, 2.5e-3  # of the finite differences [m], [s]
 _FINER = 3  # cells of the camera in one of these: its bilinear weights blur
 _MARGIN = 15e-3  # of the screen around the plane [m]
+_BLUR = 0.5  # of images [pixels]
 
 
 def pinhole(
@@ -41,22 +42,16 @@ def pinhole(
 class HeatedScreen:
     """A screen, larger than the plane, that a field heats, and a camera that sees it."""
 
-    def __init__(
-        self,
-        registration: Registration,
-        shape: tuple[int, int],
-        blur: float = 0.5,
-        screen: Screen | None = None,
-    ) -> None:
-        """Set up the grid, and the part of each cell in each pixel of images (H, W), with blur [pixels]."""
+    def __init__(self, registration: Registration, shape: tuple[int, int]) -> None:
+        """Set up the grid, and the part of each cell in each pixel of images (H, W)."""
         plane = registration.plane
         self.counts = [round((size + 2 * _MARGIN) / _SPACING) for size in plane.size]
-        self.screen, self.shape = screen or Screen(heating=1e-6), shape
+        self.screen, self.shape = Screen(heating=1e-6), shape
         large = at.Plane(plane.center, plane.normal, (self.counts[0] * _SPACING, self.counts[1] * _SPACING))
         self.points = large.points(_SPACING).reshape(-1, 3)
         rows, columns = np.divmod(np.arange(math.prod(shape)), shape[1])
         cells, spacing = _FINER * np.array(self.counts), _SPACING / _FINER
-        offsets, weights = point_spread(blur)
+        offsets, weights = point_spread(_BLUR)
         entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for dx, wx in zip(offsets, weights, strict=True):
             for dy, wy in zip(offsets, weights, strict=True):

@@ -33,11 +33,9 @@ def paper_objectives() -> dict[str, at.SimulatedObjective]:
     return {name: objective_of(paper_scene(name)) for name in PAPER}
 
 
-def autd3_array(units: tuple[int, int] = (1, 1)) -> at.TransducerArray:
-    """Return AUTD3s of 249 point sources each, side by side in the place of the paper's array."""
-    return at.TransducerArray.autd3(
-        MIDDLE, units=units, source_strength=at.PAPER_SOURCE_STRENGTH, radius=None
-    )
+def autd3_array() -> at.TransducerArray:
+    """Return an AUTD3 of 249 point sources in the place of the paper's array."""
+    return at.TransducerArray.autd3(MIDDLE, source_strength=at.PAPER_SOURCE_STRENGTH, radius=None)
 
 
 def with_array(scene: at.Scene, array: at.TransducerArray) -> at.Scene:

@@ -5,11 +5,9 @@ number of the trial. The true score is the weakest focus that the resulting driv
 device in its final state.
 """
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +17,7 @@ from shared.document import Page, command_line, table
 from shared.scenes import PAPER, paper_objectives
 
 import autdtorch as at
-from autdtorch.plot.style import TICK_SIZE, Look, label_of, looks_of, new_figure, readable, styled
+from autdtorch.plot.style import TICK_SIZE, Look, looks_of, new_figure, readable, styled
 
 DOCUMENT = "conditions.md"
 SHOWN = "three_cubes"
@@ -31,34 +29,16 @@ Wrap = Callable[[at.Objective, int], at.Objective]
 """Puts an objective under a condition, for the number of a trial."""
 
 
-@dataclass(frozen=True)
-class Method:
-    """A function of the package with its settings.
-
-    `together` runs all trials in one call, for methods whose trials take equally many evaluations a step.
-    """
-
-    function: str
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    together: bool = False
-
-    @property
-    def label(self) -> str:
-        settings = (each if isinstance(each, str) else f"{each} {key}" for key, each in self.settings.items())
-        return ", ".join([label_of(self.function), *settings])
-
-
-METHODS = {
-    "random_search": Method("random_search"),
-    "lssg": Method("lssg"),
-    "gabs": Method("gabs"),
-    "gabs_2_passes": Method("gabs", {"passes": 2}),
-    "bayes_opt": Method("bayes_opt", together=True),
-    "bayes_opt_circle": Method("bayes_opt", {"kernel": "circle"}, together=True),
-    "identify": Method("identify"),
-    "identify_256": Method("identify", {"evaluations": 256}),
+METHODS: dict[str, at.Method] = {
+    "random search": at.RandomSearch(),
+    "LSSG": at.LSSG(),
+    "GABS": at.GABS(),
+    "GABS, 2 passes": at.GABS(passes=2),
+    "BO": at.BayesOpt(),
+    "BO, circle": at.BayesOpt(kernel="circle"),
+    "identify": at.Identify(),
+    "identify, 256 evaluations": at.Identify(256),
 }
-
 
 OPTIONS = {
     "--methods": {"nargs": "+", "choices": METHODS, "default": list(METHODS), "help": "compared methods"},
@@ -72,8 +52,9 @@ def main(page: Page, methods: list[str], trials: int) -> None:
     for scene, objective in paper_objectives().items():
         for condition, wrap in CONDITIONS.items():
             for name in methods:
-                result = outcome(METHODS[name], objective, wrap, trials)
-                outcomes[scene, condition, METHODS[name].label] = result
+                method = METHODS[name]
+                result = outcome(method, objective, wrap, trials, isinstance(method, at.BayesOpt))
+                outcomes[scene, condition, name] = result
                 print(f"{scene}, {condition}, {name}: {result.true.mean():.3f} Pa", flush=True)
     for scene in PAPER:
         print("", f"True weakest focus [Pa], {scene}:", "", true_scores(outcomes, scene), sep="\n")
@@ -134,7 +115,7 @@ class Outcome:
 
 
 Outcomes = Mapping[tuple[str, str, str], Outcome]
-"""Outcomes by scene, condition and label of the method."""
+"""Outcomes by scene, condition and method."""
 
 
 class SideBySide:
@@ -153,21 +134,18 @@ class SideBySide:
         return torch.cat([see(share) for see, share in zip(self._objectives, shares, strict=True)])
 
 
-def solve(method: Method, objective: at.Objective, trials: Sequence[int]) -> at.Solution:
-    """Run trials of a method; a method without random choices takes no `trials` and no `seed`."""
-    function = getattr(at, method.function)
-    known = inspect.signature(function).parameters.keys() & {"trials", "seed"}
-    settings = {key: value for key, value in {"trials": list(trials), "seed": 0}.items() if key in known}
-    return function(objective, **method.settings, **settings)
+def outcome(
+    method: at.Method, objective: at.Objective, wrap: Wrap, trials: int, together: bool = False
+) -> Outcome:
+    """Return true and observed scores of a method's trials under a condition.
 
-
-def outcome(method: Method, objective: at.Objective, wrap: Wrap, trials: int) -> Outcome:
-    """Return true and observed scores of a method's trials under a condition."""
+    All trials run in one call if `together`, of methods whose trials take equally many evaluations a step.
+    """
     objectives = [wrap(objective, trial) for trial in range(trials)]
-    if method.together:
-        solutions = [solve(method, SideBySide(objectives), range(trials))]
+    if together:
+        solutions = [at.run(method, SideBySide(objectives), trials)]
     else:
-        solutions = [solve(method, each, [trial]) for trial, each in enumerate(objectives)]
+        solutions = [at.run(method, each, [trial]) for trial, each in enumerate(objectives)]
     drives = torch.cat([solution.drive for solution in solutions])
     true = [at.true_pressure(each, drive) for each, drive in zip(objectives, drives, strict=True)]
     return Outcome(at.weakest_focus(torch.stack(true)), torch.cat([each.score for each in solutions]))

@@ -23,9 +23,9 @@ from shared import cases, document
 from shared.cases import cube_case, free_space_case, piston_case, simulate, slab_case, sphere_case, wall_case
 from shared.document import DOCS, with_block
 from shared.runner import SCRIPTS, commands, run
-from shared.scenes import autd3_array, paper_scene, with_array
+from shared.scenes import MIDDLE, paper_scene, with_array
 from small_scenes import small_scene
-from studies.conditions import CONDITIONS, Method, outcome
+from studies.conditions import CONDITIONS, outcome
 
 import autdtorch as at
 from autdtorch.objectives.objective import SimulatedObjective
@@ -177,7 +177,9 @@ def test_exponent_of_a_power_law_is_its_power(
 
 def test_domain_holds_paper_and_large_array() -> None:
     scene = paper_scene("two_cubes")
-    lower, upper = torch.tensor(with_array(scene, autd3_array((2, 1))).domain)
+    lower, upper = torch.tensor(
+        with_array(scene, at.TransducerArray.autd3(MIDDLE, units=(2, 1), radius=None)).domain
+    )
     assert (lower < torch.tensor(scene.domain[0])).all()
     assert (upper > torch.tensor(scene.domain[1])).all()
 
@@ -187,8 +189,7 @@ def test_trials_together_are_those_one_by_one(condition: str) -> None:
     scene = small_scene()
     objective = SimulatedObjective(scene, FreeSpacePropagator(scene))
     alone, together = (
-        outcome(Method("gabs", {"levels": 4}, joined), objective, CONDITIONS[condition], trials=3)
-        for joined in (False, True)
+        outcome(at.GABS(levels=4), objective, CONDITIONS[condition], 3, joined) for joined in (False, True)
     )
     # GABS sums in equal groups, as all trials take the same steps.
     assert torch.equal(alone.true, together.true)

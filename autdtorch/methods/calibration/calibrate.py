@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
+from scipy.stats import rankdata
 
 from autdtorch.methods.calibration.calibration import (
     Calibration,
@@ -226,14 +227,7 @@ def _correlation(expected: torch.Tensor, observed: torch.Tensor) -> float:
     levels = []
     for pair in zip(expected.T, observed.T, strict=True):
         known = ~pair[1].isnan()
-        ranks = torch.stack([_ranks(values[known]) for values in pair])
-        if ranks.shape[1] > 2:
+        if known.sum() > 2:
+            ranks = torch.from_numpy(rankdata([values[known].numpy() for values in pair], axis=1))
             levels.append(torch.corrcoef(ranks)[0, 1].nan_to_num())
     return float(torch.stack(levels).mean()) if levels else 0.0
-
-
-def _ranks(values: torch.Tensor) -> torch.Tensor:
-    """Return the ranks of values (N,), their mean where values are equal."""
-    _, place, counts = torch.unique(values, return_inverse=True, return_counts=True)
-    ranks: torch.Tensor = counts.cumsum(0) - 0.5 * counts.double()
-    return ranks[place]

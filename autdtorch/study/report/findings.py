@@ -74,18 +74,15 @@ def _winners(results: StudyResult, best: Mapping[str, _Best]) -> str:
     for name, top in best.items():
         groups.setdefault(top.labels, []).append(name)
     largest_first = sorted(groups, key=lambda labels: -len(groups[labels]))
+    level = f" (less than {100 * LEVEL:.0f} % apart)"
     parts = [
-        f"{_scores(groups[labels], scenes, best)}, by {listed(labels)}{_level(labels)}"
+        f"{_scores(groups[labels], scenes, best)}, by {listed(labels)}{level if len(labels) > 1 else ''}"
         for labels in largest_first[:MOST_NAMED]
     ]
     if rest := sum(len(groups[labels]) for labels in largest_first[MOST_NAMED:]):
         parts.append(f"by other methods in {rest} more scenes")
     kind = f"{'best ' if len(every) > 1 else ''}{'median ' if median else ''}score"
     return f"For the goal {goal}, the {kind} is {'; '.join(parts)}."
-
-
-def _level(labels: Sequence[str]) -> str:
-    return f" (less than {100 * LEVEL:.0f} % apart)" if len(labels) > 1 else ""
 
 
 def _scores(names: Sequence[str], scenes: Mapping[str, SceneResult], best: Mapping[str, _Best]) -> str:
