@@ -79,18 +79,13 @@ def hardware_trial(settings: dict[str, Any], modules: list[Any], output: Any, re
 
 def note_outputs(error: BaseException, begun: bool, then: str = "") -> None:
     """Add a note to an error on whether the outputs are off, if a device was opened."""
-    if (left_on := _left_on(error)) is not None:
-        if left_on is not error:
-            error.add_note(str(left_on))
-    elif begun:
+    left_on: BaseException | None = error  # says that a device may play on: this one, or one that it followed
+    while left_on is not None and not isinstance(left_on, hardware.OffError):
+        left_on = left_on.__cause__ or left_on.__context__
+    if left_on is None and begun:
         error.add_note(f"the outputs are off{then}")
-
-
-def _left_on(error: BaseException | None) -> BaseException | None:
-    """Return the error that says that a device may play on: this one, or one that it followed."""
-    while error is not None and not isinstance(error, hardware.OffError):
-        error = error.__cause__ or error.__context__
-    return error
+    elif left_on not in (None, error):
+        error.add_note(str(left_on))
 
 
 class _Measured(NamedTuple):

@@ -26,7 +26,6 @@ from autdtorch.propagators.tmatrix.propagator import placed_bodies
 from autdtorch.scene.obstacles.moving import is_movable
 from autdtorch.scene.scene import Scene
 from autdtorch.study.folder import TrialFile, open_folder
-from autdtorch.study.problems import blank_problem, method_for_bodies, objective_of, scenes_of
 from autdtorch.study.results import (
     MethodResult,
     SceneResult,
@@ -35,7 +34,18 @@ from autdtorch.study.results import (
     median_trial,
     provenance_now,
 )
-from autdtorch.study.study_method import StudyMethod, check_goal, code_of, counts_of, goals_of, solve
+from autdtorch.study.study_method import (
+    StudyMethod,
+    blank_problem,
+    check_goal,
+    code_of,
+    counts_of,
+    goals_of,
+    method_for_bodies,
+    objective_of,
+    scenes_of,
+    solve,
+)
 from autdtorch.utils.files import require_name
 from autdtorch.utils.progress import Progress, show_progress
 from autdtorch.utils.spatial import nearest

@@ -19,7 +19,7 @@ import torch
 from autdtorch.methods.base import Method, State
 from autdtorch.methods.gradient import GradientAscent
 from autdtorch.methods.problem import Problem
-from autdtorch.methods.run import observed
+from autdtorch.methods.run import observed, run
 from autdtorch.objectives.bound import focus_bound
 from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.plot.explore.situation import Situation
@@ -193,8 +193,10 @@ class Calculator:
         drive = situation.drive
         if request.method is not None:
             state = None
+            label = request.method.label
             for state in self._steps(request, propagator):
-                yield _progress(request, state)
+                most, score = request.method.most_evaluations(state.problem), float(state.best.score[0])
+                yield MethodProgress(request, label, state.evaluations, most, score)
                 if self._is_old():
                     return
             assert state is not None
@@ -251,21 +253,10 @@ class Calculator:
             yield state
 
 
-def _progress(request: Request, state: State) -> MethodProgress:
-    assert request.method is not None
-    most = request.method.most_evaluations(state.problem)
-    score = float(state.best.score[0])
-    return MethodProgress(request, request.method.label, state.evaluations, most, score)
-
-
 def _followed(propagator: Propagator, drive: torch.Tensor) -> torch.Tensor:
     """Return the drive of gradient ascent on the transfer matrix, with a drive (M,) among its starts."""
     objective = SimulatedObjective(propagator.scene, propagator)
-    method = GradientAscent()
-    state = method.start(Problem.of(objective, start=drive), 0)
-    while not state.done:
-        state = method.tell(state, objective(method.ask(state)))
-    return method.best(state).drive[0]
+    return run(GradientAscent(), objective, start=drive).drive[0]
 
 
 def _field(
