@@ -41,7 +41,9 @@ def main(keep: list[str], arguments: list[str]) -> int:
         newer = [f"{name} {version}" for name, version in versions if pinned.get(name, version) != version]
         print(f"Python {sys.version.partition(' ')[0]}; unlike constraints.txt: {', '.join(newer) or 'none'}")
         command = [python, "-m", "pytest", "-q", "-n", "auto", "--maxprocesses", "8", *arguments]
-        return subprocess.run(command, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}).returncode
+        # another Numba would take the place of the kernels that are compiled for this one
+        environment = os.environ | {"PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(folder / "numba")}
+        return subprocess.run(command, cwd=ROOT, env=environment).returncode
 
 
 def new_environment(folder: Path) -> Path:
