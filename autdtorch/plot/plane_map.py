@@ -20,7 +20,6 @@ from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.reflectors import Reflector, are_in_front
 from autdtorch.utils.array_types import REAL, Array
-from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 _AXIS_TOLERANCE = 1e-12  # deviation from 1 of the coordinate of a unit vector along x, y or z
 _OUTLINE_CELLS = 400  # samples along the longer side of a plane, to outline obstacles
@@ -95,19 +94,16 @@ def _outline(ax: Axes, plane: Plane, obstacle: Obstacle, reflectors: Sequence[Re
 def _hatch(ax: Axes, plane: Plane, reflector: Reflector, others: Iterable[Reflector]) -> None:
     """Draw the line where a reflector crosses the plane in front of the others, with strokes on its back."""
     corners = plane.corners[[0, 1, 3, 2]]
-    height = reflector.mirror.height(corners).numpy()
-    height[np.abs(height) < LENGTH_TOLERANCE] = 0.0
-    ends = list(corners[height == 0].numpy())
-    for here, there in zip(range(4), (1, 2, 3, 0), strict=True):
-        if height[here] * height[there] < 0:
-            share = height[here] / (height[here] - height[there])
-            ends.append((corners[here] + share * (corners[there] - corners[here])).numpy())
+    everywhere = (-math.inf,) * 3, (math.inf,) * 3
+    behind = Reflector(reflector.point, [-part for part in reflector.normal])
+    ends = clipped(corners.numpy(), *everywhere, [reflector, behind])
     if len(ends) != 2:  # it misses the plane, or touches a corner
         return
-    ends = list(clipped(np.array(ends), (-math.inf,) * 3, (math.inf,) * 3, others)[:2])
+    ends = clipped(ends, *everywhere, others)[:2]
     if len(ends) != 2:
         return
-    here, there = coordinates_in(plane, torch.from_numpy(np.array(ends))).numpy()
+    here, there = coordinates_in(plane, torch.from_numpy(ends)).numpy()
+    height = reflector.mirror.height(corners).numpy()
     far = int(np.abs(height).argmax())
     aside = coordinates_in(plane, corners)[far].numpy() - here
     line = MM * np.array([here, there])
