@@ -134,7 +134,6 @@ class BayesOpt(Method):
     device: Literal["cpu", "cuda"] = choice("cpu", "cuda")
 
     def __post_init__(self) -> None:
-        """Check the settings, also against each other."""
         super().__post_init__()
         device_type("device", self.device)  # refuses a GPU that is not there
         least = self.initial + 1 if self.prior is None else 2

@@ -88,7 +88,6 @@ class LeastForm(GoalOfForce):
     weights: Array = field(repr=False)
 
     def __eq__(self, other: object) -> bool:
-        """Return whether another goal gives the same scores of readings."""
         if not isinstance(other, LeastForm):
             return NotImplemented
         return self.of == other.of and np.array_equal(self.weights, other.weights)

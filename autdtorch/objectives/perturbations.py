@@ -53,7 +53,6 @@ class Perturbation:
         self.evaluations = 0
 
     def __repr__(self) -> str:
-        """Return the nested objectives, from the outside inwards."""
         return f"{type(self).__name__}({self.inner!r}, {counted(self.evaluations, 'evaluation')})"
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:

@@ -53,7 +53,6 @@ class Certificate:
     offsets: torch.Tensor
 
     def __repr__(self) -> str:
-        """Return the pressures, and the shift to the worst place."""
         shift = ", ".join(f"{1e3 * entry:.2f}" for entry in self.offsets[0].tolist())
         return f"Certificate(at least {self.least:.4g} Pa, {self.worst:.4g} Pa at ({shift}) mm)"
 

@@ -88,12 +88,10 @@ class _GoalBesideOthers(_BesideOthers):
 
     @property
     def unit(self) -> str:  # type: ignore[override]
-        """The unit of the goal."""
         return self.goal.unit
 
     @property
     def absolute(self) -> bool:  # type: ignore[override]
-        """True if the goal wants pressures in Pa."""
         return self.goal.absolute
 
     def check(self, points: int) -> None:

@@ -56,7 +56,6 @@ class TrialFile:
         self._lines = JsonLines(path, origin, self._use)
 
     def __len__(self) -> int:
-        """Return the number of trials."""
         return len(self._trials)
 
     def mend(self) -> None:

@@ -57,7 +57,6 @@ class Provenance:
         return digest_of(self.config, self.seed, sorted(self.versions.items()), self.source_digest)
 
     def __repr__(self) -> str:
-        """Return version, seed and date, without the settings."""
         return f"Provenance(autdtorch {self.versions.get('autdtorch')}, seed {self.seed}, begun {self.date})"
 
     @classmethod
@@ -116,7 +115,6 @@ class SceneSimulation:
     plane_seconds: float
 
     def __repr__(self) -> str:
-        """Return method, settings and times, with units."""
         grid = (
             ""
             if self.spacing is None
@@ -156,7 +154,6 @@ class MethodResult:
         return values
 
     def __repr__(self) -> str:
-        """Return the solution and the mean time of a trial, with units."""
         return f"MethodResult({self.solution!r}, {self.seconds.mean():.2g} s a trial)"
 
 
@@ -197,7 +194,6 @@ class SceneResult:
         return f"{score} {self.unit}".rstrip()
 
     def __repr__(self) -> str:
-        """Return counts, bound and methods, with units."""
         points, transducers = self.transfer_matrix.shape
         return (
             f"SceneResult({counted(self.obstacles, 'obstacle')}, {counted(transducers, 'transducer')}, "
@@ -220,7 +216,6 @@ class StudyResult:
     scenes: dict[str, SceneResult]
 
     def __repr__(self) -> str:
-        """Return the methods of each scene."""
         scenes = "; ".join(f"{name}: {', '.join(scene.methods)}" for name, scene in self.scenes.items())
         return f"StudyResult({scenes})"
 

@@ -162,7 +162,6 @@ def objective(transducers: int) -> at.SimulatedObjective:
 
 @cache
 def goal_and_bound(transducers: int, case: str) -> tuple[at.Goal, float]:
-    """Return the goal of a case, and its certified bound."""
     matrix, goal = objective(transducers).transfer_matrix, at.WeakestFocus()
     if case == "targets":
         level = REACHED * at.WeakestFocus(WANTED).bound(matrix)

@@ -81,7 +81,6 @@ def disc_error(size: float) -> float:
 
 
 def large_bodies() -> Iterator[list[str]]:
-    """Simulate all bodies, each beside its reference."""
     for kind, sides in SIDES.items():
         for side in sides:
             matrix, spacing, seconds, memory, claimed = in_new_process(by_tolerance, (kind, side))

@@ -102,7 +102,6 @@ def fine(scene: at.Scene, spacing: float) -> tuple[torch.Tensor, float]:
 
 
 def row(name: str, known: list[Judged]) -> list[str]:
-    """Return the counts of a family, of the scenes that are known."""
     if not known:
         return [name, *[""] * 4]
     parts = {part: np.array([getattr(case, part) for case in known]) for part in vars(known[0])}

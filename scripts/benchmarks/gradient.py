@@ -77,6 +77,5 @@ def gradient(case: str, spacing: float, periods: int) -> Cost:
 
 
 def measure(case: str) -> Cost:
-    """Compile the kernel, then measure."""
     gradient("cubes", 2e-3, 9)
     return gradient(case, 1e-3, PERIODS)

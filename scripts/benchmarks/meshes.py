@@ -30,7 +30,6 @@ def main() -> None:
 
 
 def hand() -> at.Mesh:
-    """Return a rigid hand, its parts merged."""
     palm = pyvista.Icosphere(radius=1.0, nsub=5).scale((50.0, 42.0, 14.0)).translate((-35.0, 0.0, 0.0))
     finger = pyvista.Icosphere(radius=1.0, nsub=4)
     parts = [finger.scale((length, r, r)).translate((30.0, y, 0.0)) for y, length, r in FINGERS]

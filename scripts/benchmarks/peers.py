@@ -109,7 +109,6 @@ class Setting:
     cases: tuple[str, ...] = tuple(CASES)
 
     def __str__(self) -> str:
-        """Return what distinguishes settings of a peer."""
         order = f"order {self.order}, " if self.order else ""
         return f"{self.spacing:g} mm, {order}focus {'between cells' if self.offset else 'on a cell'}"
 

@@ -37,7 +37,6 @@ def main(trials: int, snr: float) -> None:
 
 
 def matrix_of(scene: at.Scene) -> torch.Tensor:
-    """Simulate the transfer matrix (P, M) [Pa]."""
     return at.make_propagator(scene).transfer_matrix().to("cpu", torch.complex128)
 
 

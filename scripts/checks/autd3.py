@@ -112,7 +112,6 @@ def play(geometry: Geometry, phases: PhaseBuffer, intensities: IntensityBuffer |
 
 
 def play_focus() -> Emission:
-    """Play a focus of their SDK."""
     geometry = Geometry([Autd3()])
     phases = geometry.phase_buffer()
     focus(geometry, [1e3 * x for x in FOCUS], wavelength(Velocity.from_m_s(SOUND_SPEED)), phases)
@@ -166,7 +165,6 @@ def scaled(values: torch.Tensor, other: torch.Tensor) -> tuple[complex, float]:
 
 
 def random_drive(transducers: int) -> torch.Tensor:
-    """Return random amplitudes and phases (M,)."""
     amplitude, phase = torch.rand((2, transducers), generator=torch.Generator().manual_seed(0)).double()
     return at.drive_from_phases(2 * math.pi * phase, amplitude)
 

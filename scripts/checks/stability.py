@@ -91,7 +91,6 @@ class Outcome:
         return not self.finite or risen or self.wandering > WANDERING
 
     def __str__(self) -> str:
-        """Describe the trial and its figures."""
         rates = ", ".join(
             f"{run} {rate:+.2g} (x {math.exp(min(self.rise[run], 700)):.3g})"
             for run, rate in self.rate.items()

@@ -63,7 +63,6 @@ class Trial:
     refused: int  # scenes drawn before it that are refused
 
     def __str__(self) -> str:
-        """Describe the scene."""
         cells = f"{WAVELENGTH / self.spacing:.2f} cells per wavelength"
         obstacles = "\n    ".join(map(repr, self.scene.obstacles))
         return f"scene {self.number}: {cells}, {self.dtype}, {', '.join(self.labels)}\n    {obstacles}"

@@ -45,7 +45,6 @@ class Registration:
     residuals: Array = field(default_factory=lambda: np.zeros(4))
 
     def __post_init__(self) -> None:
-        """Check the attributes, and copy the arrays."""
         require_kind("plane", self.plane, Plane)
         matrix = _array("matrix", self.matrix)
         if matrix.shape != (3, 3) or not _is_view(matrix, self.plane):

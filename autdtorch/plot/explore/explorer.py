@@ -102,7 +102,6 @@ class Explorer:
         self._server.wait()
 
     def __repr__(self) -> str:
-        """Scene and address."""
         return f"Explorer(scene {self.scene.name!r}, {self.address})"
 
     def _repr_html_(self) -> str:
@@ -115,7 +114,6 @@ class _AtOnce(Executor):
     """An executor that works in the calling thread; at exit, pools of threads end before views do."""
 
     def submit(self, function: Callable[..., T], /, *arguments: Any, **options: Any) -> Future[T]:
-        """Call a function at once."""
         future: Future[T] = Future()
         future.set_result(function(*arguments, **options))
         return future

@@ -241,11 +241,9 @@ class Outboxes(dict[str, Outbox]):
     """Outboxes of the open pages, by page; their sockets are assigned."""
 
     def __setitem__(self, page: str, socket: Any) -> None:
-        """Make the outbox of a page."""
         super().__setitem__(page, Outbox(socket))
 
     def __delitem__(self, page: str) -> None:
-        """End the outbox of a page."""
         self[page].end()
         super().__delitem__(page)
 
