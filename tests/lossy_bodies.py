@@ -34,9 +34,9 @@ class BoxRun:
         self.region = region
         self.assembly = assembly = assemble_on(make_box(region, spacing), region, torch.float32, None)
         self.box = box = ScatteredField(assembly, complex(WAVENUMBER), np.eye(3))
-        self.source = Apertures.of_points(torch.from_numpy(SOURCE[None]))
+        self.source = Apertures(torch.from_numpy(SOURCE[None]))
         force = box.driving([(self.source, torch.ones(1, dtype=torch.complex128))])
-        self.transform = box.near_to_far(Apertures.of_points(torch.from_numpy(sphere(0.03))))
+        self.transform = box.near_to_far(Apertures(torch.from_numpy(sphere(0.03))))
         self.cells = np.unique(np.concatenate((self.transform.cells, extra(assembly))))
         place = torch.from_numpy(np.searchsorted(self.cells, self.transform.cells))
         (state,) = run_to_steady_state(

@@ -74,7 +74,6 @@ class _Run:
         return state, record[0].cpu()
 
     def single(self, cells: Tensor) -> Receivers:
-        """Return cells (k,) as receivers."""
         return Receivers(cells[:, None], torch.ones((len(cells), 1), dtype=self.assembly.dtype, device="cpu"))
 
     def fields(

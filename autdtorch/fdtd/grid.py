@@ -17,7 +17,7 @@ from autdtorch.fdtd.placement import grid_offset
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.shapes import Shape, bounds
 from autdtorch.fdtd.stencil import places_of
-from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.array_types import Array, Index, triple
 from autdtorch.utils.process import cached_property
 from autdtorch.utils.spatial import parts_of, places_on
 from autdtorch.utils.validation import invalid
@@ -52,8 +52,7 @@ class Grid:
     @property
     def shape(self) -> tuple[int, int, int]:
         """Shape of the whole array."""
-        x, y, z = (cells + 2 * self.rim for cells in self.interior)
-        return x, y, z
+        return triple(cells + 2 * self.rim for cells in self.interior)
 
     @property
     def first(self) -> tuple[int, int, int]:
@@ -63,8 +62,7 @@ class Grid:
     @property
     def last(self) -> tuple[int, int, int]:
         """One past the last interior cell."""
-        x, y, z = (self.rim + cells for cells in self.interior)
-        return x, y, z
+        return triple(self.rim + cells for cells in self.interior)
 
     @property
     def crossing(self) -> float:
@@ -79,11 +77,10 @@ class Grid:
     @cached_property
     def centers(self) -> tuple[Array, Array, Array]:
         """Coordinates of the cell centres along each axis [m]."""
-        x, y, z = (
+        return triple(
             np.asarray(origin + self.spacing * np.arange(cells), np.float64)
             for origin, cells in zip(self.origin, self.shape, strict=True)
         )
-        return x, y, z
 
     def to_cells(self, points: Tensor) -> Array:
         """Return positions (..., 3) [m] in cells; cell centres are whole numbers."""
@@ -120,11 +117,10 @@ class Extent:
 
     def interior(self, spacing: float, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> tuple[int, int, int]:
         """Return the cells per axis that cover it, the first `offset` (3,) [cells] below the lower corner."""
-        x, y, z = (
+        return triple(
             math.ceil((high - low) / spacing + first - 1e-6) + 2 * self.margin
             for low, high, first in zip(self.lower, self.upper, offset, strict=True)
         )
-        return x, y, z
 
 
 def domain_extent(region: Region, spacing: float) -> Extent:
@@ -173,8 +169,8 @@ def _covering(region: Region, spacing: float, extent: Extent) -> Grid:
     offset = grid_offset(region, spacing, extent.lower, extent.upper)
     layer = extent.layer.cells(kappa)
     rim = layer + 1 + extent.margin - 0.5
-    x, y, z = (low - (rim + first) * spacing for low, first in zip(extent.lower, offset, strict=True))
-    grid = Grid(spacing, extent.interior(spacing, offset), (x, y, z), kappa, layer, extent.path)
+    origin = triple(low - (rim + first) * spacing for low, first in zip(extent.lower, offset, strict=True))
+    grid = Grid(spacing, extent.interior(spacing, offset), origin, kappa, layer, extent.path)
     require_cells(grid.shape, spacing)
     return grid
 

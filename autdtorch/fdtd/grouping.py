@@ -25,7 +25,7 @@ from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil
 from autdtorch.fdtd.turning import axes_along, is_tilted
-from autdtorch.utils.array_types import Array
+from autdtorch.utils.array_types import Array, triple
 from autdtorch.utils.process import cached_property
 
 logger = logging.getLogger(__name__)
@@ -79,8 +79,7 @@ class PlannedGrid:
     def shape(self) -> tuple[int, int, int]:
         """Cells per axis, absorbing layers included."""
         rim = self.extent.layer.cells(self.kappa) + 1
-        x, y, z = (length + 2 * rim for length in self.interior)
-        return x, y, z
+        return triple(length + 2 * rim for length in self.interior)
 
     @property
     def cells(self) -> int:

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.stencil import OFFSETS, Stencil, flat_strides, places_of
-from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.array_types import Array, Index, triple
 from autdtorch.utils.process import cached_property, parts_of_size, spread
 from autdtorch.utils.spatial import places_among
 
@@ -56,8 +56,7 @@ class HuygensSurface:
         """Return the surface of a grid; `scale` is the ratio of its coefficients in air to the stencil's."""
         cells = _radiating(grid)
         place = places_among(cells, math.prod(grid.shape))
-        x, y, z = (min(count, _ALIKE) for count in grid.interior)
-        small = replace(grid, interior=(x, y, z))
+        small = replace(grid, interior=triple(min(count, _ALIKE) for count in grid.interior))
         weight, offset = _rows(small, stencil, flat_strides(grid.shape))
         alike = _among_rows(grid, small, cells)
         width = np.count_nonzero(weight, axis=1)
@@ -85,7 +84,6 @@ class HuygensSurface:
 
     @cached_property
     def _weights_on_gpu(self) -> Tensor:
-        """The weights on the current GPU."""
         parts = self.weights.indptr, self.weights.indices, self.weights.data
         first_of_row, place, weight = (torch.from_numpy(part).cuda() for part in parts)
         with warnings.catch_warnings():  # that PyTorch may change its sparse matrices

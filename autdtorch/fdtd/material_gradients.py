@@ -61,7 +61,6 @@ class DifferentiableCells:
         return replace(assembly, coefficients=rows)
 
     def _at_time_step(self, assembly: Assembly) -> SteppedCells:
-        """Return the cells at the time step of an assembly."""
         if self.damping is None:
             return SteppedCells(self.weight, self.mass, torch.zeros((0, 27), **REAL), torch.zeros(0, **REAL))
         steps = float(assembly.steps_per_period)

@@ -76,13 +76,9 @@ DOMAIN_LAYER = Thickness(6, 8)
 # first's reflection of the scattered field is a small part of the error: at 1 mm it raises 0.11 to 0.12 % for
 # the paper's three cubes, and leaves 0.45 % for a rigid sphere. In the shadow of a larger body incident and
 # scattered field cancel: behind a plate of 0.1 m, 12 wavelengths, the error at 1 mm is 1.1 %, and 0.3 % with
-# 6 cells. Coarser boxes have 6 cells. With 8, half of such a grid is layers, and the error of a hand differs
-# by less than 0.1 %, of 4 % at 5.4 cells per wavelength and 23 % at 3.4. Behind plates of 8 wavelengths 6
-# cells add 0.2 to 0.3 % at 6 cells per wavelength, where 1.3 to 2 % are claimed, and 2 to 3 % of 5 to 10 % at
-# 4. Deep in the shadow of still larger bodies 1 to 2 % of the incident field are left: behind a plate of
-# 0.4 m, 8 cells leave an error of 8.2 % at 4 cells per wavelength, and 10 cells 3.8 %. At 6 cells per
-# wavelength 8 cells err by 0.2 % more than 10, and at 9 cells per wavelength 6 cells add 0.5 %. Behind a
-# plate of 0.2 m, 23 wavelengths, two grids claim 1.3 % at 6 cells per wavelength, 2.7 % with 6 cells.
+# 6 cells. Coarser boxes have 6 cells: with 8, half of such a grid is layers, and the error of a hand differs
+# by less than 0.1 %. Deep in the shadow of still larger bodies 1 to 2 % of the incident field are left:
+# behind a plate of 0.4 m, 8 cells leave an error of 8.2 % at 4 cells per wavelength, and 10 cells 3.8 %.
 _SMALL, _SMALL_LAYER, _LARGE_LAYER = 4, Thickness(4, 6), Thickness(6, 6)
 _DEEP, _DEEP_LAYER = 12, Thickness(8, 10, limit=5.5)
 

@@ -19,7 +19,7 @@ import torch
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.shapes import Shape
 from autdtorch.fdtd.turning import ALIGNED, slender_faces
-from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.array_types import Array, Index, triple
 from autdtorch.utils.spatial import doubled_normals
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
@@ -51,11 +51,10 @@ def grid_offset(
 ) -> tuple[float, float, float]:
     """Return the offset of a grid's first cell below a lower corner (3,) [m], per axis [cells], in [0, 1)."""
     surfaces = [_flat_surface(shape, spacing) for shape in region.shapes]
-    x, y, z = (
+    return triple(
         _axis_offset(_faces(region, surfaces, axis, low), region.sources[:, axis] - low, high - low, spacing)
         for axis, (low, high) in enumerate(zip(lower, upper, strict=True))
     )
-    return x, y, z
 
 
 def fitting_spacing(regions: Sequence[Region], spacing: float, coarsest: float = math.inf) -> float:

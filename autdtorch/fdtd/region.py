@@ -26,7 +26,7 @@ from autdtorch.fdtd.shapes import (
     with_image,
 )
 from autdtorch.fdtd.turning import FlatFaces, flat_faces, slender_faces
-from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.array_types import Array, Index, triple
 from autdtorch.utils.images import Image, Mirror, images_of
 from autdtorch.utils.process import cached_property
 from autdtorch.utils.spatial import (
@@ -324,8 +324,8 @@ class Region:
             half = upper[axis] - plane if mirror.normal[axis] > 0 else plane - lower[axis]
             lower[axis], upper[axis] = plane - half, plane + half
             sources = torch.cat([sources, mirror.image.of(sources)])
-        (x, y, z), (u, v, w) = lower.tolist(), upper.tolist()
-        bodies, domain = _with_images(self.bodies, self.mirrors), ((x, y, z), (u, v, w))
+        bodies = _with_images(self.bodies, self.mirrors)
+        domain = triple(lower.tolist()), triple(upper.tolist())
         return replace(self, bodies=bodies, domain=domain, sources=sources.numpy(), mirrors=())
 
     def can_hold(self, near: Sequence[int]) -> bool:

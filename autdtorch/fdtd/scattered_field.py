@@ -156,7 +156,7 @@ class ScatteredField:
             field[~near] += self.incident(driven[~near], sources.chosen(source), strength[source])
             field[near] += strength[number] * torch.from_numpy(wave / grid.spacing)
             if not within.all():
-                outside = Apertures.of_points(nodes[number, ~within])
+                outside = Apertures(nodes[number, ~within])
                 field[near] += self.incident(driven[near], outside, shares[number, ~within])
         index, source_force = self.assembly.forces(kernels, shares[inside])
         shared, ours, theirs = np.intersect1d(cells.index, index, assume_unique=True, return_indices=True)
@@ -287,7 +287,6 @@ class ScatteredField:
 
 
 def _chosen(points: Tensor | Discs, mask: Tensor) -> Tensor | Discs:
-    """Return the points or discs of a mask (P,)."""
     return Discs(*(part[mask] for part in points)) if isinstance(points, Discs) else points[mask]
 
 

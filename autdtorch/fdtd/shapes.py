@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from autdtorch.utils.array_types import Array
+from autdtorch.utils.array_types import Array, triple
 from autdtorch.utils.images import Mirror
 from autdtorch.utils.process import cached_property
 from autdtorch.utils.validation import LENGTH_TOLERANCE, Vector
@@ -150,14 +150,12 @@ class Turned(Bounded):
     def _bounds(self) -> tuple[Vector, Vector]:
         if (np.abs(self.axes).max(axis=1) == 1).all():
             corners = np.array([self.shape.lower, self.shape.upper]) @ self.axes.T + self.offset
-            (x, y, z), (u, v, w) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
-            return (x, y, z), (u, v, w)
+            return triple(corners.min(axis=0).tolist()), triple(corners.max(axis=0).tolist())
         vertices, triangles = self.surface()
         middle = self.signed_distance(vertices[triangles].mean(dim=1))
         beyond = _SAGITTA * float(middle.abs().max())
-        x, y, z = (vertices.amin(dim=0) - beyond).tolist()
-        u, v, w = (vertices.amax(dim=0) + beyond).tolist()
-        return (x, y, z), (u, v, w)
+        ends = vertices.amin(dim=0) - beyond, vertices.amax(dim=0) + beyond
+        return triple(ends[0].tolist()), triple(ends[1].tolist())
 
 
 def turned_shape(shape: Shape, axes: Array) -> Shape:
@@ -203,8 +201,7 @@ class _Doubled(Bounded):
         if np.count_nonzero(normal) == 1:  # the part behind is gone
             axis = int(normal.argmax())
             lower[axis], upper[axis] = vertices[:, axis].min(), vertices[:, axis].max()
-        (x, y, z), (u, v, w) = lower.tolist(), upper.tolist()
-        return (x, y, z), (u, v, w)
+        return triple(lower.tolist()), triple(upper.tolist())
 
 
 def with_image(shape: Shape, mirror: Mirror) -> list[Shape]:

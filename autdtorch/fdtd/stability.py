@@ -21,7 +21,7 @@ from scipy.sparse import csr_array
 
 from autdtorch.fdtd.assembly.neighbours import inner_cells, with_neighbours
 from autdtorch.fdtd.stencil import ROW_ROUNDING, Stencil, flat_offsets, places_of
-from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.array_types import Array, Index, triple
 from autdtorch.utils.process import parts_of_size, spread
 
 logger = logging.getLogger(__name__)
@@ -116,10 +116,9 @@ def _shortened(
         stays = few[place[:, axis]]
         place, weight, lengths[axis] = place[stays], weight[stays], int(few.sum())
         place[:, axis] = (np.cumsum(few) - 1)[place[:, axis]]
-    x, y, z = lengths
-    index = np.ravel_multi_index(tuple(place.T), (x, y, z))
+    index = np.ravel_multi_index(tuple(place.T), lengths)
     order = np.argsort(index)
-    return index[order], weight[order], (x, y, z)
+    return index[order], weight[order], triple(lengths)
 
 
 def _with_rim(index: Index, shape: tuple[int, int, int]) -> tuple[Index, NDArray[np.int32]]:

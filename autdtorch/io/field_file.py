@@ -1,15 +1,10 @@
-"""Fields on regular grids in files: VTK image data (.vti) for ParaView, and HDF5.
-
-VTK's XML format is written directly: VTK is a large dependency, and small writers lack the direction matrix
-of a tilted plane.
-"""
+"""Fields on regular grids in files: VTK image data (.vti) for ParaView, and HDF5."""
 
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -118,39 +113,31 @@ def _along_coordinates(pressure: Array, grid: _Grid) -> tuple[Array, _Grid]:
 
 
 def _write_vti(path: Path, pressure: torch.Tensor, grid: _Grid, frequency: float) -> None:
+    # these load slowly
+    from vtkmodules.vtkCommonDataModel import vtkImageData
+    from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+
     values = pressure.numpy().reshape(*pressure.shape, *(1,) * (3 - pressure.ndim))
     values, grid = _along_coordinates(values, grid)
-    arrays = {"pressure_real": values.real, "pressure_imag": values.imag}
-    arrays["pressure_magnitude"] = np.abs(values)
-    extent = " ".join(f"0 {count - 1}" for count in values.shape)
-    size = values.size * 8
-    # Each appended block follows its length.
-    entries = "".join(
-        f'<DataArray type="Float64" Name="{name}" format="appended" offset="{place * (size + 8)}"/>\n'
-        for place, name in enumerate(arrays)
-    )
-    # VTK wants the axes as columns.
-    header = f"""<?xml version="1.0"?>
-<VTKFile type="ImageData" version="1.0" byte_order="{sys.byteorder.capitalize()}Endian" header_type="UInt64">
-<ImageData WholeExtent="{extent}" Origin="{_text(grid.origin)}" Spacing="{_text(grid.spacing)}"
- Direction="{_text(grid.axes.T)}">
-<FieldData>
-<DataArray type="Float64" Name="frequency" NumberOfTuples="1" format="ascii">{frequency!r}</DataArray>
-</FieldData>
-<Piece Extent="{extent}">
-<PointData Scalars="pressure_magnitude">
-{entries}</PointData>
-</Piece>
-</ImageData>
-<AppendedData encoding="raw">
-_"""
-    with path.open("wb") as file:
-        file.write(header.encode("ascii"))
-        for block in arrays.values():  # its length, then the values with x fastest
-            file.write(np.uint64(size).tobytes())
-            file.write(np.asarray(block, dtype=np.float64).tobytes(order="F"))
-        file.write(b"\n</AppendedData>\n</VTKFile>\n")
+    image = vtkImageData()
+    image.SetDimensions(*values.shape)
+    image.SetOrigin(*grid.origin)
+    image.SetSpacing(*grid.spacing)
+    image.SetDirectionMatrix(*grid.axes.T.ravel())  # the axes are its columns
+    for name, part in (("real", values.real), ("imag", values.imag), ("magnitude", np.abs(values))):
+        image.GetPointData().AddArray(_named(f"pressure_{name}", part.ravel(order="F")))
+    image.GetPointData().SetActiveScalars("pressure_magnitude")
+    image.GetFieldData().AddArray(_named("frequency", np.array([frequency])))
+    writer = vtkXMLImageDataWriter()
+    writer.SetInputData(image)
+    writer.WriteToOutputStringOn()  # Python's errors of a full disk name the file
+    writer.Write()
+    path.write_text(writer.GetOutputString(), encoding="ascii")
 
 
-def _text(numbers: Array) -> str:
-    return " ".join(repr(float(number)) for number in numbers.ravel())
+def _named(name: str, values: Array) -> Any:
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+
+    array = numpy_to_vtk(values, deep=True)  # type: ignore[no-untyped-call]
+    array.SetName(name)
+    return array

@@ -60,7 +60,6 @@ def load_goal(where: str, section: object) -> Goal | ForceGoal:
 
 
 def _particle(where: str, section: object) -> Particle:
-    """Return the particle of a section."""
     fields = [field.name for field in dataclasses.fields(Particle)]
     if not isinstance(section, Mapping):
         raise invalid(where, section, "must be a mapping, such as {material: EPS, radius: 1e-3}")

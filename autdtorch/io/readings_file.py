@@ -176,7 +176,6 @@ def _drives(value: ArrayLike) -> torch.Tensor:
 
 
 def _refuse(path: Path, arguments: Mapping[str, object]) -> None:
-    """Refuse arguments that have no meaning for a file."""
     for name, value in arguments.items():
         if value is not None:
             raise invalid(name, str(value), f"must not be given: {path} states its own")

@@ -174,7 +174,7 @@ class BoxSimulation(Simulation):
 
     def _everywhere(self, points: torch.Tensor) -> torch.Tensor:
         """Return points (P, 3) and their images on grids."""
-        return self.seen_twice(Apertures.of_points(points))[0].centers
+        return self.seen_twice(Apertures(points))[0].centers
 
     @cached_property
     def _keeps_surfaces(self) -> bool:
@@ -230,13 +230,13 @@ class BoxSimulation(Simulation):
         groups = [part[~self.silent(part[:, None])] for part in (places, around)]
         ends = np.cumsum([0, *map(len, groups)])
         slices = tuple(slice(*pair) for pair in itertools.pairwise(ends) if pair[0] < pair[1])
-        return Judged(Apertures.of_points(torch.cat(groups)), 1, slices)
+        return Judged(Apertures(torch.cat(groups)), 1, slices)
 
     def _total(
         self, radiation: Radiation, sources: Sequence[Apertures], strength: torch.Tensor, points: torch.Tensor
     ) -> PressureMap:
         """Return the pressure of K drives at points (P, 3) that their radiation reaches."""
-        receivers, weights = self.seen_twice(Apertures.of_points(points))
+        receivers, weights = self.seen_twice(Apertures(points))
         pressure = self._incident(sources, strength, receivers) + radiation.pressure(receivers)
         pressure = mean_of_images(pressure, weights)
         return PressureMap.of_runs(pressure, radiation.runs, from_points=False)

@@ -219,7 +219,7 @@ class Simulation(ABC):
         obstacles = torch.zeros((len(drive), len(scene.obstacles)), **REAL)
         places = torch.cat([each.places for each in self.absorptions])
         if len(places):
-            sources, receivers = self.sources_of(drive), Apertures.of_points(places)
+            sources, receivers = self.sources_of(drive), Apertures(places)
             pressure, _ = self._recorded(
                 len(drive), lambda stepped: self._simulate(*sources, receivers, stepped)
             )
@@ -327,7 +327,7 @@ class Simulation(ABC):
 
     def _matrix_of_orbits(self, points: torch.Tensor, orbits: Orbits) -> PressureMap:
         """Simulate the transfer matrix of unit strengths by a run for each of the orbits' representatives."""
-        targets, transducers = Apertures.of_points(points), self.transducers
+        targets, transducers = Apertures(points), self.transducers
         sources, receivers = (targets, transducers) if orbits.from_points else (transducers, targets)
         begins = "points" if orbits.from_points else "transducers"
         logger.debug("transfer matrix: %d runs serve %d %s", orbits.runs, len(orbits.representative), begins)
@@ -340,7 +340,7 @@ class Simulation(ABC):
 
     def _fields(self, drive: torch.Tensor, points: torch.Tensor) -> PressureMap:
         """Simulate the pressure of drives at points; see `fields`."""
-        pressure, runs = self._run(*self.sources_of(drive), Apertures.of_points(points))
+        pressure, runs = self._run(*self.sources_of(drive), Apertures(points))
         return PressureMap.of_runs(pressure.mT, runs, from_points=False)
 
     def _run(

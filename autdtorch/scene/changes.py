@@ -22,7 +22,7 @@ from autdtorch.scene.obstacles import Obstacle, Sphere
 from autdtorch.scene.obstacles.moving import circumscribed, is_movable, moved
 from autdtorch.scene.reflectors import Reflector, is_panel
 from autdtorch.scene.scene import OverlapWarning, ScaleWarning, Scene
-from autdtorch.utils.array_types import REAL
+from autdtorch.utils.array_types import REAL, triple
 from autdtorch.utils.hints import did_you_mean
 from autdtorch.utils.images import Image
 from autdtorch.utils.validation import Vector, finite_vector, invalid, within
@@ -247,8 +247,7 @@ def changed_reflectors(scene: Scene, amounts: Amounts) -> tuple[Reflector, ...]:
 def move_of(part: str, amounts: Amounts) -> tuple[torch.Tensor, Vector]:
     """Return shift (3,) [m] and turn, angles (3,) [rad] about the fixed axes, of a part."""
     shift = torch.tensor([amounts.get(f"{part}.{axis}", 0.0) for axis in _AXES], **REAL)
-    x, y, z = (amounts.get(f"{part}.turn_{axis}", 0.0) for axis in _AXES)
-    return shift, (x, y, z)
+    return shift, triple(amounts.get(f"{part}.turn_{axis}", 0.0) for axis in _AXES)
 
 
 def _moved(obstacles: tuple[Obstacle, ...], part: str, amounts: Amounts) -> tuple[Obstacle, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cmath
 import logging
 import math
 from collections import Counter
@@ -21,7 +20,7 @@ from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
     Vector,
-    finite_number,
+    complex_number,
     finite_vector,
     invalid,
     require_kind,
@@ -67,7 +66,10 @@ class Reflector:
         """
         object.__setattr__(self, "point", finite_vector("Reflector.point", point))
         object.__setattr__(self, "normal", unit_vector("Reflector.normal", normal))
-        object.__setattr__(self, "reflection", _factor(reflection))
+        factor = complex_number("Reflector.reflection", reflection)
+        if abs(factor) > 1 + LENGTH_TOLERANCE:
+            raise invalid("Reflector.reflection", reflection, "its magnitude must be at most 1")
+        object.__setattr__(self, "reflection", factor)
 
     @classmethod
     def behind(cls, array: TransducerArray, reflection: complex = 1.0) -> Self:
@@ -140,20 +142,6 @@ def kinds_of(reflectors: Iterable[Reflector]) -> list[str]:
     ratios = [reflector.reflection for reflector in reflectors]
     counts = Counter(names.get(ratio, f"reflection {ratio:.3g}") for ratio in ratios)
     return [f"{count} x {kind}" for kind, count in counts.items()]
-
-
-def _factor(value: object) -> float | complex:
-    """Return a reflection factor after checking it; a real number where it is one."""
-    name = "Reflector.reflection"
-    if isinstance(value, complex | np.complexfloating) and value.imag != 0:
-        factor: float | complex = complex(value)
-        if not cmath.isfinite(factor):
-            raise invalid(name, value, "must be finite")
-    else:
-        factor = finite_number(name, value.real if isinstance(value, complex) else value)
-    if abs(factor) > 1 + LENGTH_TOLERANCE:
-        raise invalid(name, value, "its magnitude must be at most 1")
-    return factor
 
 
 def require_in_front(

@@ -45,11 +45,6 @@ class Apertures(NamedTuple):
     radii: torch.Tensor | None = None  # of discs (N,) [m]
     size: float = 0.0  # k a of the largest disc
 
-    @classmethod
-    def of_points(cls, points: torch.Tensor) -> Self:
-        """Return points (P, 3) as sources or receivers."""
-        return cls(points)
-
     @property
     def positions(self) -> torch.Tensor:
         """The positions (N, n, 3) [m] of monopoles that stand for each, one for a point."""

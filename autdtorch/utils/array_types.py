@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Final, TypeAlias
+from collections.abc import Iterable
+from typing import Any, Final, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -22,6 +23,15 @@ REAL: Final[dict[str, Any]] = {"dtype": torch.float64, "device": "cpu"}
 
 COMPLEX: Final[dict[str, Any]] = {"dtype": torch.complex128, "device": "cpu"}
 """COMPLEX: complex128 on the CPU."""
+
+
+_T = TypeVar("_T")
+
+
+def triple(values: Iterable[_T]) -> tuple[_T, _T, _T]:
+    """Return three values, such as coordinates, as a tuple."""
+    x, y, z = values
+    return x, y, z
 
 
 def device_of(value: object) -> torch.device:

@@ -134,10 +134,6 @@ def _let_go() -> None:
     while _fork.held:
         _fork.held.pop().release()
     restore_handlers(_fork.handlers)
-
-
-def _let_go_in_parent() -> None:
-    _let_go()
     while _fork.signals:
         send_again(_fork.signals.pop())
 
@@ -148,7 +144,7 @@ def _let_go_in_child() -> None:
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=_hold, after_in_parent=_let_go_in_parent, after_in_child=_let_go_in_child)
+    os.register_at_fork(before=_hold, after_in_parent=_let_go, after_in_child=_let_go_in_child)
 
 
 T = TypeVar("T")

@@ -11,6 +11,7 @@ from contextvars import ContextVar
 
 import torch
 
+from autdtorch.utils.array_types import triple
 from autdtorch.utils.validation import (
     ArrayLike,
     Vector,
@@ -69,11 +70,10 @@ def angles(name: str, value: object, degrees: object = None) -> Vector:
         return turn
     if any(turn):
         raise invalid(f"{name}_degrees", degrees, f"must not be given beside {name}, {turn} rad", "degrees")
-    x, y, z = (
+    return triple(
         math.radians(math.remainder(angle, 360))
         for angle in finite_vector(f"{name}_degrees", degrees, "degrees")
     )
-    return x, y, z
 
 
 def turn_tensor(value: ArrayLike, degrees: ArrayLike | None) -> torch.Tensor:

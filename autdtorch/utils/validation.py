@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from autdtorch.utils.array_types import MOST_AXES, is_dense
+from autdtorch.utils.array_types import MOST_AXES, is_dense, triple
 from autdtorch.utils.hints import did_you_mean
 from autdtorch.utils.text import SHOWN_ENTRIES, shown
 
@@ -228,8 +228,7 @@ def no_cuda() -> str:
 
 def finite_vector(name: str, value: object, unit: str = "m") -> Vector:
     """Return `value` as three finite floats."""
-    x, y, z = _entries(name, value, 3, unit)
-    return x, y, z
+    return triple(_entries(name, value, 3, unit))
 
 
 def positive_entries(name: str, value: object, count: int) -> tuple[float, ...]:
@@ -249,8 +248,7 @@ def unit_vector(name: str, value: object) -> Vector:
         raise invalid(name, value, f"must be a vector of finite length > {LENGTH_TOLERANCE:g}")
     if abs(length - 1) < _UNIT_ROUNDING:  # so that a unit vector stays what it is, in files and their digests
         return vector
-    x, y, z = (entry / length for entry in vector)
-    return x, y, z
+    return triple(entry / length for entry in vector)
 
 
 def real_tensor(name: str, value: object, unit: str = "") -> torch.Tensor:

@@ -79,7 +79,6 @@ class _Facets(NamedTuple):
     normal: Array  # outwards (n, 64, 3)
 
     def chosen(self, some: NDArray[np.bool_]) -> _Facets:
-        """Return the surface in some of the elements."""
         return _Facets(*(part[some] for part in self))
 
 

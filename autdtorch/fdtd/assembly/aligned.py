@@ -27,7 +27,7 @@ from autdtorch.fdtd.assembly.layers import layered_elements
 from autdtorch.fdtd.assembly.prisms import Prisms, prisms, stacked
 from autdtorch.fdtd.assembly.sections import MaterialKey, Section
 from autdtorch.fdtd.stencil import Stencil, places_of
-from autdtorch.utils.array_types import AnyArray, Array, Index
+from autdtorch.utils.array_types import AnyArray, Array, Index, triple
 from autdtorch.utils.process import cached_property
 from autdtorch.utils.spatial import distinct_cells, places_among
 
@@ -119,9 +119,9 @@ class Blocks:
 
         `material` returns the material (...) at positions (..., 3) [cells].
         """
-        x, y, z = (Planes.among(each, count) for each, count in zip(places, elements, strict=True))
-        middles = np.stack(np.meshgrid(x.middles, y.middles, z.middles, indexing="ij"), axis=-1)
-        return cls((x, y, z), material(middles))
+        planes = triple(Planes.among(each, count) for each, count in zip(places, elements, strict=True))
+        middles = np.meshgrid(*(each.middles for each in planes), indexing="ij")
+        return cls(planes, material(np.stack(middles, axis=-1)))
 
     @cached_property
     def varied(self) -> NDArray[np.bool_]:
@@ -266,7 +266,6 @@ def _densities(materials: Materials) -> Array:
 
 
 def _key(materials: Materials) -> MaterialKey:
-    """Return materials as a key of caches."""
     return MaterialKey(
         tuple(_densities(materials).tolist()),
         tuple(materials.mass.tolist()),

@@ -25,7 +25,7 @@ from autdtorch.fdtd.region import Body, Fluid, Region
 from autdtorch.fdtd.shapes import Shape, Solids, bounds, distance_from, remaining
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.turning import slender_faces, staircase_excess
-from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.array_types import Array, Index, triple
 from autdtorch.utils.spatial import doubled_normals, extents, spread_evenly
 
 logger = logging.getLogger(__name__)
@@ -88,8 +88,7 @@ class Union:
         if self.continued:
             limits = zip(positions, grid.first, grid.last, strict=True)
             positions = [along.clip(first, last - 1) for along, first, last in limits]
-        x, y, z = map(slice, *self._reach(positions, grid).tolist())
-        return x, y, z
+        return triple(map(slice, *self._reach(positions, grid).tolist()))
 
     def range(self, grid: Grid) -> Index:
         """Return the first element around it along each axis, and one past the last (2, 3)."""

@@ -191,19 +191,22 @@ class Receivers:
 
 
 class Kernel(Protocol):
-    """Advances the states of runs by whole steps."""
+    """Advances the states of runs by whole steps; by default one run at a time, on one thread."""
 
     device: torch.device
     """The device of states between calls; states on another one are copied."""
 
     def at_once(self, shape: tuple[int, int, int]) -> int:
         """Return the number of calls on a grid of `shape` that threads may make concurrently."""
+        return 1
 
     def threads(self, shape: tuple[int, int, int]) -> int:
         """Return the number of threads of a call on a grid of `shape`, if it is made alone."""
+        return 1
 
     def together(self, shape: tuple[int, int, int], receivers: int) -> int:
         """Return the number of runs on a grid of `shape`, with q receivers each, that a call should step."""
+        return 1
 
     def advance(
         self, state: WaveState, c: Coefficients, sources: Sources, receivers: Receivers, signal: Tensor

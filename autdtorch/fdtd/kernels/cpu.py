@@ -27,6 +27,7 @@ from autdtorch.fdtd.kernels.contract import (
     CPU,
     Coefficients,
     Columns,
+    Kernel,
     Receivers,
     Sources,
     WaveState,
@@ -161,8 +162,11 @@ def _unsigned(index: torch.Tensor) -> AnyArray:
     return index.contiguous().numpy().view(np.uint64)
 
 
-class CpuKernel:
-    """Kernel on the CPU, which updates the state in place; see `kernels.contract`."""
+class CpuKernel(Kernel):
+    """Kernel on the CPU, which updates the state in place; see `kernels.contract`.
+
+    A call steps one run: the fields of several would share the caches.
+    """
 
     device = CPU
 
@@ -178,10 +182,6 @@ class CpuKernel:
     def threads(self, shape: tuple[int, int, int]) -> int:
         """Return a thread for each chunk, as far as there are any."""
         return min(thread_count(), len(_cuts(shape)) - 1)
-
-    def together(self, shape: tuple[int, int, int], receivers: int) -> int:
-        """Return 1: the fields of several runs would share the caches."""
-        return 1
 
     def advance(
         self, state: WaveState, c: Coefficients, sources: Sources, receivers: Receivers, signal: torch.Tensor

@@ -120,7 +120,6 @@ def _copy_rows(u, first, planes, ny, row, reach, out):  # type: ignore[no-untype
 
 @njit(**INNER)
 def _copy_ends(p, first, rows, nz, reach, out):  # type: ignore[no-untyped-def]
-    """Copy the ends of rows."""
     to = _U(0)
     for row in range(first, first + rows):
         low, high = row * nz, (row + _U(1)) * nz - reach

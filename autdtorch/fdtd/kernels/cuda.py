@@ -18,6 +18,7 @@ from autdtorch.fdtd.kernels import cuda_steps, cuda_sweep
 from autdtorch.fdtd.kernels.contract import (
     Coefficients,
     Columns,
+    Kernel,
     Layer,
     Memory,
     Receivers,
@@ -159,7 +160,6 @@ class DeviceRun:
             done += part[1]
 
     def _launch(self, turn: int, steps: int) -> None:
-        """Launch steps, and count them."""
         for offset in range(steps):
             self._step(turn + offset, offset)
         self._first += steps
@@ -190,8 +190,11 @@ class DeviceRun:
         )  # fmt: skip
 
 
-class CudaKernel:
-    """Kernel on the current CUDA device, which keeps states, the medium and the last run; see `Kernel`."""
+class CudaKernel(Kernel):
+    """Kernel on the current CUDA device, which keeps states, the medium and the last run; see `Kernel`.
+
+    One thread makes its calls, and waits for the device.
+    """
 
     def __init__(self, blocks: BlockSizes | None = None) -> None:
         """Find the device; Triton may interpret without one. By default, `blocks` fit the grid."""
@@ -202,14 +205,6 @@ class CudaKernel:
         self._blocks = blocks
         self._medium: DeviceMedium | None = None
         self._run: DeviceRun | None = None
-
-    def at_once(self, shape: tuple[int, int, int]) -> int:
-        """Return 1: the device holds the last runs."""
-        return 1
-
-    def threads(self, shape: tuple[int, int, int]) -> int:
-        """Return 1, which waits for the device."""
-        return 1
 
     def together(self, shape: tuple[int, int, int], receivers: int) -> int:
         """Return as many as fit half of the free memory, at most enough to occupy the device."""

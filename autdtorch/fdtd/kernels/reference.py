@@ -9,6 +9,7 @@ from autdtorch.fdtd.kernels.contract import (
     CPU,
     Coefficients,
     Columns,
+    Kernel,
     Layer,
     Memory,
     Receivers,
@@ -30,22 +31,10 @@ def middle(field: Tensor, axis: int) -> Tensor:
     return field.narrow(axis, 1, field.shape[axis] - 2)
 
 
-class ReferenceKernel:
+class ReferenceKernel(Kernel):
     """One torch expression per line of the contract, none of them in place."""
 
     device = CPU
-
-    def at_once(self, shape: tuple[int, int, int]) -> int:
-        """Return 1: this kernel is not meant to be fast."""
-        return 1
-
-    def threads(self, shape: tuple[int, int, int]) -> int:
-        """Return 1."""
-        return 1
-
-    def together(self, shape: tuple[int, int, int], receivers: int) -> int:
-        """Return 1, as it holds all states."""
-        return 1
 
     def advance(
         self, state: WaveState, c: Coefficients, sources: Sources, receivers: Receivers, signal: Tensor

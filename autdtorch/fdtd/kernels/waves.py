@@ -76,5 +76,4 @@ def is_differentiated(points: Tensor) -> bool:
 
 
 def _moved(places: Tensor | Discs, device: torch.device | str) -> Tensor | Discs:
-    """Return points or discs on a device."""
     return Discs(*(part.to(device) for part in places)) if isinstance(places, Discs) else places.to(device)

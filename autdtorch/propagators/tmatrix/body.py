@@ -181,7 +181,7 @@ class StillBody:
     def _kinds(self) -> torch.Tensor:
         """The kind (N,) of each real wave; waves of different kinds do not scatter into one another."""
         box, odd = self._box, parities(self.degree).numpy()
-        mirrors = symmetries([box.assembly], box.axes, Apertures.of_points(self.sphere[0][None]))
+        mirrors = symmetries([box.assembly], box.axes, Apertures(self.sphere[0][None]))
         turns = [box.axes @ symmetry.matrix @ box.axes.T for symmetry in mirrors]
         flips = np.stack([np.diag(turn) < 0 for turn in turns if np.allclose(np.abs(turn), np.eye(3))])
         odd = odd @ flips.T.astype(np.int64) % 2  # by wave and symmetry

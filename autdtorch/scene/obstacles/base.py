@@ -250,7 +250,6 @@ def shared_box(
 
 
 def _impedance(name: str, value: object) -> complex:
-    """Return the impedance of a surface, a ratio to the medium's."""
     impedance = passive_impedance(name, value)
     least, most = _IMPEDANCES
     if not least <= abs(impedance) <= most:

@@ -16,7 +16,7 @@ from autdtorch.scene.obstacles.mesh_distance import MeshDistance
 from autdtorch.scene.obstacles.mesh_file import read_mesh
 from autdtorch.scene.obstacles.mesh_repair import repaired
 from autdtorch.scene.obstacles.mesh_solid import Triangles, outer_parts, solid_of
-from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.array_types import Array, Index, triple
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import replacing
 from autdtorch.utils.hints import suggesting
@@ -162,14 +162,12 @@ class Mesh(Obstacle):
     @cached_property
     def lower(self) -> Vector:
         """Lower corner of the bounding box (3,) [m]."""
-        x, y, z = self.vertices.amin(dim=0).tolist()
-        return x, y, z
+        return triple(self.vertices.amin(dim=0).tolist())
 
     @cached_property
     def upper(self) -> Vector:
         """Upper corner of the bounding box (3,) [m]."""
-        x, y, z = self.vertices.amax(dim=0).tolist()
-        return x, y, z
+        return triple(self.vertices.amax(dim=0).tolist())
 
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return copies of `vertices` and `faces`; see `Obstacle.surface`."""
@@ -188,7 +186,6 @@ class Mesh(Obstacle):
 
 
 def _solid(triangles: Triangles, repair: bool) -> Triangles:
-    """Return the solid of triangles, repaired if asked for."""
     if not repair:
         return solid_of(*triangles)
     vertices, faces, done = repaired(*triangles)
@@ -198,7 +195,6 @@ def _solid(triangles: Triangles, repair: bool) -> Triangles:
 
 
 def _read(path: object, repair: bool) -> _Source:
-    """Check the path of a mesh file and read it."""
     path, triangles = read_mesh(path)
     source = _Source(path)
     try:

@@ -290,7 +290,6 @@ def _table(stream: _Bytes | _Words, element: _Element) -> _Table:
 
 
 def _row(stream: _Bytes | _Words, each: _Property) -> Array:
-    """Return the next number or list."""
     count = 1 if each.length is None else int(stream.rows([each.length], [1], 1)[0].item())
     if count < 0:
         raise ValueError(f"a list {each.name!r} of {count} entries; must be at least 0")

@@ -13,7 +13,7 @@ import torch
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles import KINDS
 from autdtorch.scene.obstacles.base import Obstacle
-from autdtorch.utils.array_types import REAL
+from autdtorch.utils.array_types import REAL, triple
 from autdtorch.utils.validation import Vector, invalid
 
 # Decimals of a position [m], and of an angle [rad] or direction: far above rounding, far below what an
@@ -139,5 +139,4 @@ def _position(obstacle: Obstacle, like: torch.Tensor) -> torch.Tensor:
 
 
 def _rounded(vector: torch.Tensor, digits: int) -> Vector:
-    x, y, z = (vector.round(decimals=digits) + 0.0).tolist()  # no -0, whose digest differs
-    return x, y, z
+    return triple((vector.round(decimals=digits) + 0.0).tolist())  # no -0, whose digest differs

@@ -22,7 +22,6 @@ _ZERO, _ONE, _NOWHERE = np.uint64(0), np.uint64(1), np.uint64(0)
 
 @njit(**INNER)
 def _gap(lower, upper, low, high):  # type: ignore[no-untyped-def]
-    """Return the distance between two intervals."""
     gap = lower - high if lower - high > low - upper else low - upper
     return gap if gap > 0.0 else 0.0
 
@@ -52,7 +51,6 @@ def _is_near(boxes, node, lanes):  # type: ignore[no-untyped-def]
 
 @njit(**INNER, forceinline=True)
 def _dot(a, b, c, x, y, z):  # type: ignore[no-untyped-def]
-    """Return the product of two vectors."""
     return a * x + b * y + c * z
 
 
@@ -92,7 +90,6 @@ def _square(way):  # type: ignore[no-untyped-def]
 
 @njit(**INNER, forceinline=True)
 def _row(table, number):  # type: ignore[no-untyped-def]
-    """Return the numbers of a triangle."""
     # fmt: off
     t = table[number]
     return (

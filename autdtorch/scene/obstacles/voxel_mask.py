@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from autdtorch.scene.obstacles.base import Obstacle
 from autdtorch.scene.obstacles.voxel_surface import ThinError, VoxelCubes, VoxelSurface
-from autdtorch.utils.array_types import Array, is_dense
+from autdtorch.utils.array_types import Array, is_dense, triple
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import path_of, read_arrays, write_arrays
 from autdtorch.utils.hints import suggesting
@@ -210,8 +210,7 @@ class VoxelMask(Obstacle):
         return body
 
     def _in_scene(self, corner: Array) -> Vector:
-        x, y, z = (float(low + place) for low, place in zip(self.origin, corner, strict=True))
-        return x, y, z
+        return triple(float(low + place) for low, place in zip(self.origin, corner, strict=True))
 
     def _from_origin(self, points: torch.Tensor) -> Array:
         return np.asarray(points.detach().cpu().numpy() - self.origin, np.float64)
@@ -225,7 +224,6 @@ class VoxelMask(Obstacle):
 
 
 def _checked_spacing(spacing: object) -> float | Vector:
-    """Return the edge of a voxel, or its three edges."""
     if not isinstance(spacing, list | tuple) and getattr(spacing, "ndim", 0) != 1:
         return positive("VoxelMask.spacing", spacing, "m")
     x, y, z = positive_entries("VoxelMask.spacing", spacing, 3)

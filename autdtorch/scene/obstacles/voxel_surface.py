@@ -55,6 +55,10 @@ class VoxelSurface:
     """A closed surface through voxels with edges (3,) [m]; coordinates from the corner of the first one on.
 
     A mask (nx, ny, nz) is smoothed; of grey values the surface at a level counts, with the body above it.
+
+    Attributes:
+        uncertainty: distance [m] by which the surface may be off (rms).
+        lost: number of voxels whose centres are on the wrong side, as they are too small to be smooth.
     """
 
     def __init__(self, values: NDArray[Any], edges: Array, level: float | None) -> None:
@@ -64,27 +68,16 @@ class VoxelSurface:
             ThinError: a mask of single voxels, or one as thin.
         """
         self._values, self._edges, self._level = values, edges, level
-        self._built = self._build()
+        self._vertices, self._faces, self.uncertainty, self.lost = self._build()
 
     @property
     def bounds(self) -> tuple[Array, Array]:
         """Corners (3,) [m] of the bounding box."""
-        vertices, _ = self.surface()
-        return vertices.min(axis=0), vertices.max(axis=0)
+        return self._vertices.min(axis=0), self._vertices.max(axis=0)
 
     def surface(self) -> tuple[Array, Index]:
         """Return vertices (V, 3) [m] and outward triangles (F, 3)."""
-        return self._built[:2]
-
-    @property
-    def uncertainty(self) -> float:
-        """Distance [m] by which the surface may be off (rms)."""
-        return self._built[2]
-
-    @property
-    def lost(self) -> int:
-        """Number of voxels whose centres are on the wrong side, as they are too small to be smooth."""
-        return self._built[3]
+        return self._vertices, self._faces
 
     def inside(self, points: Array) -> NDArray[np.bool_]:
         """Return which points (N, 3) are in the body."""
@@ -136,7 +129,7 @@ class VoxelSurface:
 
     @cached_property
     def _distance(self) -> MeshDistance:
-        return MeshDistance(*self.surface())
+        return MeshDistance(self._vertices, self._faces)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the search structures, which are built again."""
