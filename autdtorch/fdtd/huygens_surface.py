@@ -8,6 +8,9 @@ wave that leaves at kz is radiated as W sin(kz) / kz times itself. With the sten
 from 1 by up to 3e-4 at 9 cells per wavelength, depending on the direction. Behind a large body, where
 incident and scattered field cancel, that would be 1 % of what is left. Weights of 25 cells are within 1e-6,
 and at 4 cells per wavelength within 1e-4. Next to edges of the surface the stencil's stay.
+
+The wave from a place on a face to a distant receiver is smooth along the face: its values at Chebyshev nodes
+give it anywhere. Transposed, this interpolation moves the amplitudes of cells to a few nodes (`FaceNodes`).
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from __future__ import annotations
 import itertools
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Self
@@ -41,6 +45,11 @@ _DISTANCE = np.abs(np.array(OFFSETS)).sum(axis=1)
 _STRAIGHT = np.flatnonzero(_DISTANCE == 1)  # neighbours across faces, in the order of `OFFSETS`
 # Places along a face of the weights, up to symmetry: those among the neighbours, and those farther away
 _NEAR, _FAR = ((0, 0), (1, 0), (1, 1)), ((2, 0), (2, 1), (3, 0))
+
+# Nodes along a face, over the phase [rad] of a wave across half of it, and beside it. Fields of the nodes are
+# within 2e-6 of those of the cells.
+_PER_PHASE, _MORE = 1.15, 8
+_CLEAR = 1.5  # Least distance [wavelengths] of receivers; evanescent waves have decayed there
 
 
 @dataclass(frozen=True)
@@ -170,6 +179,86 @@ def _farther_beside() -> Index:
     beside = np.array([each for place in _FAR for each in _alike(place)])
     lateral = [np.eye(3, dtype=np.int64)[offset == 0] for offset in offsets]
     return np.stack([offset + beside @ each for offset, each in zip(offsets, lateral, strict=True)])
+
+
+@dataclass(frozen=True)
+class FaceNodes:
+    """Few nodes that radiate like the cells of a Huygens surface, to receivers at a distance.
+
+    Attributes:
+        positions: along the axes of the grid (m, 3) [m].
+        faces: of each layer of a face, the cells (A, B) by their place in the surface, on a device. Weights
+            (a, A) and (b, B) move amplitudes to its nodes (a, b).
+        bounds: lower and upper corner of the surface, along the axes of the grid [m].
+        clearance: least distance of receivers from the surface [m].
+    """
+
+    positions: Array
+    faces: Sequence[Sequence[Tensor]]
+    bounds: tuple[Array, Array]
+    clearance: float
+
+    @classmethod
+    def of(cls, grid: Grid, surface: Index, wavenumber: float, device: str = "cpu") -> Self:
+        """Return the nodes of a surface, by the flat indices (n,) of its cells.
+
+        These are two and three cells from the rim of the interior.
+        """
+        place = np.zeros(grid.shape, np.int64)
+        place.ravel()[surface] = np.arange(len(surface))
+        positions, faces = [], []
+        for axis in range(3):  # edges go to the first axis that has them
+            depths = [4 if index < axis else 2 for index in range(3)]
+            ends = zip(grid.first, grid.last, depths, strict=True)
+            cells = [np.arange(first + depth, last - depth) for first, last, depth in ends]
+            one, other = (index for index in range(3) if index != axis)
+            (along, first), (across, second) = (
+                _nodes(cells[index], wavenumber * grid.spacing) for index in (one, other)
+            )
+            for layer in np.unique(np.concatenate([cells[axis][:2], cells[axis][-2:]])):
+                cells[axis] = np.array([layer])
+                inside = place[np.ix_(*cells)].squeeze(axis)
+                faces.append([torch.from_numpy(part).to(device) for part in (inside, first, second)])
+                node = np.empty((len(along), len(across), 3))
+                node[..., axis], node[..., one], node[..., other] = layer, along[:, None], across
+                positions.append(node.reshape(-1, 3))
+        bounds = np.array(grid.first) + 2, np.array(grid.last) - 3
+        lower, upper, everywhere = (
+            grid.origin + grid.spacing * each for each in (*bounds, np.concatenate(positions))
+        )
+        return cls(everywhere, faces, (lower, upper), _CLEAR * 2 * math.pi / wavenumber)
+
+    def reach(self, points: Array, radii: Array | float = 0.0) -> NDArray[np.bool_]:
+        """Return which points (P, 3) [m], or discs about them, are far enough, along the axes of the grid."""
+        lower, upper = self.bounds
+        apart = np.maximum(np.maximum(lower - points, points - upper), 0)
+        return np.asarray(np.linalg.norm(apart, axis=1) >= self.clearance + radii)
+
+    def amplitudes(self, amplitude: Tensor) -> Tensor:
+        """Return the amplitudes (m, R) of the nodes, on the CPU, from those (n, R) of the cells."""
+        values = torch.view_as_real(amplitude.to(self.faces[0][0].device)).flatten(1)
+        parts = []
+        for cells, first, second in self.faces:
+            moved = first @ values[cells].flatten(1)
+            moved = second @ moved.reshape(len(first), cells.shape[1], -1)
+            parts.append(moved.flatten(0, 1))
+        return torch.view_as_complex(torch.cat(parts).reshape(-1, *amplitude.shape[1:], 2).cpu())
+
+
+def _nodes(cells: Index, phase: float) -> tuple[Array, Array]:
+    """Return nodes (a,) along cells (A,), in cells, and the values (a, A) of their polynomials at the cells.
+
+    A wave advances by `phase` [rad] over a cell.
+    """
+    half = (len(cells) - 1) / 2
+    count = math.ceil(_PER_PHASE * phase * half) + _MORE
+    if count >= len(cells):
+        return cells.astype(float), np.eye(len(cells))
+    angle = (2 * np.arange(count) + 1) * np.pi / (2 * count)
+    nodes, sign = np.cos(angle), np.sin(angle) * (-1.0) ** np.arange(count)
+    apart = (cells - cells.mean()) / half - nodes[:, None]
+    terms = sign[:, None] / np.where(apart == 0, 1e-99, apart)  # barycentric
+    return cells.mean() + half * nodes, terms / terms.sum(axis=0)
 
 
 def row_matrix(weight: Array, place: NDArray[np.int32], count: int) -> csr_array:

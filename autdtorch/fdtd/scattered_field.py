@@ -22,8 +22,7 @@ from torch import Tensor
 
 from autdtorch.fdtd.assembly.neighbours import with_neighbours
 from autdtorch.fdtd.discrete_green import field_of_kernels
-from autdtorch.fdtd.face_nodes import FaceNodes
-from autdtorch.fdtd.huygens_surface import HuygensSurface, row_matrix
+from autdtorch.fdtd.huygens_surface import FaceNodes, HuygensSurface, row_matrix
 from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.kernels.waves import superposition

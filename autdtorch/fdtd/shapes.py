@@ -176,14 +176,12 @@ class _Doubled(Bounded):
     mirror: Mirror
 
     def signed_distance(self, points: Tensor, /) -> Tensor:
-        """Return the distance (...) [m] of points (..., 3) to the surface, negative inside."""
         behind = self.mirror.height(points) < 0
         return self.shape.signed_distance(
             torch.where(behind[..., None], self.mirror.image.of(points), points)
         )
 
     def surface(self) -> tuple[Tensor, Tensor]:
-        """Return vertices (V, 3) [m] and triangles (F, 3), counter-clockwise as seen from outside."""
         return self._surface
 
     @cached_property

@@ -290,7 +290,8 @@ class WindowedRuns:
         if not recording:
             return []
         self._sums = {time: value for time, value in self._sums.items() if time > first - steps}
-        inside = (time for time in range(first + 1, first + steps) if _is_needed(time, steps, shift))
+        times = range(first + 1, first + steps)
+        inside = (time for time in times if time % shift == 0 or (time + steps) % shift == 0)
         for begin, end in itertools.pairwise((first, *inside, first + steps)):
             part = slice(begin - first, end - first)
             self._total = self._total + fourier_sum(self._basis[:, part], recorded[:, part])
@@ -311,7 +312,6 @@ class WindowedRuns:
         self._sums = {time: value[places] for time, value in self._sums.items()}
 
     def _drive(self, first: int) -> tuple[Sources, Tensor]:
-        """Return the sources of a block and their signals."""
         assembly, steps = self._assembly, self._steps
         signal = drive_signal(assembly.steps_per_period, first, steps).to(assembly.dtype)
         if not self._echo:
@@ -326,11 +326,6 @@ class WindowedRuns:
 def _shift(steps: int) -> int:
     """Return the steps from a window to the next, for blocks of `steps`."""
     return max(1, steps // _PARTS)
-
-
-def _is_needed(time: int, steps: int, shift: int) -> bool:
-    """Return whether a window ends or begins after `time` steps; ends are `shift` apart."""
-    return time % shift == 0 or (time + steps) % shift == 0
 
 
 class _Judging:
@@ -349,7 +344,6 @@ class _Judging:
         return residual, bound
 
     def choose(self, mask: NDArray[np.bool_]) -> None:
-        """Go on with some of the runs."""
         self._floors = self._floors[:, mask]
         for values in self._values:
             values[:] = [value[:, mask] for value in values]

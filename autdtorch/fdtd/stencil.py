@@ -135,7 +135,6 @@ _DIRECTIONS, _SOLID_ANGLES = _directions()
 
 
 def _mean_symbol(wavenumber: complex, weights: tuple[float, ...]) -> complex:
-    """Return the symbol at a complex wavenumber times spacing, averaged over directions."""
     return complex(np.average(_basis(wavenumber * _DIRECTIONS) @ weights, weights=_SOLID_ANGLES))
 
 

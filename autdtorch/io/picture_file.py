@@ -92,7 +92,6 @@ def newest_picture(folder: Path) -> Path | None:
 
 
 def _numbers(name: str, values: AnyArray, count: int) -> list[float]:
-    """Return `count` finite numbers of a file, after checking them."""
     if values.size != count or values.dtype.kind not in "biuf" or not np.isfinite(values).all():
         raise ValueError(f"{name}: {values.tolist()!r:.80}; must be {count} finite numbers")
     return [float(value) for value in values.ravel()]

@@ -214,7 +214,6 @@ def _drives(table: Table, columns: Columns, said: Unit | None, drives: torch.Ten
 
 
 def _metres(table: Table, column: ReadingColumn) -> Array:
-    """Return coordinates (R, 1) [m]."""
     values = table.read([column], column.unit)
     with within(table.place):
         return in_metres(values, column.unit)

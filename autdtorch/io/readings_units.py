@@ -233,11 +233,9 @@ def drives_of(phases: Array, amplitudes: Array | None, unit: Unit, of_amplitudes
 
 
 def _levels_of(unit: Unit) -> int | None:
-    """Return the number of levels that a unit states; None if it states none."""
     match = re.fullmatch(r"levels of (\d+)", unit.unit or "")
     return int(match[1]) if match else None
 
 
 def _pressure_word(word: str) -> str | None:
-    """Return the unit of pressure that a word is; None if it is none."""
     return "mPa" if word == "mPa" else _PRESSURE_WORDS.get(word.casefold())

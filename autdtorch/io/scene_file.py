@@ -323,7 +323,6 @@ def _obstacle(obstacle: Obstacle, name: str, where: str) -> dict[str, Any]:
 
 
 def _reflector(reflector: Reflector) -> dict[str, Any]:
-    """Return the section of a reflector, without the default."""
     section: dict[str, Any] = {"point": list(reflector.point), "normal": list(reflector.normal)}
     return section | ({} if reflector.reflection == 1 else {"reflection": reflector.reflection})
 

@@ -288,7 +288,6 @@ def _grown(domain: torch.Tensor, array: TransducerArray, points: torch.Tensor) -
 
 
 def _index_of(name: str) -> int | None:
-    """Return the index in the name of a change, if it has one."""
     place = re.search(r"\d+", name)
     return int(place[0]) if place else None
 

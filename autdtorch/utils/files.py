@@ -155,7 +155,6 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, AnyArray]:
 
 
 def _read(file: Any, size: int) -> AnyArray:
-    """Read the array of a file of `size` bytes."""
     version = npy.read_magic(file)
     if version not in _HEADERS:
         raise ValueError(f"format {version} of an array; must be 1.0 or 2.0")

@@ -13,8 +13,7 @@ from small_scenes import CUBE, NO_RECEIVERS, NO_SOURCES, all_tensors, assembled_
 
 from autdtorch.analytic.discs import waves_of
 from autdtorch.analytic.green import green
-from autdtorch.fdtd.kernels.blocks import BLOCK, blocks_of
-from autdtorch.fdtd.kernels.contract import Sources, uniform_state
+from autdtorch.fdtd.kernels.contract import BLOCK, Sources, blocks_of, uniform_state
 from autdtorch.fdtd.kernels.cpu import CpuKernel, _cuts
 from autdtorch.fdtd.kernels.cpu_sweep import strips_of
 from autdtorch.fdtd.kernels.cpu_waves import superposition, wave_matrix

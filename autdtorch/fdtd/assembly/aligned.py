@@ -327,7 +327,6 @@ class _Sections:
     """Sections across an axis, at the level of one block, around elements that vary along both other axes."""
 
     def __init__(self, blocks: Blocks, axis: int, level: int) -> None:
-        """Find the elements, and the groups that touch."""
         self._material = np.take(blocks.material, [level], axis=axis).squeeze(axis)
         self._planes = [planes for other, planes in enumerate(blocks.planes) if other != axis]
         varied = [varies(self._material, self._planes, each) for each in (0, 1)]

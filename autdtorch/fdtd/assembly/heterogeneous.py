@@ -117,7 +117,9 @@ def heterogeneous_cells(
     vertices, around = _vertices(elements, shape), np.zeros(shape, bool)
     around.ravel()[vertices] = True
     touched = inner_cells(around)
-    largest = _largest_of_elements(elements.materials, stencil)
+    # the eigenvalue that no element exceeds, and therefore no sum of elements
+    margin = _FINE_MARGIN if stencil.kappa <= 2 * math.pi / _FINE_CELLS else _COARSE_MARGIN
+    largest = margin * stencil.largest_symbol * float(elements.materials.speed.max())
     cut, hard, rows = _without_rigid(elements, vertices, touched, shape, stencil, largest)
     enclosed = np.zeros(0, np.int64)
     if elements.materials.rigid.any():
@@ -160,16 +162,9 @@ class _CellRows(NamedTuple):
     loss: Array  # (n, 29), or (n, 0) if nothing absorbs
 
     def joined(self, others: Self) -> Self:
-        """Return these cells and others in ascending order."""
         both = [np.concatenate(parts) for parts in zip(self, others, strict=True)]
         order = np.argsort(both[0], kind="stable")  # of two runs
         return type(self)(*(part[order] for part in both))
-
-
-def _largest_of_elements(materials: Materials, stencil: Stencil) -> float:
-    """Return the eigenvalue that no element exceeds, and therefore no sum of elements."""
-    margin = _FINE_MARGIN if stencil.kappa <= 2 * math.pi / _FINE_CELLS else _COARSE_MARGIN
-    return margin * stencil.largest_symbol * float(materials.speed.max())
 
 
 def lossy_cells(loss: Array) -> LossyCells | None:
@@ -293,12 +288,10 @@ def _uniform_elements(materials: Materials, stencil: Stencil) -> InterfaceElemen
 
 
 def _densest(elements: Elements) -> float:
-    """Return the largest density, relative to air."""
     return float(elements.materials.density[~elements.materials.rigid].max())
 
 
 def _all_condensed(interface: InterfaceElements, out: NDArray[np.bool_]) -> InterfaceElements:
-    """Return `condensed` elements, computed in threads."""
     parts = [slice(*ends) for ends in parts_of_size(len(out), _TOGETHER)]
     return InterfaceElements.joined(spread(lambda part: condensed(interface.chosen(part), out[part]), parts))
 

@@ -30,7 +30,7 @@ from autdtorch.fdtd.assembly.sections import (
     uniform_columns,
 )
 from autdtorch.fdtd.stencil import Stencil
-from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.array_types import Array
 
 # Fields of the fit of one element; each further one needs two more, up to a limit
 _FIELDS, _MOST_FIELDS = 8, 12
@@ -41,6 +41,8 @@ _LEAST_WEIGHT, _EXACT, _MOST_STEPS = 1e-12, 1e-14, 100
 _SUM = 100.0  # Weight of the sum of masses, relative to their moments
 _LEAST_MOBILITY = 1e-9  # Mobility of a column that a rigid material closes
 _DECIMALS = 9  # Sections that agree to so many decimals [cells] share their fit
+# Number of sides between two columns (2, 2, 2, 2)
+_SIDES = np.abs(COLUMNS[:, None] - COLUMNS).sum(axis=2).reshape((2,) * 4)
 
 
 class Prisms(NamedTuple):
@@ -114,8 +116,8 @@ def stacked(width: Array, slices: Prisms, axis: int, stencil: Stencil) -> tuple[
     total = resistance.sum(axis=1, keepdims=True)
     end, drop = np.cumsum(resistance, axis=1) / total, resistance / total
     middle = end - drop / 2
-    by_edges, sides = coupling_by_edges(stencil), _sides_between()
-    straight, oblique = by_edges[sides], by_edges[np.minimum(sides + 1, 3)]
+    by_edges = coupling_by_edges(stencil)
+    straight, oblique = by_edges[_SIDES], by_edges[_SIDES + 1]
     number = np.moveaxis(np.arange(8).reshape(2, 2, 2), axis, 0).reshape(2, 4)  # vertices at both ends
     matrix, masses = np.zeros((len(width), 8, 8)), np.zeros((len(width), 8))
     low, high = np.eye(8)[number]
@@ -139,12 +141,6 @@ def _stiffness(coupling: Array) -> Array:
     """Return the stiffness matrices (n, 4, 4) of coupling between columns (n, 2, 2, 2, 2)."""
     pairs = coupling.reshape(-1, 4, 4)[:, COLUMN_PAIRS[:, 0], COLUMN_PAIRS[:, 1]]
     return stiffness_matrix(pairs, COLUMN_PAIRS)
-
-
-def _sides_between() -> Index:
-    """Return the number of sides between two columns (2, 2, 2, 2)."""
-    first, second = np.indices((2, 2, 2, 2)).reshape(2, 2, -1)
-    return np.asarray(np.abs(first - second).sum(axis=0).reshape((2,) * 4), np.int64)
 
 
 @lru_cache(maxsize=4096)

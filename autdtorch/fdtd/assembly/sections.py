@@ -238,7 +238,6 @@ def _stiffness(
 
 
 def _solved(matrix: csr_array, right: Array) -> Array:
-    """Return the solution of a symmetric positive system."""
     settings = {"SymmetricMode": True}
     solver = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=settings)
     return np.asarray(solver.solve(right))

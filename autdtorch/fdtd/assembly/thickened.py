@@ -91,7 +91,6 @@ class _Receding(Bounded):
         return cosine > _PARALLEL
 
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the vertices (V, 3) [m] and triangles (F, 3) of the original shape."""
         return self.shape.surface()
 
 

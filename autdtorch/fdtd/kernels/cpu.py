@@ -22,9 +22,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.kernels.blocks import BLOCK, Blocks
 from autdtorch.fdtd.kernels.contract import (
+    BLOCK,
     CPU,
+    Blocks,
     Coefficients,
     Columns,
     Kernel,

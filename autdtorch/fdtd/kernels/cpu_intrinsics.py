@@ -16,7 +16,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from autdtorch.fdtd.kernels.blocks import BLOCK
+from autdtorch.fdtd.kernels.contract import BLOCK
 
 _WIDTH = 4  # Cells of a row that are added at once
 _MIDDLE = 13  # The cell itself among its neighbours, from which it does not differ

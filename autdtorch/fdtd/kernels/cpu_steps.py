@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from autdtorch.fdtd.kernels.blocks import BLOCK
+from autdtorch.fdtd.kernels.contract import BLOCK
 from autdtorch.fdtd.kernels.cpu_intrinsics import (
     add_to_counter,
     give_way,
@@ -24,7 +24,6 @@ _LOOKS = 2000
 
 @njit(**INNER)
 def _wait_for(counters, tasks):  # type: ignore[no-untyped-def]
-    """Wait until so many tasks are finished."""
     looks = 0
     while read_counter(counters, _FINISHED) < tasks:
         looks += 1

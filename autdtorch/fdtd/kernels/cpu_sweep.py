@@ -28,7 +28,7 @@ import torch
 from numba import njit
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.kernels.blocks import BLOCK
+from autdtorch.fdtd.kernels.contract import BLOCK
 from autdtorch.fdtd.kernels.cpu_intrinsics import step_around
 from autdtorch.fdtd.kernels.cpu_layers import absorb_x, add_terms, stretch_planes
 from autdtorch.utils.array_types import Index

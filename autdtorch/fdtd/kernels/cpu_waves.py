@@ -259,7 +259,6 @@ def wave_matrix(
 
 
 def _spread(function: Callable[[tuple[int, int]], None], units: int, pairs: int) -> None:
-    """Call a function with the bounds of parts of the units, in threads."""
     spread(function, even_parts(units, max(1, min(units, 1 + pairs // _PAIRS))))
 
 

@@ -147,7 +147,6 @@ class DeviceRun:
         return received.recorded.clone()
 
     def _replay(self, steps: int) -> None:
-        """Step by replays of captured graphs."""
         done = 0
         while done < steps:
             part = self._turn, min(_GRAPH_STEPS, steps - done)

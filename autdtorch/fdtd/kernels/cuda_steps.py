@@ -18,8 +18,17 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from autdtorch.fdtd.kernels.cuda_layers import stretch_columns, stretch_y, stretch_yz, stretch_z
-from autdtorch.fdtd.kernels.cuda_runs import KEEP, begin, field_of, layer_of, task_of
+from autdtorch.fdtd.kernels.cuda_layers import (
+    KEEP,
+    begin,
+    field_of,
+    layer_of,
+    stretch_columns,
+    stretch_y,
+    stretch_yz,
+    stretch_z,
+    task_of,
+)
 
 
 @triton.jit

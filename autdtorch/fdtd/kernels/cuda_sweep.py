@@ -8,16 +8,17 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from autdtorch.fdtd.kernels.cuda_layers import advance, stretch_columns
-from autdtorch.fdtd.kernels.cuda_runs import (
+from autdtorch.fdtd.kernels.cuda_layers import (
     CENTER,
     CORNER,
     EDGE,
     FACE,
     KEEP,
+    advance,
     begin,
     field_of,
     layer_of,
+    stretch_columns,
     task_of,
 )
 

@@ -255,7 +255,6 @@ class _Words:
         self._words, self.place = np.array(body.split()).astype(np.float64), 0
 
     def rows(self, types: list[np.dtype[Any]], widths: list[int], count: int) -> list[Array]:
-        """Return the next columns (count, width), one for each type and width."""
         some = self._words[self.place : self.place + count * sum(widths)]
         if len(some) < count * sum(widths):
             raise ValueError("the file ends too early")

@@ -74,7 +74,6 @@ def _without_doubles(faces: Index, done: list[str]) -> Index:
 
 
 def _without_strays(vertices: Array, faces: Index, done: list[str]) -> Index:
-    """Leave out small pieces that are open."""
     import igl
 
     _, label = igl.facet_components(faces)

@@ -84,7 +84,6 @@ def _ways(x, y, z, triangle):  # type: ignore[no-untyped-def]
 
 @njit(**INNER, forceinline=True)
 def _square(way):  # type: ignore[no-untyped-def]
-    """Return the squared length of a way of `_ways`."""
     return way[1] * way[1] + way[2] * way[2] + way[3] * way[3]
 
 

@@ -33,20 +33,17 @@ class _Centred(Obstacle):
     center: Vector
 
     def __post_init__(self) -> None:
-        """Check the material and the centre."""
         super().__post_init__()
         center = finite_vector(f"{type(self).__name__}.center", self.center)
         object.__setattr__(self, "center", center)
 
     @property
     def lower(self) -> Vector:
-        """Lower corner of the bounding box (3,) [m]."""
         (x, y, z), (a, b, c) = self.center, self._half_extents
         return x - a, y - b, z - c
 
     @property
     def upper(self) -> Vector:
-        """Upper corner of the bounding box (3,) [m]."""
         (x, y, z), (a, b, c) = self.center, self._half_extents
         return x + a, y + b, z + c
 
