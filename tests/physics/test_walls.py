@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from small_scenes import AIR, NO_RECEIVERS, NO_SOURCES, relative_error, small_scene
 
 from autdtorch import analytic
-from autdtorch.fdtd.assembly.thickened import Thickened, thickened
+from autdtorch.fdtd.assembly.thin_walls import Thickened, thickened
 from autdtorch.fdtd.assembly.unions import thin_wall
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stepping import assemble

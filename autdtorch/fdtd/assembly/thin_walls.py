@@ -1,22 +1,37 @@
-"""Thin rigid walls: finite elements in front of one and behind it share no vertices.
+"""Thin rigid sheets and walls: their least thickness, and the finite elements on their sides.
 
-The air in an element that walls cross is in several parts, its sides. To a side belong the vertices in its
-air, and those inside a wall whose nearest face does not look the opposite way. Sound would pass through
-others. Vertices half-way between two faces belong to no side, as a mirror image would choose the other one.
+Sheets are thickened on both sides. Where a later fluid leaves a thin wall of a rigid body, the fluid
+recedes, so that the outer surface of the body stays.
+
+Finite elements in front of a wall and behind it share no vertices. The air in an element that walls cross is
+in several parts, its sides. To a side belong the vertices in its air, and those inside a wall whose nearest
+face does not look the opposite way. Sound would pass through others. Vertices half-way between two faces
+belong to no side, as a mirror image would choose the other one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.ndimage import generate_binary_structure, label
 
 from autdtorch.fdtd.assembly.element import CORNERS, SUBCELLS, subcell_gradients, subcell_means
-from autdtorch.utils.array_types import Array, Index
+from autdtorch.fdtd.shapes import Bounded, Shape
+from autdtorch.utils.array_types import REAL, Array, Index
+from autdtorch.utils.spatial import extents, mean_thickness
+from autdtorch.utils.validation import Vector
 
+_THINNEST = 0.32  # Least thickness of a rigid sheet or wall [cells]
+_OPEN = 1e-9  # Thickness [cells] up to which a surface is open, as of a half-space
+_WIDE = 2.0  # Least extent [cells] of a sheet along two axes: needles would become much thicker than they are
+_FLUSH = 1e-6  # Thickness of a wall [cells] up to which its faces coincide: the fluid opens to the air there
+_PARALLEL = 0.85  # Least cosine of the angle between the faces of a wall
+_STEP = 1e-3  # Distance [cells] of the points that tell the directions of faces
 _OPPOSITE = -0.5  # Cosine of the angle between two faces below which they look opposite ways
 _LEAST = 1 / len(CORNERS)  # Sum of the shares of sub-cells in which a side has one point of the lattice
 _NEIGHBOURS = np.zeros((3,) * 4, bool)  # of points of the lattices of n elements: six, of the same element
@@ -64,3 +79,80 @@ def _sides(level: Array, normal: Array) -> Iterator[Side]:
         opposite = (normal * facing[:, None]).sum(axis=2) < _OPPOSITE
         share = np.divide(part, whole, out=np.zeros_like(part), where=whole > 0)
         yield Side(share, np.where(inside, opposite | undecided, ~here[:, CORNERS]))
+
+
+@dataclass(frozen=True, eq=False)
+class Thickened(Bounded):
+    """A shape whose surface is moved outwards."""
+
+    shape: Shape
+    distance: float  # of the surfaces [m]
+
+    @property
+    def _bounds(self) -> tuple[Vector, Vector]:
+        (x, y, z), (u, v, w), far = self.shape.lower, self.shape.upper, self.distance
+        return (x - far, y - far, z - far), (u + far, v + far, w + far)
+
+    def signed_distance(self, points: torch.Tensor, /) -> torch.Tensor:
+        """Return the distance (...) [m] of points (..., 3) to the surface, negative inside."""
+        return self.shape.signed_distance(points) - self.distance
+
+    def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the vertices (V, 3) [m] and triangles (F, 3) of the original shape."""
+        return self.shape.surface()
+
+
+def thickened(shape: Shape, spacing: float) -> Shape:
+    """Return a thinner sheet with the least thickness on cells of a spacing [m], other shapes unchanged."""
+    vertices, triangles = (part.numpy() for part in shape.surface())
+    thickness = mean_thickness(vertices, triangles) / spacing
+    if not _OPEN < thickness < _THINNEST or extents(vertices)[1] < _WIDE * spacing:
+        return shape
+    return Thickened(shape, (_THINNEST - thickness) * spacing / 2)
+
+
+@dataclass(frozen=True, eq=False)
+class _Receding(Bounded):
+    """A fluid shape inside a rigid one, whose surface recedes where the wall between them is thin."""
+
+    shape: Shape
+    rigid: Shape
+    spacing: float  # [m]
+
+    @property
+    def _bounds(self) -> tuple[Vector, Vector]:
+        return self.shape.lower, self.shape.upper
+
+    def signed_distance(self, points: torch.Tensor, /) -> torch.Tensor:
+        """Return the distance (...) [m] of points (..., 3) to the surface, negative inside.
+
+        In a wall and beside it, the distances from its two faces differ by its thickness.
+        """
+        distance, outer = (each.signed_distance(points) for each in (self.shape, self.rigid))
+        wall = distance - outer
+        thin = (wall > _FLUSH * self.spacing) & (wall < _THINNEST * self.spacing)
+        thin[thin.clone()] = self._is_parallel(points[thin])
+        return torch.where(thin, outer + _THINNEST * self.spacing, distance)
+
+    def _is_parallel(self, points: torch.Tensor) -> torch.Tensor:
+        """Return at which points (n, 3) the nearest faces of both shapes look the same way."""
+        step = _STEP * self.spacing
+        axes = torch.eye(3, **REAL).to(points)
+        around = points + step * torch.cat((axes, -axes))[:, None]
+        ahead, behind = (
+            torch.stack([each.signed_distance(part) for each in (self.shape, self.rigid)])
+            for part in torch.split(around, 3)
+        )
+        cosine = ((ahead - behind) / (2 * step)).prod(dim=0).sum(dim=0)
+        return cosine > _PARALLEL
+
+    def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.shape.surface()
+
+
+def receding(shape: Shape, before: Sequence[Shape], spacing: float) -> Shape:
+    """Return a fluid shape that leaves rigid shapes `before` it walls of the least thickness on cells [m]."""
+    for rigid in before:
+        if (np.maximum(shape.lower, rigid.lower) < np.minimum(shape.upper, rigid.upper)).all():
+            shape = _Receding(shape, rigid, spacing)
+    return shape

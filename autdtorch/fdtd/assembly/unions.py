@@ -19,7 +19,7 @@ import torch
 
 from autdtorch.fdtd.assembly.element import FAR, MaterialLosses, Materials
 from autdtorch.fdtd.assembly.losses import STEP
-from autdtorch.fdtd.assembly.thickened import receding, thickened
+from autdtorch.fdtd.assembly.thin_walls import receding, thickened
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Body, Fluid, Region
 from autdtorch.fdtd.shapes import Shape, Solids, bounds, distance_from, remaining
