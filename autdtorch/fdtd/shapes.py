@@ -71,7 +71,6 @@ class Solids:
     solid: Sequence[bool]  # which of them are
 
     def __bool__(self) -> bool:
-        """Return whether any is solid."""
         return any(self.solid)
 
     def distance(self, points: Array) -> Array:

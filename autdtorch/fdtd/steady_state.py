@@ -189,7 +189,6 @@ class Extrapolation:
         self._values = self._last = self._steps = self._products = torch.empty(0, **REAL)
 
     def __len__(self) -> int:
-        """Return the number of stored values."""
         return min(self._count, self._most)
 
     def append(self, values: Tensor) -> None:

@@ -270,11 +270,9 @@ class TransducerArray:
         return radii_of(self)[:, None] * (1 - self.normals**2).clamp(min=0).sqrt()
 
     def __len__(self) -> int:
-        """Return the number of transducers M."""
         return len(self.positions)
 
     def __repr__(self) -> str:
-        """Return count, centre, radius, strength and phases, with units."""
         x, y, z = (1e3 * self.positions.mean(dim=0)).tolist()
         size = f"radius {range_text(radii_of(self), 1e3)} mm, " if radii_of(self).any() else ""
         return (

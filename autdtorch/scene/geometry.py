@@ -42,11 +42,9 @@ class Coordinates(torch.Tensor):
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
 
     def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> npt.NDArray[Any]:
-        """Return the values, copied as `copy` says."""
         return np.array(self.numpy(), dtype=dtype, copy=copy)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Coordinates:
-        """Return a copy of the same class."""
         return self.clone().as_subclass(Coordinates)
 
     def __reduce_ex__(self, protocol: Any) -> Any:
@@ -244,7 +242,6 @@ class Plane:
     size: tuple[float, float]
 
     def __post_init__(self) -> None:
-        """Check the attributes and bring them into canonical form."""
         object.__setattr__(self, "center", finite_vector("Plane.center", self.center))
         object.__setattr__(self, "normal", unit_vector("Plane.normal", self.normal))
         object.__setattr__(self, "size", positive_entries("Plane.size", self.size, 2))

@@ -55,7 +55,6 @@ class Medium:
     absorption_frequency: float | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
         density, sound_speed = fluid("Medium", self.density, self.sound_speed)
         object.__setattr__(self, "density", density)
         object.__setattr__(self, "sound_speed", sound_speed)

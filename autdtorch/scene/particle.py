@@ -37,7 +37,6 @@ class Particle:
     sound_speed: float
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         density, sound_speed = fluid("Particle", self.density, self.sound_speed)
         object.__setattr__(self, "radius", positive("Particle.radius", self.radius, "m"))
         object.__setattr__(self, "density", density)

@@ -173,7 +173,6 @@ class Scene(SceneContents):
         return images_of([reflector.mirror for reflector in self.reflectors], self.complex_wavenumber, size)
 
     def __repr__(self) -> str:
-        """Return name, frequency, counts and extent, with units."""
         wave = f"{self.frequency / 1e3:.4g} kHz, wavelength {1e3 * self.wavelength:.4g} mm"
         points = counted(len(self.control_points), "control point")
         counts = f"{counted(len(self.array), 'transducer')}, {points}"

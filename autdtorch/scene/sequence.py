@@ -54,7 +54,6 @@ class Sequence:
     loop: bool = True
 
     def __post_init__(self) -> None:
-        """Check the attributes, and copy the drives to the CPU."""
         drives = drive_tensor(self.drives, "drives")
         if drives.ndim != 2 or drives.numel() == 0:
             accepted = "must be (T, M), T >= 1 frames of M >= 1 transducers"
@@ -101,11 +100,9 @@ class Sequence:
         return Sequence(self.drives[playing], rate, self.loop)
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return len(self.drives)
 
     def __repr__(self) -> str:
-        """Return the sizes."""
         frames = f"{counted(len(self), 'frame')} of {counted(self.transducers, 'transducer')}"
         return f"Sequence({frames}, {self.rate:g} Hz, {self.duration:g} s{', loop' if self.loop else ''})"
 

@@ -71,7 +71,6 @@ class Obstacle(ABC):
     impedance: complex | None = None
 
     def __post_init__(self) -> None:
-        """Check the material."""
         kind = type(self).__name__
         object.__setattr__(self, "rigid", boolean(f"{kind}.rigid", self.rigid))
         object.__setattr__(self, "absorption", not_negative(f"{kind}.absorption", self.absorption, "dB/m"))

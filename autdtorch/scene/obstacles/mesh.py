@@ -87,7 +87,6 @@ class Mesh(Obstacle):
     digest: str = field(init=False)
 
     def __post_init__(self, rotation_degrees: Vector | None) -> None:
-        """Check the attributes and read the file."""
         super().__post_init__()
         object.__setattr__(self, "scale", positive("Mesh.scale", self.scale))
         object.__setattr__(self, "offset", finite_vector("Mesh.offset", self.offset))

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from autdtorch.scene.obstacles.mesh_part import winding_number
+from autdtorch.scene.obstacles.mesh_parts import winding_number
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.process import parts_of_size, spread
 from autdtorch.utils.spatial import doubled_normals

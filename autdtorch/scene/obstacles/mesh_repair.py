@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion
 
-from autdtorch.scene.obstacles.mesh_part import place_of, winding_number, without_sheets
+from autdtorch.scene.obstacles.mesh_parts import place_of, winding_number, without_sheets
 from autdtorch.scene.obstacles.mesh_solid import (
     Triangles,
     joined,

@@ -13,17 +13,17 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.scene.obstacles.mesh_part import (
+from autdtorch.scene.obstacles.mesh_parts import (
     Part,
     box_of,
     extent_of,
     part_of,
     place_of,
+    union_of,
     winding_number,
     with_three,
     without_sheets,
 )
-from autdtorch.scene.obstacles.mesh_union import union_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.spatial import (
     areas_of,

@@ -77,7 +77,6 @@ class Box(_Centred):
     rotation_degrees: InitVar[Vector | None] = field(default=None, kw_only=True)
 
     def __post_init__(self, rotation_degrees: Vector | None) -> None:
-        """Check the attributes and bring them into canonical form."""
         super().__post_init__()
         object.__setattr__(self, "size", positive_entries("Box.size", self.size, 3))
         object.__setattr__(self, "rotation", angles("Box.rotation", self.rotation, rotation_degrees))
@@ -130,7 +129,6 @@ class Sphere(_Centred):
     radius: float
 
     def __post_init__(self) -> None:
-        """Check the attributes and bring them into canonical form."""
         super().__post_init__()
         object.__setattr__(self, "radius", positive("Sphere.radius", self.radius, "m"))
 
@@ -174,7 +172,6 @@ class Cylinder(_Centred):
     axis: Vector = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        """Check the attributes and bring them into canonical form."""
         super().__post_init__()
         object.__setattr__(self, "radius", positive("Cylinder.radius", self.radius, "m"))
         object.__setattr__(self, "height", positive("Cylinder.height", self.height, "m"))

@@ -73,7 +73,6 @@ class VoxelMask(Obstacle):
     digest: str = field(init=False)
 
     def __post_init__(self) -> None:
-        """Check the attributes and copy the mask."""
         super().__post_init__()
         object.__setattr__(self, "spacing", _checked_spacing(self.spacing))
         object.__setattr__(self, "origin", finite_vector("VoxelMask.origin", self.origin))
