@@ -35,6 +35,7 @@ from autdtorch.io.drive_file import save_drive
 from autdtorch.io.goal_section import goal_section, load_goal, score_label
 from autdtorch.io.picture_file import AGAIN, EVALUATION, PICTURES, pictures_of_evaluations, save_picture
 from autdtorch.io.readings_file import load_readings
+from autdtorch.methods.base import Method
 from autdtorch.methods.calibration.calibrate import calibrate
 from autdtorch.methods.calibration.calibration import Calibration
 from autdtorch.methods.problem import Problem
@@ -197,8 +198,10 @@ class _Trial:
                 log,
                 self._settings,
                 _watcher(progress, goal, pictures),
-                simulated_matrix(self._simulated),
+                simulated_matrix(self._simulated) if goal.of_pressures else None,
             )
+            if isinstance(self._method, Method):  # before anything is played
+                self._method.check(Problem.of(objective, goal, readings=self._readings))
             self.begun = not bench.is_dry
             at_the_end.callback(lambda: objective.log.end(limited.seconds_on))
             at_the_end.callback(limited.off)

@@ -69,7 +69,7 @@ class HardwareObjective:
     Attributes:
         scene: the scene on the bench.
         log: of the evaluations.
-        transfer_matrix: simulated G (P, M) [Pa], or None.
+        transfer_matrix: simulated G (P, M) [Pa], or None, as for a sensor of another quantity.
         goal: the weakest focus; of a sensor of another quantity its least reading, which takes its place.
     """
 
@@ -98,7 +98,8 @@ class HardwareObjective:
 
         Raises:
             ValueError: no scene or sensor; the link is not limited, or plays another number of transducers
-                than the scene has; a transfer matrix of another shape; or `settings` that JSON cannot hold.
+                than the scene has; a transfer matrix of another shape, or beside a sensor of another
+                quantity than the pressure; or `settings` that JSON cannot hold.
             LogError: the log is of another trial, none, or open in another process.
             OSError: the log cannot be read or written.
         """
@@ -123,6 +124,9 @@ class HardwareObjective:
         self.scene, self._link, self._sensor, self._watch = scene, link, sensor, watch
         self.goal = goal_of(sensor)
         if not self.goal.of_pressures:
+            if transfer_matrix is not None:
+                accepted = f"must be None with a sensor of {self.goal.name}: it gives pressures"
+                raise invalid("transfer_matrix", "a matrix", accepted)
             named["quantity"] = f"{self.goal.name} [{self.goal.unit}]"
         self._sensed: Callable[[torch.Tensor], torch.Tensor] | None = getattr(sensor, "deviation", None)
         origin = {

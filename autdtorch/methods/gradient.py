@@ -55,6 +55,10 @@ class GradientAscent(Method):
     starts: int = whole(32, least=1)
     steps: int = whole(300, least=2)
 
+    def check(self, problem: Problem) -> None:
+        """Check that the problem has a transfer matrix."""
+        known_matrix(problem)
+
     def numbers_kept(self, problem: Problem) -> float:
         """Return the numbers of all climbs."""
         return self.steps + 2.0 * self.starts * (4 * problem.transducers + 2 * problem.foci)

@@ -58,8 +58,8 @@ class Identify(Method):
 
     Attributes:
         evaluations: number of evaluations of a trial, > 2.3 M, or >= 2 with a prior. With fewer than 3 M - 1
-            the search takes long, and noise harms more. None: 64 with a prior, or else the larger of 64 and
-            4 M. More of them average noise.
+            noise harms more. None: 64 with a prior, or else the larger of 64 and 4 M. More of them average
+            noise.
         prior: what a simulation says of the transfer matrix.
     """
 

@@ -141,5 +141,7 @@ def known_matrix(problem: Problem) -> torch.Tensor:
     """Return the transfer matrix (P, M) [Pa] of a problem, which must have one."""
     if problem.transfer_matrix is None:
         accepted = 'must have a transfer matrix, as SimulatedObjective has in mode "transfer"'
+        if not scores_pressures(problem.goal):
+            accepted += "; without one of what a sensor reads, take gabs or bayes_opt, which see scores alone"
         raise invalid("objective", None, accepted)
     return problem.transfer_matrix

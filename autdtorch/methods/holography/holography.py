@@ -54,6 +54,11 @@ class Holography(Method):
     free_amplitudes: bool = setting(False, boolean)
     starts: int = whole(1, least=1)
 
+    def check(self, problem: Problem) -> None:
+        """Check that the problem has a transfer matrix, and a goal of pressures."""
+        require_pressures(problem, self.name)
+        known_matrix(problem)
+
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Compute the drive, and observe it."""
         matrix = known_matrix(problem)
