@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from autdtorch.hardware.camera.frames import Degrees, Frame, FrameSource
 from autdtorch.hardware.camera.heat import HeatInversion
@@ -307,8 +308,7 @@ def _shows(image: Degrees) -> bool:
 
 def _flashes(medians: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which of the frames' medians (T,) are off those of their neighbours."""
-    padded = np.pad(medians, 2, mode="reflect") if len(medians) > 2 else np.pad(medians, 2, mode="edge")
-    usual = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
+    usual = median_filter(medians, 5, mode="mirror" if len(medians) > 2 else "nearest")
     return np.asarray(np.abs(medians - usual) > _FLASH)
 
 
