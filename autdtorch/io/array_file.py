@@ -99,7 +99,6 @@ def _from_csv(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def _names(values: Array) -> list[str]:
-    """Return the names of columns without header."""
     names = [*PLACE_COLUMNS, *NORMAL_COLUMNS]
     if values.shape[1] not in (3, 6):
         accepted = (

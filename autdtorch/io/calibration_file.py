@@ -184,7 +184,6 @@ def _digest(arrays: Mapping[str, AnyArray]) -> str:
 
 
 def _scene_files(scene: Scene) -> dict[str, AnyArray]:
-    """Return the bytes of the files of a scene, by their names."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         save_scene(folder / _SCENE_FILE, scene)

@@ -248,7 +248,6 @@ def without_index(rows: CsvRows) -> CsvRows:
 
 
 def _header(rows: CsvRows, columns: Mapping[str, str]) -> list[Column]:
-    """Return the columns that the first line names."""
     line, cells = rows.lines[0]
     where = f"{rows.path}, line {line}"
     header = [_column(where, cell, columns) for cell in cells]

@@ -182,7 +182,6 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
 
 
 def _from_arrays(path: Path, arrays: Mapping[str, AnyArray]) -> torch.Tensor:
-    """Return the drive or the frames of the arrays of a file."""
     if "device" in arrays:
         name = str(arrays["device"])
         require_one_of(f"{path}: device", name, DEVICES)

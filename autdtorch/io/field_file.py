@@ -130,9 +130,12 @@ def _write_vti(path: Path, pressure: torch.Tensor, grid: _Grid, frequency: float
     image.GetFieldData().AddArray(_named("frequency", np.array([frequency])))
     writer = vtkXMLImageDataWriter()
     writer.SetInputData(image)
-    writer.WriteToOutputStringOn()  # Python's errors of a full disk name the file
-    writer.Write()
-    path.write_text(writer.GetOutputString(), encoding="ascii")
+    writer.SetFileName(str(path))
+    writer.SetHeaderTypeToUInt64()
+    writer.SetCompressorTypeToNone()  # takes ten times as long
+    writer.EncodeAppendedDataOff()
+    if not writer.Write():
+        raise OSError("VTK could not write the file")
 
 
 def _named(name: str, values: Array) -> Any:

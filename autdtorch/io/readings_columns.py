@@ -202,7 +202,6 @@ def _column(index: int, title: str, what: str | None = None) -> ReadingColumn | 
 
 
 def _quantity(names: set[str]) -> str | None:
-    """Return the quantity that the words of a name stand for."""
     axes = names & {"x", "y", "z"}
     if len(axes) == 1 and names <= {*axes, "point", "position", "pos"}:
         return axes.pop()

@@ -275,7 +275,6 @@ def _without_rigid(
 
 
 def _uniform_elements(materials: Materials, stencil: Stencil) -> InterfaceElements:
-    """Return an element of each material."""
     losses, count = materials.losses, len(materials.density)
     loss = np.zeros((count, 0))
     if losses is not None:

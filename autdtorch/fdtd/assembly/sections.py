@@ -201,7 +201,6 @@ def plane_fields(section: Section, mobility: Array, count: int) -> PlaneFields:
 
 
 def _places_of_vertices(nodes: Array, size: int) -> Index:
-    """Return the indices of the vertices of elements among the nodes along an axis."""
     return np.searchsorted(nodes, np.arange(-RING, size + RING + 1) - _ROUNDING)
 
 
