@@ -79,7 +79,7 @@ class BoxScatterer:
     ) -> list[SteadyState]:
         """Simulate the answers to forces (h, R) until all that is observed has converged.
 
-        By default, these are the amplitudes of the Huygens surface.
+        They are phasors of some cells. By default, the amplitudes of the Huygens surface are observed.
         """
         box, cells, plan = self.transform.box, self.transform.cells, self.plan
         # without those of obstacles of air, and of drives that cancel
@@ -117,7 +117,10 @@ class BoxScatterer:
         return self.transform.amplitudes(phasors)
 
     def incoming(self, other: BoxScatterer, outgoing: torch.Tensor) -> torch.Tensor | None:
-        """Return the forces (h, R) of what a Huygens surface radiates to this box, its own by mirrors."""
+        """Return the forces (h, R) of what a Huygens surface radiates to this box; None if nothing comes.
+
+        Its own comes back by mirrors, as far as its runs do not include that.
+        """
         box, here = other.transform.box, self.transform.box
         if other is self and not self.comes_back_later:
             return None

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import Protocol, Self
 
 import numpy as np
 import torch
 
 from autdtorch.fdtd.grouping import MOST_PASSES
 from autdtorch.fdtd.steady_state import Observe, SteadyState
+from autdtorch.propagators.box_scatterer import BoxScatterer
 from autdtorch.utils.array_types import REAL
 
 logger = logging.getLogger(__name__)
@@ -40,27 +40,8 @@ _NOISE = 1e-4
 """Singular values, relative to the largest, that are noise of runs: those of orders without news."""
 
 
-class Scatterer(Protocol):
-    """A body whose answers are simulated, as phasors (k, R) of some of its cells."""
-
-    def answers(self, incoming: torch.Tensor, tolerances: Sequence[float]) -> list[SteadyState]:
-        """Simulate the answers to incoming waves (n, R) of R runs."""
-        ...
-
-    def outgoing(self, phasors: torch.Tensor) -> torch.Tensor:
-        """Return outgoing waves (m, R) of phasors (k, R)."""
-        ...
-
-    def incoming(self, other: Self, outgoing: torch.Tensor) -> torch.Tensor | None:
-        """Return the waves (n, R) that come in from outgoing ones (m, R); None if none do.
-
-        From a body to itself, they are those that reflectors send back and that its runs do not include.
-        """
-        ...
-
-
 def iterated(
-    bodies: Sequence[Scatterer],
+    bodies: Sequence[BoxScatterer],
     incident: Sequence[torch.Tensor],
     observe: Observe,
     floors: torch.Tensor,

@@ -25,17 +25,9 @@ from autdtorch.propagators.tmatrix.bodies import waves_to_simulate
 from autdtorch.scene.arrays import apertures_of, radii_of
 from autdtorch.scene.obstacles import Mesh, Obstacle
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.array_types import REAL
 from autdtorch.utils.process import cached_property, require_memory
 from autdtorch.utils.units import warn_user
-from autdtorch.utils.validation import (
-    LENGTH_TOLERANCE,
-    integer_at_least,
-    invalid,
-    positive,
-    require_kind,
-    require_one_of,
-)
+from autdtorch.utils.validation import integer_at_least, invalid, positive, require_kind, require_one_of
 
 logger = logging.getLogger(__name__)
 
@@ -58,8 +50,6 @@ _NEAR_RIGID = 1.4
 
 _NO_EFFECT = ("observation_plane", "name")
 """Scene fields that do not affect the pressure; left out of keys."""
-
-_SIDES = torch.tensor([-1.0, 1.0], **REAL)
 
 
 @dataclass(frozen=True)
@@ -241,17 +231,10 @@ def plan(
 ) -> Plan:
     """Plan a simulation, with the arguments of `make_propagator`; no spacing gives the coarsest."""
     require_kind("scene", scene, Scene)
-    region, kernel, precision = region_of(scene), available_kernel(kernel, device), precision_of(dtype)
+    kernel, precision = available_kernel(kernel, device), precision_of(dtype)
     tolerance = positive("tolerance", tolerance)
     if tolerance >= 1:
         raise invalid("tolerance", tolerance, "must be in (0, 1)")
-    if spacing is None:
-        spacing, most = region.coarsest_spacing, _TAKEN_AS_RIGID * tolerance
-    else:
-        spacing = positive("spacing", spacing, "m")
-        on_cells = _RIGID_ON_CELLS * (spacing / region.wavelength) ** 2
-        most = tolerance * min(max(on_cells / tolerance, 1.0), _MOST_RIGID)
-    region = with_rigid(region, most)
     max_periods = integer_at_least("max_periods", max_periods, 1)
     time_step = None if time_step is None else positive("time_step", time_step, "s")
     if isinstance(method, str) and method == "operator":
@@ -260,21 +243,42 @@ def plan(
     require_one_of("method", method, ("auto", "free_space", "box", "full", "tmatrix"))
     if method in ("box", "tmatrix") and not scene.obstacles:
         raise invalid("method", method, "needs a scene with obstacles; take free_space")
-    if method == "auto" and not scene.obstacles:
+    region = region_of(scene)
+    cell = region.coarsest_spacing if spacing is None else positive("spacing", spacing, "m")
+    region = with_rigid(region, _largest_rigid_error(region.wavelength, spacing, tolerance))
+    method, runs, grids = _chosen(scene, region, method, cell, tolerance)
+    settings = cell, tolerance, kernel, precision, max_periods, time_step
+    return Plan(scene, region, method, *settings, runs, grids)
+
+
+def _largest_rigid_error(wavelength: float, spacing: float | None, tolerance: float) -> float:
+    """Return the difference up to which bodies are taken as rigid."""
+    if spacing is None:
+        return _TAKEN_AS_RIGID * tolerance
+    on_cells = _RIGID_ON_CELLS * (spacing / wavelength) ** 2
+    return tolerance * min(max(on_cells / tolerance, 1.0), _MOST_RIGID)
+
+
+def _chosen(
+    scene: Scene, region: Region, method: str, spacing: float, tolerance: float
+) -> tuple[str, int, Grouping | None]:
+    """Return the method, its number of runs, and its grids where it was chosen by their costs."""
+    is_open, runs = method == "auto", min(len(scene.control_points), len(scene.array))
+    if is_open and not scene.obstacles:
         logger.debug("method auto: free_space (no obstacles)")
         method = "free_space"
-    runs, grouping = min(len(scene.control_points), len(scene.array)), Grouping()
-    if method != "free_space":
-        region.require_spacing(spacing)
-        by_waves, (chosen, grouping) = None, choose_grids(region, method, spacing, tolerance, runs)
-        if method == "tmatrix" or (method == "auto" and not any(body.continued for body in region.bodies)):
-            by_waves = waves_to_simulate(scene, tolerance, runs if method == "auto" else None)
-        if method == "auto" and by_waves is not None:
-            logger.debug("method auto: tmatrix; %d waves, where %s takes %d runs", by_waves, chosen, runs)
-        method, runs = (chosen, runs) if by_waves is None else ("tmatrix", by_waves)
-    return Plan(
-        scene, region, method, spacing, tolerance, kernel, precision, max_periods, time_step, runs, grouping
-    )
+    if method == "free_space":
+        return method, runs, Grouping()
+    region.require_spacing(spacing)
+    if method == "tmatrix" or (is_open and not any(body.continued for body in region.bodies)):
+        waves = waves_to_simulate(scene, tolerance, runs if is_open else None)
+        if waves is not None:
+            logger.debug("method %s: tmatrix; %d waves, where grids take %d runs", method, waves, runs)
+            return "tmatrix", waves, None
+    if not is_open:
+        return method, runs, None
+    method, grids = choose_grids(region, method, spacing, tolerance, runs)
+    return method, runs, grids
 
 
 def region_of(scene: Scene) -> Region:
@@ -354,43 +358,3 @@ def walls_of(scene: Scene) -> list[tuple[bool, bool]]:
         if continued and ends:
             normal = ends[0]
     return walls
-
-
-def in_rigid(region: Region, points: torch.Tensor) -> torch.Tensor:
-    """Return which points (N, 3) [m] are in rigid bodies, bool (N,); of overlapping bodies the later counts.
-
-    A point on a surface is in the air, if there is air next to it: where rigid bodies touch there is none.
-    """
-    rigid = _in_rigid(region, points, LENGTH_TOLERANCE)
-    place = rigid.nonzero()[:, 0]
-    place = place[_on_surfaces(region, points[place])]
-    around = points[place, None] + 2 * LENGTH_TOLERANCE * torch.cartesian_prod(*[_SIDES] * 3)
-    for mirror in region.mirrors:  # behind it is the image of what is in front
-        behind = mirror.height(around).clamp(max=0.0)
-        around = around - 2 * behind[..., None] * around.new_tensor(mirror.normal)
-    rigid[place] = _in_rigid(region, around.reshape(-1, 3)).reshape(around.shape[:2]).all(dim=1)
-    return rigid
-
-
-def _in_rigid(region: Region, points: torch.Tensor, margin: float = 0.0) -> torch.Tensor:
-    """Return which points (N, 3) [m] are in rigid bodies that are enlarged by a margin [m]."""
-    rigid = torch.zeros(len(points), dtype=torch.bool, device="cpu")
-    for body in region.bodies:
-        inside = cast(Obstacle, body.shape).contains(points, margin)
-        rigid = torch.where(inside, body.fluid is None, rigid)
-    return rigid
-
-
-def _on_surfaces(region: Region, points: torch.Tensor) -> torch.Tensor:
-    """Return which points (N, 3) [m] are on the surface of a body, bool (N,)."""
-    on = torch.zeros(len(points), dtype=torch.bool, device="cpu")
-    for body in region.bodies:
-        on |= on_surface(cast(Obstacle, body.shape), points)
-    return on
-
-
-def on_surface(obstacle: Obstacle, points: torch.Tensor) -> torch.Tensor:
-    """Return which points (..., 3) [m] are on the surface of an obstacle, bool (...)."""
-    on = obstacle.near(points)
-    on[on.clone()] = obstacle.signed_distance(points[on]).abs() <= LENGTH_TOLERANCE
-    return on

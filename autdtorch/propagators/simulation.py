@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, Self, TypeVar, cast
+from typing import NamedTuple, Self, TypeVar
 
 import torch
 
@@ -25,10 +25,10 @@ from autdtorch.propagators.absorbed_power import (
     power_into_reflectors,
     radiators_of_array,
 )
-from autdtorch.propagators.plan import Plan, in_rigid, on_surface
+from autdtorch.propagators.plan import Plan
+from autdtorch.propagators.silent_points import in_filled_cavities, in_rigid
 from autdtorch.propagators.store import Store
 from autdtorch.scene.arrays import apertures_of, complex_strengths_of
-from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.digest import digest_of
@@ -279,14 +279,8 @@ class Simulation(ABC):
 
     def enclosed(self, points: torch.Tensor) -> torch.Tensor:
         """Return which points (..., 3) are in air that rigid obstacles enclose."""
-        enclosed = self._in_enclosed_cells(points)
-        for obstacle, body in zip(self.plan.scene.obstacles, self.plan.region.bodies, strict=True):
-            if body.shape is not obstacle:  # its cavities are filled
-                filled = cast(Obstacle, body.shape)
-                inside = filled.contains(points) & ~obstacle.contains(points)
-                inside[inside.clone()] = ~on_surface(filled, points[inside])  # where rounding would decide
-                enclosed = enclosed | inside
-        return enclosed
+        filled = in_filled_cavities(self.plan.scene, self.plan.region, points)
+        return filled | self._in_enclosed_cells(points)
 
     def _loaded(self, key: str, points: torch.Tensor) -> PressureMap | None:
         """Return the transfer matrix of unit strengths that an earlier process saved, if it is there."""

@@ -35,6 +35,17 @@ def test_the_cheapest_accurate_method_is_chosen(obstacle, method):
     assert plan(small_scene((obstacle,))).method == method
 
 
+@pytest.mark.parametrize("method", ["auto", "tmatrix", "box", "full"])
+def test_grids_are_chosen_where_they_are_used(method, monkeypatch):
+    def choose_grids(*_):
+        raise AssertionError("grids that nobody has asked for")
+
+    monkeypatch.setattr("autdtorch.propagators.plan.choose_grids", choose_grids)
+    scene = small_scene((BALL,))
+    planned = plan(scene, method)  # "auto" takes the T-matrix of a sphere
+    assert planned.of(replace(scene, frequency=39e3)).at(2e-3, 1e-2).method == planned.method
+
+
 def test_the_domain_of_a_box_may_be_too_large_for_full():
     scene = replace(small_scene((CUBE,)), domain=((-2, -2, -2), (2, 2, 2)))
     assert at.make_propagator(scene, spacing=2e-3).method == "box"  # 8e9 cells

@@ -12,7 +12,8 @@ from small_meshes import ball, inverted, merged
 from small_scenes import relative_error
 
 import autdtorch as at
-from autdtorch.propagators.plan import in_rigid, region_of
+from autdtorch.propagators.plan import region_of
+from autdtorch.propagators.silent_points import in_rigid
 from autdtorch.scene.geometry import rotation_matrix
 
 AIR = at.Medium(1.2, 343.0)

@@ -27,7 +27,7 @@ from autdtorch.analytic.spherical_waves import (
     regular_waves,
     sphere_coefficients,
 )
-from autdtorch.fdtd.grouping import USUAL_PERIODS, Grouping, one_box
+from autdtorch.fdtd.grouping import USUAL_PERIODS, one_box
 from autdtorch.fdtd.kernels import make_kernel
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.scattered_field import ScatteredField
@@ -120,7 +120,7 @@ class StillBody:
     @cached_property
     def axes(self) -> torch.Tensor:
         """The axes of the grid, along which waves are taken: the columns of a matrix (3, 3)."""
-        return torch.from_numpy(self._grouping.grids[0].axes).mT.contiguous()
+        return torch.from_numpy(self._plan.grouping.grids[0].axes).mT.contiguous()
 
     @cached_property
     def runs(self) -> list[list[int]]:
@@ -167,15 +167,12 @@ class StillBody:
 
     @cached_property
     def _plan(self) -> Plan:
-        return plan(self.scene, "box", *self.solver)
-
-    @cached_property
-    def _grouping(self) -> Grouping:
-        return one_box(self._plan.region, self._plan.spacing)
+        chosen = plan(self.scene, "box", *self.solver)
+        return replace(chosen, grids=one_box(chosen.region, chosen.spacing))
 
     @cached_property
     def _box(self) -> ScatteredField:
-        return BoxSimulation(replace(self._plan, grids=self._grouping), Store()).boxes[0]
+        return BoxSimulation(self._plan, Store()).boxes[0]
 
     @cached_property
     def _kinds(self) -> torch.Tensor:

@@ -15,7 +15,7 @@ import functools
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 
@@ -108,34 +108,12 @@ def solved(maps: Sequence[torch.Tensor], ways: Ways, incident: Sequence[torch.Te
     return sweep.after(carried, incident)
 
 
-class _System(Protocol):
-    """A system x = start + K x, of tensors that it depends on."""
-
-    @property
-    def tensors(self) -> list[torch.Tensor]: ...
-
-    def of(self, tensors: Sequence[torch.Tensor]) -> Self:
-        """Return the system of other tensors."""
-        ...
-
-    def start(self) -> torch.Tensor: ...
-
-    def linear(self, x: torch.Tensor) -> torch.Tensor:
-        """Return K x."""
-        ...
-
-    def adjoint(self, x: torch.Tensor) -> torch.Tensor:
-        """Return K^H x."""
-        ...
-
-    def step(self, x: torch.Tensor) -> torch.Tensor:
-        """Return start + K x."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class _Sweep:
-    """A step for one body after the other; its unknowns are the waves of those that send to earlier ones."""
+    """A system x = start + K x: a step for one body after the other.
+
+    Its unknowns are the waves of those that send to earlier ones. `tensors` are all that it depends on.
+    """
 
     maps: list[torch.Tensor]
     ways: Ways
@@ -154,6 +132,7 @@ class _Sweep:
         return [*self.maps, *self.incident, *frames]
 
     def of(self, tensors: Sequence[torch.Tensor]) -> _Sweep:
+        """Return the system of other tensors."""
         count, rest = len(self.maps), iter(tensors[2 * len(self.maps) :])
 
         def placed(way: Way) -> Way:
@@ -171,9 +150,11 @@ class _Sweep:
         return self._next(self.after(None, self.incident))
 
     def linear(self, x: torch.Tensor) -> torch.Tensor:
+        """Return K x."""
         return self._next(self.after(x, None))
 
     def adjoint(self, x: torch.Tensor) -> torch.Tensor:
+        """Return K^H x."""
         later: list[torch.Tensor | None] = self._sent(x)  # by waves after the step
         before: list[torch.Tensor | None] = [None] * len(self.maps)
         for number, matrix in reversed(list(enumerate(self.maps))):
@@ -190,6 +171,7 @@ class _Sweep:
         return torch.cat([waves for body in self.carried if (waves := before[body]) is not None])
 
     def step(self, x: torch.Tensor) -> torch.Tensor:
+        """Return start + K x."""
         return self._next(self.after(x, self.incident))
 
     def _sent(self, x: torch.Tensor) -> list[torch.Tensor | None]:
@@ -291,6 +273,9 @@ class _Adjoint:
 
     def step(self, x: torch.Tensor) -> torch.Tensor:
         return self.gradient + self.linear(x)
+
+
+_System: TypeAlias = _Sweep | _Adjoint
 
 
 class _Fixed(torch.autograd.Function):
