@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.sparse import csr_array
 
 from autdtorch.analytic.green import directivity
 from autdtorch.fdtd.assembly.heterogeneous import LossyCells
@@ -125,32 +124,38 @@ def _half_sphere(degree: int, mirror: Mirror, count: int) -> Iterator[tuple[torc
 
 @dataclass(frozen=True)
 class Absorption:
-    """The absorbed power of K bodies on a grid, a form of the pressure in their cells."""
+    """The power that obstacles absorb on a grid, a form of the pressure in its cells.
 
-    cells: Index  # flat indices (k,) of the cells whose phasors are needed, ascending
-    body: Index  # number of the body that each lossy cell belongs to (l,)
-    bodies: int  # K
-    place: Index  # places of the lossy cells and their neighbours among the cells (l, 27)
-    mass: Array  # power [W/Pa^2] by the squared pressure of each lossy cell (l,)
-    coupling: Array  # by squared differences of pressure from its neighbours (l, 27)
+    Attributes:
+        cells: flat indices (k,) of the cells whose phasors are needed, ascending.
+        places: of these cells (k, 3) [m].
+        obstacle: number of the obstacle that each lossy cell belongs to, or to its image (l,).
+        around: places of the lossy cells and their neighbours among the cells (l, 27).
+        mass: power [W/Pa^2] by the squared pressure of each lossy cell (l,).
+        coupling: by squared differences of pressure from its neighbours (l, 27).
+    """
 
-    def power(self, phasors: torch.Tensor) -> torch.Tensor:
-        """Return the power (K, R) [W] that each body absorbs, from phasors (k, R) [Pa] of the total field."""
+    cells: Index
+    places: torch.Tensor
+    obstacle: Index
+    around: Index
+    mass: Array
+    coupling: Array
+
+    def power(self, phasors: torch.Tensor, count: int) -> torch.Tensor:
+        """Return the power (count, R) [W] of so many obstacles, from phasors (k, R) [Pa]."""
         pressure = phasors.numpy()
-        power = self.mass[:, None] * np.abs(pressure[self.place[:, 13]]) ** 2
-        for column, neighbour in zip(self.coupling.T, self.place.T, strict=True):
-            power += column[:, None] * np.abs(pressure[neighbour] - pressure[self.place[:, 13]]) ** 2
-        return torch.from_numpy(self._sums @ power)
-
-    @property
-    def _sums(self) -> csr_array:
-        """The matrix (K, l) that sums over the cells of each body."""
-        places = self.body, np.arange(len(self.body))
-        return csr_array((np.ones(len(self.body)), places), (self.bodies, len(self.body)))
+        power = self.mass[:, None] * np.abs(pressure[self.around[:, 13]]) ** 2
+        for column, neighbour in zip(self.coupling.T, self.around.T, strict=True):
+            power += column[:, None] * np.abs(pressure[neighbour] - pressure[self.around[:, 13]]) ** 2
+        total = torch.zeros((count, power.shape[1]), **REAL)
+        return total.index_add(0, torch.from_numpy(self.obstacle), torch.from_numpy(power))
 
 
-def absorption(assembly: Assembly, region: Region, axes: Array | None = None) -> Absorption:
-    """Return the absorption of a region's bodies on a grid.
+def absorption(
+    assembly: Assembly, region: Region, mirrors: Sequence[object] = (), axes: Array | None = None
+) -> Absorption:
+    """Return the absorption of a region's bodies on a grid, without that of their images in some mirrors.
 
     A cell belongs to one body, see `_owners`. `axes` are those of a turned grid, one a row (3, 3).
     """
@@ -162,15 +167,17 @@ def absorption(assembly: Assembly, region: Region, axes: Array | None = None) ->
     used, place = np.unique(around, return_inverse=True)
     # on the grid the flow of a wave of unit pressure is less than in air by slope / 2 kappa
     watts = grid.spacing / (2 * 2 * np.pi * region.frequency * region.fluid.density.real)
-    watts *= 2 * stencil.kappa / stencil.slope.real
-    places = grid.centers_of(index)
+    watts *= 2 * stencil.kappa / stencil.slope.real * 0.5 ** len(mirrors)
     turned = np.eye(3) if axes is None else axes
-    body, nearest = _owners(torch.from_numpy(places @ turned), region, turned, grid.spacing)
+    places = torch.from_numpy(grid.centers_of(index) @ turned)
+    body, nearest = _owners(places, region, turned, grid.spacing)
     # of a fluid the mass also absorbs as air does, which its losses leave out
     in_fluid = np.array([each.fluid is not None for each in region.bodies], bool)[nearest]
     mass = losses.mass + np.where(in_fluid, stencil.loss * cells.mass[losses.place], 0)
+    obstacle = np.array([each.number for each in region.bodies], np.int64)[body]
+    everywhere = torch.from_numpy(grid.centers_of(used) @ turned)
     return Absorption(
-        used, body, len(region.bodies), place.reshape(around.shape), watts * mass, watts / 2 * losses.coupling
+        used, everywhere, obstacle, place.reshape(around.shape), watts * mass, watts / 2 * losses.coupling
     )
 
 

@@ -28,19 +28,12 @@ from autdtorch.fdtd.steady_state import MOST_JUDGED, Observe
 from autdtorch.fdtd.stepping import Assembly, assemble_on
 from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_array, orbits_of_transducers
 from autdtorch.fdtd.turning import is_tilted
-from autdtorch.propagators.absorbed_power import Radiators, absorption
+from autdtorch.propagators.absorbed_power import Absorption, Radiators, absorption
 from autdtorch.propagators.box_scatterer import BoxScatterer, Couplings
 from autdtorch.propagators.multiple_scattering import iterated
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.radiation import Judged, Radiation, Solved, spread_runs
-from autdtorch.propagators.simulation import (
-    AbsorbingCells,
-    PressureMap,
-    Run,
-    Simulation,
-    Stepped,
-    mean_of_images,
-)
+from autdtorch.propagators.simulation import PressureMap, Run, Simulation, Stepped, mean_of_images
 from autdtorch.propagators.store import BODIES, MOST_BYTES, Store, key_of
 from autdtorch.scene.checks import require_clear
 from autdtorch.scene.geometry import sphere_points
@@ -57,6 +50,9 @@ from autdtorch.utils.process import cached_property, one_library_thread
 logger = logging.getLogger(__name__)
 
 _ENTRY_BYTES = torch.complex128.itemsize
+
+Drive = tuple[Apertures, torch.Tensor]
+"""Drive: the sources of a run and their strengths (N,) [Pa m], with all images."""
 
 
 class BoxSimulation(Simulation):
@@ -114,13 +110,10 @@ class BoxSimulation(Simulation):
         return Couplings(self.plan.region.mirrors)
 
     @cached_property
-    def absorptions(self) -> Sequence[AbsorbingCells]:
-        """The cells of each box that absorb."""
-        result = []
-        for box, grid in zip(self.boxes, self.plan.grouping.grids, strict=True):
-            form = absorption(box.assembly, grid.part, box.axes)
-            result.append(AbsorbingCells.of(form, box.positions(form.cells), grid.part, box.mirrors))
-        return result
+    def absorptions(self) -> Sequence[Absorption]:
+        """The absorption of the obstacles in each box."""
+        pairs = zip(self.boxes, self.plan.grouping.grids, strict=True)
+        return [absorption(box.assembly, grid.part, box.mirrors, box.axes) for box, grid in pairs]
 
     def radiators(self, drive: torch.Tensor) -> list[Radiators]:
         """Return the Huygens surfaces as monopoles, in runs of drives (R, M)."""
@@ -237,36 +230,38 @@ class BoxSimulation(Simulation):
     ) -> PressureMap:
         """Return the pressure of K drives at points (P, 3) that their radiation reaches."""
         receivers, weights = self.seen_twice(Apertures(points))
-        pressure = self._incident(sources, strength, receivers) + radiation.pressure(receivers)
+        drives = self._with_images(sources, strength)
+        pressure = self._incident(drives, receivers) + radiation.pressure(receivers)
         pressure = mean_of_images(pressure, weights)
         return PressureMap.of_runs(pressure, radiation.runs, from_points=False)
 
-    def _incident(
-        self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures
-    ) -> torch.Tensor:
-        """Return the incident field (P, R) [Pa] at P receivers in R runs; see `_run`."""
-        drives = [self.imaged(*drive) for drive in zip(sources, strength, strict=True)]
+    def _with_images(self, sources: Sequence[Apertures], strength: torch.Tensor) -> list[Drive]:
+        """Return the sources of runs, and their strengths, with those of all images."""
+        return [self.imaged(*drive) for drive in zip(sources, strength, strict=True)]
+
+    def _incident(self, drives: Sequence[Drive], receivers: Apertures) -> torch.Tensor:
+        """Return the incident field (P, R) [Pa] at P receivers in R runs."""
         return torch.stack([self.boxes[0].incident(receivers.places, *drive) for drive in drives], dim=1)
 
     def _simulate(
         self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures, stepped: Stepped
     ) -> tuple[torch.Tensor, list[Run]]:
         solved, runs = self._solved(sources, strength, Judged.of(receivers), stepped)
-        total = self._incident(sources, strength, receivers) + solved.pressure
-        return total.mT, runs
+        incident = self._incident(self._with_images(sources, strength), receivers)
+        return (incident + solved.pressure).mT, runs
 
     def _solved(
         self, sources: Sequence[Apertures], strength: torch.Tensor, judged: Judged, stepped: Stepped
     ) -> tuple[Solved, list[Run]]:
         """Simulate R runs until the pressure at the judged receivers has converged; see `_run`."""
-        drives = [self.imaged(*drive) for drive in zip(sources, strength, strict=True)]
+        drives = self._with_images(sources, strength)
         transforms = [box.near_to_far(judged.receivers) for box in self.boxes]
         settings = self.plan, self._kernel, self._couplings, stepped
         bodies = [BoxScatterer(*settings, transform) for transform in transforms]
         single = len(bodies) == 1 and not bodies[0].comes_back_later
         observed = None  # of a short run, nothing
         if not (single and self.plan.is_short):
-            observed = self._observed(sources, strength, drives, judged, transforms)
+            observed = self._observed(drives, judged, transforms)
         begin, count, tolerance = time.perf_counter(), len(drives), self.plan.tolerance
         driving = [box.driving(drives) for box in self.boxes]
         if single:
@@ -284,23 +279,15 @@ class BoxSimulation(Simulation):
         return Solved(transforms, torch.split(phasors, sizes), runs), runs
 
     def _observed(
-        self,
-        sources: Sequence[Apertures],
-        strength: torch.Tensor,
-        drives: Sequence[tuple[Apertures, torch.Tensor]],
-        judged: Judged,
-        transforms: Sequence[NearToFar],
+        self, drives: Sequence[Drive], judged: Judged, transforms: Sequence[NearToFar]
     ) -> tuple[Observe, torch.Tensor]:
-        """Return what is observed of R runs, and the norms (Q, R) below which it counts as silence.
-
-        `drives` are the sources and strengths of the runs with those of their images.
-        """
+        """Return what is observed of R runs, and the norms (Q, R) below which it counts as silence."""
         receivers, every, groups = judged
         some = receivers.chosen(slice(None, None, every))
         sizes = [len(transform.cells) for transform in transforms]
         with self._kernels_compiled(self.assemblies[0].dtype):
             readings = [transform.matrices(every) for transform in transforms]
-            incident = self._incident(sources, strength, some)
+            incident = self._incident(drives, some)
         audible = (~self.silent(some.positions)).to(incident.dtype)[:, None]
         floors = [[self._silence(some.positions[group], *drive) for group in groups] for drive in drives]
         least = torch.tensor(floors, **REAL).mT.clamp(min=torch.finfo(torch.float64).tiny)

@@ -12,8 +12,8 @@ import torch
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.steady_state import MOST_JUDGED, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble
-from autdtorch.propagators.absorbed_power import Radiators, absorption
-from autdtorch.propagators.simulation import AbsorbingCells, Run, Simulation, Stepped
+from autdtorch.propagators.absorbed_power import Absorption, Radiators, absorption
+from autdtorch.propagators.simulation import Run, Simulation, Stepped
 from autdtorch.scene.checks import require_inside
 from autdtorch.scene.reflectors import require_in_front
 from autdtorch.utils.apertures import Apertures
@@ -38,12 +38,10 @@ class DomainSimulation(Simulation):
         return self.plan.region.mirrors
 
     @cached_property
-    def absorptions(self) -> Sequence[AbsorbingCells]:
-        """The cells of the domain that absorb."""
-        (assembly,), region = self.assemblies, self.plan.region
-        form = absorption(assembly, region.whole)
-        places = torch.from_numpy(assembly.grid.centers_of(form.cells))
-        return [AbsorbingCells.of(form, places, region.whole, region.mirrors)]
+    def absorptions(self) -> Sequence[Absorption]:
+        """The absorption of the obstacles in the domain."""
+        region = self.plan.region
+        return [absorption(self.assemblies[0], region.whole, region.mirrors)]
 
     def radiators(self, drive: torch.Tensor) -> list[Radiators]:
         """Return nothing: reflectors of a domain absorb nothing."""

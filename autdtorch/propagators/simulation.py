@@ -8,13 +8,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, Self, TypeVar
+from typing import TypeVar
 
 import torch
 
 from autdtorch.fdtd.grouping import USUAL_PERIODS
 from autdtorch.fdtd.kernels import make_kernel
-from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import SILENCE, SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_points, orbits_of_transducers, symmetries
@@ -104,27 +103,6 @@ def mean_of_images(pressure: torch.Tensor, weights: torch.Tensor | None) -> torc
     return (weights[..., None] * pressure.reshape(*weights.shape, -1)).sum(dim=0)
 
 
-class AbsorbingCells(NamedTuple):
-    """The cells of a grid that absorb.
-
-    Attributes:
-        form: the power as a form of their pressure.
-        places: of these cells (k, 3) [m].
-        owners: the obstacle that each body of the grid is, or is an image of.
-        share: what falls to an obstacle, and not to its images.
-    """
-
-    form: Absorption
-    places: torch.Tensor
-    owners: Sequence[int]
-    share: float
-
-    @classmethod
-    def of(cls, form: Absorption, places: torch.Tensor, region: Region, mirrors: Sequence[object]) -> Self:
-        """Return the cells of a grid of a region, in which bodies are with their images in some mirrors."""
-        return cls(form, places, [body.number for body in region.bodies], 0.5 ** len(mirrors))
-
-
 class Simulation(ABC):
     """A plan's grids, which are assembled at first use, and the runs on them.
 
@@ -165,8 +143,8 @@ class Simulation(ABC):
 
     @property
     @abstractmethod
-    def absorptions(self) -> Sequence[AbsorbingCells]:
-        """The cells of each grid that absorb."""
+    def absorptions(self) -> Sequence[Absorption]:
+        """The absorption of the obstacles on each grid."""
 
     @abstractmethod
     def radiators(self, drive: torch.Tensor) -> list[Radiators]:
@@ -216,20 +194,19 @@ class Simulation(ABC):
     def absorbed_power(self, drive: torch.Tensor) -> AbsorbedPower:
         """Simulate drives (R, M), none of them silent; return the power [W] by obstacle and reflector."""
         scene = self.plan.scene
-        obstacles = torch.zeros((len(drive), len(scene.obstacles)), **REAL)
-        places = torch.cat([each.places for each in self.absorptions])
-        if len(places):
-            sources, receivers = self.sources_of(drive), Apertures(places)
+        obstacles = torch.zeros((len(scene.obstacles), len(drive)), **REAL)
+        places = [each.places for each in self.absorptions]
+        if any(map(len, places)):
+            sources, receivers = self.sources_of(drive), Apertures(torch.cat(places))
             pressure, _ = self._recorded(
                 len(drive), lambda stepped: self._simulate(*sources, receivers, stepped)
             )
-            parts = torch.split(pressure.mT, [len(each.places) for each in self.absorptions])
+            parts = torch.split(pressure.mT, list(map(len, places)))
             for each, part in zip(self.absorptions, parts, strict=True):
-                for owner, power in zip(each.owners, each.form.power(part), strict=True):
-                    obstacles[:, owner] += each.share * power
+                obstacles += each.power(part, len(obstacles))
         absorbing = any(abs(reflector.reflection) < 1 for reflector in scene.reflectors)
-        parts_of = [radiators_of_array(scene, drive), *self.radiators(drive)] if absorbing else []
-        return AbsorbedPower(obstacles, power_into_reflectors(scene, parts_of, len(drive)))
+        radiators = [radiators_of_array(scene, drive), *self.radiators(drive)] if absorbing else []
+        return AbsorbedPower(obstacles.mT, power_into_reflectors(scene, radiators, len(drive)))
 
     def matrix_runs(self, points: torch.Tensor) -> int:
         """Return the number of runs that the transfer matrix of points (P, 3) takes."""
