@@ -44,7 +44,11 @@ def green(points: ArrayLike, sources: ArrayLike, wavenumber: complex) -> torch.T
     """
     targets = differentiable_points("points", points)
     origins = points_tensor("sources", sources).to(targets.device)
-    k, alpha = _wavenumber(wavenumber)
+    if isinstance(wavenumber, complex):
+        k = positive("wavenumber.real", wavenumber.real, "rad/m")
+        alpha = not_negative("wavenumber.imag", wavenumber.imag, "Np/m")
+    else:
+        k, alpha = positive("wavenumber", wavenumber, "rad/m"), 0.0
     r = distances(targets, origins)
     if r.detach().min() < LENGTH_TOLERANCE:
         point, source = divmod(int(r.argmin()), len(origins))
@@ -143,14 +147,6 @@ def piston_on_axis(distance: ArrayLike, wavenumber: float, radius: float) -> tor
     half_path = radius**2 / (rim + z) / 2
     amplitude = torch.sinc(wavenumber * half_path / math.pi) / (2 * math.pi * (rim + z))
     return amplitude * torch.exp(0.5j * wavenumber * (rim + z))
-
-
-def _wavenumber(value: complex) -> tuple[float, float]:
-    """Return wavenumber k and attenuation alpha of a complex wavenumber."""
-    if not isinstance(value, complex):
-        return positive("wavenumber", value, "rad/m"), 0.0
-    k = positive("wavenumber.real", value.real, "rad/m")
-    return k, not_negative("wavenumber.imag", value.imag, "Np/m")
 
 
 def _rim(size: float) -> list[tuple[float, float]]:

@@ -28,7 +28,7 @@ def linear_momentum(waves: torch.Tensor) -> torch.Tensor:
 
     `waves` are coefficients (..., N, R), all regular or all outgoing. Degrees above the highest are cut.
     """
-    degree = _degree(waves)
+    degree = math.isqrt(waves.shape[-2]) - 1
     above = torch.nn.functional.pad(waves, (0, 0, 0, 2 * degree + 3))  # the next degree
     return torch.stack(_along_axes(*_slopes(degree, above, -2)))
 
@@ -120,10 +120,6 @@ def _neighbours(waves: torch.Tensor, place: torch.Tensor, factor: torch.Tensor, 
     parts = [share.reshape(shape) * waves.index_select(dim, each) for each, share in pairs]
     total: torch.Tensor = functools.reduce(torch.add, parts)
     return total
-
-
-def _degree(waves: torch.Tensor) -> int:
-    return math.isqrt(waves.shape[-2]) - 1
 
 
 @functools.lru_cache(8)

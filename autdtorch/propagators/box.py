@@ -276,7 +276,7 @@ class BoxSimulation(Simulation):
         phasors = torch.stack([state.pressure for state in states]).mT
         runs = [Run.of(state, seconds) for state in states]
         sizes = [len(transform.cells) for transform in transforms]
-        return Solved(transforms, torch.split(phasors, sizes), runs), runs
+        return Solved(transforms, torch.split(phasors, sizes)), runs
 
     def _observed(
         self, drives: Sequence[Drive], judged: Judged, transforms: Sequence[NearToFar]

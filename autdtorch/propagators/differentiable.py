@@ -13,7 +13,7 @@ from autdtorch.fdtd.material_gradients import cells_of_maps, cells_of_obstacles,
 from autdtorch.fdtd.region import Region, require_fine, warn_if_coarse
 from autdtorch.fdtd.steady_state import SILENCE, block_of, blocks_needed, fewest_periods
 from autdtorch.fdtd.stepping import drive_dft, drive_signal
-from autdtorch.propagators.notices import warn_of_ending_walls, warn_of_few_periods, warn_of_near_points
+from autdtorch.propagators.notices import warn_of_ending_walls, warn_of_near_points, warn_of_no_steady_state
 from autdtorch.propagators.plan import region_of
 from autdtorch.scene.arrays import apertures_of, complex_strengths_of
 from autdtorch.scene.checks import require_inside
@@ -128,7 +128,8 @@ def differentiable_field(
         needs.append(blocks_needed(phasors, floor, _STEADY))
     residual, enough = max(needs)
     if residual > _STEADY:
-        warn_of_few_periods(blocks * block, residual, _STEADY, max(enough * block, usual))
+        advice = f"periods to about {max(enough * block, usual)}"
+        warn_of_no_steady_state(f"after {blocks * block} periods", residual, _STEADY, advice)
     return torch.cat(fields).reshape(*drive.shape[:-1], len(targets)).to(device_of(drive))
 
 

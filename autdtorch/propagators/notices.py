@@ -144,20 +144,17 @@ def warn_of_near_points(scene: Scene, name: str, points: torch.Tensor, spacing: 
 def warn_of_unsettled(runs: Sequence[Run], tolerance: float) -> None:
     """Warn of runs that did not converge."""
     if unsettled := [run for run in runs if not run.reached]:
-        periods, residual = max(run.periods for run in unsettled), max(run.remaining for run in unsettled)
-        warn_user(
-            f"no steady state after {periods} periods in {len(unsettled)} of {counted(len(runs), 'run')}"
-            f": estimated relative error up to {residual:.1e}, tolerance {tolerance:g}; raise "
-            "max_periods or tolerance", SteadyStateWarning,
-        )  # fmt: skip
+        what = f"after {max(run.periods for run in unsettled)} periods in {len(unsettled)} of"
+        residual = max(run.remaining for run in unsettled)
+        warn_of_no_steady_state(f"{what} {counted(len(runs), 'run')}", residual, tolerance)
 
 
-def warn_of_few_periods(periods: int, residual: float, tolerance: float, enough: int) -> None:
-    """Warn that a run of fixed length ended before its steady state; so many periods are expected to do."""
-    warn_user(
-        f"no steady state after {periods} periods: estimated relative error {residual:.1e}, tolerance "
-        f"{tolerance:g}; raise periods to about {enough}", SteadyStateWarning,
-    )  # fmt: skip
+def warn_of_no_steady_state(
+    what: str, residual: float, tolerance: float, advice: str = "max_periods or tolerance"
+) -> None:
+    """Warn that runs ended before their steady state; `what` tells when, and the advice what to raise."""
+    error = f"estimated relative error up to {residual:.1e}, tolerance {tolerance:g}"
+    warn_user(f"no steady state {what}: {error}; raise {advice}", SteadyStateWarning)
 
 
 def _in_mm(point: torch.Tensor) -> tuple[float, ...]:

@@ -68,7 +68,6 @@ class Solved(NamedTuple):
 
     transforms: Sequence[NearToFar]
     phasors: Sequence[torch.Tensor]
-    runs: list[Run]
 
     @property
     def pressure(self) -> torch.Tensor:

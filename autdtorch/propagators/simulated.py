@@ -112,7 +112,7 @@ class SimulatedPropagator(ScenePropagator):
     @property
     def planned_runs(self) -> int:
         """Number of simulations of the control points' transfer matrix."""
-        return self.simulation.matrix_runs(self.scene.control_points)
+        return self.simulation.orbits(self.scene.control_points).runs
 
     @one_library_thread()
     def _matrix(self, points: ArrayLike | None, with_error: bool) -> tuple[torch.Tensor, float]:
@@ -163,7 +163,7 @@ class SimulatedPropagator(ScenePropagator):
             self._notices.of_points(points)
         flat = drive.reshape(-1, drive.shape[-1])
         loud = flat.detach().any(dim=1)
-        by_matrix = drive.requires_grad or int(loud.sum()) > self.simulation.matrix_runs(points)
+        by_matrix = drive.requires_grad or int(loud.sum()) > self.simulation.orbits(points).runs
         rows = len(self.scene.array) if by_matrix else len(flat)
         require_memory("points", tuple(points.shape), PAIR_BYTES * rows * len(points))
         field = torch.zeros((len(flat), len(points)), **COMPLEX)

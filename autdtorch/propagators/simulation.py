@@ -208,10 +208,6 @@ class Simulation(ABC):
         radiators = [radiators_of_array(scene, drive), *self.radiators(drive)] if absorbing else []
         return AbsorbedPower(obstacles.mT, power_into_reflectors(scene, radiators, len(drive)))
 
-    def matrix_runs(self, points: torch.Tensor) -> int:
-        """Return the number of runs that the transfer matrix of points (P, 3) takes."""
-        return self.orbits(points).runs
-
     def orbits(self, points: torch.Tensor) -> Orbits:
         """Return the fewest runs for a transfer matrix: from transducers or, by reciprocity, from points."""
         forward = self._orbits_of_transducers(points)
@@ -332,8 +328,11 @@ class Simulation(ABC):
         self, count: int, simulate: Callable[[Stepped], tuple[ResultT, list[Run]]]
     ) -> tuple[ResultT, list[Run]]:
         """Simulate so many runs, show their progress and record them."""
-        self._refuse_enclosed_transducers()
         plan, grids = self.plan, [assembly.grid for assembly in self.assemblies]
+        for number in self._enclosed_transducers:
+            place = tuple(plan.scene.array.positions[number].tolist())
+            accepted = "is enclosed by rigid obstacles, which no sound leaves; must be outside"
+            raise invalid(f"array.positions[{number}]", place, accepted, "m")
         what = f"simulating {plan.scene.name}"
         settings = plan.method, 1e3 * plan.spacing, counted(count, "run")
         logger.debug("%s: %s, cells of %.3g mm, %s", what, *settings)
@@ -356,14 +355,8 @@ class Simulation(ABC):
         faintest = max(SILENCE, torch.finfo(self.plan.dtype).eps / self.plan.tolerance)
         return faintest * sources.loudest(points.mean(dim=1), strength, self.plan.spacing / 2)
 
-    def _refuse_enclosed_transducers(self) -> None:
-        if len(self._enclosed_transducers):
-            number = int(self._enclosed_transducers[0])
-            place = tuple(self.plan.scene.array.positions[number].tolist())
-            accepted = "is enclosed by rigid obstacles, which no sound leaves; must be outside"
-            raise invalid(f"array.positions[{number}]", place, accepted, "m")
-
     @cached_property
-    def _enclosed_transducers(self) -> torch.Tensor:
-        """Numbers (n,) of the transducers that rigid obstacles enclose."""
-        return self.enclosed(self.plan.scene.array.nodes.positions).any(dim=1).nonzero()[:, 0]
+    def _enclosed_transducers(self) -> list[int]:
+        """Numbers of the transducers that rigid obstacles enclose."""
+        enclosed = self.enclosed(self.plan.scene.array.nodes.positions).any(dim=1)
+        return list(map(int, enclosed.nonzero()))

@@ -270,7 +270,7 @@ def test_a_coarse_spacing_is_logged_once_for_all_obstacles(method, extent, caplo
     propagator = simulated(of_two_speeds(extent), method, 2.5e-3)
     assert len(propagator.simulation.assemblies) == (2 if method == "box" else 1)
     assert propagator._others[0].plan.spacing < propagator.spacing
-    assert propagator._others[0].matrix_runs(propagator.scene.control_points)
+    assert propagator._others[0].orbits(propagator.scene.control_points).runs
     (message,) = messages(caplog, "coarse")
     assert "2.5 mm" in message
     assert all(where in message for where in ("the medium", "obstacle 1", "obstacle 2"))

@@ -12,7 +12,6 @@ import torch
 
 from autdtorch.scene.obstacles import Obstacle, Sphere
 from autdtorch.scene.obstacles.moving import circumscribed
-from autdtorch.scene.reflectors import Reflector
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import LENGTH_TOLERANCE, invalid
 
@@ -76,13 +75,12 @@ def waves_to_simulate(scene: Scene, error: float, most: int | None = None) -> in
         if any(waves(max(np.subtract(obstacle.upper, obstacle.lower)) / 2) > most for obstacle in unknown):
             return None
     bodies = bodies_of(obstacles)
-    if crossed := [
-        number for number, reflector in enumerate(scene.reflectors) if not _in_front(reflector, bodies)
-    ]:
-        if most is not None:
-            return None
-        accepted = f"needs the spheres around obstacles to be in front of reflector {crossed[0]}; take box"
-        raise invalid("method", "tmatrix", accepted)
+    for number, reflector in enumerate(scene.reflectors):
+        if any(float(reflector.mirror.height(body.center)) < body.radius for body in bodies):
+            if most is not None:
+                return None
+            accepted = f"needs the spheres around obstacles to be in front of reflector {number}; take box"
+            raise invalid("method", "tmatrix", accepted)
     unknown_bodies = [body for body in bodies if not has_closed_form(body.obstacles)]
     simulated = sum(waves(body.radius) for body in unknown_bodies)
     if most is None:
@@ -96,11 +94,6 @@ def are_outside(points: torch.Tensor, bodies: Sequence[ObstacleGroup]) -> torch.
     """Return which points (P, 3) [m] are outside the spheres of all bodies."""
     apart = torch.stack([(points - body.center).norm(dim=1) - body.radius for body in bodies])
     return (apart > LENGTH_TOLERANCE).all(dim=0)
-
-
-def _in_front(reflector: Reflector, bodies: Sequence[ObstacleGroup]) -> bool:
-    """Return whether the spheres of bodies are in front of a reflector."""
-    return all(float(reflector.mirror.height(body.center)) >= body.radius for body in bodies)
 
 
 def _body(obstacles: Sequence[Obstacle], numbers: tuple[int, ...]) -> ObstacleGroup:

@@ -34,7 +34,7 @@ from autdtorch.fdtd.scattered_field import ScatteredField
 from autdtorch.fdtd.steady_state import MOST_JUDGED, fewest_periods, run_to_steady_state
 from autdtorch.fdtd.symmetry import symmetries
 from autdtorch.propagators.box import BoxSimulation
-from autdtorch.propagators.notices import SteadyStateWarning
+from autdtorch.propagators.notices import warn_of_no_steady_state
 from autdtorch.propagators.plan import Plan, plan
 from autdtorch.propagators.store import BODIES, Store, key_of
 from autdtorch.propagators.tmatrix.bodies import enough_degrees, has_closed_form
@@ -49,7 +49,6 @@ from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL, Index
 from autdtorch.utils.process import cached_property, one_library_thread, require_memory
 from autdtorch.utils.progress import show_progress
-from autdtorch.utils.units import warn_user
 
 logger = logging.getLogger(__name__)
 
@@ -224,12 +223,8 @@ class Placed(NamedTuple):
             simulated = BODIES.get(key, lambda: _loaded(body, key, store) or body.simulated())
             matrix, axes = simulated.matrix.clone(), simulated.axes
             if simulated.residual > body.solver.error:
-                warn_user(
-                    f"no steady state of the waves of a body after {body.solver.max_periods} periods: "
-                    f"estimated relative error up to {simulated.residual:.1e}, tolerance "
-                    f"{body.solver.error:g}; raise max_periods or tolerance",
-                    SteadyStateWarning,
-                )
+                what = f"of the waves of a body after {body.solver.max_periods} periods"
+                warn_of_no_steady_state(what, simulated.residual, body.solver.error)
             elif store.folder is not None and store.load(key, tuple(matrix.shape), 1) is None:
                 store.save(key, matrix.numpy(), simulated.residual)
         place = self.turn @ center + self.shift

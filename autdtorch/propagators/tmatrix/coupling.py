@@ -128,23 +128,21 @@ class _Sweep:
 
     @property
     def tensors(self) -> list[torch.Tensor]:
-        frames = [tensor for way in self._ways for frame in _frames(way) for tensor in frame[:2]]
-        return [*self.maps, *self.incident, *frames]
+        translations = (way.translation for row in self.ways for pair in row for way in pair)
+        frames = (frame for each in translations for frame in (each.here, each.there))
+        return [*self.maps, *self.incident, *(tensor for frame in frames for tensor in frame[:2])]
 
     def of(self, tensors: Sequence[torch.Tensor]) -> _Sweep:
         """Return the system of other tensors."""
         count, rest = len(self.maps), iter(tensors[2 * len(self.maps) :])
 
         def placed(way: Way) -> Way:
-            here, there = (WaveFrame(next(rest), next(rest), frame.degree) for frame in _frames(way))
+            frames = way.translation.here, way.translation.there
+            here, there = (WaveFrame(next(rest), next(rest), frame.degree) for frame in frames)
             return way._replace(translation=replace(way.translation, here=here, there=there))
 
         ways = [[[placed(way) for way in pair] for pair in row] for row in self.ways]
         return replace(self, maps=list(tensors[:count]), ways=ways, incident=list(tensors[count : 2 * count]))
-
-    @property
-    def _ways(self) -> list[Way]:
-        return [way for row in self.ways for pair in row for way in pair]
 
     def start(self) -> torch.Tensor:
         return self._next(self.after(None, self.incident))
@@ -242,10 +240,6 @@ def _scattered_by(
     maps = [block.matrix.mH if is_adjoint else block.matrix for block in blocks]
     products = torch.cat([each @ part for each, part in zip(maps, parts, strict=True)])
     return products.index_select(0, order.argsort()).reshape(waves.shape)
-
-
-def _frames(way: Way) -> tuple[WaveFrame, WaveFrame]:
-    return way.translation.here, way.translation.there
 
 
 @dataclass(frozen=True, eq=False)

@@ -106,13 +106,18 @@ class IncomingWaves:
     @property
     def matrix(self) -> torch.Tensor:
         """The coefficients (..., N, M) [Pa]."""
-        each = [(index, weight, _dense(waves).mT) for index, weight, waves in self.parts]
+        each = [
+            (index, weight, (waves.matrix if isinstance(waves, MeanWaves) else waves).mT)
+            for index, weight, waves in self.parts
+        ]
         return self._summed(each)
 
     def driven(self, drive: torch.Tensor) -> torch.Tensor:
         """Return the coefficients (..., R, N) [Pa] under drives (..., R, M)."""
-        strong = self.strengths * drive
-        each = [weight * _driven(waves, strong[..., index]) for index, weight, waves in self.parts]
+        every, each = self.strengths * drive, []
+        for index, weight, waves in self.parts:
+            strong = every[..., index]
+            each.append(weight * (waves.driven(strong) if isinstance(waves, MeanWaves) else strong @ waves))
         return torch.stack(each).sum(dim=0)
 
     def weighted(self, weights: torch.Tensor) -> torch.Tensor:
@@ -128,14 +133,6 @@ class IncomingWaves:
         for index, weight, part in parts:
             total = total.index_add(-1, index, weight * part)
         return self.strengths * total
-
-
-def _dense(waves: MeanWaves | torch.Tensor) -> torch.Tensor:
-    return waves.matrix if isinstance(waves, MeanWaves) else waves
-
-
-def _driven(waves: MeanWaves | torch.Tensor, drive: torch.Tensor) -> torch.Tensor:
-    return waves.driven(drive) if isinstance(waves, MeanWaves) else drive @ waves
 
 
 def _alike(array: TransducerArray) -> list[torch.Tensor]:

@@ -22,12 +22,6 @@ _AT_ONCE = 200_000
 """Waves at points that are computed at once: 3 MB, which fit into a cache."""
 
 
-def parts_of(points: torch.Tensor, waves: int) -> tuple[torch.Tensor, ...]:
-    """Return points (P, ..., 3) in parts, so that few of so many waves at them are in memory at once."""
-    each = points[0].numel() // 3
-    return torch.split(points, max(1, _AT_ONCE // (each * waves)))
-
-
 def scattered_field(
     bodies: Sequence[BodyMatrix],
     array: TransducerArray,
@@ -52,9 +46,8 @@ def scattered_field(
         scattered = together @ torch.cat(each, dim=-2)
     if scattered.ndim > 2:
         return waves_at(bodies, points, images) @ scattered
-    return torch.cat(
-        [waves_at(bodies, part, images) @ scattered for part in parts_of(points, len(scattered))]
-    )
+    few = max(1, _AT_ONCE // (points[0].numel() // 3 * len(scattered)))
+    return torch.cat([waves_at(bodies, part, images) @ scattered for part in torch.split(points, few)])
 
 
 def _weights(bodies: Sequence[BodyMatrix], waves: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:
@@ -146,18 +139,13 @@ def joined_on(
     """
     more, sizes = 2 * bodies[number].degree + 3, [len(body.matrix) for body in bodies]
     end = sum(sizes[: number + 1])
-    columns = _with_zeros(every.mT, end, more).mT
+    columns = torch.cat([every[:, :end], every.new_zeros(len(every), more), every[:, end:]], dim=1)
     sent = [part[:, None] for part in torch.split(columns, sizes)]
     echoes = received(ways_between(bodies, NO_MIRRORS, 1)[number], sent)
     sizes[number] += more
     direct = torch.split(torch.eye(sum(sizes), **COMPLEX), sizes)[number]
     outgoing = torch.nn.functional.pad(sent[number][:, 0], (0, 0, 0, more))
     return direct if echoes is None else direct + echoes[:, 0], outgoing
-
-
-def _with_zeros(rows: torch.Tensor, place: int, count: int) -> torch.Tensor:
-    """Return rows (N + count, K) with so many of zeros at a place."""
-    return torch.cat([rows[:place], rows.new_zeros(count, rows.shape[1]), rows[place:]])
 
 
 def waves_at(bodies: Sequence[BodyMatrix], points: torch.Tensor, images: Sequence[Image]) -> torch.Tensor:
