@@ -29,11 +29,11 @@ from autdtorch.analytic.spherical_waves import (
 )
 from autdtorch.fdtd.grouping import USUAL_PERIODS, one_box
 from autdtorch.fdtd.kernels import make_kernel
-from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.scattered_field import ScatteredField
-from autdtorch.fdtd.steady_state import MOST_JUDGED, fewest_periods, run_to_steady_state
+from autdtorch.fdtd.steady_state import MOST_JUDGED, fewest_periods
 from autdtorch.fdtd.symmetry import symmetries
 from autdtorch.propagators.box import BoxSimulation
+from autdtorch.propagators.box_scatterer import BoxScatterer, Couplings
 from autdtorch.propagators.notices import warn_of_no_steady_state
 from autdtorch.propagators.plan import Plan, plan
 from autdtorch.propagators.store import BODIES, Store, key_of
@@ -46,7 +46,7 @@ from autdtorch.scene.obstacles import Obstacle, Sphere
 from autdtorch.scene.obstacles.moving import at_rest, circumscribed, is_movable, shifted
 from autdtorch.scene.scene import OverlapWarning, ScaleWarning, Scene
 from autdtorch.utils.apertures import Apertures
-from autdtorch.utils.array_types import COMPLEX, REAL, Index
+from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.process import cached_property, one_library_thread, require_memory
 from autdtorch.utils.progress import show_progress
 
@@ -135,26 +135,21 @@ class StillBody:
         logger.debug("simulating a T-matrix: %d waves, cells of %.3g mm", size, spacing)
         if not len(self._box.assembly.heterogeneous.index):  # obstacles of the medium's own material
             return SimulatedT(torch.zeros((size, size), **COMPLEX), self.axes, 0.0)
-        box, plan, kernel = self._box, self._plan, make_kernel(self._plan.kernel)
+        box, plan, count = self._box, self._plan, len(self.runs)
         mixing = real_waves(self.degree)
         incoming = self._regular(box.driven) @ mixing
         strength = incoming.norm(dim=0).clamp_min(torch.finfo(torch.float64).tiny)
+        fields = [(incoming[:, waves] / strength[waves]).sum(dim=1) for waves in self.runs]
         outgoing = mixing.mH @ self._multipoles()
         judged = sphere_points((0.0, 0.0, 0.0), self.sphere[1], MOST_JUDGED)
         observed = outgoing_waves(self.degree, box.wavenumber, judged) @ mixing @ outgoing
-
-        def drive(runs: Index) -> Sources:
-            waves = (self.runs[run] for run in runs)
-            fields = [(incoming[:, some] / strength[some]).sum(dim=1) for some in waves]
-            return box.sources(box.forces(torch.stack(fields, dim=1)))
-
-        count = len(self.runs)
+        nowhere = box.near_to_far(Apertures.of_points(judged[:0]))
         periods = math.ceil(count * USUAL_PERIODS * fewest_periods(box.assembly.grid.arrival))
         with show_progress(periods, "simulating the waves of a body") as progress:
-            states = run_to_steady_state(
-                box.assembly, kernel, drive, box.surface.cells, [plan.tolerance] * count, plan.max_periods,
-                lambda phasors, runs: [observed @ phasors.cpu()], progress.advance,
-                torch.zeros((1, count), **REAL),
+            body = BoxScatterer(plan, make_kernel(plan.kernel), Couplings(()), progress.advance, nowhere)
+            states = body.answers(
+                box.forces(torch.stack(fields, dim=1)), [plan.tolerance] * count,
+                lambda phasors, _: [observed @ phasors.cpu()],
             )  # fmt: skip
         answers = outgoing @ torch.stack([steady.pressure for steady in states], dim=1).cpu()
         matrix, kinds = torch.zeros_like(mixing), self._kinds
