@@ -19,6 +19,7 @@ from typing import TypeAlias
 import torch
 
 from autdtorch.analytic.green import green
+from autdtorch.analytic.spherical_waves import bessel_slopes, counted
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.fluids import fluid_ratios, passive_impedance
 from autdtorch.utils.units import real_wavenumber
@@ -200,7 +201,7 @@ def _field_outside(
     x = setup.size
 
     def radial(kr: torch.Tensor, orders: int) -> torch.Tensor:
-        admittance, bessel, hankel = boundary(orders), _bessel_slopes(x, orders), _hankel_slopes(x, orders)
+        admittance, bessel, hankel = boundary(orders), bessel_slopes(x, orders), _hankel_slopes(x, orders)
         # A_n h_n(x)^2, with the Wronskian j_n h_n (h_n'/h_n - j_n'/j_n) = i / x^2.
         modes = (admittance + bessel) / ((bessel - hankel) * (admittance + hankel))
         return (1j / x**2 * modes)[:, None] * _hankel_fall(x, kr, orders)
@@ -228,7 +229,7 @@ def _field_inside(
 
 def _fluid_boundary(x: torch.Tensor, density_ratio: complex, speed_ratio: complex) -> Boundary:
     """Return the condition that p and (1/rho) dp/dr are continuous."""
-    return lambda orders: -_bessel_slopes(x / speed_ratio, orders) / (density_ratio * speed_ratio)
+    return lambda orders: -bessel_slopes(x / speed_ratio, orders) / (density_ratio * speed_ratio)
 
 
 def _series(setup: _Setup, kr: torch.Tensor, radial: Radial, inner_size: float) -> torch.Tensor:
@@ -242,7 +243,7 @@ def _series(setup: _Setup, kr: torch.Tensor, radial: Radial, inner_size: float) 
 
 def _block(setup: _Setup, kr: torch.Tensor, radial: Radial, inner_size: float) -> torch.Tensor:
     orders = _enough_orders(setup, inner_size)
-    weights = 2 * _counted(setup.size, orders) + 1
+    weights = 2 * counted(setup.size, orders) + 1
     at_points = weights[:, None] * radial(kr, orders)
     at_sources = _hankel_fall(setup.size, setup.wavenumber * setup.source_distances, orders)
     bound = at_points.abs().amax(dim=1) * at_sources.abs().amax(dim=1)
@@ -275,22 +276,9 @@ def _enough_orders(setup: _Setup, inner_size: float) -> int:
     return math.ceil(orders)
 
 
-def _bessel_slopes(x: torch.Tensor, orders: int) -> torch.Tensor:
-    """Return j_n'(x) / j_n(x), (orders + 1, *x.shape), by downward recurrence of j_{n-1} / j_n."""
-    largest = float(x.abs().max())
-    start = math.ceil(max(orders, largest) + 8 * math.cbrt(largest)) + 32
-    ratio = (2 * start + 1) / x
-    ratios = []
-    for n in range(start - 1, -1, -1):
-        ratio = (2 * n + 1) / x - 1 / ratio
-        if n <= orders:
-            ratios.append(ratio)
-    return torch.stack(ratios[::-1]) - (_counted(x, orders) + 1) / x
-
-
 def _hankel_slopes(x: torch.Tensor, orders: int) -> torch.Tensor:
     """Return h_n'(x) / h_n(x), (orders + 1, *x.shape)."""
-    return _hankel_ratios(x, orders) - (_counted(x, orders) + 1) / x
+    return _hankel_ratios(x, orders) - (counted(x, orders) + 1) / x
 
 
 def _hankel_ratios(x: torch.Tensor, orders: int) -> torch.Tensor:
@@ -315,12 +303,7 @@ def _hankel_fall(near: torch.Tensor, far: torch.Tensor, orders: int) -> torch.Te
 
 def _product(x: torch.Tensor, orders: int) -> torch.Tensor:
     """Return j_n(x) h_n(x), (orders + 1, *x.shape), from their Wronskian."""
-    return 1j / x**2 / (_hankel_slopes(x, orders) - _bessel_slopes(x, orders))
-
-
-def _counted(x: torch.Tensor, orders: int) -> torch.Tensor:
-    """Return the orders 0 to `orders`, (orders + 1, 1, ...), for broadcasting with x."""
-    return torch.arange(orders + 1, dtype=torch.float64, device=x.device).reshape(-1, *[1] * x.ndim)
+    return 1j / x**2 / (_hankel_slopes(x, orders) - bessel_slopes(x, orders))
 
 
 def _require_outside(name: str, positions: torch.Tensor, distances: torch.Tensor, least: float) -> None:

@@ -17,12 +17,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.special import jve, spherical_jn, spherical_yn
+from scipy.special import spherical_jn, spherical_yn
 
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.utils.array_types import COMPLEX, REAL, AnyArray, ComplexArray
 
-_LOST = 1e-280  # Magnitude below which j_l loses digits to underflow
 _TINY = 1e-12  # distance from the centre [m] below which a point has the direction z
 
 _SAMPLES = 2
@@ -284,24 +283,31 @@ def sphere_coefficients(
     regular, slope = spherical_jn(order, size), spherical_jn(order, size, derivative=True)
     out = regular + 1j * spherical_yn(order, size)
     out_slope = slope + 1j * spherical_yn(order, size, derivative=True)
-    inner: AnyArray = np.ones(degree + 1)
-    inner_slope: AnyArray = np.zeros(degree + 1)
+    inner: AnyArray = np.zeros(degree + 1)  # dp/d(kr) over p on the surface
     if impedance is not None:  # the velocity into the surface is p / impedance
-        inner_slope = np.full(degree + 1, -1j / impedance)
+        inner = inner - 1j / impedance
     elif not cmath.isinf(density_ratio):
-        inside = size / speed_ratio
-        if isinstance(
-            inside, complex
-        ):  # the ratio of Bessel functions that are scaled, so as not to overflow
-            scaled = jve(np.arange(-1, degree + 1) + 0.5, inside)
-            inner, slope_inside = scaled[1:], scaled[:-1] - (order + 1) / inside * scaled[1:]
-        else:
-            inner, slope_inside = spherical_jn(order, inside), spherical_jn(order, inside, derivative=True)
-        lost = np.abs(inner) < _LOST  # j_l is proportional to x^l there
-        inner, slope_inside = np.where(lost, 1.0, inner), np.where(lost, order / inside, slope_inside)
-        inner_slope = slope_inside / (density_ratio * speed_ratio)
-    outgoing = out_slope * inner - out * inner_slope
-    return np.asarray(-(slope * inner - regular * inner_slope) / outgoing, np.complex128)
+        inner = bessel_slopes(torch.from_numpy(np.asarray(size / speed_ratio)), degree).numpy()
+        inner = inner / (density_ratio * speed_ratio)
+    return np.asarray(-(slope - regular * inner) / (out_slope - out * inner), np.complex128)
+
+
+def bessel_slopes(x: torch.Tensor, orders: int) -> torch.Tensor:
+    """Return j_n'(x) / j_n(x), (orders + 1, *x.shape), by downward recurrence of j_{n-1} / j_n."""
+    largest = float(x.abs().max())
+    start = math.ceil(max(orders, largest) + 8 * math.cbrt(largest)) + 32
+    ratio = (2 * start + 1) / x
+    ratios = []
+    for n in range(start - 1, -1, -1):
+        ratio = (2 * n + 1) / x - 1 / ratio
+        if n <= orders:
+            ratios.append(ratio)
+    return torch.stack(ratios[::-1]) - (counted(x, orders) + 1) / x
+
+
+def counted(x: torch.Tensor, orders: int) -> torch.Tensor:
+    """Return the orders 0 to `orders`, (orders + 1, 1, ...), for broadcasting with x."""
+    return torch.arange(orders + 1, dtype=torch.float64, device=x.device).reshape(-1, *[1] * x.ndim)
 
 
 def turns(degree: int, turn: torch.Tensor) -> list[torch.Tensor]:
