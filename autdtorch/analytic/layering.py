@@ -171,10 +171,7 @@ def source_response(layering: Layering, offset: float, height: float, source_hei
     absorption F is real there for real kappa.
     """
     wavenumbers = layering.wavenumber, layering.inner_wavenumber
-    vertical, end = (
-        source_height + abs(height),
-        1.5 * max(layering.wavenumber, abs(layering.inner_wavenumber)),
-    )
+    vertical, end = source_height + abs(height), 1.5 * max(map(abs, wavenumbers))
 
     def integrand(kappa: ComplexArray) -> ComplexArray:
         gamma = vertical_wavenumber(layering.wavenumber, kappa)

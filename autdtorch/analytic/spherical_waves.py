@@ -100,6 +100,13 @@ def sphere_rule(rings: int) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.from_numpy(nodes.reshape(-1, 3)), torch.from_numpy(weights)
 
 
+@functools.lru_cache(8)
+def to_harmonics(degree: int, rings: int) -> torch.Tensor:
+    """Return the map (S, N) from values at the nodes of a `sphere_rule` to coefficients of harmonics."""
+    nodes, weights = sphere_rule(rings)
+    return weights[:, None] * harmonics(degree, nodes).conj()
+
+
 class _Recurrence(NamedTuple):
     """Factors of P_lm / sin^m, and the places of the harmonics of all m among those of m >= 0."""
 

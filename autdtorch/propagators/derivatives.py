@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 
 from autdtorch.analytic.momentum import linear_momentum
-from autdtorch.analytic.spherical_waves import harmonics, regular_radial, sphere_rule
+from autdtorch.analytic.spherical_waves import regular_radial, sphere_rule, to_harmonics
 from autdtorch.propagators.propagator import Propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX
@@ -92,9 +92,8 @@ def field_derivatives(propagator: Propagator, drive: torch.Tensor, nodes: torch.
 @functools.lru_cache(8)
 def _to_waves(wavenumber: complex, degree: int) -> torch.Tensor:
     """Return the map (S, N) from pressures at nodes to coefficients of regular waves."""
-    nodes, weights = sphere_rule(_RINGS)
     size = torch.tensor([[wavenumber * SIZE / wavenumber.real]], **COMPLEX)
-    return weights[:, None] * harmonics(degree, nodes).conj() / regular_radial(degree, size)
+    return to_harmonics(degree, _RINGS) / regular_radial(degree, size)
 
 
 @functools.lru_cache(8)

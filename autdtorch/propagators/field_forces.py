@@ -7,7 +7,6 @@ ones that it scatters. Pressures on both spheres tell them apart; the force foll
 
 from __future__ import annotations
 
-import functools
 import math
 
 import torch
@@ -15,10 +14,10 @@ import torch
 from autdtorch.analytic.momentum import linear_momentum, taken_up
 from autdtorch.analytic.spherical_waves import (
     degrees,
-    harmonics,
     outgoing_radial,
     regular_radial,
     sphere_rule,
+    to_harmonics,
 )
 from autdtorch.propagators.derivatives import field_derivatives, nodes_around
 from autdtorch.propagators.propagator import Propagator
@@ -73,7 +72,7 @@ def _force_on(propagator: Propagator, drive: torch.Tensor, body: ObstacleGroup) 
     degree = math.ceil(scene.wavenumber * float(radii[1])) + _MORE_DEGREES
     points = body.center + radii[:, None, None] * sphere_rule(degree + 1)[0]
     # a grid, which may be near obstacles without a warning
-    on_spheres = propagator.field(drive, points) @ _to_harmonics(degree)  # (2, N)
+    on_spheres = propagator.field(drive, points) @ to_harmonics(degree, degree + 1)  # (2, N)
     size = scene.complex_wavenumber * radii
     radial = regular_radial(degree, size[:, None]), outgoing_radial(degree, size).mT[:, degrees(degree)]
     columns = torch.stack(radial, dim=-1).movedim(1, 0)  # (N, spheres, kinds)
@@ -83,13 +82,6 @@ def _force_on(propagator: Propagator, drive: torch.Tensor, body: ObstacleGroup) 
     factor = 1 / (2 * scene.medium.density * scene.angular_frequency**2)
     force: torch.Tensor = factor * taken_up(linear_momentum, incoming, outgoing)[:, 0, 0].real
     return force
-
-
-@functools.lru_cache(4)
-def _to_harmonics(degree: int) -> torch.Tensor:
-    """Return the map (S, N) from values at the nodes of a sphere to those of harmonics."""
-    nodes, weights = sphere_rule(degree + 1)
-    return weights[:, None] * harmonics(degree, nodes).conj()
 
 
 def radiation_stress(

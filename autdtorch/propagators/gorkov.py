@@ -127,10 +127,8 @@ def warn_of_large(particle: Particle, scene: Scene) -> None:
     """Warn if a particle is not small against the wavelength."""
     size = particle.radius / scene.wavelength
     if size > LARGEST:
-        shown = (
-            f"particle: its radius is {size:.2f} wavelengths; Gor'kov's force is right for up to {LARGEST:g}"
-        )
-        warn_user(f"{shown}, and `radiation_force` of a sphere for all")
+        valid = f"Gor'kov's force is right for up to {LARGEST:g}, and `radiation_force` of a sphere for all"
+        warn_user(f"particle: its radius is {size:.2f} wavelengths; {valid}")
 
 
 def _of(

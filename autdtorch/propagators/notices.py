@@ -59,11 +59,9 @@ class Notices:
             enclosed = silent[self._simulation.enclosed(silent)]
             if len(enclosed):
                 more = f" and {len(enclosed) - 1} more" if len(enclosed) > 1 else ""
-                text = (
-                    "rigid obstacles close off the point at %s mm%s: pressure 0 (gaps narrower than a cell,"
-                )
-                text += " %.2g mm, may count as closed)"
-                self._once("cavity", text, _in_mm(enclosed[0]), more, 1e3 * self._plan.spacing)
+                text = "rigid obstacles close off the point at %s mm%s: pressure 0 (%s)"
+                gaps = f"gaps narrower than a cell, {1e3 * self._plan.spacing:.2g} mm, may count as closed"
+                self._once("cavity", text, _in_mm(enclosed[0]), more, gaps)
 
     def of_faint_points(self, matrix: torch.Tensor, free: torch.Tensor) -> None:
         """Log that the matrix at control points is rounding, relative to free space: methods would use it."""
@@ -77,11 +75,11 @@ class Notices:
     def of_ringing(self, periods: int) -> None:
         """Log that obstacles resonate, where grids may agree and be wrong together."""
         if periods > _RINGING:
-            text = (
-                "sound rings for %d periods in or between obstacles: next to a resonance a small shift of its"
+            text = "sound rings for %d periods in or between obstacles: next to a resonance %s"
+            shift = (
+                "a small shift of its frequency changes the field, and the error may be larger than estimated"
             )
-            text += " frequency changes the field, and the error may be larger than estimated"
-            self._once("ringing", text, periods)
+            self._once("ringing", text, periods, shift)
 
     def _once(self, kind: str, text: str, *values: object) -> None:
         if kind not in self._logged:

@@ -233,10 +233,7 @@ class Simulation(ABC):
 
     def imaged(self, sources: Apertures, strength: torch.Tensor) -> tuple[Apertures, torch.Tensor]:
         """Return sources of strength (N,) [Pa m] with all their images in the scene's reflectors."""
-        images = self.plan.scene.images
-        if len(images) == 1:
-            return sources, strength
-        everything, weights = sources.with_images(images)
+        everything, weights = sources.with_images(self.plan.scene.images)
         return everything, weights * strength.repeat(len(weights) // len(strength))
 
     @property
