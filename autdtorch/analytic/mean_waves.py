@@ -12,7 +12,6 @@ powers, in a frame with z along the normal.
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -20,6 +19,7 @@ import torch
 
 from autdtorch.analytic.spherical_waves import outgoing_waves, turned, turns
 from autdtorch.scene.geometry import plane_basis
+from autdtorch.utils.process import cached_tensors
 
 _ERROR = 1e-10
 """Size of the first power that is left out, relative to the wave at the centre."""
@@ -101,7 +101,7 @@ class MeanWaves(NamedTuple):
         return none.index_copy(-1, places, torch.cat(parts, dim=-1)) @ self.waves.mT
 
 
-@functools.lru_cache(16)
+@cached_tensors(16)
 def _means(degree: int, size: complex, powers: int) -> list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
     """Return `MeanWaves.means`."""
     result = []

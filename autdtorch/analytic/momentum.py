@@ -18,6 +18,7 @@ import torch
 
 from autdtorch.analytic.spherical_waves import degrees, ladder, orders
 from autdtorch.utils.array_types import COMPLEX, REAL, ComplexArray
+from autdtorch.utils.process import cached_tensors
 
 PAIRS = (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)
 """PAIRS: axes of the six different entries of the stiffness."""
@@ -122,7 +123,7 @@ def _neighbours(waves: torch.Tensor, place: torch.Tensor, factor: torch.Tensor, 
     return total
 
 
-@functools.lru_cache(8)
+@cached_tensors(8)
 def _steps(degree: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
     """Return the places (N, 1) of waves, and factors, that L_x + i L_y, L_x - i L_y and L_z bring to each."""
     n, m = degrees(degree).to(torch.float64), orders(degree).to(torch.float64)

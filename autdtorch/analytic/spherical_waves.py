@@ -11,7 +11,6 @@ themselves; the map is fitted to their values at a few directions.
 from __future__ import annotations
 
 import cmath
-import functools
 import math
 from typing import Any, NamedTuple
 
@@ -21,6 +20,7 @@ from scipy.special import spherical_jn, spherical_yn
 
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.utils.array_types import COMPLEX, REAL, AnyArray, ComplexArray
+from autdtorch.utils.process import cached_tensors
 
 _TINY = 1e-12  # distance from the centre [m] below which a point has the direction z
 
@@ -89,7 +89,7 @@ def harmonics(degree: int, directions: torch.Tensor) -> torch.Tensor:
     return torch.cat([upper, upper.conj()], dim=-1)[..., table.place] * table.sign
 
 
-@functools.lru_cache(8)
+@cached_tensors(8)
 def sphere_rule(rings: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Return nodes (S, 3) on the unit sphere and weights (S,) that integrate waves up to 2 * rings - 1."""
     z, weight = np.polynomial.legendre.leggauss(rings)
@@ -100,7 +100,7 @@ def sphere_rule(rings: int) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.from_numpy(nodes.reshape(-1, 3)), torch.from_numpy(weights)
 
 
-@functools.lru_cache(8)
+@cached_tensors(8)
 def to_harmonics(degree: int, rings: int) -> torch.Tensor:
     """Return the map (S, N) from values at the nodes of a `sphere_rule` to coefficients of harmonics."""
     nodes, weights = sphere_rule(rings)
@@ -118,7 +118,7 @@ class _Recurrence(NamedTuple):
     sign: torch.Tensor  # (N,)
 
 
-@functools.lru_cache(8)
+@cached_tensors(8)
 def _recurrence(degree: int) -> _Recurrence:
     none = torch.zeros(0, **REAL)
     factor, back, tops = [none], [none], [math.sqrt(1 / (4 * math.pi))]
@@ -226,7 +226,7 @@ def _slopes(
     return (up + down) / 2, (up - down) / 2j, along
 
 
-@functools.lru_cache(8)
+@cached_tensors(8)
 def ladder(degree: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
     """Return the places (N, 2) of neighbours and their factors, for d/dx + i d/dy, d/dx - i d/dy and d/dz.
 
@@ -333,7 +333,7 @@ def turned(waves: torch.Tensor, maps: list[torch.Tensor]) -> torch.Tensor:
     return torch.cat([waves[..., n * n : (n + 1) ** 2] @ each for n, each in enumerate(maps)], dim=-1)
 
 
-@functools.lru_cache(8)
+@cached_tensors(8)
 def _directions(degree: int) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Return directions (n, 3), and the inverse (2 l + 1, n) of the harmonics of each degree at these."""
     directions = sphere_points((0.0, 0.0, 0.0), 1.0, _SAMPLES * (2 * degree + 1))

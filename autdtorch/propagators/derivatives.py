@@ -8,7 +8,6 @@ whose errors a small step would magnify, and a propagator needs to know nothing 
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import NamedTuple
 
@@ -19,6 +18,7 @@ from autdtorch.analytic.spherical_waves import regular_radial, sphere_rule, to_h
 from autdtorch.propagators.propagator import Propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX
+from autdtorch.utils.process import cached_tensors
 from autdtorch.utils.validation import invalid
 
 SIZE = 1.5
@@ -89,14 +89,14 @@ def field_derivatives(propagator: Propagator, drive: torch.Tensor, nodes: torch.
     return derivatives(pressure, propagator.scene.complex_wavenumber)
 
 
-@functools.lru_cache(8)
+@cached_tensors(8)
 def _to_waves(wavenumber: complex, degree: int) -> torch.Tensor:
     """Return the map (S, N) from pressures at nodes to coefficients of regular waves."""
     size = torch.tensor([[wavenumber * SIZE / wavenumber.real]], **COMPLEX)
     return to_harmonics(degree, _RINGS) / regular_radial(degree, size)
 
 
-@functools.lru_cache(8)
+@cached_tensors(8)
 def _to_derivatives(wavenumber: complex) -> torch.Tensor:
     """Return the map (N, 40) from coefficients of waves to p and its first, second and third derivatives."""
     each, columns = torch.eye((_THIRD + 1) ** 2, **COMPLEX), []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple, Self
@@ -12,6 +11,7 @@ import torch
 
 from autdtorch.utils.array_types import COMPLEX, REAL, Array, ComplexArray, Index
 from autdtorch.utils.images import Image, distinct
+from autdtorch.utils.process import cached_tensors
 
 TOGETHER = 3
 """Degrees of the waves of a disc that are summed at once."""
@@ -132,7 +132,7 @@ class EvenWaves(NamedTuple):
     counts: Index  # numbers of steps that suffice from each distance on (R, K)
 
 
-@functools.lru_cache(64)
+@cached_tensors(64)
 def even_waves(wavenumber: complex, radii: tuple[float, ...]) -> EvenWaves:
     """Return the waves of discs of radii a [m]; very small ones are points, of one wave.
 
@@ -187,7 +187,7 @@ def even_waves(wavenumber: complex, radii: tuple[float, ...]) -> EvenWaves:
     )
 
 
-@functools.lru_cache(64)
+@cached_tensors(64)
 def disc_rule(size: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
     """Return nodes (n, 2) and weights (n,) of a quadrature rule for the mean over the unit disc.
 

@@ -21,7 +21,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol, Self, TypeVar, overload
+from typing import Any, ParamSpec, Protocol, Self, TypeVar, cast, overload
 
 import psutil
 import torch
@@ -149,6 +149,7 @@ if hasattr(os, "register_at_fork"):
 
 T = TypeVar("T")
 R = TypeVar("R")
+P = ParamSpec("P")
 
 _count: ContextVar[int | None] = ContextVar("threads", default=None)
 
@@ -266,6 +267,19 @@ def _processors() -> int:
 
 
 T_co = TypeVar("T_co", covariant=True)
+
+
+def cached_tensors(count: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Return a decorator that keeps the last results of a function, for arguments that have a hash.
+
+    Their tensors serve calls with gradients, also where the first call is in inference mode.
+    """
+
+    def decorator(function: Callable[P, R]) -> Callable[P, R]:
+        computed = torch.inference_mode(False)(torch.no_grad()(function))
+        return cast(Callable[P, R], functools.lru_cache(count)(computed))
+
+    return decorator
 
 
 class cached_property(functools.cached_property[T_co]):  # noqa: TID251

@@ -121,3 +121,16 @@ def test_without_sound_there_is_no_place_of_equilibrium():
         torch.zeros(2, 2, 3), torch.ones(4, 4), at.Plane((0, 0, 0), (1, 0, 0), (4e-3, 4e-3))
     )
     assert figure.axes
+
+
+def test_what_inference_mode_computes_first_serves_gradients_later():
+    array = at.TransducerArray.grid((2, 2), pitch=10e-3, center=(0, 0, 0), normal=(0, 0, 1))
+    scene = at.Scene(array, MEDIUM, 39_876.5, POINTS)  # a frequency of its own, whose maps no test has made
+    free = at.make_propagator(scene)
+    drive = torch.ones(4, dtype=torch.complex128)
+    with torch.inference_mode():
+        force = at.gorkov(free, POINTS, drive).force
+    again = at.gorkov(free, POINTS, drive.requires_grad_()).force
+    again.sum().backward()
+    assert torch.equal(again.detach(), force)
+    assert drive.grad.norm() > 0

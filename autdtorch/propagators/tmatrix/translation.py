@@ -12,7 +12,6 @@ Each column of waves passes all of them in `translation_kernel`.
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -23,6 +22,7 @@ import torch
 from autdtorch.analytic.momentum import gradient_by_place, gradient_by_turn
 from autdtorch.analytic.spherical_waves import harmonics, mirrored, outgoing_radial, turns
 from autdtorch.utils.array_types import REAL
+from autdtorch.utils.process import cached_tensors
 
 
 class WaveFrame(NamedTuple):
@@ -207,9 +207,7 @@ def _turn(frame: WaveFrame, along: torch.Tensor) -> tuple[torch.Tensor, torch.Te
     return around + math.pi / 2, tilt, axes @ torch.stack([first, second], dim=-1), is_left
 
 
-@functools.lru_cache(8)
-@torch.inference_mode(False)
-@torch.no_grad()
+@cached_tensors(8)
 def _quarters(degree: int) -> torch.Tensor:
     """Return a quarter of the real turn that brings z to x about y, flat: of each degree l, (l + 1, l + 1).
 
@@ -227,9 +225,7 @@ def _quarters(degree: int) -> torch.Tensor:
     return torch.cat(parts)
 
 
-@functools.lru_cache(8)
-@torch.inference_mode(False)
-@torch.no_grad()
+@cached_tensors(8)
 def _shifts_along_z(degree: int, other: int) -> torch.Tensor:
     """Return the terms (C, Q) of h_q in S_lnm by m, l and n, for outgoing waves up to the degree `other`."""
     nodes, weights = np.polynomial.legendre.leggauss(degree + other + 1)
