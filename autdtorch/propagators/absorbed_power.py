@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from autdtorch.analytic.green import directivity
-from autdtorch.fdtd.assembly.heterogeneous import LossyCells
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
@@ -154,14 +153,15 @@ class Absorption:
 
 def absorption(
     assembly: Assembly, region: Region, mirrors: Sequence[object] = (), axes: Array | None = None
-) -> Absorption:
+) -> Absorption | None:
     """Return the absorption of a region's bodies on a grid, without that of their images in some mirrors.
 
-    A cell belongs to one body, see `_owners`. `axes` are those of a turned grid, one a row (3, 3).
+    None where nothing absorbs. A cell belongs to one body, see `_owners`. `axes` are those of a turned grid,
+    one a row (3, 3).
     """
     cells, grid, stencil = assembly.heterogeneous, assembly.grid, assembly.stencil
-    nothing = np.zeros(0, np.int64), np.zeros((0, 27)), np.zeros(0), np.zeros(0)
-    losses = cells.losses or LossyCells(*nothing)
+    if (losses := cells.losses) is None:
+        return None
     index = cells.index[losses.place]
     around = index[:, None] + flat_offsets(grid.shape)
     used, place = np.unique(around, return_inverse=True)
@@ -199,7 +199,5 @@ def _owners(places: torch.Tensor, region: Region, axes: Array, spacing: float) -
         if body.impedance is not None or (body.fluid is not None and body.fluid.is_lossy):
             nearness[number] = torch.maximum(distance, -later)
         later = torch.minimum(later, distance)
-    if not len(places):
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     nearest, (least, beside) = nearness.argmin(dim=0), surface.min(dim=0)
     return torch.where(least < math.inf, beside, nearest).numpy(), nearest.numpy()

@@ -111,9 +111,10 @@ class BoxSimulation(Simulation):
 
     @cached_property
     def absorptions(self) -> Sequence[Absorption]:
-        """The absorption of the obstacles in each box."""
+        """The absorption of the obstacles in each box where some absorb."""
         pairs = zip(self.boxes, self.plan.grouping.grids, strict=True)
-        return [absorption(box.assembly, grid.part, box.mirrors, box.axes) for box, grid in pairs]
+        parts = (absorption(box.assembly, grid.part, box.mirrors, box.axes) for box, grid in pairs)
+        return [part for part in parts if part]
 
     def radiators(self, drive: torch.Tensor) -> list[Radiators]:
         """Return the Huygens surfaces as monopoles, in runs of drives (R, M)."""

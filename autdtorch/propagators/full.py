@@ -41,7 +41,8 @@ class DomainSimulation(Simulation):
     def absorptions(self) -> Sequence[Absorption]:
         """The absorption of the obstacles in the domain."""
         region = self.plan.region
-        return [absorption(self.assemblies[0], region.whole, region.mirrors)]
+        part = absorption(self.assemblies[0], region.whole, region.mirrors)
+        return [part] if part else []
 
     def radiators(self, drive: torch.Tensor) -> list[Radiators]:
         """Return nothing: reflectors of a domain absorb nothing."""

@@ -144,7 +144,7 @@ class Simulation(ABC):
     @property
     @abstractmethod
     def absorptions(self) -> Sequence[Absorption]:
-        """The absorption of the obstacles on each grid."""
+        """The absorption of the obstacles on each grid where some absorb."""
 
     @abstractmethod
     def radiators(self, drive: torch.Tensor) -> list[Radiators]:
@@ -195,8 +195,8 @@ class Simulation(ABC):
         """Simulate drives (R, M), none of them silent; return the power [W] by obstacle and reflector."""
         scene = self.plan.scene
         obstacles = torch.zeros((len(scene.obstacles), len(drive)), **REAL)
-        places = [each.places for each in self.absorptions]
-        if any(map(len, places)):
+        if self.absorptions:
+            places = [each.places for each in self.absorptions]
             sources, receivers = self.sources_of(drive), Apertures(torch.cat(places))
             pressure, _ = self._recorded(
                 len(drive), lambda stepped: self._simulate(*sources, receivers, stepped)

@@ -98,7 +98,7 @@ class Store:
         """Return a saved matrix and its `count` numbers; None if there is none, or a damaged or other one."""
         if self.folder is None:
             return None
-        path = self._path(self.folder, key)
+        path = self.folder / f"{key}{SUFFIX}"
         try:
             content = path.read_bytes()
         except FileNotFoundError:
@@ -127,9 +127,7 @@ class Store:
         if self.folder is None:
             return
         body = np.append(matrix, numbers).astype(np.complex128).tobytes()
-        if len(body) > self._most_saved:
-            return
-        path, content = self._path(self.folder, key), _with_checksum(key, matrix.shape, body)
+        path = self.folder / f"{key}{SUFFIX}"
         try:
             replace_file(path, content)
         except OSError as error:
@@ -137,10 +135,6 @@ class Store:
         share = int(content[:8], 16) / 16**8  # of the checksum, as good as random
         if share * self._most_saved * _OVERRUN <= len(content):
             _remove_oldest(self.folder, self._most_saved)
-
-    @staticmethod
-    def _path(folder: Path, key: str) -> Path:
-        return folder / f"{key}{SUFFIX}"
 
 
 BODIES = Store(most_bytes=MOST_BYTES // 4)

@@ -45,25 +45,8 @@ _ENTRY_BYTES = 48.0
 _TINY = torch.finfo(torch.float64).tiny
 
 
-class Way(NamedTuple):
-    """Waves that an image of a body sends, with their weight."""
-
-    weight: complex
-    translation: Translation
-
-    def applied(self, waves: torch.Tensor) -> torch.Tensor:
-        """Return the regular waves (N, B, R) of outgoing ones (K, B, R)."""
-        regular = self.translation.applied(waves)
-        return regular if self.weight == 1 else self.weight * regular
-
-    @property
-    def adjoint(self) -> Way:
-        """The way back."""
-        return Way(complex(self.weight).conjugate(), self.translation.adjoint)
-
-
-Ways = list[list[list[Way]]]
-"""Ways: those to body i from the images of body j, by i and j."""
+Ways = list[list[list[Translation]]]
+"""Ways: the translations to body i from the images of body j, by i and j."""
 
 
 def ways_between(bodies: Sequence[BodyMatrix], images: Sequence[Image], more: int = 0) -> Ways:
@@ -72,10 +55,10 @@ def ways_between(bodies: Sequence[BodyMatrix], images: Sequence[Image], more: in
         WaveFrame(each.center.reshape(-1, 3), each.axes.reshape(-1, 3, 3), each.degree) for each in bodies
     ]
 
-    def ways(number: int, other: int) -> list[Way]:
+    def ways(number: int, other: int) -> list[Translation]:
         here = frames[number]._replace(degree=frames[number].degree + more)
         return [
-            Way(image.weight, Translation(bodies[0].wavenumber, here, _seen(frames[other], image)))
+            Translation(bodies[0].wavenumber, here, _seen(frames[other], image), image.weight)
             for image in (images[1:] if number == other else images)
         ]
 
@@ -88,7 +71,9 @@ def _seen(frame: WaveFrame, image: Image) -> WaveFrame:
     return WaveFrame(center, image.matrix.mT @ frame.axes, frame.degree)
 
 
-def received(ways: Sequence[Sequence[Way]], sent: Sequence[torch.Tensor | None]) -> torch.Tensor | None:
+def received(
+    ways: Sequence[Sequence[Translation]], sent: Sequence[torch.Tensor | None]
+) -> torch.Tensor | None:
     """Return the regular waves (N, B, R) that come to a body from the outgoing ones (K, B, R) of bodies."""
     parts = [
         way.applied(waves)
@@ -128,18 +113,17 @@ class _Sweep:
 
     @property
     def tensors(self) -> list[torch.Tensor]:
-        translations = (way.translation for row in self.ways for pair in row for way in pair)
-        frames = (frame for each in translations for frame in (each.here, each.there))
+        ways = (way for row in self.ways for pair in row for way in pair)
+        frames = (frame for way in ways for frame in (way.here, way.there))
         return [*self.maps, *self.incident, *(tensor for frame in frames for tensor in frame[:2])]
 
     def of(self, tensors: Sequence[torch.Tensor]) -> _Sweep:
         """Return the system of other tensors."""
         count, rest = len(self.maps), iter(tensors[2 * len(self.maps) :])
 
-        def placed(way: Way) -> Way:
-            frames = way.translation.here, way.translation.there
-            here, there = (WaveFrame(next(rest), next(rest), frame.degree) for frame in frames)
-            return way._replace(translation=replace(way.translation, here=here, there=there))
+        def placed(way: Translation) -> Translation:
+            here, there = (WaveFrame(next(rest), next(rest), each.degree) for each in (way.here, way.there))
+            return replace(way, here=here, there=there)
 
         ways = [[[placed(way) for way in pair] for pair in row] for row in self.ways]
         return replace(self, maps=list(tensors[:count]), ways=ways, incident=list(tensors[count : 2 * count]))

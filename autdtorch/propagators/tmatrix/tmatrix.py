@@ -168,10 +168,9 @@ class TMatrix(BodyMatrix):
         path = path_of("path", path, suffixes=(".npz",))
         if self.center.ndim > 1:
             raise ValueError(f"center: shape {tuple(self.center.shape)}; a file holds one pose, (3,)")
-        values = {name: getattr(self, name) for name in _ARRAYS}
-        tensors = (name for name, value in values.items() if isinstance(value, torch.Tensor))
-        values |= {name: values[name].detach() for name in tensors}
-        write_arrays(path, {name: np.asarray(value) for name, value in values.items()})
+        tensors = {name: getattr(self, name).detach() for name in ("matrix", "center", "axes")}
+        values = vars(replace(self, **tensors))
+        write_arrays(path, {name: np.asarray(values[name]) for name in _ARRAYS})
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> TMatrix:

@@ -13,7 +13,7 @@ Each column of waves passes all of them in `translation_kernel`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,12 +41,14 @@ class Translation:
         wavenumber: k [rad/m].
         here: the frame of the regular waves.
         there: the frame of the outgoing waves.
+        weight: factor of all, as of an image.
         is_conjugate: whether radial functions are conjugated, as in the adjoint.
     """
 
     wavenumber: complex
     here: WaveFrame
     there: WaveFrame
+    weight: complex = 1.0
     is_conjugate: bool = False
     _shared: dict[bool, _Factors] = field(default_factory=dict, repr=False)  # with copies of equal frames
 
@@ -56,15 +58,18 @@ class Translation:
         tensors = waves, center, axes, other_center, other_axes
         regular: torch.Tensor
         if torch.is_grad_enabled() or any(map(_has_tangent, tensors)):
-            regular = _Translated.apply(*tensors, self)  # type: ignore[no-untyped-call]
+            alone = replace(self, weight=1.0)
+            regular = _Translated.apply(*tensors, alone)  # type: ignore[no-untyped-call]
         else:  # much quicker for few waves
             regular = self.factors.applied(waves)
-        return regular[: (degree + 1) ** 2]
+        regular = regular[: (degree + 1) ** 2]
+        return regular if self.weight == 1 else self.weight * regular
 
     @property
     def adjoint(self) -> Translation:
         """The adjoint map: a translation back, with conjugate radial functions, as turns are unitary."""
-        return Translation(self.wavenumber, self.there, self.here, not self.is_conjugate, self._shared)
+        weight, is_conjugate = complex(self.weight).conjugate(), not self.is_conjugate
+        return Translation(self.wavenumber, self.there, self.here, weight, is_conjugate, self._shared)
 
     @property
     def factors(self) -> _Factors:
@@ -107,7 +112,7 @@ class _Translated(torch.autograd.Function):
         by_place = by_turn = by_other_place = by_other_turn = None
         _, *needed = ctx.needs_input_grad[:5]
         if any(needed[:3]) and torch.is_grad_enabled():  # for derivatives of the gradient
-            more = translation.wavenumber, _with_next_degree(here), there, translation.is_conjugate
+            more = translation.wavenumber, _with_next_degree(here), there, 1.0, translation.is_conjugate
             regular = Translation(*more).applied(waves)
         if needed[0] or needed[2]:
             wavenumber = complex(translation.wavenumber)
