@@ -9,10 +9,10 @@ import torch
 
 from autdtorch.propagators.free_space import FreeSpacePropagator
 from autdtorch.propagators.propagator import Propagator
+from autdtorch.propagators.tmatrix.bodies import room_around
 from autdtorch.propagators.tmatrix.force import radiation_force
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
-from autdtorch.scene.arrays import TransducerArray, radii_of
 from autdtorch.scene.drive import validate_single_drive
 from autdtorch.scene.obstacles import Sphere
 from autdtorch.scene.particle import Particle
@@ -97,10 +97,7 @@ def equilibrium(
         return sound - particle.weight * upwards
 
     def is_clear(place: torch.Tensor) -> bool:
-        apart = [float((place - body.center).norm()) - body.radius for body in others]
-        apart += [float(each.mirror.height(place)) for each in scene.reflectors]
-        apart.append(_from_transducers(scene.array, place))
-        return min(apart) >= particle.radius
+        return room_around(place, others, scene) >= particle.radius
 
     if not is_clear(start):
         raise invalid(
@@ -118,14 +115,6 @@ def equilibrium(
         if float(step.norm()) < _SETTLED * scene.wavelength:
             return Equilibrium(first, place, stiffness)
     return Equilibrium(first, None, at_start)
-
-
-def _from_transducers(array: TransducerArray, place: torch.Tensor) -> float:
-    """Return the distance [m] of a place (3,) [m] from the nearest transducer, a disc or a point."""
-    offsets = place - array.positions
-    along = (offsets * array.normals).sum(dim=-1)
-    across = torch.linalg.cross(offsets, array.normals).norm(dim=-1)
-    return float(torch.hypot(along, (across - radii_of(array)).clamp_min(0)).min())
 
 
 @torch.inference_mode(False)

@@ -21,11 +21,10 @@ from autdtorch.analytic.spherical_waves import (
 )
 from autdtorch.propagators.derivatives import field_derivatives, nodes_around
 from autdtorch.propagators.propagator import Propagator
-from autdtorch.propagators.tmatrix.bodies import ObstacleGroup, bodies_of
+from autdtorch.propagators.tmatrix.bodies import ObstacleGroup, bodies_of, room_around
 from autdtorch.propagators.tmatrix.force import radiation_force
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.drive import validate_drive
-from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import REAL, device_of
 from autdtorch.utils.validation import ArrayLike, points_grid, real_tensor, require_kind
 
@@ -49,20 +48,11 @@ def forces_on_obstacles(propagator: Propagator, drive: torch.Tensor) -> torch.Te
         rows = list(body.numbers)
         if isinstance(propagator, TMatrixPropagator):
             forces[rows] = radiation_force(propagator, drive, number).detach()
-        elif _is_alone(scene, bodies, body):
-            forces[rows] = _force_on(propagator, drive, body)
+        else:
+            others = [other for other in bodies if other is not body]
+            if room_around(body.center, others, scene) > body.radius + _APART[1] * scene.wavelength:
+                forces[rows] = _force_on(propagator, drive, body)
     return forces
-
-
-def _is_alone(scene: Scene, bodies: list[ObstacleGroup], body: ObstacleGroup) -> bool:
-    """Return whether nothing else is within the spheres around a body."""
-    radius = body.radius + _APART[1] * scene.wavelength
-    others = [
-        float((other.center - body.center).norm()) - other.radius for other in bodies if other is not body
-    ]
-    others += [float(each.mirror.height(body.center)) for each in scene.reflectors]
-    others.append(float((scene.array.nodes.positions - body.center).norm(dim=-1).min()))
-    return min(others) > radius
 
 
 def _force_on(propagator: Propagator, drive: torch.Tensor, body: ObstacleGroup) -> torch.Tensor:

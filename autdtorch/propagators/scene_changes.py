@@ -96,7 +96,7 @@ class SceneChanges:
         Raises:
             ValueError: amounts that make no scene, such as an obstacle moved onto a control point.
         """
-        return self._scene(self._by_name(amounts))
+        return changed_scene(self._base, self._of_scene(self._by_name(amounts)))
 
     def points(self, amounts: ArrayLike) -> torch.Tensor:
         """Return the points of observation (P, 3) [m] after changes by amounts (K,)."""
@@ -166,9 +166,6 @@ class SceneChanges:
 
     def _points_by(self, amounts: Amounts) -> torch.Tensor:
         return changed_points(self._base.control_points if self._points is None else self._points, amounts)
-
-    def _scene(self, amounts: Amounts) -> Scene:
-        return changed_scene(self._base, self._of_scene(amounts))
 
     def _of_scene(self, amounts: Amounts) -> Amounts:
         """Return the amounts of changes of the scene."""

@@ -10,6 +10,8 @@ from itertools import combinations
 import numpy as np
 import torch
 
+from autdtorch.propagators.tmatrix.body_matrix import BodyMatrix
+from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.obstacles import Obstacle, Sphere
 from autdtorch.scene.obstacles.moving import circumscribed
 from autdtorch.scene.scene import Scene
@@ -94,6 +96,15 @@ def are_outside(points: torch.Tensor, bodies: Sequence[ObstacleGroup]) -> torch.
     """Return which points (P, 3) [m] are outside the spheres of all bodies."""
     apart = torch.stack([(points - body.center).norm(dim=1) - body.radius for body in bodies])
     return (apart > LENGTH_TOLERANCE).all(dim=0)
+
+
+def room_around(place: torch.Tensor, bodies: Sequence[ObstacleGroup | BodyMatrix], scene: Scene) -> float:
+    """Return the distance [m] of a place (3,) [m] from some bodies' spheres, reflectors and transducers."""
+    offsets, normals = place - scene.array.positions, scene.array.normals
+    along, across = (offsets * normals).sum(dim=-1), torch.linalg.cross(offsets, normals).norm(dim=-1)
+    apart = [float(torch.hypot(along, (across - radii_of(scene.array)).clamp_min(0)).min())]
+    apart += [float((place - body.center).norm()) - body.radius for body in bodies]
+    return min(apart + [float(reflector.mirror.height(place)) for reflector in scene.reflectors])
 
 
 def _body(obstacles: Sequence[Obstacle], numbers: tuple[int, ...]) -> ObstacleGroup:
