@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -33,15 +33,8 @@ from autdtorch.utils.images import Image
 from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import ArrayLike, integer_at_least, invalid, require_kind
 
-
-class _Momentum(NamedTuple):
-    """A momentum of waves: the map of their coefficients (..., N, R) to (3, ..., N, R), and its kind."""
-
-    of_waves: Callable[[torch.Tensor], torch.Tensor]
-    is_angular: bool
-
-
-_LINEAR, _ANGULAR = _Momentum(linear_momentum, is_angular=False), _Momentum(angular_momentum, is_angular=True)
+_Momentum = Callable[[torch.Tensor], torch.Tensor]
+"""`linear_momentum` or `angular_momentum`."""
 
 
 def radiation_force(
@@ -71,7 +64,7 @@ def radiation_force(
     Raises:
         ValueError: an argument of another kind, shape or range.
     """
-    return _Driven.of(bodies, body, array, medium).sums(_LINEAR, drive)
+    return _Driven.of(bodies, body, array, medium).sums(linear_momentum, drive)
 
 
 def radiation_torque(
@@ -87,7 +80,7 @@ def radiation_torque(
     The centre is its circumscribed sphere's, `TMatrix.center`. About another point, add the
     cross product of the centre's offset from it and the force.
     """
-    return _Driven.of(bodies, body, array, medium).sums(_ANGULAR, drive)
+    return _Driven.of(bodies, body, array, medium).sums(angular_momentum, drive)
 
 
 def force_matrices(
@@ -101,7 +94,7 @@ def force_matrices(
 
     Leading dimensions are those of the poses. Arguments and errors are those of `radiation_force`.
     """
-    return _Driven.of(bodies, body, array, medium).matrices(_LINEAR)
+    return _Driven.of(bodies, body, array, medium).matrices()
 
 
 @dataclass(frozen=True)
@@ -151,7 +144,7 @@ class _Driven:
 
         def of_drives(bodies: Sequence[TMatrix], drives: torch.Tensor) -> torch.Tensor:  # (..., R, M)
             regular, outgoing = waves_of_body(bodies, self.number, self.array, self.images, drives, together)
-            taken = -(momentum.of_waves(regular + outgoing).conj() * outgoing).sum(dim=-2).real
+            taken = -(momentum(regular + outgoing).conj() * outgoing).sum(dim=-2).real
             return (self._to_scene(bodies, momentum) @ taken.movedim(0, -2)).mT
 
         beside = f" beside poses {self.cluster.poses}"
@@ -166,14 +159,14 @@ class _Driven:
         return forces.permute(*np.argsort(order), -1).to(device)
 
     @one_library_thread()
-    def matrices(self, momentum: _Momentum) -> torch.Tensor:
-        """Return the Hermitian matrices (..., 3, M, M) of `sums`."""
+    def matrices(self) -> torch.Tensor:
+        """Return the Hermitian matrices (..., 3, M, M) of the linear momentum's `sums`."""
         together = self.cluster.together_on(self.number)
 
         def of_units(bodies: Sequence[TMatrix], _: slice = slice(None)) -> torch.Tensor:
             regular, outgoing = waves_of_body(bodies, self.number, self.array, self.images, together=together)
-            taken = taken_up(momentum.of_waves, regular, outgoing).movedim(0, -3)
-            scene = self._to_scene(bodies, momentum).to(taken.dtype)
+            taken = taken_up(linear_momentum, regular, outgoing).movedim(0, -3)
+            scene = self._to_scene(bodies, linear_momentum).to(taken.dtype)
             return torch.einsum("...ij,...jmn->...imn", scene, taken)
 
         poses = self.cluster.poses
@@ -185,7 +178,7 @@ class _Driven:
     def _to_scene(self, bodies: Sequence[TMatrix], momentum: _Momentum) -> torch.Tensor:
         """Return the map (..., 3, 3) from momentum along a body's axes to that in the scene [SI]."""
         body = bodies[self.number]
-        if not momentum.is_angular:
+        if momentum is linear_momentum:
             return self.scale * body.axes
         handedness: torch.Tensor = torch.linalg.det(body.axes)[..., None, None]
         return self.scale / body.wavenumber.real * handedness * body.axes

@@ -29,11 +29,11 @@ def incoming_waves(
     Gradients by the pose take sums over N waves, not over those of each transducer.
     """
     setting = replace(body, center=body.center.detach(), axes=body.axes.detach()), array, images, body.degree
-    waves: torch.Tensor = _Driven.apply(body.center, body.axes, drive, *setting)  # type: ignore[no-untyped-call]
+    waves: torch.Tensor = _DrivenWaves.apply(body.center, body.axes, drive, *setting)  # type: ignore[no-untyped-call]
     return waves[..., : len(body.matrix)].mT
 
 
-class _Driven(torch.autograd.Function):
+class _DrivenWaves(torch.autograd.Function):
     """Waves (..., R, K) with a degree more, whose gradient is left out."""
 
     @staticmethod
@@ -59,7 +59,7 @@ class _Driven(torch.autograd.Function):
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         (center, axes, drive, waves), (body, array, images, degree) = ctx.saved_tensors, ctx.setting
         if torch.is_grad_enabled():  # for derivatives of the gradient
-            waves = _Driven.apply(center, axes, drive, body, array, images, degree + 1)  # type: ignore[no-untyped-call]
+            waves = _DrivenWaves.apply(center, axes, drive, body, array, images, degree + 1)  # type: ignore[no-untyped-call]
         by_place = by_turn = by_drive = None
         count = (degree + 1) ** 2
         if ctx.needs_input_grad[0]:
