@@ -53,6 +53,7 @@ from autdtorch.utils.progress import show_progress
 logger = logging.getLogger(__name__)
 
 _ENTRY_BYTES = 48.0  # of T and what makes it
+_TOGETHER = 16  # Runs whose forces are computed together
 _DIGITS = 10  # Decimals of the places [m] of obstacles in their body, so that poses are the same body
 
 
@@ -139,16 +140,21 @@ class StillBody:
         mixing = real_waves(self.degree)
         incoming = self._regular(box.driven) @ mixing
         strength = incoming.norm(dim=0).clamp_min(torch.finfo(torch.float64).tiny)
-        fields = [(incoming[:, waves] / strength[waves]).sum(dim=1) for waves in self.runs]
         outgoing = mixing.mH @ self._multipoles()
         judged = sphere_points((0.0, 0.0, 0.0), self.sphere[1], MOST_JUDGED)
         observed = outgoing_waves(self.degree, box.wavenumber, judged) @ mixing @ outgoing
+
+        def forces(runs: Sequence[Sequence[int]]) -> torch.Tensor:
+            fields = [(incoming[:, waves] / strength[waves]).sum(dim=1) for waves in runs]
+            return box.forces(torch.stack(fields, dim=1))
+
+        parts = [self.runs[first : first + _TOGETHER] for first in range(0, count, _TOGETHER)]
         nowhere = box.near_to_far(Apertures.of_points(judged[:0]))
         periods = math.ceil(count * USUAL_PERIODS * fewest_periods(box.assembly.grid.arrival))
         with show_progress(periods, "simulating the waves of a body") as progress:
             body = BoxScatterer(plan, make_kernel(plan.kernel), Couplings(()), progress.advance, nowhere)
             states = body.answers(
-                box.forces(torch.stack(fields, dim=1)), [plan.tolerance] * count,
+                torch.cat([forces(part) for part in parts], dim=1), [plan.tolerance] * count,
                 lambda phasors, _: [observed @ phasors.cpu()],
             )  # fmt: skip
         answers = outgoing @ torch.stack([steady.pressure for steady in states], dim=1).cpu()
