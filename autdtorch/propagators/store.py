@@ -127,7 +127,9 @@ class Store:
         if self.folder is None:
             return
         body = np.append(matrix, numbers).astype(np.complex128).tobytes()
-        path = self.folder / f"{key}{SUFFIX}"
+        if len(body) > self._most_saved:
+            return
+        path, content = self.folder / f"{key}{SUFFIX}", _with_checksum(key, matrix.shape, body)
         try:
             replace_file(path, content)
         except OSError as error:

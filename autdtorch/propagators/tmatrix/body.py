@@ -149,7 +149,7 @@ class StillBody:
             return box.forces(torch.stack(fields, dim=1))
 
         parts = [self.runs[first : first + _TOGETHER] for first in range(0, count, _TOGETHER)]
-        nowhere = box.near_to_far(Apertures.of_points(judged[:0]))
+        nowhere = box.near_to_far(Apertures(judged[:0]))
         periods = math.ceil(count * USUAL_PERIODS * fewest_periods(box.assembly.grid.arrival))
         with show_progress(periods, "simulating the waves of a body") as progress:
             body = BoxScatterer(plan, make_kernel(plan.kernel), Couplings(()), progress.advance, nowhere)
