@@ -95,14 +95,14 @@ def make_propagator(
             return refined(planned.on_grids, Budget(seconds, memory), store)
         return SimulatedPropagator(planned.on_grids, store)
 
-    if planned.method == "free_space":
-        return FreeSpacePropagator(scene, planned.device)
     if not planned.runs:
         return TMatrixPropagator(planned, store, on_grids)
     propagator: TMatrixPropagator | SimulatedPropagator
     if planned.method == "tmatrix":
         settled = planned if spacing else planned.at(on_grids().spacing, tolerance, time_step)
         propagator = TMatrixPropagator(settled, store, on_grids)
+    elif planned.method == "free_space":
+        return FreeSpacePropagator(scene, planned.device)
     else:
         propagator = on_grids()
     if time_step is not None:

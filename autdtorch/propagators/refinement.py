@@ -121,11 +121,11 @@ def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
 
 def first_plan(pilot: Plan, is_unlimited: bool = True) -> Plan:
     """Return the plan of the first grid of a choice; without a budget it is finer where that saves a grid."""
-    region, tolerance, spacing = pilot.region, pilot.tolerance, pilot.region.coarsest_spacing
+    region, spacing = pilot.region, pilot.region.coarsest_spacing
     if is_unlimited:
         spacing /= min(region.wavelength / region.shortest_wavelength, _FINER_IF_SLOW)
-        spacing = min(spacing, pilot.law.spacing_of(tolerance / _FIRST_ERROR))
-    return pilot.fitted(spacing, _SETTLED * tolerance, spacing)
+        spacing = min(spacing, pilot.law.spacing_of(pilot.tolerance / _FIRST_ERROR))
+    return pilot.fitted(spacing, _SETTLED * pilot.tolerance, spacing)
 
 
 def usual_plans(first: Plan, usual: float, tolerance: float) -> list[Plan]:
