@@ -296,7 +296,7 @@ def test_a_function_runs_its_method_with_the_settings_and_arguments_it_is_called
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_the_old_keyword_of_the_goal_is_taken_with_a_warning(objective, name):
     function = getattr(at, name)
-    few = {"evaluations": 17, "levels": 4, "steps": 5}
+    few = {"evaluations": 17, "initial": 16, "levels": 4, "steps": 5}
     settings = {key: few[key] for key in few.keys() & inspect.signature(function).parameters.keys()}
     if name == "random_search":
         del settings["levels"]

@@ -115,7 +115,7 @@ def test_a_simulation_is_corrected_by_few_readings(make_objective, random_matrix
         objective = make_objective(deviating(simulated, seed))
         best = at.gradient_ascent(objective).score
         begin = objective(at.gradient_ascent(make_objective(simulated)).drive).amin(dim=1)
-        options = {"evaluations": 20, "prior": at.Prior(simulated), "seed": seed}
+        options = {"evaluations": 14, "prior": at.Prior(simulated), "seed": seed}
         fitted = at.identify(Noise(objective, 30, seed=seed), **options)
         foci = at.bayes_opt(Noise(objective, 30, seed=seed), **options, **FOCI)
         shares.append([begin / best, *(objective(one.drive).amin(dim=1) / best for one in (fitted, foci))])
@@ -145,7 +145,7 @@ def test_a_sensor_in_other_units_costs_nothing(make_objective, random_matrix, me
     simulated = random_matrix(3, 8, 2)
     objective = make_objective(factor * deviating(simulated, 1))
     best = at.gradient_ascent(objective).score
-    assert method(objective, evaluations=20, prior=at.Prior(simulated)).score > 0.97 * best
+    assert method(objective, evaluations=12, prior=at.Prior(simulated)).score > 0.97 * best
 
 
 @pytest.mark.parametrize(

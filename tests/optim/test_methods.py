@@ -23,10 +23,10 @@ BLACK_BOX = [
     at.GABS(levels=4, passes=3),
     at.GABS(levels=3, order="strength"),
     at.RandomSearch(evaluations=130),
-    at.Identify(evaluations=18),
-    at.Identify(evaluations=9, prior=at.Prior(GUESS)),
+    at.Identify(evaluations=15),
+    at.Identify(evaluations=5, prior=at.Prior(GUESS)),
     at.BayesOpt(evaluations=9, initial=5, fixed_transducer=1),
-    at.BayesOpt(12, 5, 1, model="foci", kernel="phasor", noise="inferred"),
+    at.BayesOpt(8, 5, 1, model="foci", kernel="phasor", noise="inferred"),
     at.BayesOpt(6, 5, 1, model="foci", kernel="phasor", noise="inferred", prior=at.Prior(GUESS)),
     at.PhaseStepping(rounds=2),
 ]
@@ -212,7 +212,7 @@ def test_a_block_of_bayes_opt_is_the_same_on_any_number_of_threads(objective, me
     assert torch.equal(solutions[0].history, solutions[1].history)
 
 
-@pytest.mark.parametrize("method", [at.identify, at.gradient_ascent])
+@pytest.mark.parametrize("method", [partial(at.identify, evaluations=14), at.gradient_ascent])
 def test_a_method_of_small_steps_takes_one_thread_and_gives_the_others_back(
     objective, method, monkeypatch, set_threads
 ):

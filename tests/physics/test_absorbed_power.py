@@ -133,11 +133,11 @@ def test_power_of_a_second_call_is_the_first():
 
 
 def test_box_and_domain_absorb_alike_and_what_is_rigid_absorbs_nothing():
-    """Two grids of 1.5 mm: 2 %, the error of either for small bodies."""
+    """Two grids of 1.8 mm: 2 %, the error of either for small bodies; 1 % measured."""
     rigid = at.Sphere((-14e-3, 0.0, 25e-3), 4e-3, rigid=True)
     scene = scene_of(monopole(), [BALL, BLOCK, rigid], [at.Reflector(*FLOOR)])
     box, full = (
-        at.make_propagator(scene, method, 1.5e-3).absorbed_power(unit(1)) for method in ("box", "full")
+        at.make_propagator(scene, method, 1.8e-3).absorbed_power(unit(1)) for method in ("box", "full")
     )
     np.testing.assert_allclose(box.obstacles[:2], full.obstacles[:2], rtol=2e-2)
     assert float(box.obstacles[2]) == float(full.obstacles[2]) == 0
