@@ -312,8 +312,8 @@ def numbers(folder: Path) -> dict[str, torch.Tensor]:
         "lssg": at.lssg(objective, passes=2),
         "gabs": at.gabs(objective, order="strength", trials=3),
         "random": at.random_search(objective, levels=7, trials=2),
-        "bo": at.bayes_opt(objective, 18, trials=2, fixed_transducer=0),
-        "identify": at.identify(objective, 20, trials=2),
+        "bo": at.bayes_opt(objective, 17, trials=2, fixed_transducer=0),
+        "identify": at.identify(objective, 12, trials=2),
         "gradient": at.gradient_ascent(objective, starts=3, steps=20),
         "noisy": at.gabs(noisy, trials=2),
     }.items():
