@@ -30,8 +30,8 @@ _AIR_SPACING, _AIR_RIM = 1e-3, 28
 _PILOT_CELLS = 6
 """Cells per wavelength of the coarse grid that symmetries are found on."""
 
-_PILOT_POINTS, _PILOT_TOLERANCE = 4, 0.05
-"""Most points whose scattered field is simulated on the first grid, and where their runs end."""
+_PILOT_POINTS, _PILOT_TOLERANCE, _PILOT_SECONDS = 4, 0.05, 10.0
+"""Most points whose scattered field is simulated on a first grid, where runs end, and their most time [s]."""
 
 _PAIR_SECONDS = 1e-8
 """Time [s] of a pair of a point and a transducer in free space."""
@@ -83,7 +83,7 @@ def estimate(
     Args:
         scene: the scene.
         spacing: edge of a cell [m]. None: that which `make_propagator` is expected to choose by `tolerance`,
-            from a run on its first grid; the time is that of all its grids.
+            from runs on its first grid of up to 10 s; the time is that of all its grids.
         tolerance: relative distance to the steady state, or without a spacing the estimated error, in (0, 1).
         method: as in `make_propagator`, as are `device`, `kernel` and `dtype`.
         device: where simulations would run.
@@ -112,24 +112,29 @@ def estimate(
     without_symmetries = planned.work
     if pilot.memory < available_memory():
         planned = replace(planned, runs=kind(pilot).planned_runs)
-    small, large = _MEASURED_CELLS
-    cells = small if max(grid.cells for grid in planned.grouping.grids) < large / 2 else large
     work = planned.work + planned.work / without_symmetries * sum(each.work for each in before)
-    seconds = work / _rate(planned.kernel, planned.dtype, cells)
+    seconds = work / _rate_of(planned)
     return Estimate(planned.method, spacing, planned.cells, planned.runs, planned.memory, seconds)
 
 
 def _plans_by_tolerance(pilot: Plan) -> list[Plan]:
     """Return the plans of the grids that a choice by tolerance is expected to take.
 
-    Some points are simulated on the first grid, to see how much is scattered; all, if it is refused.
+    Some points are simulated on the first grid to see how much is scattered; all, if that is refused or long.
     """
     first, points = first_plan(pilot), pilot.scene.control_points
-    usual = first.law.usual(first.spacing)
-    if not first.refusal:
-        some = points[:: math.ceil(len(points) / _PILOT_POINTS)]
-        usual = SimulatedPropagator(first.at(first.spacing, _PILOT_TOLERANCE)).usual_error(some)
+    some, usual = points[:: math.ceil(len(points) / _PILOT_POINTS)], first.law.usual(first.spacing)
+    loose = replace(first.at(first.spacing, _PILOT_TOLERANCE), runs=len(some))
+    if not first.refusal and loose.work / _rate_of(loose) < _PILOT_SECONDS:
+        usual = SimulatedPropagator(loose).usual_error(some)
     return usual_plans(first, usual, pilot.tolerance)
+
+
+def _rate_of(planned: Plan) -> float:
+    """Return the steps of a cell in a second on the largest grid of a plan, about."""
+    small, large = _MEASURED_CELLS
+    is_small = max(grid.cells for grid in planned.grouping.grids) < large / 2
+    return _rate(planned.kernel, planned.dtype, small if is_small else large)
 
 
 @functools.cache

@@ -122,6 +122,8 @@ def test_an_estimate_by_tolerance_tells_the_choice(monkeypatch):
     assert tight.spacing < loose.spacing
     by_waves = at.estimate(scene, None, 0.02, method="tmatrix")
     assert (by_waves.method, by_waves.spacing) == ("tmatrix", pytest.approx(tight.spacing, rel=0.2))
+    monkeypatch.setattr(simulation_estimate, "_PILOT_SECONDS", 0.0)  # all is taken to be scattered
+    assert at.estimate(scene, None, 0.02, method="box").spacing < tight.spacing
 
 
 def test_a_choice_logs_its_cost_and_warns_if_it_is_long(monkeypatch, caplog):
