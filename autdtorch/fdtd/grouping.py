@@ -184,9 +184,11 @@ class Grouping:
         """Pairs of a radiating cell of one box and a scattering cell of another."""
         return sum(one.radiating * other.scattering for one, other in permutations(self.grids, 2))
 
-    def with_layer(self, layer: Thickness) -> Self:
-        """Return the same grids with other absorbing layers."""
-        grids = [replace(grid, extent=replace(grid.extent, layer=layer)) for grid in self.grids]
+    def with_rim(self, margin: int, layer: Thickness) -> Self:
+        """Return the same grids with other cells of air and absorbing layers around bodies."""
+        grids = [
+            replace(grid, extent=replace(grid.extent, margin=margin, layer=layer)) for grid in self.grids
+        ]
         return replace(self, grids=tuple(grids))
 
     def box_cost(self, runs: int) -> float:

@@ -18,7 +18,7 @@ from autdtorch.fdtd.kernels import available_kernel, precision_of
 from autdtorch.fdtd.placement import fitting_spacing
 from autdtorch.fdtd.region import Body, Fluid, Region
 from autdtorch.fdtd.shapes import Shape
-from autdtorch.fdtd.short_runs import THIN_LAYER
+from autdtorch.fdtd.short_runs import THIN_LAYER, THIN_MARGIN
 from autdtorch.propagators.free_space import PAIR_BYTES
 from autdtorch.propagators.store import key_of
 from autdtorch.propagators.tmatrix.bodies import waves_to_simulate
@@ -84,7 +84,7 @@ class Plan:
         if self.grids is not None:
             return self.grids
         _, grouping = choose_grids(self.region, self.method, self.spacing, self.tolerance, self.runs)
-        return grouping.with_layer(THIN_LAYER) if self.is_short else grouping
+        return grouping.with_rim(THIN_MARGIN, THIN_LAYER) if self.is_short else grouping
 
     def at(self, spacing: float, tolerance: float, time_step: float | None = None) -> Self:
         """Return a plan of the same method with another spacing [m], tolerance and time step [s]."""

@@ -4,13 +4,16 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_scenes import relative_error, small_scene
+from small_scenes import AIR, relative_error, small_scene
 
 from autdtorch.propagators import make_propagator
+from autdtorch.propagators import nearby as nearby_module
 from autdtorch.propagators.nearby import NearbyPoses
+from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.changes import seen_from_obstacles
 from autdtorch.scene.obstacles import Box, Cylinder, Sphere
 from autdtorch.scene.reflectors import Reflector
+from autdtorch.scene.scene import Scene
 
 BALL = Sphere((12e-3, 14e-3, 14e-3), 2.5e-3, rigid=True)
 ROD = Cylinder((13e-3, 8e-3, 12e-3), 2e-3, 6e-3, axis=(1, 2, 1), rigid=True)
@@ -65,6 +68,19 @@ def test_errors_of_small_moves_are_claimed_within_a_factor_of_three(bodies):
         error = relative_error(matrix, fresh)  # of a grid that does not turn with a ball or along a block
         assert told / 3 < error < 3 * told
         assert error < 0.5 * relative_error(start, fresh)
+
+
+def test_what_extrapolation_leaves_follows_the_difference_of_its_grids(monkeypatch):
+    block = Box((0, 0, 70e-3), (16e-3, 12e-3, 10e-3), rigid=True)
+    array = TransducerArray.autd3((0, 0, 0), (0, 0, 1))
+    scene = Scene(array, AIR, 40e3, [(-10e-3, 5e-3, 0.1), (12e-3, 0, 0.11)], [block])
+    propagator = make_propagator(scene, "box", 1e-3, 2e-3, cache=False)
+    pose = (1e-3, 0.5e-3, -0.5e-3), (0.03, -0.02, 0.05)
+    fresh = make_propagator(scene.moved(*pose), "box", 1e-3, 2e-3, cache=False).transfer_matrix()
+    error = relative_error(NearbyPoses(propagator).transfer_matrix(*pose), fresh)
+    monkeypatch.setattr(nearby_module, "_AROUND", 1 + len(array))  # too few for a fit
+    # a tenth to a third, for bodies of several shapes before an AUTD3
+    assert error < 0.9 * relative_error(NearbyPoses(propagator).transfer_matrix(*pose), fresh)
 
 
 def test_reflectors_that_move_with_the_array_leave_long_runs():
