@@ -14,7 +14,7 @@ from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels import make_kernel
 from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.region import Region
-from autdtorch.fdtd.steady_state import MOST_JUDGED, phasors_kept
+from autdtorch.fdtd.steady_state import MOST_JUDGED, stored_bytes
 from autdtorch.utils.process import cached_property, thread_count
 from autdtorch.utils.spatial import doubled_normals
 
@@ -33,9 +33,6 @@ with forces, at tilted surfaces of fluids; relative to tilted surfaces of rigid 
 
 _ELEMENTS, _MOST_ELEMENTS = 1.4, 4096
 """Elements assembled for each that a surface cuts, as some are only near it; the most at once by a thread."""
-
-_RECORDED = 44
-"""Memory [bytes] of a recorded number, and of what is made of it for the Fourier sums."""
 
 _CELL_STEPS, _UNLIKE_STEPS, _COLUMN_STEPS, _LOSSY = 3.0, 9.0, 150.0, 2.0
 """Times of a step, in steps of a cell of air, as in the following: of a heterogeneous cell, the additional
@@ -99,7 +96,7 @@ class Costs:
         grouping, filled, cells = self.grouping, self._heterogeneity, self._cells_read
         block = 3 * max(grid.steps_per_period for grid in grouping.grids)
         run = _FIELD_NUMBERS * self.itemsize * grouping.cells
-        run += cells * (16 * phasors_kept(cells) + _RECORDED * block)
+        run += stored_bytes(cells, self.itemsize) + self.itemsize * block * cells  # which are recorded
         judged = min(MOST_JUDGED, self.receivers) if self.in_boxes else 0
         lasting = _CELL_BYTES * grouping.cells + _CELL_MEMORY * filled.cells + _COLUMN_BYTES * filled.columns
         assembled = min(_ELEMENTS * filled.cut / len(grouping.grids), _MOST_ELEMENTS * thread_count())

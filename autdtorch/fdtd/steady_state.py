@@ -40,6 +40,7 @@ _PARTS = 4  # Windows per block
 _FEWEST_PHASORS, _MOST_PHASORS = 12, 64
 _MOST_NUMBERS = 20_000_000  # Most complex numbers of the stored phasors: 160 MB of single precision
 _MOST_FITTED = 2048  # Most cells whose phasors decide the means
+_SUMS = 18  # Complex numbers of a cell in Fourier sums of a block, its windows and limits
 # Numbers of stored phasors that are summed at once: as many as the CPU's cache holds, and for a GPU more
 _SUMMED, _SUMMED_ON_GPU = 2**15, 2**24
 _ROUNDING = 1e-13  # Regularisation of the normal equations, relative to the mean square of the differences
@@ -175,6 +176,12 @@ def blocks_needed(phasors: Tensor, floor: float, tolerance: float) -> tuple[floa
 def phasors_kept(cells: int) -> int:
     """Return the number of phasors of `cells` cells that a run stores."""
     return min(max(_FEWEST_PHASORS, _MOST_NUMBERS // max(1, cells)), _MOST_PHASORS)
+
+
+def stored_bytes(cells: int, itemsize: int) -> int:
+    """Return the memory [bytes] of the phasors and sums of `cells` cells in a run on fields of a precision."""
+    phasors, steps = 2 * itemsize * cells, 16 * min(cells, _MOST_FITTED)
+    return phasors_kept(cells) * (phasors + steps) + 16 * _SUMS * cells
 
 
 class Extrapolation:
