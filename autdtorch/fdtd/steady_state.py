@@ -179,7 +179,7 @@ def phasors_kept(cells: int) -> int:
 
 
 def stored_bytes(cells: int, itemsize: int) -> int:
-    """Return the memory [bytes] of the phasors and sums of `cells` cells in a run on fields of a precision."""
+    """Return the memory [bytes] of the phasors and sums of `cells` cells that a run on some fields stores."""
     phasors, steps = 2 * itemsize * cells, 16 * min(cells, _MOST_FITTED)
     return phasors_kept(cells) * (phasors + steps) + 16 * _SUMS * cells
 
