@@ -16,7 +16,7 @@ from autdtorch.hardware.sensors.sensor import AnySensor, SensorConfig, Setup
 from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.propagators import Propagator
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.validation import boolean, indices, invalid, require_known, require_one_of
+from autdtorch.utils.validation import boolean, indices, invalid, require_known, require_one_of, within
 
 #: Keys of the section `hardware` of every bench; `DEVICES` and `SENSORS` declare the others.
 _KEYS = ("device", "emulated", "transducers", "failed", "settle", "dry_run", "limits", "sensor")
@@ -39,7 +39,8 @@ class Bench:
         self._section, self._scene, self._seed = section, scene, seed
         limits = section_of(section, "limits")
         _require_keys("hardware.limits", limits, [field.name for field in fields(hardware.Limits)])
-        self.limits = hardware.Limits(**limits)
+        with within("hardware.limits"):
+            self.limits = hardware.Limits(**limits)
         self.is_dry = boolean("hardware.dry_run", section["dry_run"])  # frames are printed, nothing is opened
         self.is_emulated = boolean("hardware.emulated", section["emulated"]) or self.is_dry
         silent = self.is_dry or not has_sensor

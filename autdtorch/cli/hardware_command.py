@@ -50,7 +50,7 @@ from autdtorch.study.study_method import check_goal, name_of, solve
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.progress import Progress, show_progress
-from autdtorch.utils.validation import invalid
+from autdtorch.utils.validation import invalid, within
 
 logger = logging.getLogger(__name__)
 
@@ -131,7 +131,9 @@ class _Trial:
         self._propagator = make_propagator(self._scene, **solver_of(settings))
         simulated = SimulatedObjective(self._scene, self._propagator)
         bench.emulate(simulated, self._propagator)
-        self._simulated = hardware.Played(simulated, bench.device, bench.transducers, bench.limits.amplitude)
+        played = bench.device, bench.transducers, bench.limits.amplitude
+        with within("hardware.limits"):  # the transducers are checked
+            self._simulated = hardware.Played(simulated, *played)
         self._settings["largest amplitude"] = round(self._simulated.largest, 4)
         simulated_readings = self._with_readings(readings)
         self._expected = solve(

@@ -144,7 +144,7 @@ MISTAKES = [
     (["play.tempo=3"], "play.tempo: unknown key"),
     (["trials=3"], "trials=3: has no effect on play"),
     (["method=gabs"], "method=gabs: has no effect on play"),
-    (["hardware.limits.amplitude=2"], "amplitude: 2"),
+    (["hardware.limits.amplitude=2"], "hardware.limits: amplitude: 2"),
 ]
 
 
