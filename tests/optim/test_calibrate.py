@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 
 import pytest
 import torch
@@ -177,7 +178,10 @@ def test_silent_transducers_are_named(silent, points):
     matrix = at.make_propagator(scene(points)).transfer_matrix()
     bench = Bench(matrix, 8)
     bench.matrix[:, silent] = 0
-    (doubt,) = at.calibrate(matrix, bench.readings(150 // points)).doubts
+    calibration = at.calibrate(matrix, bench.readings(150 // points))
+    (doubt,) = calibration.doubts
+    # that of the others, of which the fit takes a part for noise; with the silent ones it is 12 to 23 %
+    assert float(re.search(r"gains +spread ([\d.]+) %", calibration.summary())[1]) < 8
     named = f"transducers {silent[0]}, {silent[1]} are" if len(silent) > 1 else f"transducer {silent[0]} is"
     assert doubt.startswith(f"{named} silent, or below")
 

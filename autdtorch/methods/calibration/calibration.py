@@ -261,11 +261,15 @@ class Calibration:
                 ("error at readings held back", error),
                 ("within 95 % intervals", f"{100 * held.coverage:.0f} % of {held.readings}"),
             ]
-        gains, phases = _spreads(self, torch.ones_like(self.gain, dtype=torch.bool))
+        sounding = ~_silent(self)
+        gains, phases = _spreads(self, sounding)
+        gain_error, phase_error = (
+            float(deviation[sounding].mean()) for deviation in (self.gain_deviation, self.phase_deviation)
+        )
         facts += [
             ("scale", f"{self.scale.value:.4g} +- {self.scale.deviation:.2g}"),
-            ("gains", f"spread {_percent(gains)}, each +- {_percent(float(self.gain_deviation.mean()))}"),
-            ("phases", f"spread {phases:.3f} rad, each +- {float(self.phase_deviation.mean()):.3f} rad"),
+            ("gains", f"spread {_percent(gains)}, each +- {_percent(gain_error)}"),
+            ("phases", f"spread {phases:.3f} rad, each +- {phase_error:.3f} rad"),
             ("noise", f"{self.noise:.3g} Pa"),
             ("determined", f"{self.determined:.0f} of {2 * len(self.gain)} directions of gains and phases"),
         ]
