@@ -90,10 +90,10 @@ class Plan:
         """Return a plan of the same method with another spacing [m], tolerance and time step [s]."""
         return replace(self, spacing=spacing, tolerance=tolerance, time_step=time_step, grids=None)
 
-    def fitted(self, spacing: float, tolerance: float, coarsest: float = math.inf) -> Self:
+    def fitted(self, spacing: float, coarsest: float = math.inf) -> Self:
         """Return the plan at a spacing [m] near one, not above a limit, with which flat faces fall best."""
         regions = [grid.part.unbounded.turned(grid.axes) for grid in self.grouping.grids]
-        return self.at(fitting_spacing(regions, spacing, coarsest), tolerance, self.time_step)
+        return self.at(fitting_spacing(regions, spacing, coarsest), self.tolerance, self.time_step)
 
     def of(self, scene: Scene) -> Self:
         """Return a plan of a changed scene with these settings, which takes the same bodies as rigid."""

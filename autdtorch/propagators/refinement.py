@@ -6,7 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from autdtorch.fdtd.region import Region
 from autdtorch.propagators.plan import Plan
@@ -107,7 +107,8 @@ def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
                 reason = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
                 raise ValueError(f"max_periods: {plan.max_periods}; {reason}")
         ahead = _plans_ahead(plan, grid_error, len(others), aim)
-        for finer in (ahead[0], _finer(plan, _SMALLEST_STEP)):
+        _, coarsest = _next_spacings(plan)
+        for finer in (ahead[0], plan.fitted(coarsest, coarsest)):
             if budget.fits(finer, plan, taken):
                 break
         else:
@@ -125,7 +126,8 @@ def first_plan(pilot: Plan, is_unlimited: bool = True) -> Plan:
     if is_unlimited:
         spacing /= min(region.wavelength / region.shortest_wavelength, _FINER_IF_SLOW)
         spacing = min(spacing, pilot.law.spacing_of(pilot.tolerance / _FIRST_ERROR))
-    return pilot.fitted(spacing, _SETTLED * pilot.tolerance, spacing)
+    settled = replace(pilot, tolerance=_SETTLED * pilot.tolerance, grids=pilot.grouping)
+    return settled.fitted(spacing, spacing)
 
 
 def usual_plans(first: Plan, usual: float, tolerance: float) -> list[Plan]:
@@ -149,9 +151,9 @@ class _Aim:
     def finer(self, plan: Plan, grid_error: float) -> Plan:
         """Return the next plan after one whose grid has an error."""
         aim = max(_AIM * self.tolerance - self.known, self.shape / _SHAPE)
-        wanted = aim / grid_error * plan.law.growth(plan.spacing)
-        step = plan.spacing / plan.law.spacing_of(wanted)
-        return _finer(plan, min(max(step, _SMALLEST_STEP), _LARGEST_STEP))
+        wanted = plan.law.spacing_of(aim / grid_error * plan.law.growth(plan.spacing))
+        finest, coarsest = _next_spacings(plan)
+        return plan.fitted(min(max(wanted, finest), coarsest), coarsest)
 
 
 def _plans_ahead(plan: Plan, grid_error: float, others: int, aim: _Aim) -> list[Plan]:
@@ -168,9 +170,9 @@ def _plans_ahead(plan: Plan, grid_error: float, others: int, aim: _Aim) -> list[
         plans.append(aim.finer(plans[-1], error))
 
 
-def _finer(plan: Plan, ratio: float) -> Plan:
-    """Return the plan at a spacing finer by a ratio, about."""
-    return plan.fitted(plan.spacing / ratio, plan.tolerance, plan.spacing / _SMALLEST_STEP)
+def _next_spacings(plan: Plan) -> tuple[float, float]:
+    """Return the finest and the coarsest spacing [m] of the grid after a plan's."""
+    return plan.spacing / _LARGEST_STEP, plan.spacing / _SMALLEST_STEP
 
 
 def _log_cost(

@@ -10,6 +10,7 @@ True errors are against a finer grid where faces fall as well, extrapolated by t
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -114,7 +115,7 @@ def on_a_finer_grid(case: tuple[str, float, float]) -> tuple[torch.Tensor, float
     """Return the matrix of a body on a grid finer than a spacing [m], and the ratio of both errors."""
     kind, side, spacing = case
     coarse = plan(scene_of(body(kind, side)), "box", None, TOLERANCE).on_grids
-    finer = coarse.fitted(FINER * spacing, REFERENCE_TOLERANCE)
+    finer = replace(coarse, tolerance=REFERENCE_TOLERANCE, grids=coarse.grouping).fitted(FINER * spacing)
     ratio = coarse.law.growth(finer.spacing) / coarse.law.growth(spacing)
     return SimulatedPropagator(finer).transfer_matrix(), ratio
 
