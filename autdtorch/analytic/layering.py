@@ -45,7 +45,6 @@ class Layering:
     thickness: float | None = None  # d of a slab [m], None for a half-space
 
     def __post_init__(self) -> None:
-        """Check the attributes and make them floats."""
         object.__setattr__(self, "wavenumber", real_wavenumber(self.wavenumber))
         density, speed = fluid_ratios(self.density_ratio, self.speed_ratio)
         object.__setattr__(self, "density_ratio", density)

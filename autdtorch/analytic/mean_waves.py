@@ -103,7 +103,6 @@ class MeanWaves(NamedTuple):
 
 @cached_tensors(16)
 def _means(degree: int, size: complex, powers: int) -> list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """Return `MeanWaves.means`."""
     result = []
     for least in range(degree + 1):
         every = np.arange(least, degree + 2 * powers + 1)

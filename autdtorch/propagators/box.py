@@ -198,7 +198,6 @@ class BoxSimulation(Simulation):
         return self._store.get(key, lambda: self._radiation(sources, strength))
 
     def _radiation(self, sources: Sequence[Apertures], strength: torch.Tensor) -> Radiation:
-        """Simulate the radiation of runs; see `_run`."""
         solved, runs = self._recorded(
             len(sources), lambda stepped: self._solved(sources, strength, self._judged, stepped)
         )

@@ -58,7 +58,6 @@ class Estimate:
     seconds: float
 
     def __repr__(self) -> str:
-        """Return all values with units."""
         grid = "" if self.spacing is None else f" at {1e3 * self.spacing:.4g} mm, {self.cells:,} cells"
         cost = f"{counted(self.runs, 'run')}, {self.memory / 1e6:,.0f} MB, {self.seconds:.2g} s"
         return f"Estimate({self.method}{grid}, {cost})"

@@ -96,7 +96,6 @@ class FreeSpacePropagator(ScenePropagator):
             logger.warning("free_space ignores %s of scene %r", counted(count, "obstacle"), scene.name)
 
     def __repr__(self) -> str:
-        """Name of the scene."""
         return f"FreeSpacePropagator(scene {self.scene.name!r})"
 
     def for_scene(self, scene: Scene) -> FreeSpacePropagator:

@@ -89,7 +89,6 @@ class DomainSimulation(Simulation):
 
 
 def _joined(parts: Sequence[Sources]) -> Sources:
-    """Return the sources of several runs from those of each."""
     index = torch.unique(torch.cat([part.index for part in parts]))
     force = parts[0].force.new_zeros((len(parts), len(index), 2))
     for run, part in zip(force, parts, strict=True):

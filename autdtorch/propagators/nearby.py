@@ -83,7 +83,6 @@ class NearbyPoses:
         self.spacings = _COARSER * spacing, _COARSEST * spacing
 
     def __repr__(self) -> str:
-        """The propagator, and the spacings."""
         return (
             f"NearbyPoses({self.propagator}, by {' and '.join(f'{1e3 * h:.4g}' for h in self.spacings)} mm)"
         )

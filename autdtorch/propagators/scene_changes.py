@@ -199,7 +199,6 @@ class SceneChanges:
 
     @cached_property
     def _bodies(self) -> MovedBodies | None:
-        """The bodies of T-matrices, if there are any."""
         return MovedBodies(self._propagator) if isinstance(self._propagator, TMatrixPropagator) else None
 
     def _by_name(self, amounts: ArrayLike) -> dict[str, float]:

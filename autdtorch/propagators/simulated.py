@@ -65,7 +65,6 @@ class SimulatedPropagator(ScenePropagator):
         self.plan, self._store, self._coarser = plan, store or Store(), tuple(others)
 
     def __repr__(self) -> str:
-        """Scene, settings and number of runs."""
         settings = f"{self.method}, spacing {1e3 * self.spacing:.4g} mm, steady to {self.tolerance:g}"
         return f"SimulatedPropagator(scene {self.scene.name!r}, {settings}, {counted(len(self.runs), 'run')})"
 
@@ -253,7 +252,6 @@ class SimulatedPropagator(ScenePropagator):
         return errors + shape_errors(matrix, free, region) + rigid_errors(matrix, free, region)
 
     def _free(self, points: torch.Tensor) -> torch.Tensor:
-        """Return the matrix of points in free space."""
         return free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber, self.scene.images)
 
 

@@ -253,7 +253,6 @@ class Simulation(ABC):
         return filled | self._in_enclosed_cells(points)
 
     def _loaded(self, key: str, points: torch.Tensor) -> PressureMap | None:
-        """Return the transfer matrix of unit strengths that an earlier process saved, if it is there."""
         saved = self._store.load(key, (len(points), len(self.plan.scene.array)), 2)
         if saved is None:
             return None
@@ -303,7 +302,6 @@ class Simulation(ABC):
         return PressureMap.of_runs(matrix, runs, orbits.from_points)
 
     def _fields(self, drive: torch.Tensor, points: torch.Tensor) -> PressureMap:
-        """Simulate the pressure of drives at points; see `fields`."""
         pressure, runs = self._run(*self.sources_of(drive), Apertures(points))
         return PressureMap.of_runs(pressure.mT, runs, from_points=False)
 
@@ -340,7 +338,6 @@ class Simulation(ABC):
         return result, runs
 
     def _orbits_of_transducers(self, points: torch.Tensor) -> Orbits:
-        """Return the orbits of runs from the transducers that serve points (P, 3)."""
         return orbits_of_transducers(points, self.symmetries)
 
     def _silence(self, points: torch.Tensor, sources: Apertures, strength: torch.Tensor) -> float:

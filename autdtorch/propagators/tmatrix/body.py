@@ -260,7 +260,6 @@ def _of_sphere(sphere: Obstacle, scene: Scene, degree: int) -> torch.Tensor:
 
 
 def _loaded(body: StillBody, key: str, store: Store) -> SimulatedT | None:
-    """Return T that an earlier process saved, if it is there."""
     saved = store.load(key, 2 * ((body.degree + 1) ** 2,), 1)
     if saved is None:
         return None

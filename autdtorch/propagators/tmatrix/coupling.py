@@ -66,7 +66,6 @@ def ways_between(bodies: Sequence[BodyMatrix], images: Sequence[Image], more: in
 
 
 def _seen(frame: WaveFrame, image: Image) -> WaveFrame:
-    """Return the image of a frame."""
     center = (frame.center - image.offset) @ image.matrix
     return WaveFrame(center, image.matrix.mT @ frame.axes, frame.degree)
 

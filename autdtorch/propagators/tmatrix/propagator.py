@@ -75,7 +75,6 @@ class TMatrixPropagator(ScenePropagator):
         self._make_box = make_box or functools.partial(SimulatedPropagator, plan.on_grids, self._store)
 
     def __repr__(self) -> str:
-        """Scene, settings and number of bodies."""
         settings = f"tmatrix, spacing {1e3 * self.spacing:.4g} mm, tolerance {self.tolerance:g}"
         return f"TMatrixPropagator(scene {self.scene.name!r}, {settings})"
 
