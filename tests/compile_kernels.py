@@ -9,21 +9,25 @@ import autdtorch as at
 
 
 def main(dtype: str) -> None:
-    """Simulate in a box and in free space, differentiate, run holography, let spheres scatter."""
+    """Simulate in a box and in free space, differentiate, run holography; in float64, spheres scatter too.
+
+    Spheres and meshes have kernels of one dtype; the other process meanwhile compiles those of grids.
+    """
     scene, rigid = small_scene((CUBE,)), small_scene((at.Sphere(CUBE.center, 3e-3, rigid=True),))
+    drive = torch.ones(4, dtype=torch.complex128)
+    if dtype == "float64":
+        at.Mesh.from_surface(CUBE.surface(), rigid=True).contains(CUBE.center)
+        sphere = at.TMatrix.of(at.Sphere((0, 0, 0.05), 2e-3, rigid=True), scene.medium, scene.frequency)
+        pair = at.TMatrixCluster([sphere, sphere.moved((5e-3, 0, 0))])
+        at.radiation_force(pair, drive, array=scene.array, medium=scene.medium)
     matrix = at.make_propagator(rigid, "box", 2e-3, dtype=dtype, cache=False).transfer_matrix()
     density = torch.tensor([CUBE.density], dtype=torch.float64, requires_grad=True)
-    drive = torch.ones(4, dtype=torch.complex128)
     field = at.differentiable_field(scene, drive, density=density, spacing=2e-3, dtype=dtype)
     field.abs().sum().backward()
     points = torch.rand((30_000, 3), dtype=torch.float64) + 1
     at.make_propagator(small_scene(()), "free_space", cache=False).transfer_matrix(points)
     for algorithm in ("naive", "gs"):
         at.holography(matrix.to(getattr(torch, dtype).to_complex()), algorithm=algorithm)
-    at.Mesh.from_surface(CUBE.surface(), rigid=True).contains(CUBE.center)
-    sphere = at.TMatrix.of(at.Sphere((0, 0, 0.05), 2e-3, rigid=True), scene.medium, scene.frequency)
-    pair = at.TMatrixCluster([sphere, sphere.moved((5e-3, 0, 0))])
-    at.radiation_force(pair, drive, array=scene.array, medium=scene.medium)
 
 
 if __name__ == "__main__":
