@@ -141,7 +141,8 @@ def test_forces_in_scenes_have_one_goal():
     )
     every = at.Scenarios([low, same])
     drive = torch.ones(1, 9) + 0j
-    assert every.scores(drive).tolist() == [[low.goal(low(drive)).item()] * 2]
+    # sums of one drive and of a batch round apart with other numbers of threads
+    assert every.scores(drive).tolist() == [pytest.approx([low.goal(low(drive)).item()] * 2, rel=1e-9)]
     with pytest.raises(ValueError, match=r"objectives\[1\]: goal .*must be that of the first"):
         at.Scenarios([low, other])
 
