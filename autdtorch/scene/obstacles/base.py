@@ -229,14 +229,15 @@ def inside_any(points: torch.Tensor, obstacles: Iterable[Obstacle]) -> torch.Ten
 
 
 def overlap(obstacle: Obstacle, other: Obstacle) -> bool:
-    """Return whether two obstacles share one of 16^3 points of their bounding boxes' intersection."""
+    """Return whether one of 16^3 points of their bounding boxes' intersection is inside two obstacles."""
     shared = shared_box((obstacle.lower, obstacle.upper), (other.lower, other.upper))
     if shared is None:
         return False
     lower, upper = shared
     share = (torch.arange(_SAMPLES, **REAL) + 0.5) / _SAMPLES
     points = lower + (upper - lower) * torch.cartesian_prod(share, share, share)
-    return bool((obstacle.contains(points) & other.contains(points)).any())
+    inside = [body.signed_distance(points) < -LENGTH_TOLERANCE for body in (obstacle, other)]
+    return bool((inside[0] & inside[1]).any())
 
 
 def shared_box(
