@@ -176,6 +176,11 @@ def test_links_matrices_and_settings_of_another_trial_are_refused(trial):
         )
         with pytest.raises(ValueError, match=r"transfer_matrix: shape \(16, 2\); must be \(2, 16\)"):
             objective(transfer_matrix=trial.simulated.transfer_matrix.T)
+        sensor.quantity = hw.Quantity("force", "mN")
+        with pytest.raises(ValueError, match=r"transfer_matrix: .* None with a sensor of force"):
+            objective(transfer_matrix=trial.simulated.transfer_matrix)
+        assert objective().transfer_matrix is None
+        del sensor.quantity
         for settings in ({1}, {"gain": torch.ones(1)}):
             with pytest.raises(ValueError, match=r"settings: .* what JSON can hold"):
                 objective(settings)
