@@ -144,6 +144,37 @@ def slow(rng: np.random.Generator) -> Drawn:
     return _ball(rng, rng.uniform(1e-3, 3e-3), (log_uniform(rng, 0.1, 100), log_uniform(rng, 0.3, 0.6)))
 
 
+def _soft_body(
+    rng: np.random.Generator, center: Vector, reach: float, material: dict[str, Any]
+) -> at.Obstacle:
+    """Draw a cuboid, cylinder, ball or ellipsoid in a reach [m] around a centre."""
+    kind, sizes = rng.integers(4), rng.uniform(0.4 * reach, reach, 3)
+    if kind == 0:
+        return at.Box(center, tuple((1.1 * sizes).tolist()), _angles(rng), **material)
+    if kind == 1:
+        return at.Cylinder(
+            center, 0.7 * sizes[0], 1.4 * sizes[1], tuple(rng.normal(size=3).tolist()), **material
+        )
+    if kind == 2:
+        return at.Sphere(center, sizes[0], **material)
+    ball = pyvista.ParametricEllipsoid(*(1e3 * sizes), u_res=40, v_res=40, w_res=40).clean().triangulate()
+    return at.Mesh.from_surface(ball, scale=1e-3, rotation=_angles(rng), offset=center, **material)
+
+
+def tissue(rng: np.random.Generator) -> Drawn:
+    """One or two small bodies of fluids as foam, tissue, water and plastics are to air."""
+    bodies: list[at.Obstacle] = []
+    places = ((0.0,), (-6e-3, 6e-3))[rng.integers(2)]
+    for side in places:
+        ratios = log_uniform(rng, 3.0, 1e3), log_uniform(rng, 0.5, 5.0)
+        material = {"density": ratios[0] * AIR.density, "sound_speed": ratios[1] * AIR.sound_speed}
+        x, y, z = (_middle(rng) + np.array([side, 0.0, 0.0])).tolist()
+        bodies.append(_soft_body(rng, (x, y, z), 4.4e-3 * (3 - len(places)), material))
+    if len(bodies) == 1 and isinstance(body := bodies[0], at.Sphere):
+        return Drawn(bodies, Exact(np.array(body.center), body.radius, ratios))
+    return Drawn(bodies)
+
+
 def _impedance(rng: np.random.Generator) -> complex:
     """Draw an impedance from soft to nearly rigid, with a phase of up to 70 degrees."""
     return cmath.rect(log_uniform(rng, 0.3, 20), rng.uniform(-1.2, 1.2))
@@ -224,7 +255,7 @@ FAMILIES: Mapping[str, Family] = {
     each.__name__: each
     for each in (
         *(plate, slit, corner, block, apart, needle, cylinder),
-        *(sphere, slow, absorber, lined, touching, torus, shell, voxels, shadow, room),
+        *(sphere, slow, tissue, absorber, lined, touching, torus, shell, voxels, shadow, room),
     )
 }
 
