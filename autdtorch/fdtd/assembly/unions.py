@@ -41,7 +41,7 @@ _PLACES, _DEPTHS = 200, 16  # Places of a surface where the thickness is measure
 _LEAST_SHARE = 0.05  # Least share of a surface that is a thin wall; at sharp edges less is
 _ROUNDING = 1e-3  # Distance above a surface [depths] that is rounding
 _PARALLEL = 0.85  # Least cosine of the angle between the faces of a wall
-_THICK = 2.4  # Least thickness [cells] of a wall of which vertices within continue the field of one side
+THICK = 2.4  # Least thickness [cells] of a wall of which vertices within continue the field of one side
 _ALIKE = 2.0  # Ratio of densities up to which a thin wall of fluid causes only a small error
 
 _STEP = 2e-5  # Distance [cells] from a cell's centre of the points that tell its nearest face
@@ -142,14 +142,14 @@ def nearest_normals(bodies: Sequence[Union], cells: Array, grid: Grid) -> Array:
 def stiffness_of_thick(bodies: Sequence[Union], materials: Materials, spacing: float) -> Array:
     """Return the densities (m,) of fluids, at most their bulk moduli, relative to air; 0 with thin walls.
 
-    A wall is thin below `_THICK` cells of a spacing [m]. Later bodies may leave one.
+    A wall is thin below `THICK` cells of a spacing [m]. Later bodies may leave one.
     """
     stiff = np.where(materials.rigid, 0, materials.density / np.maximum(materials.slowness, 1) ** 2)
     for number, body in enumerate(bodies):
         if not weight_of_finite(stiff[body.material]):
             continue
         later = [shape for each in bodies[number + 1 :] for shape in each.shapes]
-        if not all(_is_thick(shape, _THICK * spacing, later) for shape in body.shapes):
+        if not all(_is_thick(shape, THICK * spacing, later) for shape in body.shapes):
             stiff[body.material] = 0
     return stiff
 
