@@ -47,9 +47,8 @@ _RIGID_SHARE = 0.3
 _SETTLED = 0.05
 """Distance to the steady state at which runs end, relative to the tolerance."""
 
-
-_LONG = 300.0
-"""Time of a choice [s] from which a warning tells it."""
+_NOTICED, _LONG = 10.0, 300.0
+"""Times of further grids [s] from which the log and a warning tell them; shorter ones only a verbose log."""
 
 
 @dataclass(frozen=True)
@@ -178,14 +177,14 @@ def _next_spacings(plan: Plan) -> tuple[float, float]:
 def _log_cost(
     plan: Plan, ahead: Sequence[Plan], taken: float, error: float, budget: Budget, is_second: bool
 ) -> None:
-    """Log the time that the grids `ahead` take, after the last one `taken` [s]; a warning if it is long.
+    """Log the time that the grids `ahead` take, after the last one `taken` [s]: more loudly the longer it is.
 
     Only the second grid warns: in the first one's time is the start of kernels, and later ones repeat it.
     """
     seconds = taken * sum(each.work for each in ahead) / plan.work
     is_long = is_second and seconds > _LONG and budget.seconds is None
     logger.log(
-        logging.WARNING if is_long else logging.INFO,
+        logging.WARNING if is_long else logging.INFO if seconds > _NOTICED else logging.DEBUG,
         "spacing %.3g mm: estimated error %.2g; %s down to %.3g mm for a tolerance of %g: about %.2g s%s",
         1e3 * plan.spacing, error, counted(len(ahead), "finer grid"), 1e3 * ahead[-1].spacing,
         plan.tolerance / _SETTLED, seconds, "; limit them by seconds=" if is_long else "",

@@ -144,7 +144,7 @@ def test_a_run_that_ends_before_its_steady_state_says_how_many_periods_do():
             warnings.simplefilter("always")
             field = at.differentiable_field(scene, DRIVE, spacing=1.5e-3, periods=periods)
         texts = [str(each.message) for each in caught if each.category is at.SteadyStateWarning]
-        found = [re.search(r"relative error (\S+), .* about (\d+)$", text).groups() for text in texts]
+        found = [re.search(r"relative error up to (\S+), .* about (\d+)$", text).groups() for text in texts]
         return relative_error(field, exact), *(found[0] if found else (None, None))
 
     error, estimated, periods = run(None)
