@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -135,7 +136,7 @@ def _write_vti(path: Path, pressure: torch.Tensor, grid: _Grid, frequency: float
     writer.SetCompressorTypeToNone()  # takes ten times as long
     writer.EncodeAppendedDataOff()
     if not writer.Write():
-        raise OSError("VTK could not write the file")
+        raise OSError(errno.EIO, "VTK could not write it; is the disk full?")
 
 
 def _named(name: str, values: Array) -> Any:

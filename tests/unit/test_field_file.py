@@ -1,6 +1,7 @@
 """Fields in the whole domain and in files, whose folders are made."""
 
 import math
+from unittest import mock
 
 import h5py
 import numpy as np
@@ -185,3 +186,13 @@ def test_a_file_in_the_place_of_a_folder_is_named(tmp_path):
     (tmp_path / "taken").write_text("")
     with pytest.raises(OSError, match="taken"):
         at.save_scene(tmp_path / "taken" / "scene.yaml", SCENE)
+
+
+def test_a_file_that_vtk_cannot_write_is_named_with_the_reason(tmp_path, monkeypatch):
+    writer = mock.Mock(**{"return_value.Write.return_value": 0})
+    monkeypatch.setattr("vtkmodules.vtkIOXML.vtkXMLImageDataWriter", writer)
+    points = Plane((0, 0, 0), (0, 0, 1), (2e-3, 2e-3)).points(1e-3)
+    pressure = torch.zeros(points.shape[:-1], dtype=torch.complex128)
+    with pytest.raises(OSError, match=r"VTK could not write it.*field\.vti"):
+        save_field(tmp_path / "field.vti", pressure, points, 40e3)
+    assert not list(tmp_path.iterdir())
