@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import re
@@ -136,9 +137,13 @@ def _text_of(studies: Mapping[Path, StudyResult], settings: Mapping[Path, Any]) 
     texts = [f"# {first}\n{studies[first].provenance.config.strip()}"]
     for path, each in others:
         keys = [key for key in {**of_first, **each} if of_first.get(key, ...) != each.get(key, ...)]
-        lines = [f"{key}: {each.get(key, '(left out)')}" for key in keys]
+        lines = [f"{key}: {_as_yaml(each[key]) if key in each else '(left out)'}" for key in keys]
         texts.append("\n".join([f"# {path}, otherwise like {first}", *lines]))
     return "\n\n".join(texts)
+
+
+def _as_yaml(value: object) -> str:
+    return json.dumps(value, ensure_ascii=False, default=str)
 
 
 def _parts(path: Path, study: StudyResult, settings: Any) -> tuple[list[_Part], list[str]]:

@@ -32,8 +32,9 @@ METHODS = {"gabs": partial(gabs, levels=2), "lssg": lssg}
 def study(tmp_path):
     """Save a study in its own folder, like a job of a sweep."""
 
-    def leave(scene=SCENE, method="gabs", files=(), **options):
+    def leave(scene=SCENE, method="gabs", files=(), note="plain", **options):
         settings = {"scene": scene, "method": {"_target_": f"autdtorch.{method}"}, "files": {"air": [*files]}}
+        settings["note"] = note
         run_study(
             {"air": load_scene(scene)},
             {method: METHODS[method]},
@@ -88,14 +89,14 @@ def test_a_swept_list_is_one_setting_in_the_order_of_its_values(study, tmp_path)
 
 def test_common_settings_are_written_once(study, tmp_path):
     study()
-    study({**SCENE, "frequency": 41e3, "name": "lab"})
-    study(method="lssg")
+    study({**SCENE, "frequency": 41e3, "name": "lab"}, note=None)
+    study(method="lssg", note="yes: 1")
     text = collect_results(tmp_path).results.provenance.config
     first, second, third = text.split("\n\n")
     settings = yaml.safe_load(first)
     assert settings["scene"] == SCENE
-    assert yaml.safe_load(second) == {"scene.frequency": 41e3, "scene.name": "lab"}
-    assert yaml.safe_load(third) == {"method._target_": "autdtorch.lssg"}
+    assert yaml.safe_load(second) == {"scene.frequency": 41e3, "scene.name": "lab", "note": None}
+    assert yaml.safe_load(third) == {"method._target_": "autdtorch.lssg", "note": "yes: 1"}
     assert first.startswith(f"# {tmp_path / '0'}\n")
     assert second.startswith(f"# {tmp_path / '1'}, otherwise like {tmp_path / '0'}\n")
 
