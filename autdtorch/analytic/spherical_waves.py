@@ -100,7 +100,7 @@ def sphere_rule(rings: int) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.from_numpy(nodes.reshape(-1, 3)), torch.from_numpy(weights)
 
 
-@cached_tensors(8)
+@cached_tensors(4)  # of a body of 0.1 m each takes 100 MB
 def to_harmonics(degree: int, rings: int) -> torch.Tensor:
     """Return the map (S, N) from values at the nodes of a `sphere_rule` to coefficients of harmonics."""
     nodes, weights = sphere_rule(rings)

@@ -202,8 +202,9 @@ def _remove_oldest(folder: Path, most_bytes: int) -> None:
 @functools.cache
 def _warn_of_limit(folder: Path, most_bytes: int) -> None:
     """Log, once, that matrices in use are removed: a study that is repeated would need them first."""
-    full = f"is full: its limit of {most_bytes / 1e9:g} GB is less than what was used within a day"
-    logger.warning("%s %s, and is computed again; %s=10 allows 10 GB", folder, full, LIMIT_VARIABLE)
+    full = f"its limit of {most_bytes / 1e9:g} GB is less than what was used within a day"
+    again = "results that no longer fit are computed again"
+    logger.warning("%s is full: %s; %s; %s=10 allows 10 GB", folder, full, again, LIMIT_VARIABLE)
 
 
 def _with_checksum(key: str, shape: tuple[int, ...], body: bytes) -> bytes:
