@@ -44,6 +44,10 @@ _AROUND = 25
 """Transducers over which a factor b is fitted: 13 to 61 differ by a thirtieth for that hand. Arrays of fewer
 have b = 1: fits of 4 entries raise the errors of plates 4 mm apart by a half or more."""
 
+_MOST = 2.0
+"""Largest size of a factor b. Fits are larger where C - D almost vanishes at the start: beside a block that
+moves by 4 mm they reach 7, and without a limit its matrix errs by a sixth more."""
+
 _CAUTION = 1.3
 """Safety factor: the last term changes by this many times the changes of the matrix and of C - D together,
 while these are small. It cannot be wrong by more than about its size."""
@@ -136,12 +140,13 @@ class NearbyPoses:
         coarse, difference = self._coarse(seen)
         start, change, before, factor = self._start
         follows = 1 + self._fitted(difference - change, change)  # at the start 1, to the last bit
+        follows = follows / (follows.abs() / _MOST).clamp_min(1)
         matrix = coarse + factor * difference + follows * before
         if not with_error:
             return matrix
         pairs = (coarse, start), (difference, change)
         changed = math.hypot(*((now - then).norm() / then.norm().clamp_min(_TINY) for now, then in pairs))
-        wrong = _CAUTION * changed / math.hypot(1, changed) * before.norm()
+        wrong = _CAUTION * math.sin(math.atan(changed)) * before.norm()
         return matrix, float(wrong / matrix.norm().clamp_min(_TINY))
 
     @cached_property

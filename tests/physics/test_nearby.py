@@ -83,6 +83,20 @@ def test_what_extrapolation_leaves_follows_the_difference_of_its_grids(monkeypat
     assert error < 0.9 * relative_error(NearbyPoses(propagator).transfer_matrix(*pose), fresh)
 
 
+def test_a_point_where_the_grids_agree_at_the_start_follows_within_limits():
+    """Fits by almost nothing are larger without limit, and those by nothing are none."""
+    array = TransducerArray.grid((5, 5), pitch=5e-3, center=(1.2e-3, 12e-3, 12e-3))
+    nearby = NearbyPoses(make_propagator(replace(SCENE, array=array), "box", 1e-3, 5e-3, cache=False))
+    coarse, change, left, factor = nearby._start
+    change[0] *= 1e-6
+    change[1] = 0
+    matrix = nearby.transfer_matrix(SHIFT, TURN)
+    vars(nearby)["_start"] = coarse, change, torch.zeros_like(left), factor
+    added = (matrix - nearby.transfer_matrix(SHIFT, TURN)).abs() / left.abs()
+    assert added[0].max() == pytest.approx(2)
+    assert added[1].numpy() == pytest.approx(1)
+
+
 def test_reflectors_that_move_with_the_array_leave_long_runs():
     scene = replace(SCENE, obstacles=(BALL,), reflectors=(Reflector((-5e-3, 0, 0), (1, 0, 0), 0.8),))
     nearby = NearbyPoses(make_propagator(scene, "box", 1e-3, 5e-3, cache=False))
