@@ -23,7 +23,7 @@ from autdtorch.fdtd.assembly.smooth_faces import weight_of_finite
 from autdtorch.fdtd.assembly.thin_walls import receding, thickened
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Body, Fluid, Region
-from autdtorch.fdtd.shapes import Shape, Solids, bounds, distance_from, remaining
+from autdtorch.fdtd.shapes import Shape, Solids, bounds, distance_from, overlap, remaining
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.turning import slender_faces, staircase_excess
 from autdtorch.utils.array_types import Array, Index, triple
@@ -343,7 +343,8 @@ def thin_wall(shape: Shape, spacing: float, fluids: Sequence[Shape] = ()) -> tup
     step = spacing / _DEPTHS
     depths = step * np.arange(_DEPTHS + 2)  # one beyond a cell, for the slope there
     below = places[:, None] + depths[:, None] * inwards[:, None]
-    remainder = Solids((shape, *fluids), (True, *[False] * len(fluids)))
+    cutting = [each for each in fluids if overlap(each, shape)]
+    remainder = Solids((shape, *cutting), (True, *[False] * len(cutting)))
     distance = remainder.distance(below)
     covered = distance[:, 0] > _ROUNDING * step
     first = 1 + (distance[:, 1:-1] > 0).argmax(axis=1)  # depth behind the opposite face
