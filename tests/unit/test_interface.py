@@ -63,6 +63,7 @@ def element(*distance, density=(1, 77), mass=None, stencil=STENCIL, stiff=0.0):
         none[:1],
         OPEN,
         np.full(len(density), stiff),
+        materials.density,
     )
     return interface_elements(near, materials, stencil)
 
@@ -71,8 +72,9 @@ def rigid_element(distance, reduction=0.0, sides=OPEN):
     """One element that a tilted rigid surface cuts."""
     materials = Materials(np.array([1, 1e5]), np.array([1, 1e-5]), np.ones(2), np.array([False, True]))
     reductions = np.broadcast_to(reduction, (1, 3, 3))
+    beside = reductions.any(axis=(1, 2))
     near = Bodies(
-        distance[None, None], ONE, ONE[None] > 0, reductions, reductions.any(axis=(1, 2)), sides, SOFT
+        distance[None, None], ONE, ONE[None] > 0, reductions, beside, sides, SOFT, materials.density
     )
     return interface_elements(near, materials, STENCIL)
 

@@ -317,7 +317,7 @@ def _interface(
         level = rigid_level(bodies, distance)
         sides = sides_of(level, _wall_normals(bodies, level, first, walls, grid), walls)
         kinds, kind = _distinct(distance, finite, less, beside, sides)
-        near = Bodies(distance, numbers, finite, less, beside, sides, stiff).chosen(kinds)
+        near = Bodies(distance, numbers, finite, less, beside, sides, stiff, materials.density).chosen(kinds)
         elements = with_losses(lambda these: interface_elements(near, these, stencil), materials, stencil)
         elements = with_impedance(elements, near, materials, stencil)
         progress.advance(len(first))

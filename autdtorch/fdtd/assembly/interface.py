@@ -76,6 +76,7 @@ class Bodies(NamedTuple):
     beside: NDArray[np.bool_]  # mask of elements beside edges, which are finite at flat faces too (n,)
     sides: tuple[Side, ...]  # of thin rigid walls
     stiff: Array  # of the materials (m,), as of `unions.stiffness_of_thick`
+    density: Array  # of the materials (m,), of lossy ones the real part: `with_losses` must not change shares
 
     def chosen(self, some: Index | NDArray[np.bool_]) -> Bodies:
         """Return the bodies near some of the elements."""
@@ -197,8 +198,9 @@ def _set_smooth(
     sides = np.stack((used.argmax(axis=1), inner), axis=1)
     flat, surface = surfaces(level, materials.density[sides])
     cells, pair = chosen[flat], sides[flat]
-    denser = pair[range(len(pair)), surface.density.argmax(axis=1)]
-    finite = weight_of_finite(np.minimum(surface.ratio, bodies.stiff[denser]))
+    density = np.sort(bodies.density[pair], axis=1)
+    denser = pair[range(len(pair)), bodies.density[pair].argmax(axis=1)]
+    finite = weight_of_finite(np.minimum(density[:, 1] / density[:, 0], bodies.stiff[denser]))
     mobility = cut.volumes[cells] @ (1 / materials.density) / SUBCELLS**3
     cut.coupling[cells], weight = smooth_stiffness(
         surface, mobility, cut.coupling[cells], uniform_coupling(stencil)
