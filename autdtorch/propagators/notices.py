@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import torch
 
+from autdtorch.fdtd.assembly.smooth_faces import ALL_FINITE, stiffness
 from autdtorch.fdtd.assembly.unions import THICK, warn_of_thin_walls
 from autdtorch.fdtd.region import Region, warn_if_coarse
 from autdtorch.fdtd.turning import axes_along
@@ -121,8 +122,8 @@ def _densest_in_part(region: Region, spacing: float) -> float:
         if body.fluid is None:
             continue
         density = abs(body.fluid.inertia) / region.fluid.inertia
-        slow = max(region.fluid.phase_speed / body.fluid.phase_speed, 1.0)
-        if body.mean_thickness < THICK * spacing or density / slow**2 < _ALMOST_RIGID:
+        stiff = stiffness(density, region.fluid.phase_speed / body.fluid.phase_speed)
+        if body.mean_thickness < THICK * spacing or stiff < ALL_FINITE:
             largest = max(largest, float(density))
     return largest
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import cmath
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -263,7 +264,9 @@ FAMILIES: Mapping[str, Family] = {
 def scene_of(family: str, seed: int) -> tuple[at.Scene, torch.Tensor | None]:
     """Return a scene of three sources and three points around drawn bodies, and its exact matrix if known."""
     rng = np.random.default_rng([seed, *family.encode()])
-    bodies, exact, behind, reflectors = FAMILIES[family](rng)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", at.ScaleWarning)  # densities and sound speeds of no material
+        bodies, exact, behind, reflectors = FAMILIES[family](rng)
     places: list[Array] = []
     if behind is not None:
         across = rng.uniform(-behind / 3, behind / 3, (6, 2))

@@ -314,7 +314,7 @@ FLUID = {"density": 300 * AIR.density, "sound_speed": AIR.sound_speed}
 @pytest.mark.parametrize(
     ("bodies", "speed", "stiff"),
     [
-        ([Box(CENTER, (5e-3,) * 3, **FLUID)], 2.0, 300.0),
+        ([Box(CENTER, (5e-3,) * 3, **FLUID)], 2.0, 900.0),
         ([Sphere(CENTER, 2e-3, **FLUID)], 0.5, 75.0),
         ([Sphere(CENTER, 1e-3, **FLUID)], 2.0, 0.0),
         ([Box(CENTER, (8e-3, 8e-3, 2e-3), **FLUID)], 2.0, 0.0),

@@ -290,7 +290,8 @@ def _interface(
         return []
     numbers = np.array([body.material for body in bodies], np.int64)
     stiff = stiffness_of_thick(bodies, materials, grid.spacing)
-    share = np.where(materials.rigid, 1, _FLUID_SHARE + (1 - _FLUID_SHARE) * finite_at_flat_faces(stiff))
+    finite_share = finite_at_flat_faces(stiff, materials.density)
+    share = np.where(materials.rigid, 1, _FLUID_SHARE + (1 - _FLUID_SHARE) * finite_share)
     edges: list[Edge] = [
         replace(edge, share=float(share[body.material]))
         for body in bodies

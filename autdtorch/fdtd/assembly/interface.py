@@ -50,6 +50,7 @@ from autdtorch.fdtd.assembly.element import (
 from autdtorch.fdtd.assembly.finite_elements import ABSENT_SHARE, across_fluids, cut_coupling, cut_mass
 from autdtorch.fdtd.assembly.layers import Survey, flat_elements, mean_thickness
 from autdtorch.fdtd.assembly.smooth_faces import (
+    FAST,
     Surface,
     fields,
     smooth_stiffness,
@@ -200,7 +201,7 @@ def _set_smooth(
     cells, pair = chosen[flat], sides[flat]
     density = np.sort(bodies.density[pair], axis=1)
     denser = pair[range(len(pair)), bodies.density[pair].argmax(axis=1)]
-    finite = weight_of_finite(np.minimum(density[:, 1] / density[:, 0], bodies.stiff[denser]))
+    finite = weight_of_finite(np.minimum(FAST * density[:, 1] / density[:, 0], bodies.stiff[denser]))
     mobility = cut.volumes[cells] @ (1 / materials.density) / SUBCELLS**3
     cut.coupling[cells], weight = smooth_stiffness(
         surface, mobility, cut.coupling[cells], uniform_coupling(stencil)

@@ -23,7 +23,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_dilation
 
 from autdtorch.fdtd.assembly.element import (
@@ -49,10 +49,12 @@ _WEAK_CURVATURE, _BLEND = 0.0156, 0.05
 # Ratios of densities between which energies replace forces: four vertices of a face cannot have all moments,
 # and the energy of the forces would not be positive
 _LARGE_RATIO, _TOO_LARGE = 80.0, 160.0
-# Stiffness, as of `unions.stiffness_of_thick`, between which finite elements replace energies. At 1.5 mm the
-# scattered fields of balls of ratios 150 and 300 have errors of 7 to 9 %, with energies 10 to 50 %. Finite
-# elements displace resonances in a body: below, where sound in it is slow, they would double its errors.
-_FEW_FINITE, _ALL_FINITE = 60.0, 160.0
+# Stiffness, as of `stiffness`, between which finite elements replace energies. Energies let the scattered
+# fields of balls of 300 times air's density err by up to 60 % on some grids. Finite elements displace the
+# resonances in a body: with those of 8 mm, sound as in air and 65 to 130 times its density, fields would err
+# by 2 to 5 %, not 1.
+_FEW_FINITE, ALL_FINITE = 150.0, 300.0
+FAST = 3.0  # Largest factor of stiffness over density: faster bodies hardly resonate
 _LEAST_ENERGY = 0.01  # Smallest energy of a sum of fields, relative to theirs, that is safely positive
 _MIDDLE = len(LATTICE) // 2  # The centre of an element in the lattice
 # Weight of a vertex for the flow on the other side of a surface: power of the ratio of densities
@@ -206,15 +208,20 @@ def weight_of_forces(surface: Surface) -> Array:
     return np.asarray(weight * _forces_by_ratio(surface.ratio))
 
 
+def stiffness(density: ArrayLike, slowness: ArrayLike) -> Array:
+    """Return the bulk moduli (...) of fluids relative to air, at most `FAST` times their densities (...)."""
+    return np.asarray(np.asarray(density) * np.minimum(1 / np.square(slowness), FAST))
+
+
 def weight_of_finite(stiff: Array) -> Array:
     """Return the share (...) of finite elements, where forces have none, at a stiffness (...)."""
-    part = np.log(np.maximum(stiff, 1) / _FEW_FINITE) / math.log(_ALL_FINITE / _FEW_FINITE)
+    part = np.log(np.maximum(stiff, 1) / _FEW_FINITE) / math.log(ALL_FINITE / _FEW_FINITE)
     return np.asarray(part.clip(0, 1))
 
 
-def finite_at_flat_faces(stiff: Array) -> Array:
-    """Return the share (...) of finite elements at flat faces, at a stiffness (...)."""
-    return weight_of_finite(stiff) * (1 - _forces_by_ratio(stiff))
+def finite_at_flat_faces(stiff: Array, ratio: Array) -> Array:
+    """Return the share (...) of finite elements at flat faces, by stiffness and ratio of densities (...)."""
+    return weight_of_finite(stiff) * (1 - _forces_by_ratio(ratio))
 
 
 def _forces_by_ratio(ratio: Array) -> Array:

@@ -19,7 +19,7 @@ import torch
 
 from autdtorch.fdtd.assembly.element import FAR, MaterialLosses, Materials
 from autdtorch.fdtd.assembly.losses import STEP
-from autdtorch.fdtd.assembly.smooth_faces import weight_of_finite
+from autdtorch.fdtd.assembly.smooth_faces import stiffness, weight_of_finite
 from autdtorch.fdtd.assembly.thin_walls import receding, thickened
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Body, Fluid, Region
@@ -140,11 +140,11 @@ def nearest_normals(bodies: Sequence[Union], cells: Array, grid: Grid) -> Array:
 
 
 def stiffness_of_thick(bodies: Sequence[Union], materials: Materials, spacing: float) -> Array:
-    """Return the densities (m,) of fluids, at most their bulk moduli, relative to air; 0 with thin walls.
+    """Return the `stiffness` (m,) of fluids; 0 of rigid bodies and where a body of a material has thin walls.
 
     A wall is thin below `THICK` cells of a spacing [m]. Later bodies may leave one.
     """
-    stiff = np.where(materials.rigid, 0, materials.density / np.maximum(materials.slowness, 1) ** 2)
+    stiff = np.where(materials.rigid, 0, stiffness(materials.density, materials.slowness))
     for number, body in enumerate(bodies):
         if not weight_of_finite(stiff[body.material]):
             continue
