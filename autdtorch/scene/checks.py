@@ -16,6 +16,7 @@ from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.base import overlap, shared_box
 from autdtorch.scene.reflectors import require_in_front
 from autdtorch.utils.array_types import REAL
+from autdtorch.utils.fluids import warn_if_in_grams
 from autdtorch.utils.spatial import closest_pair, require_distinct
 from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import LENGTH_TOLERANCE, Vector, invalid
@@ -224,6 +225,9 @@ def _warn_of_implausible(scene: SceneContents) -> None:
         warn_user(f"Scene.control_points: {shown}, too far for foci; are they in m, 150 mm as 150e-3?")
     for name, hint in _too_large(scene):
         warn_user(f"Scene.{name}{hint}")
+    for index, obstacle in enumerate(scene.obstacles):
+        if (material := obstacle.fluid_at(scene.frequency)) is not None:
+            warn_if_in_grams(f"Scene.obstacles[{index}]", material[0].real, material[1].real)
     _warn_of_foci_behind(scene)
     expected, frequency = scene.medium.absorption_frequency, scene.frequency
     if expected is not None and abs(expected / frequency - 1) > _SAME_FREQUENCY:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-from autdtorch.utils.fluids import fluid
+from autdtorch.utils.fluids import fluid, warn_if_in_grams
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import invalid, not_negative, number_between, positive, require_kind
@@ -56,6 +56,7 @@ class Medium:
 
     def __post_init__(self) -> None:
         density, sound_speed = fluid("Medium", self.density, self.sound_speed)
+        warn_if_in_grams("Medium", density, sound_speed)
         object.__setattr__(self, "density", density)
         object.__setattr__(self, "sound_speed", sound_speed)
         object.__setattr__(self, "absorption", not_negative("Medium.absorption", self.absorption, "dB/m"))

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from autdtorch.scene.medium import Medium
-from autdtorch.utils.fluids import fluid
+from autdtorch.utils.fluids import fluid, warn_if_in_grams
 from autdtorch.utils.validation import positive, require_kind, require_one_of
 
 GRAVITY = 9.81
@@ -38,6 +38,7 @@ class Particle:
 
     def __post_init__(self) -> None:
         density, sound_speed = fluid("Particle", self.density, self.sound_speed)
+        warn_if_in_grams("Particle", density, sound_speed)
         object.__setattr__(self, "radius", positive("Particle.radius", self.radius, "m"))
         object.__setattr__(self, "density", density)
         object.__setattr__(self, "sound_speed", sound_speed)

@@ -14,19 +14,20 @@ _ROUNDING = 1e-12  # relative rounding of a bulk modulus, in its imaginary part
 
 
 def fluid(kind: str, density: object, sound_speed: object) -> tuple[float, float]:
-    """Return density [kg/m^3] and sound speed [m/s] of a fluid, checked as fields of `kind`.
-
-    A density that seems to be in g/cm^3 brings a warning.
-    """
+    """Return density [kg/m^3] and sound speed [m/s] of a fluid, checked as fields of `kind`."""
     rho = positive(f"{kind}.density", density, "kg/m^3")
     c = positive(f"{kind}.sound_speed", sound_speed, "m/s")
-    if _IN_GRAMS[0] <= rho <= _IN_GRAMS[1] and _DENSE_SPEEDS[0] <= c <= _DENSE_SPEEDS[1]:
-        odd = f"{kind}.density: {rho:g} kg/m^3 at {c:g} m/s, as of no solid or liquid"
-        warn_user(f"{odd}; is it in kg/m^3, 1 g/cm^3 as 1000?")
     return (
         number_between(f"{kind}.density", rho, *_DENSITIES, "kg/m^3"),
         number_between(f"{kind}.sound_speed", c, *_SOUND_SPEEDS, "m/s"),
     )
+
+
+def warn_if_in_grams(kind: str, density: float, sound_speed: float) -> None:
+    """Warn of a density [kg/m^3] that seems to be in g/cm^3, by the sound speed [m/s]."""
+    if _IN_GRAMS[0] <= density <= _IN_GRAMS[1] and _DENSE_SPEEDS[0] <= sound_speed <= _DENSE_SPEEDS[1]:
+        odd = f"{kind}.density: {density:g} kg/m^3 at {sound_speed:g} m/s, as of no solid or liquid"
+        warn_user(f"{odd}; is it in kg/m^3, 1 g/cm^3 as 1000?")
 
 
 def equivalent_fluid(kind: str, density: object, sound_speed: object) -> tuple[complex, complex]:

@@ -264,9 +264,7 @@ FAMILIES: Mapping[str, Family] = {
 def scene_of(family: str, seed: int) -> tuple[at.Scene, torch.Tensor | None]:
     """Return a scene of three sources and three points around drawn bodies, and its exact matrix if known."""
     rng = np.random.default_rng([seed, *family.encode()])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", at.ScaleWarning)  # densities and sound speeds of no material
-        bodies, exact, behind, reflectors = FAMILIES[family](rng)
+    bodies, exact, behind, reflectors = FAMILIES[family](rng)
     places: list[Array] = []
     if behind is not None:
         across = rng.uniform(-behind / 3, behind / 3, (6, 2))
@@ -279,5 +277,7 @@ def scene_of(family: str, seed: int) -> tuple[at.Scene, torch.Tensor | None]:
         if min(gaps) > _CLEAR:
             places.append(place)
     array = at.TransducerArray(np.array(places[:3]), (1, 0, 0))
-    scene = at.Scene(array, AIR, FREQUENCY, np.array(places[3:]), bodies, reflectors=reflectors)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", at.ScaleWarning)  # densities and sound speeds of no material
+        scene = at.Scene(array, AIR, FREQUENCY, np.array(places[3:]), bodies, reflectors=reflectors)
     return scene, None if exact is None else cases.sphere_matrix(scene, *exact)

@@ -76,10 +76,8 @@ def draw_trial(seed: int, number: int, long_share: float = LONG_SHARE) -> Trial:
         spacing = WAVELENGTH / log_uniform(rng, MIN_CELLS_PER_WAVELENGTH, 20.0)
         domain = np.full(3, 6.0) if long else rng.integers(6, 13, 3).astype(float)
         draft = _Draft(rng, spacing, domain, [], {"long"} if long else set())
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ScaleWarning)  # densities and sound speeds of no material
-            for _ in range(rng.integers(1, 5)):
-                draft.add_obstacle(inside)
+        for _ in range(rng.integers(1, 5)):
+            draft.add_obstacle(inside)
         scene = draft.scene()
         if scene is None:
             continue
@@ -146,7 +144,7 @@ class _Draft:
         corners = np.array((np.zeros(3), self.spacing * self.domain))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", OverlapWarning)
-            warnings.simplefilter("ignore", ScaleWarning)  # points behind sources that face anywhere
+            warnings.simplefilter("ignore", ScaleWarning)  # points behind sources, odd materials
             return Scene(
                 array, AIR, FREQUENCY, candidates[chosen[2:]], self.obstacles, domain=corners,
                 reflectors=reflectors,

@@ -95,7 +95,7 @@ WARNED = {
     "cm of all": (lambda: scene(array=grid(0.1, pitch=1.0), control_points=100 * FOCI), "1 m apart.*in m"),
     "mm of all": (lambda: scene(array=grid(1.0, pitch=10.0), control_points=1e3 * FOCI), "lengths in m"),
     "cm of foci": (lambda: scene(control_points=100 * FOCI), "points: 9.596 m from an array of.*in m"),
-    "g/cm^3 of steel": (lambda: at.Sphere(MIDDLE, 8e-3, density=7.8, sound_speed=5900.0), r"Sphere\.density"),
+    "g/cm^3": (lambda: scene(obstacles=[at.Sphere(MIDDLE, 8e-3, density=8, sound_speed=5e3)]), r"0\].dens"),
     "g/cm^3 of a bead": (lambda: at.Particle(1e-3, 1.05, 2350.0), r"Particle\.density.*1 g/cm\^3"),
     "g/cm^3 of water": (lambda: at.Medium(1.0, 1482.0), r"Medium\.density.*1 g/cm\^3"),
     "behind": (lambda: facing(0.2, (1, 0, 0)), "control_points.*behind.*normal"),
