@@ -197,6 +197,12 @@ class Region:
         kinked, smooth = (abs(ratio - 1) / (ratio + 1) for ratio in (density, compressibility))
         return 2 * kinked / (kinked + smooth) if kinked else 0.0
 
+    @property
+    def largest_density(self) -> float:
+        """The largest density of a fluid body relative to the air's; 0 without any."""
+        fluids = (body.fluid for body in self.bodies if body.fluid)
+        return max((float(abs(fluid.inertia) / self.fluid.inertia) for fluid in fluids), default=0.0)
+
     @cached_property
     def held_contrast(self) -> float:
         """The largest ratio of densities, from 1, of the air and of a fluid that is mostly in rigid bodies.

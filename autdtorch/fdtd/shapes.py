@@ -47,11 +47,6 @@ def bounds(shapes: Sequence[Shape]) -> tuple[Array, Array]:
     return lower, np.array([shape.upper for shape in shapes], np.float64).max(axis=0)
 
 
-def overlap(one: Shape, other: Shape) -> bool:
-    """Return whether the bounding boxes of two shapes overlap."""
-    return bool((np.maximum(one.lower, other.lower) < np.minimum(one.upper, other.upper)).all())
-
-
 def distance_from(shapes: Sequence[Shape], points: Tensor) -> Tensor:
     """Return the distance (...) [m] of points (..., 3) to the nearest of shapes, negative inside."""
     return torch.stack([shape.signed_distance(points) for shape in shapes]).amin(dim=0)

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 
 import torch
 
-from autdtorch.fdtd.assembly.smooth_faces import ALL_FINITE, stiffness
-from autdtorch.fdtd.assembly.unions import THICK, warn_of_thin_walls
-from autdtorch.fdtd.region import Region, warn_if_coarse
+from autdtorch.fdtd.assembly.unions import warn_of_thin_walls
+from autdtorch.fdtd.region import warn_if_coarse
 from autdtorch.fdtd.turning import axes_along
 from autdtorch.propagators.plan import Plan, walls_of
 from autdtorch.propagators.simulation import Run, Simulation
@@ -102,30 +101,14 @@ def warn_of_scene(plan: Plan) -> None:
             "a fluid in a rigid obstacle is %.2g times as dense as the air, or as light: it resonates"
             " sharply, and the error may be larger than estimated", region.held_contrast,
         )  # fmt: skip
-    if not plan.grouping.aligned and (density := _densest_in_part(region, spacing)) > _ALMOST_RIGID:
+    if not plan.grouping.aligned and region.largest_density > _ALMOST_RIGID:
         logger.warning(
-            "a thin obstacle, or one in which sound is slow, is %.3g times as dense as the air, and round or"
-            " tilted: on these cells it errs up to four times as much as is estimated; rigid=True is more"
-            " accurate if what passes it may be neglected", density,
+            "a round or tilted obstacle is %.3g times as dense as the air: on these cells it errs up to four"
+            " times as much as is estimated; rigid=True is more accurate if what passes it may be neglected",
+            region.largest_density,
         )  # fmt: skip
     warn_of_near_points(scene, "array.positions", scene.array.positions, spacing)
     warn_of_near_points(scene, "control_points", scene.control_points, spacing)
-
-
-def _densest_in_part(region: Region, spacing: float) -> float:
-    """Return the largest density, relative to air, of fluids that cells [m] do not assemble as rigid ones.
-
-    Their bodies are thin, or so soft that finite elements would displace their resonances.
-    """
-    largest = 0.0
-    for body in region.bodies:
-        if body.fluid is None:
-            continue
-        density = abs(body.fluid.inertia) / region.fluid.inertia
-        stiff = stiffness(density, region.fluid.phase_speed / body.fluid.phase_speed)
-        if body.mean_thickness < THICK * spacing or stiff < ALL_FINITE:
-            largest = max(largest, float(density))
-    return largest
 
 
 def warn_of_ending_walls(scene: Scene) -> None:

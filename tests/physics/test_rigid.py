@@ -53,17 +53,14 @@ def test_a_finger_is_rigid_on_cells_that_err_by_more(caplog):
     points = circle_points((0.0, 0.0, 60e-3), 8e-3, 3, (0.0, 0.0, 1.0))
     shape = {"center": (0.0, 0.0, 30e-3), "radius": 6e-3, "height": 20e-3, "axis": (0.0, 1.0, 0.0)}
     tissue, wood = {"density": 1050.0, "sound_speed": 1540.0}, {"density": 300.0, "sound_speed": 1500.0}
-    foam = {"density": 300.0, "sound_speed": 200.0}
-    soft, rigid, light, slow = (
+    soft, rigid, light = (
         Scene(array, AIR, 40e3, points, [Cylinder(**shape, **each)])
-        for each in (tissue, {"rigid": True}, wood, foam)
+        for each in (tissue, {"rigid": True}, wood)
     )
     matrix, claimed = make_propagator(soft, "box", 1.2e-3).transfer_matrix(return_error=True)
     fine = make_propagator(rigid, "box", 0.75e-3).transfer_matrix()
     assert relative_error(matrix, fine) < min(0.03, 3 * claimed)
-    make_propagator(light, "box", 1e-3)
-    assert "times as dense as the air" not in caplog.text
-    make_propagator(slow, "box", 1e-3)
+    make_propagator(light, "box", 1e-3).transfer_matrix()
     assert "times as dense as the air" in caplog.text
 
 

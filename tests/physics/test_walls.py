@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from small_scenes import AIR, NO_RECEIVERS, NO_SOURCES, relative_error, small_scene
 
 from autdtorch import analytic
-from autdtorch.fdtd.assembly.element import Materials
 from autdtorch.fdtd.assembly.thin_walls import Thickened, thickened
-from autdtorch.fdtd.assembly.unions import Union, stiffness_of_thick, thin_wall
+from autdtorch.fdtd.assembly.unions import thin_wall
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stepping import assemble
 from autdtorch.propagators import make_propagator
@@ -306,30 +305,6 @@ THICK = [
     Sphere(CENTER, 2e-3, rigid=True),
     Cylinder(CENTER, 3e-3, 2e-3, (1, 1, 0), rigid=True),
 ]
-
-
-FLUID = {"density": 300 * AIR.density, "sound_speed": AIR.sound_speed}
-
-
-@pytest.mark.parametrize(
-    ("bodies", "speed", "stiff"),
-    [
-        ([Box(CENTER, (5e-3,) * 3, **FLUID)], 2.0, 900.0),
-        ([Sphere(CENTER, 2e-3, **FLUID)], 0.5, 75.0),
-        ([Sphere(CENTER, 1e-3, **FLUID)], 2.0, 0.0),
-        ([Box(CENTER, (8e-3, 8e-3, 2e-3), **FLUID)], 2.0, 0.0),
-        ([Cylinder(CENTER, 1e-3, 20e-3, (1, 1, 0), **FLUID)], 2.0, 0.0),
-        ([Sphere(CENTER, 5e-3, **FLUID), Sphere(CENTER, 3.5e-3, **FLUID)], 2.0, 0.0),
-    ],
-)
-def test_fluids_are_stiff_by_density_and_sound_speed_where_no_wall_is_thin(bodies, speed, stiff):
-    unions = [
-        Union((body,), 1 - number, False, aligned=False, rigid=False, finite=True)
-        for number, body in enumerate(bodies)
-    ]
-    density, none = np.array([1.0, 300.0]), np.zeros(2, bool)
-    materials = Materials(density, 1 / density, np.array([1.0, 1 / speed]), none)
-    assert stiffness_of_thick(unions, materials, SPACING)[1] == pytest.approx(stiff)
 
 
 def test_walls_of_a_mesh_are_found_however_fine_it_is():

@@ -29,7 +29,6 @@ from autdtorch.fdtd.stencil import tuned_stencil
 STENCIL = tuned_stencil(2 * math.pi / 8.5)
 LONG = tuned_stencil(1e-3)  # of long waves: the terms of second order are 1e-6
 ONE = np.array([1])
-SOFT = np.zeros(2)
 OFFSETS = st.floats(-0.4, 0.4)
 CONTRASTS = st.floats(-3, 5).map(lambda exponent: 10**exponent)
 OPEN = (Side(np.ones((1, SUBCELLS**3)), np.zeros((1, 8), bool)),)  # without walls
@@ -47,7 +46,7 @@ def sphere(normal, offset, radius):
     return np.asarray(np.linalg.norm(LATTICE - center, axis=1) - radius)
 
 
-def element(*distance, density=(1, 77), mass=None, stencil=STENCIL, stiff=0.0):
+def element(*distance, density=(1, 77), mass=None, stencil=STENCIL):
     """One element, obstacle k of which is of material k + 1; masses are 1/density by default."""
     masses = np.array(mass or [1 / d for d in density], float)
     materials = Materials(
@@ -55,16 +54,7 @@ def element(*distance, density=(1, 77), mass=None, stencil=STENCIL, stiff=0.0):
     )
     count = len(distance)
     numbers, none = np.arange(count) + 1, np.zeros(count, bool)
-    near = Bodies(
-        np.stack(distance)[:, None],
-        numbers,
-        none[:, None],
-        np.zeros((1, 3, 3)),
-        none[:1],
-        OPEN,
-        np.full(len(density), stiff),
-        materials.density,
-    )
+    near = Bodies(np.stack(distance)[:, None], numbers, none[:, None], np.zeros((1, 3, 3)), none[:1], OPEN)
     return interface_elements(near, materials, stencil)
 
 
@@ -72,10 +62,7 @@ def rigid_element(distance, reduction=0.0, sides=OPEN):
     """One element that a tilted rigid surface cuts."""
     materials = Materials(np.array([1, 1e5]), np.array([1, 1e-5]), np.ones(2), np.array([False, True]))
     reductions = np.broadcast_to(reduction, (1, 3, 3))
-    beside = reductions.any(axis=(1, 2))
-    near = Bodies(
-        distance[None, None], ONE, ONE[None] > 0, reductions, beside, sides, SOFT, materials.density
-    )
+    near = Bodies(distance[None, None], ONE, ONE[None] > 0, reductions, reductions.any(axis=(1, 2)), sides)
     return interface_elements(near, materials, STENCIL)
 
 

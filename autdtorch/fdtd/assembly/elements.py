@@ -29,12 +29,7 @@ from autdtorch.fdtd.assembly.element import (
 from autdtorch.fdtd.assembly.interface import Bodies, interface_elements, is_near, left_by_fluids
 from autdtorch.fdtd.assembly.losses import with_losses
 from autdtorch.fdtd.assembly.near_surface import HALF_DIAGONAL, lattice_distances, near_surface
-from autdtorch.fdtd.assembly.smooth_faces import (
-    finite_at_flat_faces,
-    mean_gradient,
-    roughness,
-    unfolded,
-)
+from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, roughness, unfolded
 from autdtorch.fdtd.assembly.thin_walls import Side, sides_of
 from autdtorch.fdtd.assembly.unions import (
     Union,
@@ -42,7 +37,6 @@ from autdtorch.fdtd.assembly.unions import (
     nearest_normals,
     rigid_distance,
     rigid_level,
-    stiffness_of_thick,
     unions_of,
 )
 from autdtorch.fdtd.grid import Grid
@@ -59,9 +53,8 @@ _CHUNK = 4096  # Interface elements assembled at a time
 _DEPTHS = np.array([1.0, 1.6, 2.2])
 # Deviation [cells] of a signed distance from a quadratic one at which a second face is near
 _ROUGH = 0.01
-# Change of the stiffness at edges of fluids over that at rigid edges, where faces beside them are no finite
-# elements. With 0.15 and 0.3, tilted cubes of density ratio 77 have errors of up to 2.4 and 2.7 % (15 mm) and
-# 2.8 and 2.1 % (8 mm) at 1 mm.
+# Change of the stiffness at edges of fluids over that at rigid edges. With 0.15 and 0.3, tilted cubes of
+# density ratio 77 have errors of up to 2.4 and 2.7 % (15 mm) and 2.8 and 2.1 % (8 mm) at 1 mm.
 _FLUID_SHARE = 0.3
 # Relative density from which a fluid in front of a rigid face leaves no edge there. Of a rigid tube of slabs
 # around a fluid of three times the density of air, errors at 1.2 mm are 3 to 12 %, not 4 to 18 %.
@@ -289,11 +282,8 @@ def _interface(
     if not len(index):
         return []
     numbers = np.array([body.material for body in bodies], np.int64)
-    stiff = stiffness_of_thick(bodies, materials, grid.spacing)
-    finite_share = finite_at_flat_faces(stiff, materials.density)
-    share = np.where(materials.rigid, 1, _FLUID_SHARE + (1 - _FLUID_SHARE) * finite_share)
     edges: list[Edge] = [
-        replace(edge, share=float(share[body.material]))
+        edge if body.rigid else replace(edge, share=_FLUID_SHARE)
         for body in bodies
         if body.finite
         for shape in body.shapes
@@ -318,7 +308,7 @@ def _interface(
         level = rigid_level(bodies, distance)
         sides = sides_of(level, _wall_normals(bodies, level, first, walls, grid), walls)
         kinds, kind = _distinct(distance, finite, less, beside, sides)
-        near = Bodies(distance, numbers, finite, less, beside, sides, stiff, materials.density).chosen(kinds)
+        near = Bodies(distance, numbers, finite, less, beside, sides).chosen(kinds)
         elements = with_losses(lambda these: interface_elements(near, these, stencil), materials, stencil)
         elements = with_impedance(elements, near, materials, stencil)
         progress.advance(len(first))

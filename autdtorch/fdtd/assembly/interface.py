@@ -4,9 +4,7 @@ In an element of one material both are those of the tuned stencil. An interface 
 
 - coupling in series: density averaged along the line between vertices, exact for a flow across the surface;
 - for axis-aligned faces, a product of the direction across the faces and the two others;
-- for other surfaces of fluids, the forces or the energies of local fields (`smooth_faces.py`), or, the denser
-  the more, finite elements as of rigid bodies: to a dense fluid's field the air is a place without pressure,
-  and to the air its surface is rigid;
+- for other surfaces of fluids, the forces or the energies of local fields (`smooth_faces.py`);
 - masses on their side of the surface, except for the share of a flow through it which reaches the other side;
 - at other surfaces of rigid bodies, and tilted edges of dense fluids, finite elements; where fluids meet at a
   rigid body, these are softer across their surface than along it.
@@ -35,6 +33,7 @@ from autdtorch.fdtd.assembly.element import (
     FAR,
     HATS,
     PAIRS,
+    SLOPES,
     SUBCELLS,
     InterfaceElements,
     Materials,
@@ -43,21 +42,13 @@ from autdtorch.fdtd.assembly.element import (
     shares,
     subcell_means,
     tend_to_mean,
+    tuning_of,
     uniform_coupling,
     volume_coverage,
     without_vertices,
 )
-from autdtorch.fdtd.assembly.finite_elements import ABSENT_SHARE, across_fluids, cut_coupling, cut_mass
 from autdtorch.fdtd.assembly.layers import Survey, flat_elements, mean_thickness
-from autdtorch.fdtd.assembly.smooth_faces import (
-    FAST,
-    Surface,
-    fields,
-    smooth_stiffness,
-    surfaces,
-    unfolded,
-    weight_of_finite,
-)
+from autdtorch.fdtd.assembly.smooth_faces import Surface, fields, smooth_stiffness, surfaces, unfolded
 from autdtorch.fdtd.assembly.thin_walls import Side
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
@@ -65,6 +56,8 @@ from autdtorch.utils.array_types import Array, Index
 # Distance by which the heavier fluid of a smooth surface is shrunk, relative to the thickness added to a
 # rigid face, and the ratio of densities that halves it: the mean phase of tilted half-spaces is then exact
 _SHRUNK, _SHRUNK_RATIO = 0.5, 12.0
+_ABSENT_SHARE = 1e-4  # Share of an element's volume below which a material counts as absent
+_TINY = 1e-12  # Least length of a normal
 
 
 class Bodies(NamedTuple):
@@ -76,8 +69,6 @@ class Bodies(NamedTuple):
     reductions: Array  # relative reduction of the stiffness near edges of such bodies (n, 3, 3)
     beside: NDArray[np.bool_]  # mask of elements beside edges, which are finite at flat faces too (n,)
     sides: tuple[Side, ...]  # of thin rigid walls
-    stiff: Array  # of the materials (m,), as of `unions.stiffness_of_thick`
-    density: Array  # of the materials (m,), of lossy ones the real part: `with_losses` must not change shares
 
     def chosen(self, some: Index | NDArray[np.bool_]) -> Bodies:
         """Return the bodies near some of the elements."""
@@ -174,7 +165,7 @@ def _elements_in_series(bodies: Bodies, materials: Materials, stencil: Stencil) 
     lines = shares(line_coverage, distance, material, count)
     coupling, mass = _series_coupling(lines, materials, stencil), _lumped_mass(vertex, volumes, materials)
     at_vertices = (vertex[:, :, None] == np.arange(count)).any(axis=1)
-    present = volumes.mean(axis=1) > ABSENT_SHARE
+    present = volumes.mean(axis=1) > _ABSENT_SHARE
     two = (at_vertices.sum(axis=1) == 2) & (present <= at_vertices).all(axis=1)
     cut = _Cut(vertex, volumes, coupling, mass)
     _set_smooth(cut, bodies, at_vertices, np.flatnonzero(two), materials, stencil)
@@ -199,30 +190,15 @@ def _set_smooth(
     sides = np.stack((used.argmax(axis=1), inner), axis=1)
     flat, surface = surfaces(level, materials.density[sides])
     cells, pair = chosen[flat], sides[flat]
-    density = np.sort(bodies.density[pair], axis=1)
-    denser = pair[range(len(pair)), bodies.density[pair].argmax(axis=1)]
-    finite = weight_of_finite(np.minimum(FAST * density[:, 1] / density[:, 0], bodies.stiff[denser]))
     mobility = cut.volumes[cells] @ (1 / materials.density) / SUBCELLS**3
     cut.coupling[cells], weight = smooth_stiffness(
         surface, mobility, cut.coupling[cells], uniform_coupling(stencil)
     )
-    _tend_to_finite(cut, bodies, cells, finite * (1 - weight), materials, stencil)
     some = weight > 0
     cells, pair, surface, weight = cells[some], pair[some], surface.chosen(some), weight[some, None]
     part = _moved_shares(surface, pair, _added_thickness(stencil.kappa), count)
     lumped = _lumped_mass(cut.vertex[cells], part, materials)
     cut.mass[cells] += weight * (_balanced_mass(surface, materials.mass[pair], lumped) - cut.mass[cells])
-
-
-def _tend_to_finite(
-    cut: _Cut, bodies: Bodies, cells: Index, weight: Array, materials: Materials, stencil: Stencil
-) -> None:
-    """Change elements `cells` (n,) of fluids towards finite elements, which have a weight (n,)."""
-    here, weight = cells[weight > 0], weight[weight > 0, None]
-    fluid = np.broadcast_to(~materials.rigid[bodies.material, None], (len(bodies.material), len(here)))
-    finite = _finite_elements(bodies.chosen(here)._replace(finite=fluid), materials, stencil)
-    for value, other in zip((cut.coupling, cut.mass), finite, strict=True):
-        value[here] += weight * (other - value[here])
 
 
 def _finite_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -> tuple[Array, Array]:
@@ -246,12 +222,12 @@ def _finite_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -> 
         share, out = side.share[here], side.out[here]
         part, reductions = mobility[here] * share, bodies.reductions[here]
         if several:
-            reductions = across_fluids(reductions, part, *(other[here] * share for other in others))
-        added = cut_coupling(part, reductions, stencil)
+            reductions = _across_fluids(reductions, part, *(other[here] * share for other in others))
+        added = _cut_coupling(part, reductions, stencil)
         parted = np.flatnonzero(out.any(axis=1))
         added[parted], _ = without_vertices(added[parted], out[parted])
         coupling[here] += added
-        mass[here] += cut_mass(weight[here] * share, out)
+        mass[here] += _cut_mass(weight[here] * share, out)
     return coupling, mass
 
 
@@ -294,6 +270,36 @@ def _moved_shares(surface: Surface, pair: Index, thickness: float, count: int) -
     np.put_along_axis(share, pair[:, None, :1], (1 - part)[:, :, None], axis=2)
     np.put_along_axis(share, pair[:, None, 1:], part[:, :, None], axis=2)
     return share
+
+
+def _across_fluids(reductions: Array, mobility: Array, share: Array, density: Array) -> Array:
+    """Return reductions of the stiffness (n, 3, 3) with those across dense fluids' surfaces at rigid bodies.
+
+    Mobilities average along the surface, and densities across it. Its normal is the sum of those of
+    faces between sub-cells, times the change of mobility there. Mobilities, densities and the share of
+    fluids (n, 64) are parts of an element.
+    """
+    filled, dense, mobile = (part.sum(axis=1) for part in (share, density, mobility))
+    # without a rigid body it is the edge of a fluid, at which no normal serves; light fluids err more with it
+    several = np.flatnonzero(
+        (filled < 1 - _ABSENT_SHARE)
+        & (dense > (1 + _ABSENT_SHARE) * filled)
+        & (dense * mobile > (1 + _ABSENT_SHARE) * filled**2)
+    )
+    parts = [part[several].reshape(-1, *(SUBCELLS,) * 3) for part in (mobility, share)]
+    normal = np.zeros((len(several), 3))
+    for axis in range(3):
+        (here, filled_here), (there, filled_there) = (
+            [np.moveaxis(part, axis + 1, 1)[:, some] for part in parts]
+            for some in (slice(-1), slice(1, None))
+        )
+        normal[:, axis] = (there * filled_here - here * filled_there).sum(axis=(1, 2, 3))
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), _TINY)
+    less = 1 - filled[several] / np.sqrt(dense[several] * mobile[several])
+    left = np.eye(3) - less[:, None, None] * normal[:, :, None] * normal[:, None, :]  # root of what is left
+    reductions = reductions.copy()
+    reductions[several] = np.eye(3) - left @ (np.eye(3) - reductions[several]) @ left
+    return reductions
 
 
 _MOST_TAKEN = 0.8  # Largest share of a vertex's mass that is taken away
@@ -343,6 +349,37 @@ def _balanced_mass(surface: Surface, whole_cell: Array, mass: Array) -> Array:
     change = rise * scale[:, None]
     least = change.min(axis=1, keepdims=True)
     return np.asarray(mass * (1 + change * np.minimum(1, _MOST_TAKEN / np.maximum(-least, 1e-12))))
+
+
+_PRODUCTS = np.einsum("qix,qjx->qij", SLOPES, SLOPES)[:, PAIRS[:, 0], PAIRS[:, 1]]
+
+
+def _cut_coupling(mobility: Array, reductions: Array, stencil: Stencil) -> Array:
+    """Return the coupling (n, 28) of elements, from the mobility of sub-cells (n, 64).
+
+    `reductions` (n, 3, 3) is the relative reduction of the stiffness near edges.
+    """
+    near = np.trace(reductions, axis1=1, axis2=2) / 2
+    tuning = tuning_of(stencil)[PAIRS[:, 0], PAIRS[:, 1]]
+    coupling = -(mobility @ _PRODUCTS) - np.outer((1 - near) * mobility.sum(axis=1), tuning)
+    some = np.flatnonzero(near)
+    across = SLOPES @ reductions[some, None]
+    reduced = np.einsum("nq,nqix,qjx->nij", mobility[some], across, SLOPES, optimize=True)
+    coupling[some] += reduced[:, PAIRS[:, 0], PAIRS[:, 1]]
+    return np.asarray(coupling)
+
+
+def _cut_mass(cells: Array, out: NDArray[np.bool_]) -> Array:
+    """Return the masses at the vertices (n, 8), from those of sub-cells (n, 64).
+
+    Vertices `out` (n, 8) leave theirs to the others.
+    """
+    mass, parted = cells @ HATS, np.flatnonzero(out.any(axis=1))
+    hats = HATS * ~out[parted, None]
+    whole = hats.sum(axis=2, keepdims=True)
+    hats = np.divide(hats, whole, out=np.zeros_like(hats), where=whole > 0)
+    mass[parted] = (cells[parted, None] @ hats)[:, 0]
+    return np.asarray(mass)
 
 
 def _added_thickness(kappa: float) -> float:

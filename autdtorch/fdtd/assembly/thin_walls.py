@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import generate_binary_structure, label
 
 from autdtorch.fdtd.assembly.element import CORNERS, SUBCELLS, subcell_gradients, subcell_means
-from autdtorch.fdtd.shapes import Bounded, Shape, overlap
+from autdtorch.fdtd.shapes import Bounded, Shape
 from autdtorch.utils.array_types import REAL, Array, Index
 from autdtorch.utils.spatial import extents, mean_thickness
 from autdtorch.utils.validation import Vector
@@ -153,6 +153,6 @@ class _Receding(Bounded):
 def receding(shape: Shape, before: Sequence[Shape], spacing: float) -> Shape:
     """Return a fluid shape that leaves rigid shapes `before` it walls of the least thickness on cells [m]."""
     for rigid in before:
-        if overlap(shape, rigid):
+        if (np.maximum(shape.lower, rigid.lower) < np.minimum(shape.upper, rigid.upper)).all():
             shape = _Receding(shape, rigid, spacing)
     return shape

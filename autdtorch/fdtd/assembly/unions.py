@@ -19,11 +19,10 @@ import torch
 
 from autdtorch.fdtd.assembly.element import FAR, MaterialLosses, Materials
 from autdtorch.fdtd.assembly.losses import STEP
-from autdtorch.fdtd.assembly.smooth_faces import stiffness, weight_of_finite
 from autdtorch.fdtd.assembly.thin_walls import receding, thickened
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Body, Fluid, Region
-from autdtorch.fdtd.shapes import Shape, Solids, bounds, distance_from, overlap, remaining
+from autdtorch.fdtd.shapes import Shape, Solids, bounds, distance_from, remaining
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.turning import slender_faces, staircase_excess
 from autdtorch.utils.array_types import Array, Index, triple
@@ -41,7 +40,6 @@ _PLACES, _DEPTHS = 200, 16  # Places of a surface where the thickness is measure
 _LEAST_SHARE = 0.05  # Least share of a surface that is a thin wall; at sharp edges less is
 _ROUNDING = 1e-3  # Distance above a surface [depths] that is rounding
 _PARALLEL = 0.85  # Least cosine of the angle between the faces of a wall
-THICK = 2.4  # Least thickness [cells] of a wall of which vertices within continue the field of one side
 _ALIKE = 2.0  # Ratio of densities up to which a thin wall of fluid causes only a small error
 
 _STEP = 2e-5  # Distance [cells] from a cell's centre of the points that tell its nearest face
@@ -137,27 +135,6 @@ def nearest_normals(bodies: Sequence[Union], cells: Array, grid: Grid) -> Array:
     normal = np.asarray((ahead - behind).T / (2 * _STEP))
     normal[np.linalg.norm(normal, axis=1) < _UNDECIDED] = 0
     return normal
-
-
-def stiffness_of_thick(bodies: Sequence[Union], materials: Materials, spacing: float) -> Array:
-    """Return the `stiffness` (m,) of fluids; 0 of rigid bodies and where a body of a material has thin walls.
-
-    A wall is thin below `THICK` cells of a spacing [m]. Later bodies may leave one.
-    """
-    stiff = np.where(materials.rigid, 0, stiffness(materials.density, materials.slowness))
-    for number, body in enumerate(bodies):
-        if not weight_of_finite(stiff[body.material]):
-            continue
-        later = [shape for each in bodies[number + 1 :] for shape in each.shapes]
-        if not all(_is_thick(shape, THICK * spacing, later) for shape in body.shapes):
-            stiff[body.material] = 0
-    return stiff
-
-
-def _is_thick(shape: Shape, thickness: float, later: Sequence[Shape]) -> bool:
-    """Return whether a shape has no walls below a thickness [m], of its own or left by later shapes."""
-    widths = extents(shape.surface()[0].numpy())
-    return bool(widths[1] > thickness) and thin_wall(shape, thickness, later) is None
 
 
 def unions_of(region: Region, grid: Grid, stencil: Stencil) -> tuple[list[Union], Materials]:
@@ -343,8 +320,7 @@ def thin_wall(shape: Shape, spacing: float, fluids: Sequence[Shape] = ()) -> tup
     step = spacing / _DEPTHS
     depths = step * np.arange(_DEPTHS + 2)  # one beyond a cell, for the slope there
     below = places[:, None] + depths[:, None] * inwards[:, None]
-    cutting = [each for each in fluids if overlap(each, shape)]
-    remainder = Solids((shape, *cutting), (True, *[False] * len(cutting)))
+    remainder = Solids((shape, *fluids), (True, *[False] * len(fluids)))
     distance = remainder.distance(below)
     covered = distance[:, 0] > _ROUNDING * step
     first = 1 + (distance[:, 1:-1] > 0).argmax(axis=1)  # depth behind the opposite face
