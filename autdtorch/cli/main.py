@@ -100,7 +100,7 @@ def main() -> None:
             else:
                 _run_command(*_COMMANDS[command])
             if sweep:
-                print("autdtorch collect merges the results of a sweep into one table and one report")
+                print("autdtorch collect FOLDER merges the results of a sweep into one table and one report")
     except _Carrier as carrier:
         error = carrier.__cause__ or carrier
     except (Exception, KeyboardInterrupt) as raised:

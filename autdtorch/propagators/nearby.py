@@ -29,7 +29,7 @@ from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.process import cached_property, one_library_thread
 from autdtorch.utils.units import angles
-from autdtorch.utils.validation import ArrayLike, boolean, finite_vector, invalid, require_kind, within
+from autdtorch.utils.validation import ArrayLike, boolean, finite_vector, invalid, within
 
 _COARSER, _COARSEST = 1.7, 2.5
 """Cells of the coarser grids, relative to the propagator's. With long runs, errors of a hand at 1 mm that is
@@ -75,9 +75,9 @@ class NearbyPoses:
         Raises:
             ValueError: another propagator, or one whose cells are too large for coarser grids.
         """
-        require_kind("propagator", propagator, SimulatedPropagator)
-        if propagator.method != "box":
-            raise invalid("propagator", f"of method {propagator.method}", "must be of method box")
+        if not isinstance(propagator, SimulatedPropagator) or propagator.method != "box":
+            accepted = 'must be of method "box", as of make_propagator(scene, method="box")'
+            raise invalid("propagator", propagator, accepted)
         self.propagator = propagator
         wavelength, spacing = propagator.plan.region.shortest_wavelength, propagator.spacing
         most = wavelength / MIN_CELLS_PER_WAVELENGTH / _COARSEST

@@ -65,7 +65,7 @@ def test_jobs_log_a_line_each_and_find_methods_in_the_working_directory(
     assert sorted(line.partition(" free space")[0] for line in each) == [
         f"job {number}: homogeneous:" for number in (0, 1)
     ]
-    assert out.splitlines()[-1].startswith("autdtorch collect merges")
+    assert out.splitlines()[-1].startswith("autdtorch collect FOLDER merges")
     assert jobs(tmp_path) == [
         f"method={name},plane_spacing=0.02,scene=homogeneous,trials=3" for name in ("climb", "lssg")
     ]

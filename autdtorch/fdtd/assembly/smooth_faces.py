@@ -47,9 +47,9 @@ _LARGEST_CURVATURE = 0.5
 _WEAK_CURVATURE, _BLEND = 0.0156, 0.05
 # Ratios of densities between which energies replace forces: four vertices of a face cannot have all moments,
 # and the energy of the forces would not be positive
-# Finite elements in place of energies would halve the errors of balls 170 to 800 times as dense as air in which
-# sound is fast, at 1.7 mm. But they displace resonances of others (2 to 10 % of the field, not 1), and the power
-# absorbed in tissue would err by 34 %, not 6.
+# (Finite elements in place of energies would halve the errors of balls 170 to 800 times as dense as air, with
+# fast sound, at 1.7 mm. But they displace resonances of others, whose fields err by 2 to 10 %, not 1, and the
+# power that tissue absorbs would err by 34 %, not 6.)
 _LARGE_RATIO, _TOO_LARGE = 80.0, 160.0
 _LEAST_ENERGY = 0.01  # Smallest energy of a sum of fields, relative to theirs, that is safely positive
 _MIDDLE = len(LATTICE) // 2  # The centre of an element in the lattice
