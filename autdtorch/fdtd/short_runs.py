@@ -20,7 +20,7 @@ from autdtorch.utils.array_types import Index
 
 THIN_MARGIN, THIN_LAYER = 4, Thickness(4, 4)
 """Cells of air around bodies, and the absorbing layers of their boxes. Nearby poses of a hand err by 0.9 %,
-as with one more cell of air or two more of layers, and by 1.1 to 1.2 % with a cell less of either."""
+and by 1.1 to 1.2 % with a cell less of either. One more cell of air or two more of layers change nothing."""
 
 _RAMP, _RECORDED = 2, 2
 """Periods of the switch-on, and the last periods, whose phasor counts."""

@@ -154,7 +154,7 @@ class Absorption:
 def absorption(
     assembly: Assembly, region: Region, mirrors: Sequence[object] = (), axes: Array | None = None
 ) -> Absorption | None:
-    """Return the absorption of a region's bodies on a grid, without that of their images in some mirrors.
+    """Return the absorption of a region's bodies on a grid; images in some mirrors do not count.
 
     None where nothing absorbs. A cell belongs to one body, see `_owners`. `axes` are those of a turned grid,
     one a row (3, 3).

@@ -82,7 +82,7 @@ def estimate(
     Args:
         scene: the scene.
         spacing: edge of a cell [m]. None: that which `make_propagator` is expected to choose by `tolerance`,
-            from runs on its first grid of up to 10 s; the time is that of all its grids.
+            from runs on its first grid of up to 10 s; the time is the sum over all its grids.
         tolerance: relative distance to the steady state, or without a spacing the estimated error, in (0, 1).
         method: as in `make_propagator`, as are `device`, `kernel` and `dtype`.
         device: where simulations would run.

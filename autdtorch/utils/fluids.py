@@ -8,7 +8,7 @@ from autdtorch.utils.validation import complex_number, invalid, number_between, 
 _DENSITIES = 1e-9, 1e9  # [kg/m^3]; far beyond all materials, and squares of their ratios do not overflow
 _SOUND_SPEEDS = 1e-3, 1e6  # [m/s]
 _IN_GRAMS, _DENSE_SPEEDS = (0.5, 23.0), (1100.0, 15e3)
-"""Densities [g/cm^3] and sound speeds [m/s] of liquids and solids. Foam and gases have others, but for
+"""Densities [g/cm^3] and sound speeds [m/s] of liquids and solids. Foam and gases have others, except
 compressed hydrogen."""
 _ROUNDING = 1e-12  # relative rounding of a bulk modulus, in its imaginary part
 

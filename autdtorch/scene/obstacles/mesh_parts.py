@@ -1,6 +1,6 @@
 """The closed parts of a mesh, how messages show their place, and their union, by manifold3d.
 
-Parts of an assembly touch but for rounding errors: their union would keep slits of no width, and lose parts
+Parts of an assembly touch up to rounding errors: their union would keep slits of no width, and lose parts
 of the body as slivers are removed. So parts grow by a small distance first. The union shrinks by as much, and
 vertices of the parts return to their places, so that no fins stay where a seam meets an edge.
 """
