@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import logging
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,7 @@ class TrialFile:
         self._seed = seed
         self._shapes = shapes
         self._trials: dict[tuple[str, str, int], tuple[Solution, float]] = {}  # and its seconds
+        self._spent: dict[str, tuple[int, float]] = {}  # trials and their seconds by method
         self._lines = JsonLines(path, origin, self._use)
 
     def __len__(self) -> int:
@@ -76,8 +78,21 @@ class TrialFile:
         share = seconds / len(trials)
         added = [trial for trial in trials if (scene, method, trial) not in self._trials]
         for trial in added:
-            self._trials[scene, method, trial] = _alone(solution, trials.index(trial)), share
+            self._add((scene, method, trial), _alone(solution, trials.index(trial)), share)
         self._lines.append(*(self._row(scene, method, trial) for trial in added))
+
+    def seconds_left(self, counts: Mapping[str, int]) -> tuple[float, float]:
+        """Return the least and most time [s] of the missing trials, of so many in each scene by method.
+
+        A trial takes as long as those of its method so far, in all scenes; unknown times are infinite.
+        """
+        least = most = 0.0
+        for method, count in counts.items():
+            finished, spent = self._spent.get(method, (0, 0.0))
+            missing = count * len(self._shapes) - finished
+            least += missing * spent / max(1, finished)
+            most += 0.0 if finished else math.inf
+        return least, least + most
 
     def solution(self, scene: str, method: str, trials: int) -> tuple[Solution, torch.Tensor]:
         """Return the joined solution of the first `trials` trials, and seconds (T,) of each."""
@@ -119,7 +134,12 @@ class TrialFile:
         solution = stored_solution(fields, transducers, len(row["pressure"]) if points is None else points)
         if solution.history.shape[1] != int(solution.evaluations):
             raise invalid("history", row["history"], f"must be {row['evaluations']} numbers")
-        self._trials[where] = solution, not_negative("seconds", row["seconds"], "s")
+        self._add(where, solution, not_negative("seconds", row["seconds"], "s"))
+
+    def _add(self, where: tuple[str, str, int], solution: Solution, seconds: float) -> None:
+        self._trials[where] = solution, seconds
+        count, spent = self._spent.get(where[1], (0, 0.0))
+        self._spent[where[1]] = count + 1, spent + seconds
 
 
 def _alone(solution: Solution, place: int) -> Solution:
@@ -213,6 +233,19 @@ class StudyFolder:
 
     def _trial_file(self) -> TrialFile:
         return TrialFile(self.path / TRIALS_FILE, self.provenance.origin, self.provenance.seed, self._shapes)
+
+    def seconds_left(self, counts: Mapping[str, int]) -> tuple[float, float]:
+        """Return the least and most time [s] until all scenes are finished; unknown times are infinite.
+
+        The fields of a scene take as long as those of the scene that was finished last.
+        """
+        least, most = self.trials.seconds_left(counts)
+        if not self.scenes:
+            return least, math.inf
+        simulation = self.scenes[next(reversed(self.scenes))].simulation
+        seconds = simulation.matrix_seconds + simulation.plane_seconds
+        fields = seconds * (len(self._shapes) - len(self.scenes))
+        return least + fields, most + fields
 
     def save(self, name: str, scene: SceneResult) -> None:
         """Save a finished scene."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 import time
@@ -138,7 +139,8 @@ def run_study(
             propagators = {name: make_propagator(scene, **settings) for name, scene in missing.items()}
         stored.begin()
         names = list(scenes)
-        with show_progress(len(missing) * (sum(counts.values()) + 2)) as progress:
+        left = functools.partial(stored.seconds_left, counts)
+        with show_progress(len(missing) * (sum(counts.values()) + 2), left=left) as progress:
             for name in missing:
                 propagator = propagators.pop(name)
                 first = not poses or name == names[0]

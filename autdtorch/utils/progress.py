@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import multiprocessing
 import sys
 import threading
@@ -29,6 +30,7 @@ _MOST_POINTS = 1000  # times of earlier steps
 _BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
 _SOON = 0.5  # [s] left, of which nothing is said
 _UNSURE = 1.5  # ratio of two forecasts, from which both are shown
+_TimeLeft = Callable[[], tuple[float, float]]  # least and most [s]; infinite if unknown
 _asked: ContextVar[Callable[[], bool]] = ContextVar("asked to stop", default=lambda: False)
 
 
@@ -58,9 +60,12 @@ def stopping_when(asked: Callable[[], bool]) -> Iterator[None]:
 class Progress:
     """A counter of steps that shows the current task and the time left."""
 
-    def __init__(self, steps: int, what: str, bar: tqdm[None] | None) -> None:
+    def __init__(
+        self, steps: int, what: str, bar: tqdm[None] | None, left: _TimeLeft | None = None
+    ) -> None:
         """Show the progress on `bar`, or in the log if it is None; `steps` may be an estimate."""
         self._bar, self._steps, self._what, self._done = bar, steps, what, 0
+        self._left = left or self._by_pace
         self._begun = time.monotonic()
         self._points: list[tuple[float, int]] = []  # times after advances, with the number of steps
         self._next = _PATIENCE
@@ -104,29 +109,36 @@ class Progress:
                 self._next = 4 * spent  # ever fewer lines
 
     def _forecast(self) -> str:
-        """Return the time left as text; nothing before it is known, and when the work ends soon.
-
-        The remaining steps take as long as those of the later half so far, or become slower along the line
-        through both halves; where the two differ much, both are shown.
-        """
-        left = self._steps - self._done
-        if left < 0:
+        """Return the time left as text; nothing before it is known, and when the work ends soon."""
+        if self._done > self._steps:
             return "longer than expected"
-        (begun, first), (now, done) = self._points[0], self._points[-1]
-        if done == first:  # the time before the first may include compiling kernels
+        least, most = self._left()
+        known = math.isfinite(most)
+        if (most if known else least) < _SOON:
             return ""
-        middle, half = min(self._points, key=lambda point: abs(point[1] - (first + done) / 2))
-        least = most = left * (now - begun) / (done - first)
-        if first < half < done:
-            early, late = (middle - begun) / (half - first), (now - middle) / (done - half)
-            growth = max(0.0, late - early) / ((done - first) / 2)  # of the time of a step, by each step
-            least = left * late
-            most = least + left * growth * (done - half + left) / 2
-        if most < _SOON:
-            return ""
+        if not known:
+            return f"at least {least:.0f} s left"
         if most < _UNSURE * least:
             return f"about {(least + most) / 2:.0f} s left"
         return f"about {least:.0f} to {most:.0f} s left"
+
+    def _by_pace(self) -> tuple[float, float]:
+        """Return the least and most time left [s], 0 before it is known.
+
+        The remaining steps take as long as those of the later half so far, or become slower along the line
+        through both halves.
+        """
+        left = self._steps - self._done
+        (begun, first), (now, done) = self._points[0], self._points[-1]
+        if done == first:  # the time before the first may include compiling kernels
+            return 0.0, 0.0
+        middle, half = min(self._points, key=lambda point: abs(point[1] - (first + done) / 2))
+        if not first < half < done:
+            return (left * (now - begun) / (done - first),) * 2
+        early, late = (middle - begun) / (half - first), (now - middle) / (done - half)
+        growth = max(0.0, late - early) / ((done - first) / 2)  # of the time of a step, by each step
+        least = left * late
+        return least, least + left * growth * (done - half + left) / 2
 
 
 def is_terminal(stream: Any) -> bool:
@@ -141,10 +153,14 @@ def is_terminal(stream: Any) -> bool:
 
 
 @contextlib.contextmanager
-def show_progress(steps: int, what: str = "") -> Iterator[Progress]:
-    """Show the progress of a task of `steps`, or an estimate of it; `what` names the first part."""
+def show_progress(steps: int, what: str = "", left: _TimeLeft | None = None) -> Iterator[Progress]:
+    """Show the progress of a task of `steps`, or an estimate of it; `what` names the first part.
+
+    `left` gives the time that the work still takes where steps are of several kinds. By default it follows
+    from the times of the steps so far.
+    """
     if not is_terminal(sys.stderr) or multiprocessing.parent_process() is not None:
-        yield Progress(steps, what, None)
+        yield Progress(steps, what, None, left)
         return
     with (
         logging_redirect_tqdm(),
@@ -154,4 +170,4 @@ def show_progress(steps: int, what: str = "") -> Iterator[Progress]:
             bar_format=_BAR,
         ) as bar,
     ):  # fmt: skip
-        yield Progress(steps, what, bar)
+        yield Progress(steps, what, bar, left)

@@ -159,3 +159,16 @@ def test_work_beyond_its_estimate_has_no_forecast(clock, caplog):
     lines = lines_of(clock, caplog, 10, [(1, 1)] * 60)
     assert "longer than expected" in lines[-1]
     assert not any("about 0 s" in line for line in lines)
+
+
+def test_work_of_several_kinds_says_what_is_known_of_the_time_left(clock, caplog):
+    caplog.set_level(logging.INFO)
+    least = iter([(30.0, float("inf")), (20.0, 25.0), (0.1, 0.1)])
+    with progress.show_progress(100, "study", lambda: next(least)) as shown:
+        for seconds in (4, 100, 4000):
+            clock.now += seconds
+            shown.advance(1)
+    assert told(caplog) == [
+        "study: 4 s so far, at least 30 s left",
+        "study: 104 s so far, about 22 s left",
+    ]

@@ -15,7 +15,7 @@ import autdtorch.study.run_study
 from autdtorch.io.goal_section import load_goal
 from autdtorch.propagators import FreeSpacePropagator, Run
 from autdtorch.propagators.full import DomainSimulation
-from autdtorch.study.folder import TRIALS_FILE
+from autdtorch.study.folder import TRIALS_FILE, TrialFile
 from autdtorch.study.results import summary_rows
 from autdtorch.study.run_study import _for_poses, run_study
 
@@ -343,3 +343,17 @@ def test_scenarios_stand_for_each_scene(tmp_path):
             study(scenarios=wrong)
     with pytest.raises(ValueError, match="scenarios: failed: -1"):
         study(scenarios={"failed": -1}, config="two")
+
+
+def test_the_time_left_of_a_study_goes_by_method_and_scene(study, tmp_path, monkeypatch):
+    left = []
+    append = TrialFile.append
+
+    def timed(self, scene, method, trials, solution, seconds):
+        append(self, scene, method, trials, solution, {"lssg": 1.0, "gabs": 500.0}[method])
+        left.append(self.seconds_left({"lssg": 1, "gabs": 5}))
+
+    monkeypatch.setattr(TrialFile, "append", timed)
+    study(trials=5)
+    # of one method the time is known; then of both; then in the second scene no matter how unequal they are
+    assert left == [(1.0, math.inf), (501.0, 501.0), (500.0, 500.0), (0.0, 0.0)]
