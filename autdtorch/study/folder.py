@@ -155,6 +155,7 @@ PREVIOUS = "previous-"
 
 _FILES = (RESULTS_FILE, TRIALS_FILE, PROVENANCE_FILE)
 _LOCK_FILE = ".lock"
+_MADE_OF_THEM = ("plane.png", "poses.png", "fig*.png", "report.md", "report.html", "drive*.csv")
 _ANOTHER = "of another study (other settings, source or packages)"
 
 
@@ -186,12 +187,15 @@ class StudyFolder:
             self._take_up()
 
     def begin(self) -> None:
-        """Set aside damaged files and those of another study, and open the file of trials.
+        """Set aside damaged files and those of another study with its pictures, and open the file of trials.
 
         Nothing is written before: a study that is refused leaves the folder as it was.
         """
         aside = {name: reason for name, reason in self._not_used.items() if (self.path / name).exists()}
         if aside:
+            if len(self._not_used) == len(_FILES):  # nothing here is of this study
+                made = (file.name for pattern in _MADE_OF_THEM for file in sorted(self.path.glob(pattern)))
+                aside |= dict.fromkeys(made, _ANOTHER)
             places = (self.path / f"{PREVIOUS}{number}" for number in itertools.count(1))
             aside_folder = next(place for place in places if not place.exists())
             aside_folder.mkdir()
