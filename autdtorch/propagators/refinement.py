@@ -111,8 +111,12 @@ def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
             if budget.fits(finer, plan, taken):
                 break
         else:
-            shown = 1e3 * plan.spacing, error, tolerance
-            logger.warning("time or memory end at %.3g mm: estimated error %.2g, tolerance %g", *shown)
+            known = f"estimated error {error:.2g}"
+            if not others:
+                known = f"error not estimated, which takes a second grid (usually {grid_error:.2g})"
+            logger.warning(
+                "time or memory end at %.3g mm: %s, tolerance %g", 1e3 * plan.spacing, known, tolerance
+            )
             return propagator
         _log_cost(plan, ahead, taken, grid_error, budget, is_second=len(others) == 1)
         # the store has its matrix: a simulation without grids, whose memory is given back

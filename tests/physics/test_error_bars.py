@@ -252,6 +252,7 @@ def test_a_budget_returns_the_finest_grid_within_it(caplog):
     scene, tolerance = small_scene((RIGID,)), 1e-3
     least = make_propagator(scene, "box", None, tolerance, memory=1.0)
     assert "time or memory end" in caplog.text
+    assert "error not estimated, which takes a second grid" in caplog.text
     memory = 2 * plan(scene, "box", least.spacing).memory
     more = make_propagator(scene, "box", None, tolerance, memory=memory)
     assert more.spacing < least.spacing
