@@ -14,8 +14,7 @@ from autdtorch.fdtd.kernels import make_kernel
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stepping import assemble, drive_signal
 from autdtorch.propagators.plan import Plan, plan
-from autdtorch.propagators.refinement import first_plan, usual_plans
-from autdtorch.propagators.simulated import SimulatedPropagator
+from autdtorch.propagators.simulated import SimulatedPropagator, first_plan, usual_plans
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL

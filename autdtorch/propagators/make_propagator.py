@@ -12,8 +12,7 @@ import torch
 from autdtorch.propagators.free_space import FreeSpacePropagator
 from autdtorch.propagators.notices import warn_of_scene
 from autdtorch.propagators.plan import plan
-from autdtorch.propagators.refinement import Budget, refined
-from autdtorch.propagators.simulated import SimulatedPropagator
+from autdtorch.propagators.simulated import Budget, SimulatedPropagator, refined
 from autdtorch.propagators.store import store_in
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.scene import Scene

@@ -1,27 +1,25 @@
-"""The propagator that simulates."""
+"""The propagator that simulates, and the choice of its spacing by tolerance.
+
+Grids become finer until the estimated error is small enough.
+"""
 
 from __future__ import annotations
 
+import logging
 import math
+import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
 
-from autdtorch.fdtd.grid_errors import (
-    errors_by_grids,
-    grid_errors,
-    reading_errors,
-    rigid_errors,
-    shape_errors,
-    sizes,
-    usual_errors,
-)
+from autdtorch.fdtd.region import Region
 from autdtorch.propagators.absorbed_power import AbsorbedPower
 from autdtorch.propagators.box import BoxSimulation
-from autdtorch.propagators.free_space import PAIR_BYTES, free_space_matrix
+from autdtorch.propagators.free_space import PAIR_BYTES
 from autdtorch.propagators.full import DomainSimulation
+from autdtorch.propagators.grid_comparison import GridComparison
 from autdtorch.propagators.notices import Notices, warn_of_unsettled
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.propagator import ScenePropagator
@@ -33,8 +31,40 @@ from autdtorch.utils.process import cached_property, one_library_thread, require
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import ArrayLike, invalid
 
-_LONGER = 1.5
-"""Ratio of periods from which another grid is next to a resonance that this one is not, and is left out."""
+logger = logging.getLogger(__name__)
+
+_FIRST_ERROR = 0.1
+"""Tolerance relative to the `growth` of the first spacing, whose error is several times as large."""
+
+_FINER_IF_SLOW = 1.6
+"""Most by which the first spacing is finer where sound is slower than in air. Such bodies resonate, and what
+a coarse grid gives next to a resonance tells nothing of the others."""
+
+_SMALLEST_STEP, _LARGEST_STEP = 1.25, 1.6
+"""Ratios of a spacing and the next: the smallest that tells two errors apart; the largest over which the fall
+of an error is known."""
+
+_BY_TWO_GRIDS, _BY_THREE_GRIDS = 0.45, 0.7
+"""Estimated error, relative to the tolerance, that is accepted. Two coarse grids may agree by chance."""
+
+_AIM = 0.5
+"""Error for which a spacing is chosen, relative to the tolerance."""
+
+_UNUSUAL = 3.5
+"""Safety factor: the second spacing is chosen as if the first had this many times the usual error. Two grids
+claim 0.3 to 3 times the usual error of the finer one."""
+
+_SHAPE = 3.0
+"""Ratio of the errors of uncertain surfaces and of the grid from which a finer grid is of no use."""
+
+_RIGID_SHARE = 0.3
+"""Error of bodies taken as rigid, relative to the tolerance, from which their materials count."""
+
+_SETTLED = 0.05
+"""Distance to the steady state at which runs end, relative to the tolerance."""
+
+_NOTICED, _LONG = 10.0, 300.0
+"""Times of further grids [s] from which the log and a warning tell them; shorter ones only a verbose log."""
 
 
 class SimulatedPropagator(ScenePropagator):
@@ -115,45 +145,42 @@ class SimulatedPropagator(ScenePropagator):
 
     @one_library_thread()
     def _matrix(self, points: ArrayLike | None, with_error: bool) -> tuple[torch.Tensor, float]:
-        places = self._places(points)
-        results = self._results(places, with_error)
-        matrix = results[0].matrix
-        self._notices.of_cavities(places, matrix)
+        comparison = self._compared(points, with_error)
+        matrix = comparison.result.matrix
+        self._notices.of_cavities(comparison.points, matrix)
         if points is None:
-            self._notices.of_faint_points(matrix, self._free(places))
-        return matrix, self._error(results, places) if with_error else 0.0
+            self._notices.of_faint_points(matrix, comparison.free)
+        return matrix, comparison.error if with_error else 0.0
 
-    @one_library_thread()
     def point_errors(self, points: ArrayLike | None = None) -> torch.Tensor:
         """Return the estimated relative error of each point's row of the transfer matrix, float64 (P,).
 
         Points and errors are those of `transfer_matrix`.
         """
-        places = self._places(points)
-        results, free = self._results(places, with_error=True), self._free(places)
-        matrix, residual = results[0].matrix, results[0].residual
-        settling = torch.where(matrix.any(dim=1), residual * matrix.norm() / sizes(matrix, free), 0.0)
-        reading = reading_errors(matrix, free, places, self.plan.region, self.spacing)
-        return torch.hypot(self._errors(results, free) + reading, settling).to(device_of(points))
+        return self._compared(points, with_error=True).point_errors.to(device_of(points))
 
-    @one_library_thread()
-    def known_errors(self) -> tuple[float, float, float]:
-        """Simulate the control points; return their error, and its parts by shapes and rigid bodies.
+    @property
+    def known_error(self) -> float:
+        """The error of the control points' matrix by the grids given; infinite without any."""
+        return self._compared(with_error=bool(self._coarser)).error
 
-        The error is that by the grids given, infinite without any. For the last part see `rigid_errors`.
-        """
-        points = self.scene.control_points
-        results = self._results(points, with_error=bool(self._coarser))
-        matrix, free = (part.reshape(1, -1) for part in (results[0].matrix, self._free(points)))
-        shape, rigid = (float(of(matrix, free, self.plan.region)) for of in (shape_errors, rigid_errors))
-        return self._error(results, points) if self._coarser else math.inf, shape, rigid
-
-    @one_library_thread()
     def usual_error(self, points: ArrayLike | None = None) -> float:
         """Simulate points, by default the control points; return the usual error of grids of this spacing."""
-        points = self._places(points)
-        matrix = self._results(points, with_error=False)[0].matrix.reshape(1, -1)
-        return float(usual_errors(matrix, self._free(points).reshape(1, -1), self.spacing, self.plan.law))
+        return self._compared(points).usual_error
+
+    @one_library_thread()
+    def _compared(self, points: ArrayLike | None = None, with_error: bool = False) -> GridComparison:
+        """Simulate points, by default the control points; for their errors also on other grids."""
+        places = self._places(points)
+        grids = self._others if with_error else ()  # a grid that is refused is so before the first run
+        result = self.simulation.transfer_matrix(places)
+        others = [(grid.transfer_matrix(places), grid.plan.spacing) for grid in grids]
+        every = [result, *(other for other, _ in others)]
+        judged = [result] if self._coarser else every  # coarse grids on the way do not matter
+        warn_of_unsettled([run for each in judged for run in each.runs], self.tolerance)
+        if with_error:
+            self._notices.of_ringing(max(each.periods for each in every))
+        return GridComparison(self.plan, places, result, others)
 
     @one_library_thread()
     def _field(self, drive: torch.Tensor, points: torch.Tensor, is_picture: bool) -> torch.Tensor:
@@ -192,9 +219,8 @@ class SimulatedPropagator(ScenePropagator):
     @cached_property
     def _absorbing(self) -> Simulation:
         """The simulation in which no body that absorbs is taken as rigid."""
-        if self.plan.hides_losses:
-            return simulation_of(self.plan.with_materials, self._store)
-        return self.simulation
+        plan = self.plan
+        return simulation_of(plan.with_materials, self._store) if plan.hides_losses else self.simulation
 
     def _places(self, points: ArrayLike | None) -> torch.Tensor:
         """Return points (P, 3) after checking them, by default the control points."""
@@ -215,46 +241,157 @@ class SimulatedPropagator(ScenePropagator):
             raise invalid("spacing", self.spacing, f"the second grid of its error estimate has {reason}", "m")
         return (simulation_of(second, self._store),)
 
-    def _results(self, points: torch.Tensor, with_error: bool) -> list[PressureMap]:
-        """Return the transfer matrices of points, of this grid and, for its error, of others."""
-        grids = self._others if with_error else ()  # a grid that is refused is so before the first run
-        result = self.simulation.transfer_matrix(points)
-        others = [other.transfer_matrix(points) for other in grids]
-        judged = [result] if self._coarser else [result, *others]  # coarse grids on the way do not matter
-        warn_of_unsettled([run for each in judged for run in each.runs], self.tolerance)
-        return [result, *others]
-
-    def _error(self, results: Sequence[PressureMap], points: torch.Tensor) -> float:
-        """Return the relative error of the first matrix of points, estimated from those of other grids."""
-        matrix, residual, free = results[0].matrix, results[0].residual, self._free(points)
-        flat = [replace(each, matrix=each.matrix.reshape(1, -1)) for each in results]
-        reading = reading_errors(matrix, free, points, self.plan.region, self.spacing) * sizes(matrix, free)
-        whole = sizes(flat[0].matrix, free.reshape(1, -1))
-        known = float(self._errors(flat, free.reshape(1, -1)) + reading.norm() / whole)
-        return math.hypot(residual, known)
-
-    def _errors(self, results: Sequence[PressureMap], free: torch.Tensor) -> torch.Tensor:
-        """Return the errors (P,) of the rows of the first matrix by grid, shape and bodies taken as rigid.
-
-        The other results are those of `_others`; `free` is the matrix in free space.
-        """
-        (result, *others), matrix = results, results[0].matrix
-        self._notices.of_ringing(max(each.periods for each in results))
-        pairs = list(zip(others, self._others, strict=True))
-        calm = [pair for pair in pairs if pair[0].periods <= _LONGER * result.periods] or pairs[-1:]
-        grids = [(other.matrix, simulation.plan.spacing) for other, simulation in calm]
-        # only boxes know the incident field
-        of_grids = errors_by_grids if self.method == "full" else grid_errors
-        errors = of_grids(matrix, free, self.spacing, grids, self.plan.law)
-        heard = torch.stack([each.matrix.any(dim=1) for each in results]).any(dim=0)
-        errors = torch.where(heard, errors, 0.0)  # silence on all grids is exact
-        region = self.plan.region
-        return errors + shape_errors(matrix, free, region) + rigid_errors(matrix, free, region)
-
-    def _free(self, points: torch.Tensor) -> torch.Tensor:
-        return free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber, self.scene.images)
-
 
 def simulation_of(plan: Plan, store: Store) -> Simulation:
     """Make the simulation of a plan of method "box" or "full"."""
     return (DomainSimulation if plan.method == "full" else BoxSimulation)(plan, store)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The time [s] and the memory [bytes] that a choice may take; None is no limit."""
+
+    seconds: float | None = None
+    memory: float | None = None
+    begin: float = field(default_factory=time.perf_counter)
+
+    @property
+    def is_unlimited(self) -> bool:
+        """True if neither time nor memory is limited."""
+        return self.seconds is None and self.memory is None
+
+    def fits(self, plan: Plan, last: Plan, taken: float) -> bool:
+        """Return whether a plan is expected to fit, also this machine, after the `last` took `taken` [s]."""
+        spent = time.perf_counter() - self.begin
+        in_time = self.seconds is None or spent + taken * plan.work / last.work <= self.seconds
+        return in_time and (self.memory is None or plan.memory <= self.memory) and not plan.refusal
+
+
+def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
+    """Return the propagator of a plan, at a spacing whose estimated error is within its tolerance.
+
+    Where the budget does not suffice, it is the finest that fits. Where the surface of an obstacle is not
+    known well enough, it is one that does not add to that error. Warnings name the error.
+    """
+    tolerance, region = pilot.tolerance, pilot.region
+    plan = first_plan(pilot, budget.is_unlimited)
+    if plan.refusal:
+        raise ValueError(f"tolerance: {tolerance}; its first grid has {plan.refusal}")
+    others: list[Simulation] = []
+    while True:
+        begin, propagator = time.perf_counter(), SimulatedPropagator(plan, store, others)
+        comparison = propagator._compared(with_error=bool(others))
+        error, (shape, rigid_error) = comparison.error, comparison.lasting_errors
+        taken = time.perf_counter() - begin
+        if rigid_error > _RIGID_SHARE * tolerance:
+            logger.debug(
+                "obstacles taken as rigid would leave an error of %.2g: their materials count", rigid_error
+            )
+            return refined(pilot.with_materials, budget, store)
+        aim = _Aim(tolerance, shape, shape + rigid_error)
+        grid_error = error - aim.known if others else comparison.usual_error
+        if others:
+            if aim.is_met(grid_error, len(others)):
+                _warn_of_shape(region, shape, error, tolerance)
+                return propagator
+            if not math.isfinite(error):
+                reason = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
+                raise ValueError(f"max_periods: {plan.max_periods}; {reason}")
+        ahead = _plans_ahead(plan, grid_error, len(others), aim)
+        _, coarsest = _next_spacings(plan)
+        for finer in (ahead[0], plan.fitted(coarsest, coarsest)):
+            if budget.fits(finer, plan, taken):
+                break
+        else:
+            known = f"estimated error {error:.2g}"
+            if not others:
+                known = f"error not estimated, which takes a second grid (usually {grid_error:.2g})"
+            shown = 1e3 * plan.spacing, known, tolerance
+            logger.warning("time or memory end at %.3g mm: %s, tolerance %g", *shown)
+            return propagator
+        _log_cost(plan, ahead, taken, grid_error, budget, is_second=len(others) == 1)
+        # the store has its matrix: a simulation without grids, whose memory is given back
+        plan, others = finer, [*others, simulation_of(plan, store)]
+
+
+def first_plan(pilot: Plan, is_unlimited: bool = True) -> Plan:
+    """Return the plan of the first grid of a choice; without a budget it is finer where that saves a grid."""
+    region, spacing = pilot.region, pilot.region.coarsest_spacing
+    if is_unlimited:
+        spacing /= min(region.wavelength / region.shortest_wavelength, _FINER_IF_SLOW)
+        spacing = min(spacing, pilot.law.spacing_of(pilot.tolerance / _FIRST_ERROR))
+    settled = replace(pilot, tolerance=_SETTLED * pilot.tolerance, grids=pilot.grouping)
+    return settled.fitted(spacing, spacing)
+
+
+def usual_plans(first: Plan, usual: float, tolerance: float) -> list[Plan]:
+    """Return the plans of a choice from the `first` on, if its grids have their `usual` error."""
+    return [first, *_plans_ahead(first, usual, 0, _Aim(tolerance))]
+
+
+@dataclass(frozen=True)
+class _Aim:
+    """The tolerance, and the errors of uncertain surfaces and of all that no grid lowers, in it."""
+
+    tolerance: float
+    shape: float = 0.0
+    known: float = 0.0
+
+    def is_met(self, grid_error: float, others: int) -> bool:
+        """Return whether an error estimated from so many other grids is accepted."""
+        accepted = self.tolerance * (_BY_TWO_GRIDS if others == 1 else _BY_THREE_GRIDS)
+        return grid_error <= max(accepted - self.known, self.shape / _SHAPE)
+
+    def finer(self, plan: Plan, grid_error: float) -> Plan:
+        """Return the next plan after one whose grid has an error."""
+        aim = max(_AIM * self.tolerance - self.known, self.shape / _SHAPE)
+        wanted = plan.law.spacing_of(aim / grid_error * plan.law.growth(plan.spacing))
+        finest, coarsest = _next_spacings(plan)
+        return plan.fitted(min(max(wanted, finest), coarsest), coarsest)
+
+
+def _plans_ahead(plan: Plan, grid_error: float, others: int, aim: _Aim) -> list[Plan]:
+    """Return the finer plans, at least one, that a choice takes after a grid if errors fall as expected.
+
+    The error of the first grid, without `others`, is the usual one.
+    """
+    plans = [aim.finer(plan, grid_error if others else _UNUSUAL * grid_error)]
+    while True:
+        others += 1
+        error = grid_error * plan.law.growth(plans[-1].spacing) / plan.law.growth(plan.spacing)
+        if aim.is_met(error, others):
+            return plans
+        plans.append(aim.finer(plans[-1], error))
+
+
+def _next_spacings(plan: Plan) -> tuple[float, float]:
+    """Return the finest and the coarsest spacing [m] of the grid after a plan's."""
+    return plan.spacing / _LARGEST_STEP, plan.spacing / _SMALLEST_STEP
+
+
+def _log_cost(
+    plan: Plan, ahead: Sequence[Plan], taken: float, error: float, budget: Budget, is_second: bool
+) -> None:
+    """Log the time that the grids `ahead` take, after the last one `taken` [s]: more loudly the longer it is.
+
+    Only the second grid warns: in the first one's time is the start of kernels, and later ones repeat it.
+    """
+    seconds = taken * sum(each.work for each in ahead) / plan.work
+    is_long = is_second and seconds > _LONG and budget.seconds is None
+    logger.log(
+        logging.WARNING if is_long else logging.INFO if seconds > _NOTICED else logging.DEBUG,
+        "spacing %.3g mm: estimated error %.2g; %s down to %.3g mm for a tolerance of %g: about %.2g s%s",
+        1e3 * plan.spacing, error, counted(len(ahead), "finer grid"), 1e3 * ahead[-1].spacing,
+        plan.tolerance / _SETTLED, seconds, "; limit them by seconds=" if is_long else "",
+    )  # fmt: skip
+
+
+def _warn_of_shape(region: Region, shape: float, error: float, tolerance: float) -> None:
+    """Log that the surface of an obstacle is not known well enough for a tolerance."""
+    if error <= tolerance:
+        return
+    number, body = max(enumerate(region.bodies), key=lambda pair: pair[1].uncertainty)
+    logger.warning(
+        "the surface of obstacle %d is known to %.2g mm, which leaves an error of %.2g: estimated error %.2g,"
+        " tolerance %g; smaller voxels are needed", number, 1e3 * body.uncertainty, shape, error, tolerance,
+    )  # fmt: skip

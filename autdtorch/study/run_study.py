@@ -312,7 +312,7 @@ def _accuracy(propagator: SimulatedPropagator | TMatrixPropagator, simulation: S
     if isinstance(propagator, TMatrixPropagator):
         waves = f"{propagator.planned_runs} waves" if propagator.cells else "exact waves"
         return f"{waves}, error {propagator.tolerance:g}"
-    count, error = len(simulation.runs), propagator.known_errors()[0]
+    count, error = len(simulation.runs), propagator.known_error
     runs = counted(count, "run")
     if math.isfinite(error):
         return f"{runs}, estimated error {error:.1g}"

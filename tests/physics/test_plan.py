@@ -9,7 +9,7 @@ import pytest
 from small_scenes import CUBE, relative_error, small_scene
 
 import autdtorch as at
-from autdtorch.propagators import FreeSpacePropagator, refinement
+from autdtorch.propagators import FreeSpacePropagator, simulated
 from autdtorch.propagators import estimate as simulation_estimate
 from autdtorch.propagators.plan import plan
 
@@ -130,13 +130,13 @@ def test_a_choice_logs_its_cost_and_warns_if_it_is_long(monkeypatch, caplog):
     caplog.set_level(logging.DEBUG, "autdtorch")
     scene = small_scene((replace(CUBE, rotation=(0.2, 0.3, 0.1)),))
     for noticed, level in ((math.inf, logging.DEBUG), (0.0, logging.INFO)):
-        monkeypatch.setattr(refinement, "_NOTICED", noticed)  # the first grid may compile its kernels
+        monkeypatch.setattr(simulated, "_NOTICED", noticed)  # the first grid may compile its kernels
         at.make_propagator(scene, "box", None, 0.01)
         first, *_ = costs = [record for record in caplog.records if "finer grid" in record.getMessage()]
         assert {record.levelno for record in costs} == {level}
         assert "for a tolerance of 0.01: about" in first.getMessage()
         caplog.clear()
-    monkeypatch.setattr(refinement, "_LONG", 0.0)
+    monkeypatch.setattr(simulated, "_LONG", 0.0)
     at.make_propagator(scene, "box", None, 0.01)
     assert sum("limit them by seconds=" in record.getMessage() for record in caplog.records) == 1
     caplog.clear()

@@ -1,0 +1,109 @@
+"""The errors of a simulated transfer matrix, as those on other grids tell them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from autdtorch.fdtd.grid_errors import (
+    errors_by_grids,
+    grid_errors,
+    reading_errors,
+    rigid_errors,
+    shape_errors,
+    sizes,
+    usual_errors,
+)
+from autdtorch.propagators.free_space import free_space_matrix
+from autdtorch.propagators.plan import Plan
+from autdtorch.propagators.simulation import PressureMap
+from autdtorch.utils.process import cached_property, one_library_thread
+
+_LONGER = 1.5
+"""Ratio of periods from which another grid is next to a resonance that this one is not, and is left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class GridComparison:
+    """The transfer matrix of points by a plan, and those on other grids that tell its errors.
+
+    Attributes:
+        plan: the plan.
+        points: (P, 3) [m].
+        result: their transfer matrix.
+        others: those on other grids, each with its spacing [m].
+    """
+
+    plan: Plan
+    points: torch.Tensor
+    result: PressureMap
+    others: Sequence[tuple[PressureMap, float]]
+
+    @cached_property
+    def free(self) -> torch.Tensor:
+        """The transfer matrix (P, M) [Pa] in free space."""
+        scene = self.plan.scene
+        return free_space_matrix(self.points, scene.array, scene.complex_wavenumber, scene.images)
+
+    @property
+    @one_library_thread()
+    def error(self) -> float:
+        """The estimated relative error of the whole matrix; infinite without other grids."""
+        if not self.others:
+            return math.inf
+        reading = self._reading_errors * sizes(self.result.matrix, self.free)
+        known = float(self._errors(_as_row) + reading.norm() / sizes(*self._whole))
+        return math.hypot(self.result.residual, known)
+
+    @property
+    @one_library_thread()
+    def point_errors(self) -> torch.Tensor:
+        """The estimated relative error of each point's row of the matrix, float64 (P,)."""
+        matrix, residual = self.result.matrix, self.result.residual
+        size = sizes(matrix, self.free)
+        settling = torch.where(matrix.any(dim=1), residual * matrix.norm() / size, 0.0)
+        return torch.hypot(self._errors(lambda rows: rows) + self._reading_errors, settling)
+
+    @property
+    @one_library_thread()
+    def lasting_errors(self) -> tuple[float, float]:
+        """The parts of the error that no grid lowers: by uncertain surfaces, and by bodies taken as rigid."""
+        shape, rigid = (of(*self._whole, self.plan.region) for of in (shape_errors, rigid_errors))
+        return float(shape), float(rigid)
+
+    @property
+    @one_library_thread()
+    def usual_error(self) -> float:
+        """The usual error of grids of this spacing, without any other."""
+        return float(usual_errors(*self._whole, self.plan.spacing, self.plan.law))
+
+    @property
+    def _whole(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The matrix and that in free space, each as one row (1, P M)."""
+        return _as_row(self.result.matrix), _as_row(self.free)
+
+    @property
+    def _reading_errors(self) -> torch.Tensor:
+        plan = self.plan
+        return reading_errors(self.result.matrix, self.free, self.points, plan.region, plan.spacing)
+
+    def _errors(self, form: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
+        """Return the errors of the rows of the matrices in a form: by grids, shapes and rigid bodies."""
+        longest = _LONGER * self.result.periods
+        calm = [pair for pair in self.others if pair[0].periods <= longest] or self.others[-1:]
+        grids = [(form(other.matrix), spacing) for other, spacing in calm]
+        matrix, free, plan = form(self.result.matrix), form(self.free), self.plan
+        # only boxes know the incident field
+        of_grids = errors_by_grids if plan.method == "full" else grid_errors
+        errors = of_grids(matrix, free, plan.spacing, grids, plan.law)
+        every = [matrix, *(form(other.matrix) for other, _ in self.others)]
+        heard = torch.stack([each.any(dim=1) for each in every]).any(dim=0)
+        errors = torch.where(heard, errors, 0.0)  # silence on all grids is exact
+        return errors + shape_errors(matrix, free, plan.region) + rigid_errors(matrix, free, plan.region)
+
+
+def _as_row(matrix: torch.Tensor) -> torch.Tensor:
+    return matrix.reshape(1, -1)
