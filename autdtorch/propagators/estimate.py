@@ -13,9 +13,11 @@ from autdtorch.fdtd.grouping import domain_grid
 from autdtorch.fdtd.kernels import make_kernel
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stepping import assemble, drive_signal
+from autdtorch.propagators.free_space import PAIR_BYTES
 from autdtorch.propagators.plan import Plan, plan
 from autdtorch.propagators.simulated import SimulatedPropagator, first_plan, usual_plans
-from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
+from autdtorch.propagators.tmatrix.costs import WaveCosts
+from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator, placed_bodies
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.process import available_memory
@@ -93,9 +95,9 @@ def estimate(
     """
     spacing = None if spacing is None else positive("spacing", spacing, "m")
     planned = plan(scene, method, spacing, tolerance, kernel=kernel, dtype=dtype, device=device)
+    memory, seconds = _without_runs(planned)
     if planned.method == "free_space" or not planned.runs:
-        pairs = len(scene.array) * len(scene.control_points)
-        return Estimate(planned.method, None, 0, 0, planned.memory, _PAIR_SECONDS * pairs)
+        return Estimate(planned.method, None, 0, 0, memory, seconds)
     before: list[Plan] = []
     if spacing is None:
         *before, last = _plans_by_tolerance(planned.on_grids)
@@ -111,8 +113,20 @@ def estimate(
     if pilot.memory < available_memory():
         planned = replace(planned, runs=kind(pilot).planned_runs)
     work = planned.work + planned.work / without_symmetries * sum(each.work for each in before)
-    seconds = work / _rate_of(planned)
-    return Estimate(planned.method, spacing, planned.cells, planned.runs, planned.memory, seconds)
+    memory, seconds = max(memory, planned.memory), seconds + work / _rate_of(planned)
+    return Estimate(planned.method, spacing, planned.cells, planned.runs, memory, seconds)
+
+
+def _without_runs(planned: Plan) -> tuple[float, float]:
+    """Return the memory [bytes] and the time [s] of what needs no run: free space, and waves of bodies."""
+    array, points, images = planned.scene.array, planned.scene.control_points, len(planned.scene.images)
+    pairs = len(array) * len(points)
+    memory, seconds = PAIR_BYTES * pairs, _PAIR_SECONDS * images * pairs
+    if planned.method != "tmatrix":
+        return memory, seconds
+    waves = [(placed.body.degree + 1) ** 2 for placed in placed_bodies(planned)]
+    costs = WaveCosts(waves, images, len(array), len(points))
+    return memory + costs.memory, seconds + costs.seconds
 
 
 def _plans_by_tolerance(pilot: Plan) -> list[Plan]:

@@ -19,7 +19,6 @@ from autdtorch.fdtd.placement import fitting_spacing
 from autdtorch.fdtd.region import Body, Fluid, Region
 from autdtorch.fdtd.shapes import Shape
 from autdtorch.fdtd.short_runs import THIN_LAYER, THIN_MARGIN
-from autdtorch.propagators.free_space import PAIR_BYTES
 from autdtorch.propagators.store import key_of
 from autdtorch.propagators.tmatrix.bodies import waves_to_simulate
 from autdtorch.scene.arrays import apertures_of, radii_of
@@ -177,9 +176,7 @@ class Plan:
 
     @property
     def memory(self) -> float:
-        """The most memory in use at a time [bytes]."""
-        if self.method == "free_space" or not self.runs:
-            return PAIR_BYTES * len(self.scene.array) * len(self.scene.control_points)
+        """The most memory in use at a time by runs [bytes]."""
         return self._costs.memory
 
     @property

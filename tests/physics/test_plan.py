@@ -109,6 +109,24 @@ def test_free_space_takes_no_cells_and_infeasible_simulations_are_estimated():
     assert cost.seconds > 3600
 
 
+def test_waves_between_bodies_and_planes_take_time_and_memory():
+    """Twice the radius is three to four times the waves, whose system is a matrix for as many transducers."""
+    array = at.TransducerArray.autd3((0, 0, 0), (0, 0, 1))
+    floor = at.Reflector((0, -0.2, 0), (0, 1, 0))
+
+    def cost(radius, reflectors):
+        body = at.Sphere((0, 0, 0.1), radius, rigid=True)
+        scene = at.Scene(array, at.Medium(1.2, 340.0), 40e3, [(0, 0, 0.17)], [body], reflectors=reflectors)
+        waves = sum(len(body.matrix) for body in at.make_propagator(scene).bodies.bodies)
+        return at.estimate(scene), waves
+
+    (alone, _), (small, few), (large, many) = cost(2e-2, ()), cost(1e-2, (floor,)), cost(2e-2, (floor,))
+    assert (large.method, large.runs, large.cells) == ("tmatrix", 0, 0)
+    assert large.seconds > 3 * alone.seconds  # with nothing to solve
+    assert (many / few) ** 1.5 < large.seconds / small.seconds < (many / few) ** 2
+    assert large.memory > 3 * 16 * many**2  # a complex matrix, its factors and what it is made of
+
+
 def test_an_estimate_by_tolerance_tells_the_choice(monkeypatch):
     """Errors are usual ones within a factor of three, of which the spacing is the root."""
     monkeypatch.setattr(simulation_estimate, "_rate", lambda *_: 1e9)

@@ -33,14 +33,14 @@ _ACCURACY = 1e-11
 _MOST_STEPS = 30
 """Steps after which the system is solved as a matrix."""
 
-_USUAL_STEPS = 7
+USUAL_STEPS = 7
 """Steps that most systems take. With more right sides than 1 / 7 of the unknowns, a matrix is quicker."""
 
 _FEWEST_WAVES = 32
 """Waves in a block of a map, as products of smaller ones take as long."""
 
-_ENTRY_BYTES = 48.0
-"""Memory of a pair of waves in a matrix [bytes]."""
+ENTRY_BYTES = 130.0
+"""Memory of a pair of waves while a system is solved as a matrix [bytes]; 80 to 170 for 625 to 1250 waves."""
 
 _TINY = torch.finfo(torch.float64).tiny
 
@@ -287,7 +287,7 @@ class _Fixed(torch.autograd.Function):
 def _solution(system: _System) -> torch.Tensor:
     """Return the solution by steps, or by a matrix where this is quicker or where they do not converge."""
     start = system.start()
-    if _USUAL_STEPS * start.shape[-1] <= len(start):
+    if USUAL_STEPS * start.shape[-1] <= len(start):
         solution = _by_steps(system, start)
         if solution is not None:
             return solution
@@ -345,7 +345,7 @@ def _norm(waves: torch.Tensor) -> torch.Tensor:
 def _by_matrix(system: _System, start: torch.Tensor) -> torch.Tensor:
     """Return x of a matrix of each pose."""
     count, poses, _ = start.shape
-    require_memory("bodies", f"{count} waves", _ENTRY_BYTES * poses * count**2)
+    require_memory("bodies", f"{count} waves", ENTRY_BYTES * poses * count**2)
     identity = torch.eye(count, **COMPLEX)
     matrix = system.linear(identity[:, None].expand(-1, poses, -1).contiguous())
     solution: torch.Tensor = torch.linalg.solve(identity - matrix.movedim(1, 0), start.movedim(1, 0))
