@@ -19,7 +19,7 @@ from typing import TypeAlias
 import torch
 
 from autdtorch.analytic.green import green
-from autdtorch.analytic.spherical_waves import bessel_slopes, counted
+from autdtorch.analytic.spherical_waves import bessel_slopes, order_column
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.fluids import fluid_ratios, passive_impedance
 from autdtorch.utils.units import real_wavenumber
@@ -243,7 +243,7 @@ def _series(setup: _Setup, kr: torch.Tensor, radial: Radial, inner_size: float) 
 
 def _block(setup: _Setup, kr: torch.Tensor, radial: Radial, inner_size: float) -> torch.Tensor:
     orders = _enough_orders(setup, inner_size)
-    weights = 2 * counted(setup.size, orders) + 1
+    weights = 2 * order_column(setup.size, orders) + 1
     at_points = weights[:, None] * radial(kr, orders)
     at_sources = _hankel_fall(setup.size, setup.wavenumber * setup.source_distances, orders)
     bound = at_points.abs().amax(dim=1) * at_sources.abs().amax(dim=1)
@@ -278,7 +278,7 @@ def _enough_orders(setup: _Setup, inner_size: float) -> int:
 
 def _hankel_slopes(x: torch.Tensor, orders: int) -> torch.Tensor:
     """Return h_n'(x) / h_n(x), (orders + 1, *x.shape)."""
-    return _hankel_ratios(x, orders) - (counted(x, orders) + 1) / x
+    return _hankel_ratios(x, orders) - (order_column(x, orders) + 1) / x
 
 
 def _hankel_ratios(x: torch.Tensor, orders: int) -> torch.Tensor:

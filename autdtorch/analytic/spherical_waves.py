@@ -309,10 +309,10 @@ def bessel_slopes(x: torch.Tensor, orders: int) -> torch.Tensor:
         ratio = (2 * n + 1) / x - 1 / ratio
         if n <= orders:
             ratios.append(ratio)
-    return torch.stack(ratios[::-1]) - (counted(x, orders) + 1) / x
+    return torch.stack(ratios[::-1]) - (order_column(x, orders) + 1) / x
 
 
-def counted(x: torch.Tensor, orders: int) -> torch.Tensor:
+def order_column(x: torch.Tensor, orders: int) -> torch.Tensor:
     """Return the orders 0 to `orders`, (orders + 1, 1, ...), for broadcasting with x."""
     return torch.arange(orders + 1, dtype=torch.float64, device=x.device).reshape(-1, *[1] * x.ndim)
 

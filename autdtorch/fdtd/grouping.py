@@ -17,14 +17,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.coupling import usual_numbers
+from autdtorch.fdtd.box_coupling import usual_numbers
 from autdtorch.fdtd.grid import Extent, bodies_extent, domain_extent
+from autdtorch.fdtd.grid_axes import axes_along, is_tilted
 from autdtorch.fdtd.perfectly_matched_layer import Thickness
 from autdtorch.fdtd.region import CLEARANCE, MAX_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH, Region
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil
-from autdtorch.fdtd.turning import axes_along, is_tilted
 from autdtorch.utils.array_types import Array, triple
 from autdtorch.utils.process import cached_property
 

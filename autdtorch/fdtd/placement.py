@@ -16,9 +16,9 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from autdtorch.fdtd.grid_axes import ALIGNED, slender_faces
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.shapes import Shape
-from autdtorch.fdtd.turning import ALIGNED, slender_faces
 from autdtorch.utils.array_types import Array, Index, triple
 from autdtorch.utils.spatial import doubled_normals
 from autdtorch.utils.validation import LENGTH_TOLERANCE

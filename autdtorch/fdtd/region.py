@@ -16,6 +16,7 @@ from typing import NamedTuple, Self
 import numpy as np
 import torch
 
+from autdtorch.fdtd.grid_axes import FlatFaces, flat_faces, slender_faces
 from autdtorch.fdtd.shapes import (
     Shape,
     Solids,
@@ -25,9 +26,8 @@ from autdtorch.fdtd.shapes import (
     turned_shape,
     with_image,
 )
-from autdtorch.fdtd.turning import FlatFaces, flat_faces, slender_faces
 from autdtorch.utils.array_types import Array, Index, triple
-from autdtorch.utils.images import Image, Mirror, images_of
+from autdtorch.utils.mirror_images import Image, Mirror, images_of
 from autdtorch.utils.process import cached_property
 from autdtorch.utils.spatial import (
     areas_of,

@@ -30,7 +30,7 @@ from autdtorch.fdtd.stencil import flat_offsets, places_of
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.utils.apertures import Apertures, Discs, image_of
 from autdtorch.utils.array_types import COMPLEX, Array, Index
-from autdtorch.utils.images import NO_MIRRORS, SPACE_ITSELF, Image
+from autdtorch.utils.mirror_images import NO_MIRRORS, SPACE_ITSELF, Image
 from autdtorch.utils.process import cached_property, parts_of_size, spread
 from autdtorch.utils.spatial import distinct_cells, places_among
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from autdtorch.utils.array_types import Array, triple
-from autdtorch.utils.images import Mirror
+from autdtorch.utils.mirror_images import Mirror
 from autdtorch.utils.process import cached_property
 from autdtorch.utils.validation import LENGTH_TOLERANCE, Vector
 

@@ -22,7 +22,7 @@ from autdtorch.fdtd.stencil import OFFSETS, places_of
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.utils.apertures import Apertures, Discs
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.images import Mirror
+from autdtorch.utils.mirror_images import Mirror
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 # Largest difference of equal stencil rows, relative to the weight of a face: on a grid of 1 mm, shifts by

@@ -41,8 +41,8 @@ from .safety import Signalled as Signalled
 from .safety import ended_by_signals as ended_by_signals
 from .sensors.by_hand import ManualSensor as ManualSensor
 from .sensors.by_hand import MovedMicrophone as MovedMicrophone
+from .sensors.file_sensor import FileSensor as FileSensor
 from .sensors.kinds import SENSORS as SENSORS
-from .sensors.reading_file import FileSensor as FileSensor
 from .sensors.scope_microphones import Microphone as Microphone
 from .sensors.scope_microphones import ScopeSensor as ScopeSensor
 from .sensors.scpi_scope import KEYSIGHT as KEYSIGHT

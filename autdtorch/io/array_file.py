@@ -83,7 +83,7 @@ def _from_pat(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def _from_csv(path: str | os.PathLike[str]) -> dict[str, Any]:
     known = PLACE_COLUMNS | NORMAL_COLUMNS | SIZE_COLUMNS | {OFFSET: "rad"} | _IGNORED
-    table = table_of(read_rows(path), known, _names, _unit)
+    table = table_of(read_rows(path), known, _array_columns, _length_unit)
     wanted = PLACE_COLUMNS | (NORMAL_COLUMNS if NORMAL_COLUMNS.keys() & table.keys() else {})
     if missing := [name for name in wanted if name not in table]:
         raise ValueError(f"{path}: no column {', '.join(missing)}; must have {', '.join(wanted)}")
@@ -98,7 +98,7 @@ def _from_csv(path: str | os.PathLike[str]) -> dict[str, Any]:
     }
 
 
-def _names(values: Array) -> list[str]:
+def _array_columns(values: Array) -> list[str]:
     names = [*PLACE_COLUMNS, *NORMAL_COLUMNS]
     if values.shape[1] not in (3, 6):
         accepted = (
@@ -115,7 +115,7 @@ def _names(values: Array) -> list[str]:
     return names[: values.shape[1]]
 
 
-def _unit(kind: str, table: Mapping[str, Array]) -> Guessed | None:
+def _length_unit(kind: str, table: Mapping[str, Array]) -> Guessed | None:
     """Return the unit of lengths or strengths that state none: that in which the pitch is a usual one."""
     if OFFSET in table:
         raise ValueError(f"column {OFFSET} has no unit; must be {OFFSET} [rad] or {OFFSET} [deg]")

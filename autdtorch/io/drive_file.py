@@ -206,7 +206,7 @@ def _from_csv(path: Path) -> torch.Tensor:
     rows = read_rows(path)
     if (frames := _openmpd_frames(rows)) is not None:
         return _of_arguments(path, frames, 1.0)
-    table = table_of(rows, _COLUMNS, _names, _unit)
+    table = table_of(rows, _COLUMNS, _drive_columns, _phase_unit)
     for name, device in DEVICES.items():
         if any(f"{name} {column}" in table for column in device.columns):
             return _in_frames(path, _played(path, name, table), table)
@@ -230,7 +230,7 @@ def _openmpd_frames(rows: CsvRows) -> Array | None:
     return frames
 
 
-def _names(values: Array) -> list[str]:
+def _drive_columns(values: Array) -> list[str]:
     """Return the names of columns (R, C) without header: phase, or phase and amplitude in their order."""
     if values.shape[1] == 1:
         return ["phase"]
@@ -247,7 +247,7 @@ def _names(values: Array) -> list[str]:
     return names
 
 
-def _unit(kind: str, table: Mapping[str, Array]) -> Guessed | None:
+def _phase_unit(kind: str, table: Mapping[str, Array]) -> Guessed | None:
     """Return the unit of columns that state none: rad, if the phases can hardly be levels or degrees."""
     if kind != "rad" or "phase" not in table:
         return None  # of the array, which is not used

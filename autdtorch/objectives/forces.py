@@ -23,8 +23,8 @@ from autdtorch.objectives.hermitian import ascended, forms_bound
 from autdtorch.objectives.objective import magnitudes, observe_drives
 from autdtorch.propagators.derivatives import nodes_around, regular_coefficients
 from autdtorch.propagators.propagator import Propagator
-from autdtorch.propagators.tmatrix.bodies import bodies_of
 from autdtorch.propagators.tmatrix.force import force_matrices
+from autdtorch.propagators.tmatrix.obstacle_groups import bodies_of
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.particle import BEAD, Particle

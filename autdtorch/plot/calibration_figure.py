@@ -16,7 +16,7 @@ from matplotlib.ticker import MaxNLocator
 
 from autdtorch.methods.calibration.calibration import Calibration, gain_to, relative_error
 from autdtorch.plot import colours
-from autdtorch.plot.data import MM, pressure_unit
+from autdtorch.plot.data import MM, legible_unit
 from autdtorch.plot.style import TICK_SIZE, add_legend, new_figure, set_ticks, styled
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.spatial import closest_pair
@@ -109,7 +109,7 @@ def _draw_readings(ax: Axes, calibration: Calibration) -> list[Line2D]:
         errors = held.before, held.error
     known = ~observed.isnan()
     levels = torch.cat([part[known] for part in (observed, before, after)])
-    name, unit = pressure_unit(float(levels.max()))
+    name, unit = legible_unit(float(levels.max()))
     most = 1.05 * float(levels.max()) / unit
     size = 9.0 if len(levels) < 3 * _MOST_DOTS else 2.0
     ax.plot([0, most], [0, most], color="0.2", linewidth=0.8, zorder=1)

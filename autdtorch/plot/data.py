@@ -116,14 +116,14 @@ def largest(magnitude: Array) -> float:
     return float(np.nanmax(magnitude, initial=0.0))
 
 
-def pressure_unit(peak: float) -> tuple[str, float]:
+def legible_unit(peak: float) -> tuple[str, float]:
     """Return a unit in which pressures up to a peak [Pa] are short numbers, and its size [Pa]."""
     return next((name, size) for name, size, least in _UNITS if (peak or 1.0) >= least)
 
 
 def pressure_text(pressure: float) -> str:
     """Return a pressure [Pa] with three digits and its unit, such as "4.59 kPa"."""
-    name, size = pressure_unit(pressure)
+    name, size = legible_unit(pressure)
     return f"{pressure / size:.3g} {name}"
 
 

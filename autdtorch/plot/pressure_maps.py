@@ -312,7 +312,7 @@ def _beyond(maps: Collection[Array], limits: tuple[float, float]) -> str:
 
 def _label_bar(bar: Colorbar, limits: tuple[float, float], quantity: str, unit: str, length: float) -> None:
     """Label a colour bar of a length [inch] with the quantity and its unit, and with numbers that fit."""
-    name, size = data.pressure_unit(max(map(abs, limits))) if unit == "Pa" else (unit, 1.0)
+    name, size = data.legible_unit(max(map(abs, limits))) if unit == "Pa" else (unit, 1.0)
     bar.set_label(quantity if "[" in quantity else f"{quantity} [{name}]")
     bar.ax.tick_params(labelsize=TICK_SIZE)
     set_ticks(bar.ax.xaxis if bar.orientation == "horizontal" else bar.ax.yaxis, length, limits, size)

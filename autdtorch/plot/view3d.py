@@ -23,7 +23,7 @@ from PIL import Image, ImageColor
 
 from autdtorch.plot import meshes3d, plotter3d
 from autdtorch.plot.colours import FLOOR, WAVE_MAP
-from autdtorch.plot.data import MM, in_decibels, largest, pressure_text, pressure_unit, zero_level
+from autdtorch.plot.data import MM, in_decibels, largest, legible_unit, pressure_text, zero_level
 from autdtorch.plot.plotter3d import STILL_AXES
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.files import in_folder, path_of
@@ -195,7 +195,7 @@ def animate3d(
     phases = meshes3d.emitted_phases(drive, len(scene.array))
     plane, magnitude = meshes3d.plane_pressure(scene, field)
     pressure = complex_tensor("field", field).detach().cpu().numpy()
-    unit, size = pressure_unit(largest(magnitude))
+    unit, size = legible_unit(largest(magnitude))
     pressure[np.isnan(magnitude)] = math.nan
     pressure /= size
     frames = integer_at_least("frames", frames, 2)

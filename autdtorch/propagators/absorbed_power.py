@@ -18,7 +18,7 @@ from autdtorch.scene.arrays import apertures_of, complex_strengths_of
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.apertures import Discs, centers_of, image_of
 from autdtorch.utils.array_types import COMPLEX, REAL, Array, Index
-from autdtorch.utils.images import Mirror, images_of
+from autdtorch.utils.mirror_images import Mirror, images_of
 from autdtorch.utils.validation import invalid
 
 _MORE = 20

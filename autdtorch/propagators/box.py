@@ -22,17 +22,17 @@ import torch
 from scipy.spatial import KDTree
 
 from autdtorch.fdtd.grid import make_box
+from autdtorch.fdtd.grid_axes import is_tilted
 from autdtorch.fdtd.grouping import PlannedGrid, one_box
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
 from autdtorch.fdtd.steady_state import MOST_JUDGED, Observe
 from autdtorch.fdtd.stepping import Assembly, assemble_on
 from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_array, orbits_of_transducers
-from autdtorch.fdtd.turning import is_tilted
 from autdtorch.propagators.absorbed_power import Absorption, Radiators, absorption
+from autdtorch.propagators.box_results import Judged, Radiation, Solved, spread_runs
 from autdtorch.propagators.box_scatterer import BoxScatterer, Couplings
 from autdtorch.propagators.multiple_scattering import iterated
 from autdtorch.propagators.plan import Plan
-from autdtorch.propagators.radiation import Judged, Radiation, Solved, spread_runs
 from autdtorch.propagators.simulation import PressureMap, Run, Simulation, Stepped, mean_of_images
 from autdtorch.propagators.store import BODIES, MOST_BYTES, Store, key_of
 from autdtorch.scene.checks import require_clear
@@ -44,7 +44,7 @@ from autdtorch.scene.scene import Scene
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL, Index
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.images import Mirror
+from autdtorch.utils.mirror_images import Mirror
 from autdtorch.utils.process import cached_property, one_library_thread
 
 logger = logging.getLogger(__name__)

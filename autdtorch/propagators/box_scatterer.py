@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import torch
 
-from autdtorch.fdtd.coupling import Coupling, coupling_of
+from autdtorch.fdtd.box_coupling import Coupling, coupling_of
 from autdtorch.fdtd.kernels.contract import Kernel, Sources
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
 from autdtorch.fdtd.short_runs import short_runs
@@ -15,7 +15,7 @@ from autdtorch.fdtd.steady_state import Observe, SteadyState, run_to_steady_stat
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulation import Stepped
 from autdtorch.utils.array_types import COMPLEX, REAL, Index
-from autdtorch.utils.images import Image, Mirror
+from autdtorch.utils.mirror_images import Image, Mirror
 from autdtorch.utils.process import cached_property
 
 

@@ -9,8 +9,8 @@ import torch
 
 from autdtorch.propagators.free_space import FreeSpacePropagator
 from autdtorch.propagators.propagator import Propagator
-from autdtorch.propagators.tmatrix.bodies import room_around
 from autdtorch.propagators.tmatrix.force import radiation_force
+from autdtorch.propagators.tmatrix.obstacle_groups import room_around
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
 from autdtorch.scene.drive import validate_single_drive

@@ -21,8 +21,8 @@ from autdtorch.analytic.spherical_waves import (
 )
 from autdtorch.propagators.derivatives import field_derivatives, nodes_around
 from autdtorch.propagators.propagator import Propagator
-from autdtorch.propagators.tmatrix.bodies import ObstacleGroup, bodies_of, room_around
 from autdtorch.propagators.tmatrix.force import radiation_force
+from autdtorch.propagators.tmatrix.obstacle_groups import ObstacleGroup, bodies_of, room_around
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.drive import validate_drive
 from autdtorch.utils.array_types import REAL, device_of

@@ -23,7 +23,7 @@ from autdtorch.scene.reflectors import require_in_front
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL
-from autdtorch.utils.images import NO_MIRRORS, Image
+from autdtorch.utils.mirror_images import NO_MIRRORS, Image
 from autdtorch.utils.process import one_library_thread, require_memory
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import ArrayLike, device_type, differentiable_points, require_kind

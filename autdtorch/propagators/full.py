@@ -18,7 +18,7 @@ from autdtorch.scene.checks import require_inside
 from autdtorch.scene.reflectors import require_in_front
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import REAL, Index
-from autdtorch.utils.images import Mirror
+from autdtorch.utils.mirror_images import Mirror
 from autdtorch.utils.process import cached_property, one_library_thread
 
 

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import torch
 
 from autdtorch.fdtd.assembly.unions import warn_of_thin_walls
+from autdtorch.fdtd.grid_axes import axes_along
 from autdtorch.fdtd.region import warn_if_coarse
-from autdtorch.fdtd.turning import axes_along
 from autdtorch.propagators.plan import Plan, walls_of
 from autdtorch.propagators.simulation import Run, Simulation
 from autdtorch.scene.scene import Scene

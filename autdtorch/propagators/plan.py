@@ -20,7 +20,7 @@ from autdtorch.fdtd.region import Body, Fluid, Region
 from autdtorch.fdtd.shapes import Shape
 from autdtorch.fdtd.short_runs import THIN_LAYER, THIN_MARGIN
 from autdtorch.propagators.store import key_of
-from autdtorch.propagators.tmatrix.bodies import waves_to_simulate
+from autdtorch.propagators.tmatrix.obstacle_groups import waves_to_simulate
 from autdtorch.scene.arrays import apertures_of, radii_of
 from autdtorch.scene.obstacles import Mesh, Obstacle
 from autdtorch.scene.scene import Scene

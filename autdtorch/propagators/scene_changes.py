@@ -11,7 +11,7 @@ import torch
 from autdtorch.propagators.free_space import FreeSpacePropagator
 from autdtorch.propagators.propagator import Propagator, ScenePropagator
 from autdtorch.propagators.simulated import SimulatedPropagator
-from autdtorch.propagators.tmatrix.bodies import bodies_of
+from autdtorch.propagators.tmatrix.obstacle_groups import bodies_of
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
 from autdtorch.scene.changes import (
@@ -32,7 +32,7 @@ from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.moving import circumscribed
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.images import SPACE_ITSELF, Image
+from autdtorch.utils.mirror_images import SPACE_ITSELF, Image
 from autdtorch.utils.process import cached_property, one_library_thread
 from autdtorch.utils.validation import ArrayLike, invalid, points_tensor, real_tensor
 

@@ -31,7 +31,7 @@ from autdtorch.scene.arrays import apertures_of, complex_strengths_of
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.images import SPACE_ITSELF, Mirror
+from autdtorch.utils.mirror_images import SPACE_ITSELF, Mirror
 from autdtorch.utils.process import cached_property
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.text import counted

@@ -24,7 +24,7 @@ from autdtorch.scene.reflectors import Reflector, is_panel
 from autdtorch.scene.scene import OverlapWarning, ScaleWarning, Scene
 from autdtorch.utils.array_types import REAL, triple
 from autdtorch.utils.hints import did_you_mean
-from autdtorch.utils.images import Image
+from autdtorch.utils.mirror_images import Image
 from autdtorch.utils.validation import Vector, finite_vector, invalid, within
 
 Amounts: TypeAlias = Mapping[str, float]

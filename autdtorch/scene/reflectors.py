@@ -15,7 +15,7 @@ import torch
 
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.utils.array_types import REAL
-from autdtorch.utils.images import Mirror, resonates
+from autdtorch.utils.mirror_images import Mirror, resonates
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,

@@ -25,7 +25,7 @@ from autdtorch.scene.obstacles.moving import moved
 from autdtorch.scene.reflectors import Reflector, kinds_of, require_arrangement
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.hints import suggesting
-from autdtorch.utils.images import Image, images_of
+from autdtorch.utils.mirror_images import Image, images_of
 from autdtorch.utils.process import cached_property
 from autdtorch.utils.text import counted, html_facts
 from autdtorch.utils.units import ScaleWarning as ScaleWarning

@@ -24,7 +24,7 @@ from autdtorch.utils.validation import (
     require_one_of,
 )
 
-Waveform: TypeAlias = Literal["sine", "square"]
+WaveformName: TypeAlias = Literal["sine", "square"]
 
 LONGEST = 100_000
 """Most frames of `modulated` and `at_rate`, and most points of a path of a config."""
@@ -111,7 +111,7 @@ def modulated(
     drive: ArrayLike | Sequence,
     frequency: float,
     depth: float = 1.0,
-    waveform: Waveform | ArrayLike = "sine",
+    waveform: WaveformName | ArrayLike = "sine",
     rate: float | None = None,
 ) -> Sequence:
     """Return a drive, or a sequence, with its radiation pressure modulated in amplitude.

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from autdtorch.utils.array_types import COMPLEX, REAL, Array, ComplexArray, Index
-from autdtorch.utils.images import Image, distinct
+from autdtorch.utils.mirror_images import Image, distinct
 from autdtorch.utils.process import cached_tensors
 
 TOGETHER = 3

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from autdtorch.hardware import FileSensor, ManualSensor, MovedMicrophone, Quantity, SensorError
 from autdtorch.hardware.safety import Signalled, ended_by_signals
-from autdtorch.hardware.sensors import reading_file
+from autdtorch.hardware.sensors import file_sensor
 from autdtorch.hardware.sensors.by_hand import typed
 from autdtorch.hardware.sensors.scope_microphones import LockIn
 
@@ -107,7 +107,7 @@ def running(monkeypatch, path: Path, *contents: str | None) -> None:
             written.replace(path)
 
     now, waiting = 0.0, iter(contents)
-    monkeypatch.setattr(reading_file, "time", SimpleNamespace(sleep=sleep, monotonic=lambda: now))
+    monkeypatch.setattr(file_sensor, "time", SimpleNamespace(sleep=sleep, monotonic=lambda: now))
 
 
 def test_a_file_is_read_once_it_has_changed_and_is_whole(tmp_path, monkeypatch):

@@ -14,7 +14,7 @@ from small_scenes import assert_slopes, relative_error
 import autdtorch as at
 from autdtorch.analytic.spherical_waves import sphere_rule
 from autdtorch.propagators.tmatrix.scattering import scattered_waves, waves_at
-from autdtorch.utils.images import NO_MIRRORS
+from autdtorch.utils.mirror_images import NO_MIRRORS
 
 AIR = at.Medium(density=1.2, sound_speed=340.0)
 FREQUENCY = 40e3

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from small_scenes import relative_error
 
 import autdtorch as at
-from autdtorch.fdtd import coupling, grouping
+from autdtorch.fdtd import box_coupling, grouping
 from autdtorch.propagators import make_propagator
 
 AIR = at.Medium(1.2, 343.0)
@@ -80,7 +80,7 @@ def test_what_a_panel_sends_back_drives_the_run_itself(monkeypatch):
         return propagator.transfer_matrix(), max(run.periods for run in propagator.runs)
 
     (_, alone), (matrix, periods) = solved(scene), solved(panel)
-    monkeypatch.setattr(coupling, "_NEAREST", math.inf)  # all waves are summed one by one
+    monkeypatch.setattr(box_coupling, "_NEAREST", math.inf)  # all waves are summed one by one
     by_passes, of_passes = solved(panel)
     assert relative_error(matrix, by_passes) < 6e-4
     assert alone < periods <= 2 * alone < of_passes
@@ -108,7 +108,7 @@ def test_the_memory_of_waves_that_mirrors_send_back_is_planned(monkeypatch):
     monkeypatch.setattr(grouping, "_CHEAPER", 0.0)
     propagator = make_propagator(plate_above_a_table(), "box", 2e-3, cache=False)
     box, grid = propagator.simulation.boxes[0], propagator.plan.grouping.grids[0]
-    pairs = coupling.coupling_of(box, box, box.echoes).pairs
+    pairs = box_coupling.coupling_of(box, box, box.echoes).pairs
     assert 0.5 < sum(pair.left.size + pair.right.size for pair in pairs) / grid.echo_numbers < 2
     assert propagator.plan.memory > sum(pair.left.nbytes + pair.right.nbytes for pair in pairs) / 2
 

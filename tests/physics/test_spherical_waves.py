@@ -21,7 +21,7 @@ from autdtorch.analytic.spherical_waves import (
     regular_waves,
     sphere_coefficients,
 )
-from autdtorch.propagators.tmatrix.bodies import enough_degrees
+from autdtorch.propagators.tmatrix.obstacle_groups import enough_degrees
 from autdtorch.propagators.tmatrix.translation import Translation, WaveFrame
 from autdtorch.scene.geometry import composed_rotation, rotation_matrix
 

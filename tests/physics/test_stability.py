@@ -19,10 +19,10 @@ from shared.random_scenes import draw_trial
 from small_scenes import AIR, CUBE, NO_RECEIVERS, NO_SOURCES, relative_error, small_scene
 
 from autdtorch.fdtd import stability
-from autdtorch.fdtd.assembly.element import stiffness_matrix
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import heterogeneous_cells
 from autdtorch.fdtd.assembly.losses import GROUND
+from autdtorch.fdtd.assembly.reference_element import stiffness_matrix
 from autdtorch.fdtd.grid import make_box, make_grid
 from autdtorch.fdtd.kernels.contract import uniform_state
 from autdtorch.fdtd.kernels.cpu import CpuKernel

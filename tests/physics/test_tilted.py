@@ -16,10 +16,10 @@ from scipy.sparse.csgraph import connected_components
 from small_scenes import AIR, relative_error
 
 from autdtorch.fdtd.assembly.edges import edges_of
+from autdtorch.fdtd.grid_axes import axes_along, flat_faces
 from autdtorch.fdtd.region import Fluid
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import assemble
-from autdtorch.fdtd.turning import axes_along, flat_faces
 from autdtorch.propagators import make_propagator
 from autdtorch.propagators.plan import region_of
 from autdtorch.scene.arrays import TransducerArray

@@ -14,7 +14,7 @@ from autdtorch.propagators.estimate import estimate
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.store import BODIES
 from autdtorch.propagators.tmatrix import body
-from autdtorch.propagators.tmatrix.bodies import bodies_of
+from autdtorch.propagators.tmatrix.obstacle_groups import bodies_of
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.obstacles import Box, Sphere, VoxelMask
 from autdtorch.scene.obstacles.moving import shifted, turned

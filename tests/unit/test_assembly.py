@@ -8,11 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autdtorch.fdtd.assembly.element import VERTICES, InterfaceElements, stiffness_matrix, uniform_coupling
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import condensed, heterogeneous_cells
-from autdtorch.fdtd.assembly.layers import mean_thickness, two_port
+from autdtorch.fdtd.assembly.layered_elements import mean_air_thickness, two_port
 from autdtorch.fdtd.assembly.prisms import Prisms, prisms, stacked
+from autdtorch.fdtd.assembly.reference_element import (
+    VERTICES,
+    InterfaceElements,
+    stiffness_matrix,
+    uniform_coupling,
+)
 from autdtorch.fdtd.assembly.sections import MaterialKey, Section, plane_fields
 from autdtorch.fdtd.assembly.unions import speed_factor
 from autdtorch.fdtd.grid import Grid
@@ -84,7 +89,7 @@ def test_mass_of_elements_is_that_of_the_volume(speed):
     masses = elements.materials.mass[elements.material].ravel()
     masses[elements.index] = elements.interface.mass.sum(axis=1)[elements.kind]
     displaced = (1 - masses).sum() / (1 - elements.materials.mass[1])
-    moved = radius + mean_thickness(elements.materials, STENCIL)[1]
+    moved = radius + mean_air_thickness(elements.materials, STENCIL)[1]
     # sub-cells of a quarter: 0.2 % measured
     assert displaced == pytest.approx(4 / 3 * math.pi * moved**3, rel=5e-3)
 

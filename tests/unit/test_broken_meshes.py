@@ -13,8 +13,8 @@ from scipy.spatial import ConvexHull
 from small_meshes import CUBE, ball, box, inverted, merged, tube, volume
 
 from autdtorch.fdtd.assembly.edges import edges_of
-from autdtorch.fdtd.assembly.element import LATTICE
 from autdtorch.fdtd.assembly.near_surface import HALF_DIAGONAL, lattice_distances, near_surface
+from autdtorch.fdtd.assembly.reference_element import LATTICE
 from autdtorch.scene.obstacles import Box, Mesh, Sphere, VoxelMask
 from autdtorch.scene.obstacles.mesh_distance import MeshDistance
 

@@ -5,8 +5,8 @@ import pytest
 
 from autdtorch.fdtd.assembly.edge_fit import fitted_couplings
 from autdtorch.fdtd.assembly.edge_waves import _Window, at_the_drive, rigid_corner
-from autdtorch.fdtd.assembly.element import stiffness_matrix
 from autdtorch.fdtd.assembly.prisms import prisms
+from autdtorch.fdtd.assembly.reference_element import stiffness_matrix
 from autdtorch.fdtd.assembly.sections import COLUMN_PAIRS, MaterialKey, Section, plane_fields, uniform_columns
 from autdtorch.fdtd.stencil import tuned_stencil
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from autdtorch.fdtd.assembly.edge_energy import _reduction, changes
 from autdtorch.fdtd.assembly.edges import edges_of, rims_of
-from autdtorch.fdtd.assembly.element import tuning_of
+from autdtorch.fdtd.assembly.reference_element import tuning_of
 from autdtorch.fdtd.stencil import tuned_stencil
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles import Box, Cylinder

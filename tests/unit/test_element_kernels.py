@@ -5,7 +5,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autdtorch.fdtd.assembly.cell_kernels import least_masses
-from autdtorch.fdtd.assembly.element import (
+from autdtorch.fdtd.assembly.element_kernels import mix_materials
+from autdtorch.fdtd.assembly.layered_elements import Survey
+from autdtorch.fdtd.assembly.reference_element import (
     FAR,
     LATTICE,
     PAIRS,
@@ -16,8 +18,6 @@ from autdtorch.fdtd.assembly.element import (
     subcell_means,
     volume_coverage,
 )
-from autdtorch.fdtd.assembly.element_kernels import mix_materials
-from autdtorch.fdtd.assembly.layers import Survey
 
 SEEDS = st.integers(0, 10_000)
 ROUNDING = 1e-12  # of sums of hundreds of numbers around one

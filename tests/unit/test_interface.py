@@ -10,7 +10,8 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from autdtorch.fdtd.assembly.element import (
+from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
+from autdtorch.fdtd.assembly.reference_element import (
     CORNERS,
     FAR,
     LATTICE,
@@ -21,9 +22,8 @@ from autdtorch.fdtd.assembly.element import (
     stiffness_matrix,
     uniform_coupling,
 )
-from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
 from autdtorch.fdtd.assembly.smooth_faces import face_forces, fields, forces, smooth_stiffness, surfaces
-from autdtorch.fdtd.assembly.thin_walls import Side, sides_of
+from autdtorch.fdtd.assembly.thin_walls import Side, wall_sides
 from autdtorch.fdtd.stencil import tuned_stencil
 
 STENCIL = tuned_stencil(2 * math.pi / 8.5)
@@ -309,7 +309,7 @@ def test_a_thin_wall_parts_the_air_in_front_from_the_air_behind(normal, offset, 
     level = np.abs(middle) - thickness / 2
     assume((level < 0).any() and (level > 0.02).any())
     nearest = np.sign(middle[CORNERS])[None, :, None] * normal / np.linalg.norm(normal)
-    sides = sides_of(level[None], nearest, np.ones(1, bool))
+    sides = wall_sides(level[None], nearest, np.ones(1, bool))
     cut = rigid_element(level, sides=sides)
     front = middle[CORNERS] > 0
     across = front[PAIRS[:, 0]] != front[PAIRS[:, 1]]

@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from autdtorch.fdtd.assembly.element import (
+from autdtorch.fdtd.assembly.layered_elements import layered_elements
+from autdtorch.fdtd.assembly.prisms import Prisms, prisms, stacked
+from autdtorch.fdtd.assembly.reference_element import (
     VERTICES,
     InterfaceElements,
     Materials,
     tend_to_mean,
     uniform_coupling,
 )
-from autdtorch.fdtd.assembly.layers import layered_elements
-from autdtorch.fdtd.assembly.prisms import Prisms, prisms, stacked
 from autdtorch.fdtd.assembly.sections import MaterialKey, Section
 from autdtorch.fdtd.stencil import Stencil, places_of
 from autdtorch.utils.array_types import AnyArray, Array, Index, triple
@@ -105,7 +105,7 @@ class Planes:
 
 
 @dataclass(frozen=True, eq=False)
-class Blocks:
+class MaterialBlocks:
     """Blocks of one material between planes along the axes of a grid."""
 
     planes: tuple[Planes, Planes, Planes]
@@ -114,7 +114,7 @@ class Blocks:
     @classmethod
     def between(
         cls, places: Sequence[Array], elements: Sequence[int], material: Callable[[Array], Index]
-    ) -> Blocks:
+    ) -> MaterialBlocks:
         """Divide (nx, ny, nz) elements by planes at `places` along each axis; see `Planes`.
 
         `material` returns the material (...) at positions (..., 3) [cells].
@@ -173,7 +173,7 @@ _STIFFER = 0.2
 
 
 def aligned_elements(
-    kinds: Index, blocks: Blocks, materials: Materials, stencil: Stencil
+    kinds: Index, blocks: MaterialBlocks, materials: Materials, stencil: Stencil
 ) -> InterfaceElements:
     """Return elements of each of the kinds (k, 3)."""
     coupling, mass = _coupling_and_mass(kinds, blocks, materials, stencil)
@@ -191,7 +191,7 @@ def aligned_elements(
 
 
 def _seams(
-    kinds: Index, blocks: Blocks, materials: Materials
+    kinds: Index, blocks: MaterialBlocks, materials: Materials
 ) -> Iterator[tuple[tuple[int, int], Index, Array]]:
     """Yield pairs of fluids, the kinds at their seam that a third material touches, and their parts (n, 2).
 
@@ -208,7 +208,7 @@ def _seams(
             yield pair, some, part / part.sum(axis=1, keepdims=True)
 
 
-def _volumes(kind: Sequence[int], blocks: Blocks, count: int) -> Array:
+def _volumes(kind: Sequence[int], blocks: MaterialBlocks, count: int) -> Array:
     """Return the volume (count,) of each material in elements of a kind (3,)."""
     each = list(zip(blocks.planes, kind, strict=True))
     part = blocks.material[np.ix_(*(range(planes.first[k], planes.last[k] + 1) for planes, k in each))]
@@ -217,7 +217,7 @@ def _volumes(kind: Sequence[int], blocks: Blocks, count: int) -> Array:
 
 
 def _coupling_and_mass(
-    kinds: Index, blocks: Blocks, materials: Materials, stencil: Stencil
+    kinds: Index, blocks: MaterialBlocks, materials: Materials, stencil: Stencil
 ) -> tuple[Array, Array]:
     """Return coupling (k, 28) and mass (k, 8) of elements of each of the kinds (k, 3)."""
     varied = np.stack([each[tuple(kinds.T)] for each in blocks.varied], axis=1)
@@ -235,7 +235,7 @@ def _coupling_and_mass(
 
 
 def _layered(
-    axis: int, kinds: Index, blocks: Blocks, materials: Materials, stencil: Stencil
+    axis: int, kinds: Index, blocks: MaterialBlocks, materials: Materials, stencil: Stencil
 ) -> tuple[Array, Array]:
     """Return coupling (n, 28) and mass (n, 8) of kinds of elements (n, 3) that vary along an axis alone."""
     planes, across = blocks.planes[axis], [other for other in range(3) if other != axis]
@@ -252,7 +252,7 @@ def _layered(
 
 
 def _prismatic(
-    axis: int, kinds: Index, blocks: Blocks, materials: Materials, stencil: Stencil
+    axis: int, kinds: Index, blocks: MaterialBlocks, materials: Materials, stencil: Stencil
 ) -> tuple[Array, Array]:
     """Return coupling (n, 28) and mass (n, 8) of kinds of elements (n, 3) that do not vary along an axis."""
     planes = blocks.planes[axis]
@@ -273,7 +273,9 @@ def _key(materials: Materials) -> MaterialKey:
     )
 
 
-def _cornered(kinds: Index, blocks: Blocks, materials: Materials, stencil: Stencil) -> tuple[Array, Array]:
+def _cornered(
+    kinds: Index, blocks: MaterialBlocks, materials: Materials, stencil: Stencil
+) -> tuple[Array, Array]:
     """Return coupling (n, 28) and mass (n, 8) of kinds of elements (n, 3) that vary along all axes.
 
     Along each axis an element is a stack of slices that do not vary along it. The element is the mean of the
@@ -295,7 +297,7 @@ def _stacked(
     kinds: Index,
     levels: Sequence[Sequence[int]],
     widths: Sequence[Array],
-    blocks: Blocks,
+    blocks: MaterialBlocks,
     materials: Materials,
     stencil: Stencil,
 ) -> tuple[Array, Array]:
@@ -326,7 +328,7 @@ def _stacked(
 class _Sections:
     """Sections across an axis, at the level of one block, around elements that vary along both other axes."""
 
-    def __init__(self, blocks: Blocks, axis: int, level: int) -> None:
+    def __init__(self, blocks: MaterialBlocks, axis: int, level: int) -> None:
         self._material = np.take(blocks.material, [level], axis=axis).squeeze(axis)
         self._planes = [planes for other, planes in enumerate(blocks.planes) if other != axis]
         varied = [varies(self._material, self._planes, each) for each in (0, 1)]

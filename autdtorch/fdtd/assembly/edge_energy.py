@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from autdtorch.fdtd.assembly.edges import Edge
-from autdtorch.fdtd.assembly.element import (
+from autdtorch.fdtd.assembly.reference_element import (
     LATTICE,
     SLOPES,
     SUBCELLS,

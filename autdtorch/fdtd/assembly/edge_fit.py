@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from autdtorch.fdtd.assembly.element import stiffness_matrix
+from autdtorch.fdtd.assembly.reference_element import stiffness_matrix
 from autdtorch.fdtd.assembly.sections import (
     COLUMN_PAIRS,
     COLUMNS,

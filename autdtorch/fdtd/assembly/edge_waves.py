@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import jv
 
 from autdtorch.fdtd.assembly.edge_fit import columns_of, importance, known_elements, stiffness_between
-from autdtorch.fdtd.assembly.element import stiffness_matrix, without_negative
+from autdtorch.fdtd.assembly.reference_element import stiffness_matrix, without_negative
 from autdtorch.fdtd.assembly.sections import COLUMN_PAIRS, RING, MaterialKey, Section
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array

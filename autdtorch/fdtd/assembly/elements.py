@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
-from autdtorch.fdtd.assembly.absorbing_surfaces import with_impedance, with_impedance_faces
-from autdtorch.fdtd.assembly.aligned import Blocks, aligned_elements
+from autdtorch.fdtd.assembly.aligned import MaterialBlocks, aligned_elements
 from autdtorch.fdtd.assembly.edge_energy import changes
 from autdtorch.fdtd.assembly.edges import Edge, edges_of, rims_of
-from autdtorch.fdtd.assembly.element import (
+from autdtorch.fdtd.assembly.interface import Bodies, interface_elements, is_near, left_by_fluids
+from autdtorch.fdtd.assembly.losses import with_losses
+from autdtorch.fdtd.assembly.near_surface import HALF_DIAGONAL, lattice_distances, near_surface
+from autdtorch.fdtd.assembly.reference_element import (
     CORNERS,
     FAR,
     LATTICE,
@@ -26,11 +28,9 @@ from autdtorch.fdtd.assembly.element import (
     InterfaceElements,
     Materials,
 )
-from autdtorch.fdtd.assembly.interface import Bodies, interface_elements, is_near, left_by_fluids
-from autdtorch.fdtd.assembly.losses import with_losses
-from autdtorch.fdtd.assembly.near_surface import HALF_DIAGONAL, lattice_distances, near_surface
 from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, roughness, unfolded
-from autdtorch.fdtd.assembly.thin_walls import Side, sides_of
+from autdtorch.fdtd.assembly.surface_impedance import with_impedance, with_impedance_faces
+from autdtorch.fdtd.assembly.thin_walls import Side, wall_sides
 from autdtorch.fdtd.assembly.unions import (
     Union,
     measured,
@@ -99,7 +99,7 @@ def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
 
 
 def _aligned(
-    index: Index, uncut: NDArray[np.bool_], blocks: Blocks, materials: Materials, stencil: Stencil
+    index: Index, uncut: NDArray[np.bool_], blocks: MaterialBlocks, materials: Materials, stencil: Stencil
 ) -> tuple[InterfaceElements, Index]:
     """Return the kinds of the elements at flat indices (n,), and the kind of each (n,).
 
@@ -114,7 +114,7 @@ def _aligned(
     return every, np.arange(len(index))
 
 
-def _blocks(bodies: Sequence[Union], grid: Grid) -> Blocks:
+def _blocks(bodies: Sequence[Union], grid: Grid) -> MaterialBlocks:
     """Return the blocks of the bodies whose faces are parallel to the grid."""
     aligned = [body for body in bodies if body.aligned]
     faces = [np.zeros((3, 0)), *(body.faces(grid) for body in aligned)]
@@ -128,7 +128,7 @@ def _blocks(bodies: Sequence[Union], grid: Grid) -> Blocks:
         return numbers
 
     places = [np.concatenate(along) for along in zip(*faces, strict=True)]
-    return Blocks.between(places, [cells - 1 for cells in grid.shape], material)
+    return MaterialBlocks.between(places, [cells - 1 for cells in grid.shape], material)
 
 
 def _measured(
@@ -306,7 +306,7 @@ def _interface(
         edged = np.asarray(less.any(axis=(1, 2)))
         finite, walls = _finite(bodies, distance, first, edged, whole, grid)
         level = rigid_level(bodies, distance)
-        sides = sides_of(level, _wall_normals(bodies, level, first, walls, grid), walls)
+        sides = wall_sides(level, _wall_normals(bodies, level, first, walls, grid), walls)
         kinds, kind = _distinct(distance, finite, less, beside, sides)
         near = Bodies(distance, numbers, finite, less, beside, sides).chosen(kinds)
         elements = with_losses(lambda these: interface_elements(near, these, stencil), materials, stencil)

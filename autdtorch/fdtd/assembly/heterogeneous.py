@@ -15,7 +15,10 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.assembly.element import (
+from autdtorch.fdtd.assembly.elements import Elements
+from autdtorch.fdtd.assembly.losses import COUPLING, GROUND, MASS, condensed_loss
+from autdtorch.fdtd.assembly.neighbours import enclosed_cells, inner_cells, neighbours, with_neighbours
+from autdtorch.fdtd.assembly.reference_element import (
     PAIR_OF,
     PAIRS,
     VERTICES,
@@ -24,15 +27,7 @@ from autdtorch.fdtd.assembly.element import (
     uniform_coupling,
     without_vertices,
 )
-from autdtorch.fdtd.assembly.elements import Elements
-from autdtorch.fdtd.assembly.losses import COUPLING, GROUND, MASS, condensed_loss
-from autdtorch.fdtd.assembly.neighbours import (
-    GridShape,
-    enclosed_cells,
-    inner_cells,
-    neighbours,
-    with_neighbours,
-)
+from autdtorch.fdtd.interpolation import GridShape
 from autdtorch.fdtd.stencil import Stencil, flat_offsets, flat_strides, places_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.process import parts_of_size, spread

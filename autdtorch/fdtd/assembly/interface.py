@@ -28,7 +28,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.assembly.element import (
+from autdtorch.fdtd.assembly.layered_elements import Survey, flat_elements, mean_air_thickness
+from autdtorch.fdtd.assembly.reference_element import (
     CORNERS,
     FAR,
     HATS,
@@ -47,7 +48,6 @@ from autdtorch.fdtd.assembly.element import (
     volume_coverage,
     without_vertices,
 )
-from autdtorch.fdtd.assembly.layers import Survey, flat_elements, mean_thickness
 from autdtorch.fdtd.assembly.smooth_faces import Surface, fields, smooth_stiffness, surfaces, unfolded
 from autdtorch.fdtd.assembly.thin_walls import Side
 from autdtorch.fdtd.stencil import Stencil
@@ -160,7 +160,7 @@ def _elements_in_series(bodies: Bodies, materials: Materials, stencil: Stencil) 
     """Return coupling (n, 28) and mass (n, 8): in series, or local fields at a smooth surface of two."""
     count, distance, material = len(materials.density), bodies.distance, bodies.material
     vertex = _vertex_materials(distance, material)
-    grow = np.repeat(mean_thickness(materials, stencil)[material, None], len(vertex), axis=1)
+    grow = np.repeat(mean_air_thickness(materials, stencil)[material, None], len(vertex), axis=1)
     volumes = np.moveaxis(_mixed(bodies, grow, np.eye(count)), 0, -1)
     lines = shares(line_coverage, distance, material, count)
     coupling, mass = _series_coupling(lines, materials, stencil), _lumped_mass(vertex, volumes, materials)
@@ -387,6 +387,6 @@ def _added_thickness(kappa: float) -> float:
 
     Otherwise a wave on the grid is reflected this far behind the surface, at any tilt and incidence: the mean
     of kappa^2 (d^3 / 3 - d / 12) over all places d of a face between the cells, and higher terms. Fluids have
-    `layers.mean_thickness`.
+    `layers.mean_air_thickness`.
     """
     return (math.tan(kappa / 2) / (kappa / 2) - 1) / 2

@@ -22,7 +22,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.assembly.element import (
+from autdtorch.fdtd.assembly.reference_element import (
     PAIRS,
     VERTICES,
     InterfaceElements,

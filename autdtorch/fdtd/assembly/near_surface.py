@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from autdtorch.fdtd.assembly.element import LATTICE, SUBCELLS
+from autdtorch.fdtd.assembly.reference_element import LATTICE, SUBCELLS
 from autdtorch.fdtd.assembly.smooth_faces import quadratic
 from autdtorch.fdtd.stencil import flat_strides, places_of
 from autdtorch.utils.array_types import Array, Index

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
+from autdtorch.fdtd.interpolation import GridShape
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.spatial import places_among
 
-GridShape = tuple[int, int, int]
 # Coupling of two cells, relative to the sum of either, up to which nothing passes: 1e-5 or less through a
 # thin rigid body, and more through a heavy fluid. Slivers have the sum of a cell of the densest fluid.
 _BLOCKED = 1e-4

@@ -18,7 +18,12 @@ from scipy.optimize import lsq_linear
 
 from autdtorch.fdtd.assembly.edge_fit import fitted_couplings, importance
 from autdtorch.fdtd.assembly.edge_waves import at_the_drive, rigid_corner
-from autdtorch.fdtd.assembly.element import PAIRS, coupling_by_edges, stiffness_matrix, without_negative
+from autdtorch.fdtd.assembly.reference_element import (
+    PAIRS,
+    coupling_by_edges,
+    stiffness_matrix,
+    without_negative,
+)
 from autdtorch.fdtd.assembly.sections import (
     COLUMN_PAIRS,
     COLUMNS,
@@ -53,7 +58,7 @@ class Prisms(NamedTuple):
     mobility: Array  # mobility along each column (a, b, 2, 2)
 
 
-Image: TypeAlias = tuple[bool, bool, bool]
+SquareSymmetry: TypeAlias = tuple[bool, bool, bool]
 """A symmetry of the square: exchange the axes, then mirror the first, then mirror the second."""
 
 _IMAGES = [(a, b, c) for a, b, c in itertools.product((False, True), repeat=3)]
@@ -73,7 +78,7 @@ def prisms(section: Section, materials: MaterialKey, stencil: Stencil) -> Prisms
     return Prisms(*(np.asarray(sum(parts) / len(parts)) for parts in zip(*alike, strict=True)))
 
 
-def _image_of_section(section: Section, image: Image) -> Section:
+def _image_of_section(section: Section, image: SquareSymmetry) -> Section:
     """Return an image of a section, rounded."""
     exchanged, *mirrored = image
     (a, b), (one, other), blocks = section.size, section.cuts, np.array(section.material)
@@ -90,7 +95,7 @@ def _mirrored(cuts: tuple[float, ...], size: int, mirror: bool) -> tuple[float, 
     return tuple(round(cut, _DECIMALS) for cut in places)
 
 
-def _original(fit: Prisms, image: Image) -> Prisms:
+def _original(fit: Prisms, image: SquareSymmetry) -> Prisms:
     """Return the elements of the section that an image was fitted for."""
     exchanged, *mirrored = image
     axes = [axis for axis, mirror in enumerate(mirrored) if mirror]

@@ -17,8 +17,8 @@ from scipy.ndimage import label
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.linalg import splu
 
-from autdtorch.fdtd.assembly.element import coupling_by_edges
-from autdtorch.fdtd.assembly.layers import long_wave_port, long_wave_shares, two_port
+from autdtorch.fdtd.assembly.layered_elements import long_wave_port, long_wave_shares, two_port
+from autdtorch.fdtd.assembly.reference_element import coupling_by_edges
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 

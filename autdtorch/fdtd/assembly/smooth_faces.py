@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
-from autdtorch.fdtd.assembly.element import (
+from autdtorch.fdtd.assembly.reference_element import (
     CORNERS,
     LATTICE,
     PAIRS,

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import generate_binary_structure, label
 
-from autdtorch.fdtd.assembly.element import CORNERS, SUBCELLS, subcell_gradients, subcell_means
+from autdtorch.fdtd.assembly.reference_element import CORNERS, SUBCELLS, subcell_gradients, subcell_means
 from autdtorch.fdtd.shapes import Bounded, Shape
 from autdtorch.utils.array_types import REAL, Array, Index
 from autdtorch.utils.spatial import extents, mean_thickness
@@ -49,7 +49,7 @@ class Side(NamedTuple):
         return Side(self.share[some], self.out[some])
 
 
-def sides_of(level: Array, normal: Array, walls: NDArray[np.bool_]) -> tuple[Side, ...]:
+def wall_sides(level: Array, normal: Array, walls: NDArray[np.bool_]) -> tuple[Side, ...]:
     """Return the sides of walls in n elements; without walls, and in the mask `walls` (n,), there is one.
 
     Signed distances `level` (n, 125) are those from rigid bodies, and `normal` (n, 8, 3) their gradients at
@@ -64,7 +64,7 @@ def sides_of(level: Array, normal: Array, walls: NDArray[np.bool_]) -> tuple[Sid
 
 
 def _sides(level: Array, normal: Array) -> Iterator[Side]:
-    """Yield the sides of walls in elements that all have walls; see `sides_of`."""
+    """Yield the sides of walls in elements that all have walls; see `wall_sides`."""
     outside, gradient = level > 0, subcell_gradients(level)
     inside, whole = ~outside[:, CORNERS], subcell_means(outside.astype(float))
     undecided = ~normal.any(axis=2)

@@ -17,14 +17,14 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from autdtorch.fdtd.assembly.element import FAR, MaterialLosses, Materials
 from autdtorch.fdtd.assembly.losses import STEP
+from autdtorch.fdtd.assembly.reference_element import FAR, MaterialLosses, Materials
 from autdtorch.fdtd.assembly.thin_walls import receding, thickened
 from autdtorch.fdtd.grid import Grid
+from autdtorch.fdtd.grid_axes import slender_faces, staircase_excess
 from autdtorch.fdtd.region import Body, Fluid, Region
 from autdtorch.fdtd.shapes import Shape, Solids, bounds, distance_from, remaining
 from autdtorch.fdtd.stencil import Stencil
-from autdtorch.fdtd.turning import slender_faces, staircase_excess
 from autdtorch.utils.array_types import Array, Index, triple
 from autdtorch.utils.spatial import doubled_normals, extents, spread_evenly
 

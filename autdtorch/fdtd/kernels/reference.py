@@ -21,7 +21,7 @@ from autdtorch.fdtd.stencil import flat_offsets
 _X, _Y, _Z = 1, 2, 3  # Axes of fields; axis 0 is the runs
 
 
-def neighbours(field: Tensor, axis: int) -> Tensor:
+def neighbour_sum(field: Tensor, axis: int) -> Tensor:
     """Return the sum of the two neighbours along an axis, two cells shorter along it."""
     return field.narrow(axis, 0, field.shape[axis] - 2) + field.narrow(axis, 2, field.shape[axis] - 2)
 
@@ -79,17 +79,19 @@ def _core(field: Tensor) -> Tensor:
 
 def _sweep(p: Tensor, c: Coefficients) -> Tensor:
     """Return line 1 of the contract, without `before`, in all cells inside the ring."""
-    along = {axis: neighbours(p, axis) for axis in (_X, _Y, _Z)}
+    along = {axis: neighbour_sum(p, axis) for axis in (_X, _Y, _Z)}
     others = (_X, _Y, _Z), (_Y, _X, _Z), (_Z, _X, _Y)
     faces = sum(middle(middle(along[a], b), d) for a, b, d in others)
-    edges = sum(middle(neighbours(along[a], b), d) for a, b, d in ((_X, _Y, _Z), (_Y, _Z, _X), (_Z, _X, _Y)))
-    corners = neighbours(neighbours(along[_X], _Y), _Z)
+    edges = sum(
+        middle(neighbour_sum(along[a], b), d) for a, b, d in ((_X, _Y, _Z), (_Y, _Z, _X), (_Z, _X, _Y))
+    )
+    corners = neighbour_sum(neighbour_sum(along[_X], _Y), _Z)
     return c.center * _core(p) + c.face * faces + c.edge * edges + c.corner * corners
 
 
 def _around(field: Tensor, axis: int) -> Tensor:
     """Return the sum of the two neighbours along an axis in every cell; zero beyond the field."""
-    return _between(neighbours(field, axis), axis, 1, 1)
+    return _between(neighbour_sum(field, axis), axis, 1, 1)
 
 
 def _between(field: Tensor, axis: int, before: int, after: int) -> Tensor:

@@ -5,7 +5,7 @@ A sensor is a class and the class of its config, in a module, and a line in `SEN
 
 from autdtorch.hardware.camera.camera_config import CameraConfig
 from autdtorch.hardware.sensors.by_hand import ManualConfig
-from autdtorch.hardware.sensors.reading_file import FileConfig
+from autdtorch.hardware.sensors.file_sensor import FileConfig
 from autdtorch.hardware.sensors.scope_microphones import ScopeConfig
 from autdtorch.hardware.sensors.sensor import EmulatedConfig, SensorConfig
 

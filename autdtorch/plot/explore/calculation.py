@@ -36,7 +36,7 @@ from autdtorch.scene.geometry import Plane
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.progress import Stopped, stopping_when
 
-Propagator: TypeAlias = FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator
+MadePropagator: TypeAlias = FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator
 
 logger = logging.getLogger(__name__)
 
@@ -135,7 +135,7 @@ class Calculator:
         self._wanted: Request | None = None
         self._changed = threading.Condition()
         self._closed = False
-        self._propagators: dict[bool, list[Propagator]] = {}  # of the last scenes, fine or not
+        self._propagators: dict[bool, list[MadePropagator]] = {}  # of the last scenes, fine or not
         self._thread = threading.Thread(target=self._work, name="autdtorch explore", daemon=True)
         self._thread.start()
 
@@ -225,7 +225,7 @@ class Calculator:
             volume = volume_field(propagator, drive, situation.scene.wavelength / 3)
             yield replace(result, volume=volume, seconds=time.monotonic() - begun)
 
-    def _propagator(self, situation: Situation, fine: bool) -> Propagator:
+    def _propagator(self, situation: Situation, fine: bool) -> MadePropagator:
         """Return the propagator of a situation; those of the last scenes are at hand."""
         scene, last = situation.scene, self._propagators.get(fine, [])
         propagator = next((each for each in last if each.scene is scene), None)
@@ -243,7 +243,7 @@ class Calculator:
         coarse = min(_COARSER * self._spacing, _COARSEST * situation.scene.wavelength)
         return self._spacing if fine else max(self._spacing, coarse)
 
-    def _steps(self, request: Request, propagator: Propagator) -> Iterator[State]:
+    def _steps(self, request: Request, propagator: MadePropagator) -> Iterator[State]:
         assert request.method is not None
         objective = SimulatedObjective(propagator.scene, propagator)
         state = request.method.start(Problem.of(objective), request.seed)
@@ -253,14 +253,14 @@ class Calculator:
             yield state
 
 
-def _followed(propagator: Propagator, drive: torch.Tensor) -> torch.Tensor:
+def _followed(propagator: MadePropagator, drive: torch.Tensor) -> torch.Tensor:
     """Return the drive of gradient ascent on the transfer matrix, with a drive (M,) among its starts."""
     objective = SimulatedObjective(propagator.scene, propagator)
     return run(GradientAscent(), objective, start=drive).drive[0]
 
 
 def _field(
-    request: Request, propagator: Propagator, drive: torch.Tensor, spacing: float | None, step: float
+    request: Request, propagator: MadePropagator, drive: torch.Tensor, spacing: float | None, step: float
 ) -> Result:
     """Return the pressure at the control points and on the plane, from one simulation of the drive.
 

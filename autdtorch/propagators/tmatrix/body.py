@@ -37,8 +37,8 @@ from autdtorch.propagators.box_scatterer import BoxScatterer, Couplings
 from autdtorch.propagators.notices import warn_of_no_steady_state
 from autdtorch.propagators.plan import Plan, plan
 from autdtorch.propagators.store import BODIES, Store, key_of
-from autdtorch.propagators.tmatrix.bodies import enough_degrees, has_closed_form
 from autdtorch.propagators.tmatrix.body_matrix import BodyMatrix
+from autdtorch.propagators.tmatrix.obstacle_groups import enough_degrees, has_closed_form
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.medium import Medium

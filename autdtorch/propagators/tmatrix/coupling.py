@@ -22,7 +22,7 @@ import torch
 from autdtorch.propagators.tmatrix.body_matrix import BodyMatrix
 from autdtorch.propagators.tmatrix.translation import Translation, WaveFrame
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.images import Image
+from autdtorch.utils.mirror_images import Image
 from autdtorch.utils.process import cached_property, require_memory
 
 logger = logging.getLogger(__name__)

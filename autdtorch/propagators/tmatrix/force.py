@@ -29,7 +29,7 @@ from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.reflectors import require_in_front
 from autdtorch.utils.array_types import device_of
-from autdtorch.utils.images import Image
+from autdtorch.utils.mirror_images import Image
 from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import ArrayLike, integer_at_least, invalid, require_kind
 

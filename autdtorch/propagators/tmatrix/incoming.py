@@ -15,7 +15,7 @@ from autdtorch.analytic.spherical_waves import outgoing_waves
 from autdtorch.propagators.tmatrix.body_matrix import BodyMatrix
 from autdtorch.scene.arrays import TransducerArray, apertures_of, complex_strengths_of, radii_of
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.images import Image, distinct
+from autdtorch.utils.mirror_images import Image, distinct
 
 _ALIKE = 4
 """Discs of one radius and direction from which on their means are `MeanWaves`, and not those over nodes."""

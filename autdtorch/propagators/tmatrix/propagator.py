@@ -18,15 +18,20 @@ from autdtorch.propagators.propagator import ScenePropagator
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.propagators.simulation import Run
 from autdtorch.propagators.store import Store
-from autdtorch.propagators.tmatrix.bodies import ObstacleGroup, are_outside, bodies_of, has_closed_form
 from autdtorch.propagators.tmatrix.body import Placed, Solver, placed
+from autdtorch.propagators.tmatrix.obstacle_groups import (
+    ObstacleGroup,
+    are_outside,
+    bodies_of,
+    has_closed_form,
+)
 from autdtorch.propagators.tmatrix.scattering import scattered_waves, waves_at
 from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
 from autdtorch.scene.checks import require_clear
 from autdtorch.scene.reflectors import require_in_front
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL, device_of
-from autdtorch.utils.images import Image
+from autdtorch.utils.mirror_images import Image
 from autdtorch.utils.process import cached_property, one_library_thread
 from autdtorch.utils.validation import ArrayLike, differentiable_points, points_tensor
 

@@ -16,7 +16,7 @@ from autdtorch.propagators.tmatrix.coupling import Ways, received, solved, ways_
 from autdtorch.propagators.tmatrix.incoming import IncomingWaves, incoming_waves
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.utils.array_types import COMPLEX
-from autdtorch.utils.images import NO_MIRRORS, Image
+from autdtorch.utils.mirror_images import NO_MIRRORS, Image
 
 _AT_ONCE = 200_000
 """Waves at points that are computed at once: 3 MB, which fit into a cache."""

@@ -32,7 +32,7 @@ from autdtorch.scene.reflectors import Reflector, require_arrangement, require_i
 from autdtorch.utils.array_types import COMPLEX, REAL, device_of
 from autdtorch.utils.files import path_of, read_arrays, write_arrays
 from autdtorch.utils.hints import renamed_keywords
-from autdtorch.utils.images import NO_MIRRORS, Image, images_of
+from autdtorch.utils.mirror_images import NO_MIRRORS, Image, images_of
 from autdtorch.utils.process import cached_property, one_library_thread, spread
 from autdtorch.utils.units import turn_tensor, warn_user
 from autdtorch.utils.validation import (

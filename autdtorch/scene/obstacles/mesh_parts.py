@@ -67,13 +67,13 @@ def winding_number(vertices: Array, faces: Index, points: Array) -> Array:
     within = ((points >= lower) & (points <= upper)).all(axis=1)
     winding = np.zeros(len(points))
     if within.any():
-        middle, extent = (lower + upper) / 2, extent_of(vertices)  # libigl computes in single precision
+        middle, extent = (lower + upper) / 2, longest_side(vertices)  # libigl computes in single precision
         around = np.ascontiguousarray((vertices - middle) / extent)
         winding[within] = igl.fast_winding_number(around, faces, (points[within] - middle) / extent)
     return winding
 
 
-def extent_of(vertices: Array) -> float:
+def longest_side(vertices: Array) -> float:
     """Return the longest side of the bounding box of vertices (V, 3)."""
     return float(np.ptp(vertices, axis=0).max())
 
@@ -91,7 +91,7 @@ def box_of(points: Array) -> str:
 def union_of(parts: Sequence[Part]) -> tuple[Part, bool]:
     """Return the surface of all bodies less their cavities, and whether no two overlap or share a face."""
     bare, vertices = _united(parts), np.concatenate([part.vertices for part in parts])
-    growth = _GROWTH * extent_of(vertices)
+    growth = _GROWTH * longest_side(vertices)
     grown = _united([_grown(part, growth) for part in parts])
     shrunk = _grown(_simpler(grown, growth), -growth)
     union = _snapped(shrunk, vertices, 2 * _FARTHEST * growth)

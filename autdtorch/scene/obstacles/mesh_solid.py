@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from autdtorch.scene.obstacles.mesh_parts import (
     Part,
     box_of,
-    extent_of,
+    longest_side,
     part_of,
     place_of,
     union_of,
@@ -75,7 +75,7 @@ def solid_of(corners: Array, triangles: Index) -> Triangles:
     parts = [part_of(vertices, part) for part in _split(faces, label)]
     for part in parts:
         _require_simple(part)
-    solids = [part for part in parts if abs(part.volume) > _EMPTY * part.area * extent_of(part.vertices)]
+    solids = [part for part in parts if abs(part.volume) > _EMPTY * part.area * longest_side(part.vertices)]
     if not solids:
         raise ValueError(f"{box_of(whole.vertices)} has no volume; must enclose a volume")
     for solid in solids:
@@ -108,7 +108,7 @@ def joined(corners: Array, triangles: Index, farthest: float = _ROUNDED) -> Tria
     faces, open_ends = with_three(whole), open_edges(with_three(whole))
     apart = _ROUNDING
     while len(open_ends) and apart <= farthest:
-        nearer = _near(vertices, np.unique(open_ends), apart * extent_of(vertices))[whole]
+        nearer = _near(vertices, np.unique(open_ends), apart * longest_side(vertices))[whole]
         tried = with_three(nearer)
         left = open_edges(tried)
         if len(left) < len(open_ends):
@@ -200,7 +200,7 @@ def _require_unfolded(part: Part) -> None:
     normal = doubled_normals(corners)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     size = np.linalg.norm(normal, axis=1)
-    certain = size > _SLIVER * extent_of(vertices) * longest
+    certain = size > _SLIVER * longest_side(vertices) * longest
     one, other = pairs.T % len(faces)
     cosine = (normal[one] * normal[other]).sum(axis=1)
     folded = (cosine < (_FOLDED - 1) * size[one] * size[other]) & certain[one] & certain[other]
@@ -223,7 +223,7 @@ def _require_simple(part: Part) -> None:
         return
     some = crossed[np.linspace(0, len(crossed) - 1, min(len(crossed), _TRIED)).astype(np.int64)]
     places = first[some] + share[some, None] * along[some]
-    around = places[:, None] + _AROUND * extent_of(part.vertices) * _DIRECTIONS
+    around = places[:, None] + _AROUND * longest_side(part.vertices) * _DIRECTIONS
     turns = winding_number(part.vertices, part.faces, around.reshape(-1, 3)).reshape(len(some), -1)
     turns = turns.round() * math.copysign(1, part.volume)
     _refuse_crossing(places[((turns < 0) | (turns > 1)).any(axis=1)])
@@ -260,7 +260,7 @@ def _require_air_beside(whole: Part) -> None:
     corners = whole.vertices[whole.faces]
     middle, normal = corners.mean(axis=1), doubled_normals(corners)
     length = np.linalg.norm(normal, axis=1)
-    step = _BESIDE * extent_of(whole.vertices) * normal / np.where(length > 0, length, 1)[:, None]
+    step = _BESIDE * longest_side(whole.vertices) * normal / np.where(length > 0, length, 1)[:, None]
     outside, inside = (
         winding_number(whole.vertices, whole.faces, middle + way * step).round() for way in (1, -1)
     )
@@ -278,4 +278,4 @@ def _has_sliver(part: Part) -> bool:
     """Return whether a triangle is so flat that its normal is a rounding error."""
     corners = part.vertices[part.faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    return bool((2 * areas_of(corners) < _SLIVER * extent_of(part.vertices) * longest).any())
+    return bool((2 * areas_of(corners) < _SLIVER * longest_side(part.vertices) * longest).any())

@@ -1,4 +1,4 @@
-"""Absorbing surfaces, which react locally: their admittance as mass and damping of the elements they cut.
+"""Surfaces with an impedance, which react locally: admittance as mass and damping of the elements they cut.
 
 A surface of admittance Y, as a ratio to air, takes the flow Y p. The equation of a cell, divided by -i w,
 gets a term.
@@ -37,8 +37,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.assembly.aligned import Blocks
-from autdtorch.fdtd.assembly.element import (
+from autdtorch.fdtd.assembly.aligned import MaterialBlocks
+from autdtorch.fdtd.assembly.interface import Bodies
+from autdtorch.fdtd.assembly.reference_element import (
     FAR,
     PAIR_OF,
     PAIRS,
@@ -53,7 +54,6 @@ from autdtorch.fdtd.assembly.element import (
     subcell_gradients,
     subcell_means,
 )
-from autdtorch.fdtd.assembly.interface import Bodies
 from autdtorch.fdtd.stencil import Stencil, flat_strides
 from autdtorch.utils.array_types import Array, ComplexArray, Index
 
@@ -205,7 +205,7 @@ class _Faces(NamedTuple):
     area: Array  # [cells^2] (n,)
 
 
-def _faces(blocks: Blocks, axis: int, up: int, materials: Materials) -> _Faces:
+def _faces(blocks: MaterialBlocks, axis: int, up: int, materials: Materials) -> _Faces:
     """Return the faces of reacting materials towards fluids that face up an axis (`up` 1) or down it (0)."""
     others = [other for other in range(3) if other != axis]
     parts = [blocks.planes[other].parts for other in others]
@@ -226,7 +226,7 @@ def with_impedance_faces(
     index: Index,
     shape: Sequence[int],
     uncut: NDArray[np.bool_],
-    blocks: Blocks,
+    blocks: MaterialBlocks,
     materials: Materials,
     stencil: Stencil,
 ) -> InterfaceElements:

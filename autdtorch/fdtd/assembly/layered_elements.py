@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.assembly.element import (
+from autdtorch.fdtd.assembly.reference_element import (
     EDGES_BETWEEN,
     PAIRS,
     SUBCELLS,
@@ -134,7 +134,7 @@ def layered_elements(
     return np.where(across, 0, along * (uniform + beside)) + link, mass
 
 
-def mean_thickness(materials: Materials, stencil: Stencil) -> Array:
+def mean_air_thickness(materials: Materials, stencil: Stencil) -> Array:
     """Return the second-order thickness [cells] of air before each material (m,), averaged over places.
 
     A wave on the grid is reflected this far behind surfaces of fluids that are not parallel to the grid.

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from autdtorch.fdtd.scattered_field import ScatteredField
 from autdtorch.utils.array_types import COMPLEX, AnyArray, Array, Index
-from autdtorch.utils.images import Image
+from autdtorch.utils.mirror_images import Image
 from autdtorch.utils.process import spread, thread_count
 
 _ERROR = 1e-5

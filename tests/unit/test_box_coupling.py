@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
-from autdtorch.fdtd.coupling import cross_approximation
+from autdtorch.fdtd.box_coupling import cross_approximation
 
 
 def approximated(matrix, most=120):
