@@ -7,20 +7,25 @@ from small_scenes import CUBE, small_scene
 
 import autdtorch as at
 
+BALLS = (
+    at.Sphere((8e-3, 12e-3, 12e-3), 3e-3, rigid=True),
+    at.Sphere((16e-3, 12e-3, 12e-3), 3e-3, density=5.0, sound_speed=300.0),
+)
+
 
 def main(dtype: str) -> None:
-    """Simulate in a box and in free space, differentiate, run holography; in float64, spheres scatter too.
+    """Simulate in boxes and in free space, differentiate, run holography; in float64, spheres scatter too.
 
     Spheres and meshes have kernels of one dtype; the other process meanwhile compiles those of grids.
     """
-    scene, rigid = small_scene((CUBE,)), small_scene((at.Sphere(CUBE.center, 3e-3, rigid=True),))
+    scene = small_scene((CUBE,))
     drive = torch.ones(4, dtype=torch.complex128)
     if dtype == "float64":
         at.Mesh.from_surface(CUBE.surface(), rigid=True).contains(CUBE.center)
         sphere = at.TMatrix.of(at.Sphere((0, 0, 0.05), 2e-3, rigid=True), scene.medium, scene.frequency)
         pair = at.TMatrixCluster([sphere, sphere.moved((5e-3, 0, 0))])
         at.radiation_force(pair, drive, array=scene.array, medium=scene.medium)
-    matrix = at.make_propagator(rigid, "box", 2e-3, dtype=dtype, cache=False).transfer_matrix()
+    matrix = at.make_propagator(small_scene(BALLS), "box", 2e-3, dtype=dtype, cache=False).transfer_matrix()
     density = torch.tensor([CUBE.density], dtype=torch.float64, requires_grad=True)
     field = at.differentiable_field(scene, drive, density=density, spacing=2e-3, dtype=dtype)
     field.abs().sum().backward()

@@ -18,6 +18,7 @@ from typing import Any
 import hypothesis
 import pytest
 import torch
+from _pytest.mark.expression import Expression
 from PIL import Image
 
 TESTS = Path(__file__).parent
@@ -31,8 +32,8 @@ for name in ("SIGINT", "SIGQUIT", "SIGHUP"):
     if number is not None and signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, signal.default_int_handler if name == "SIGINT" else lambda *_: None)
 
-# An example may take long on a busy machine; pytest's limit stays.
-hypothesis.settings.register_profile("autdtorch", deadline=None, max_examples=25)
+# An example may take long on a busy machine; pytest's limit stays. Each run draws other examples.
+hypothesis.settings.register_profile("autdtorch", deadline=None, max_examples=10)
 hypothesis.settings.load_profile("autdtorch")
 
 if not torch.cuda.is_available():
@@ -77,6 +78,20 @@ def set_threads() -> Iterator[Any]:
 def pytest_xdist_auto_num_workers() -> int:
     """Return one process more than cores, as a tenth of the time is spent in waiting."""
     return (os.cpu_count() or 1) + 1
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Ignore folders and files of which `-m` chooses no test: each worker would import them all."""
+    if not (chosen := config.option.markexpr) or TESTS not in collection_path.parents:
+        return None
+    folder, expression = collection_path.relative_to(TESTS).parts[0], Expression.compile(chosen)
+    plain, marked = (
+        expression.evaluate(lambda name, marks=marks, **_: name in marks)
+        for marks in ({folder}, {folder, "processes"})
+    )
+    if plain or (marked and (collection_path.is_dir() or b"mark.processes" in collection_path.read_bytes())):
+        return None
+    return True
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -74,7 +74,7 @@ def random_drives(seed: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("name", DEVICES)
-@settings(max_examples=6)
+@settings(max_examples=3)
 @given(seed=st.integers(0, 2**31), limit=st.sampled_from([1.0, 0.8, 0.35]))
 def test_the_firmware_plays_the_quantised_drive(name: str, seed: int, limit: float):
     device, phases, step = DEVICES[name]

@@ -8,7 +8,7 @@ import re
 
 import pytest
 import torch
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from autdtorch import hardware as hw
@@ -286,7 +286,6 @@ SIZES = st.one_of(
 MATRIX = torch.polar(torch.ones(2, 16).double(), torch.arange(32.0).double().view(2, 16))
 
 
-@settings(max_examples=60)
 @given(SIZES, SIZES, SIZES)
 @example(1.0, 10.0, 1.75)  # at the coarsest scale
 def test_an_oscilloscope_reads_what_it_can_resolve_or_says_why_not(sensitivity, gain, loudest):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from autdtorch.methods.functions import gabs, gradient_ascent
@@ -17,7 +17,6 @@ from autdtorch.objectives.phase_boxes import phase_bound
 from autdtorch.objectives.quiet import QuietPoints
 
 
-@settings(max_examples=20)
 @given(
     points=st.integers(1, 8),
     transducers=st.integers(2, 32),
@@ -115,7 +114,6 @@ def test_few_foci_nearly_attain_their_bound(random_matrix, points, transducers):
         assert score <= goal.bound(matrix) < 1.01 * score
 
 
-@settings(max_examples=20)
 @given(
     foci=st.integers(1, 12),
     transducers=st.integers(1, 12),

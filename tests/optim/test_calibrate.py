@@ -78,7 +78,7 @@ def test_gains_and_phases_are_those_of_the_bench(matrix, unit):
     assert 0.85 < held.coverage <= 1  # of 360, 95 % +- 1.1 % are expected
 
 
-@settings(deadline=None, max_examples=10)
+@settings(deadline=None, max_examples=5)
 @given(st.integers(0, 10**6), st.booleans(), st.sampled_from([1, 3]))
 def test_calibration_predicts_readings_it_has_not_seen(seed, phase, points):
     matrix = at.make_propagator(scene(points)).transfer_matrix()

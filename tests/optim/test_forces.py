@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import autdtorch as at
@@ -136,7 +136,6 @@ def test_a_balance_reads_the_force_with_its_load_and_noise_and_0_when_the_body_i
     assert (reading[force < -load - 6 * sigma] == 0).all()
 
 
-@settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 10**6),
     transducers=st.integers(1, 8),

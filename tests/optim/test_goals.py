@@ -10,7 +10,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 import yaml
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import autdtorch as at
@@ -66,7 +66,6 @@ def test_scores_are_those_of_the_definitions():
         assert goal(PRESSURE[0]).shape == ()
 
 
-@settings(max_examples=24)
 @given(
     number=st.integers(0, 11),
     points=st.integers(2, 6),

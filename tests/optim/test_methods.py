@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import autdtorch as at
@@ -228,7 +228,6 @@ def test_a_method_of_small_steps_takes_one_thread_and_gives_the_others_back(
 
 
 @pytest.mark.parametrize("method", [at.lssg, partial(at.gabs, trials=3)], ids=["lssg", "gabs"])
-@settings(max_examples=25)
 @given(turns=st.lists(st.floats(0, 2 * math.pi), min_size=3, max_size=3), seed=st.integers(0, 1000))
 def test_phases_at_the_control_points_are_never_seen(make_objective, random_matrix, method, turns, seed):
     matrix = random_matrix(3, 5, seed)

@@ -39,7 +39,7 @@ def ball(balls):
     return at.PoseBall(balls, RADIUS)
 
 
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(points=st.integers(1, 3), degree=st.integers(1, 5), seed=st.integers(0, 1000), decay=st.floats(0, 2))
 def test_no_place_in_the_ball_is_below_the_bound(points, degree, seed, decay):
     generator = np.random.default_rng(seed)

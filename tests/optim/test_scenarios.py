@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import autdtorch as at
@@ -89,7 +89,6 @@ def test_lssg_takes_the_evaluations_of_one_scene(scenarios):
         at.lssg(scenarios(), order=[0, 1, 2, 3, 4, 5])
 
 
-@settings(max_examples=16)
 @given(
     number=st.integers(0, 6),
     by=st.sampled_from(BY),

@@ -80,7 +80,7 @@ def of_another_value(array, draw):
 DAMAGES = [removed, of_another_type, of_another_shape, of_another_value]
 
 
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_a_field_that_was_changed_is_refused_by_its_name(states, tmp_path, data):
     method, problem, arrays = data.draw(st.sampled_from(states))
@@ -97,7 +97,7 @@ def test_a_field_that_was_changed_is_refused_by_its_name(states, tmp_path, data)
     assert "\n" not in str(refused.value)
 
 
-@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_a_header_that_was_changed_is_refused(states, tmp_path, data):
     method, problem, arrays = data.draw(st.sampled_from(states))

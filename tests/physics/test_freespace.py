@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from exact_fields import WAVELENGTH, K
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.special import j0, struve
@@ -85,7 +85,6 @@ def around_a_disc(radius, normal, apart, over, generator):
     return torch.cat([beside, inside])
 
 
-@settings(max_examples=15)
 @given(
     size=st.floats(0.5, 40.0),
     normal=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda n: math.hypot(*n) > 0.1),
@@ -263,7 +262,6 @@ def piston(angle, radius):
     return float(piston_directivity([angle], WAVENUMBER, radius).real) if radius else 1.0
 
 
-@settings(max_examples=30)
 @given(st.lists(st.floats(0.0, 6.0), min_size=2, max_size=4), st.floats(0.0, math.pi))
 def test_each_radius_has_the_directivity_of_its_piston(sizes, angle):
     """S e^{ikr}/r 2 J1(ka sin t)/(ka sin t), with ka of each transducer."""
@@ -303,7 +301,6 @@ def test_many_pairs_are_computed_as_few():
     assert relative_error(matrix[:50], few) < 1e-8
 
 
-@settings(max_examples=20)
 @given(
     st.lists(st.tuples(st.floats(1e-3, 1e3), st.floats(0, 4e-3)), min_size=1, max_size=5),
     st.lists(st.tuples(st.floats(1e-3, 1e3), st.floats(0, 4e-3)), min_size=1, max_size=5),

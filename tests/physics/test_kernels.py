@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from small_scenes import CUBE, NO_RECEIVERS, NO_SOURCES, all_tensors, assembled_parts, small_scene
 
@@ -268,7 +268,6 @@ def drawn_discs(radii, seed):
     return Discs(centers, normals, torch.tensor(radii, dtype=torch.float64)), centers[0] + apart * ways
 
 
-@settings(max_examples=30)
 @given(
     wavenumber=st.sampled_from([200.0, 733.0, complex(733.0, 0.15), complex(1100.0, 5.0)]),
     radii=st.lists(st.sampled_from([0.0, 1e-3, 4.5e-3, 30e-3]), min_size=1, max_size=4),

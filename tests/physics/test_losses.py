@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from bloch_chain import reflection
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from lossy_bodies import AIR, FREQUENCY, WAVENUMBER, BoxRun, incident, region_of_bodies, sphere, sphere_series
 from scipy.sparse import coo_array
@@ -128,7 +128,6 @@ def test_losses_without_their_negative_part_are_as_small_as_they_were(seed, shar
     np.testing.assert_allclose(positive_part(passive[None])[0], passive, atol=1e-12 * np.linalg.norm(passive))
 
 
-@settings(max_examples=12)
 @given(
     st.sampled_from([Sphere, Box]),
     st.floats(0.3, 3.0),

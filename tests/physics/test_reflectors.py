@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from exact_planes import Ball, Plane, corner, pistons_in_panel, sphere_before_plane, waveguide
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from small_scenes import relative_error
 
@@ -160,7 +160,6 @@ def test_corners_of_planes(count, radius):
     assert relative_error(matrix, 4 * math.pi * array.source_strength * waves) < 1e-6  # of the nodes
 
 
-@settings(max_examples=15)
 @given(height=st.floats(1.02, 4.0), share=st.floats(0.15, 0.85), reflection=st.sampled_from([1.0, -1.0]))
 def test_two_planes_are_a_waveguide(height, share, reflection):
     """Heights [wavelengths] and places drawn, a round trip at least 0.1 turns from a cut-off.

@@ -172,7 +172,7 @@ def test_air_cut_from_a_rigid_cube_is_a_notch_between_plates():
     assert relative_error(*matrices) < 1e-3  # one body in two descriptions; measured 0
 
 
-@settings(max_examples=6)
+@settings(max_examples=3)
 @given(
     half=st.tuples(*[st.floats(2e-3, 5e-3)] * 3),
     wall=st.floats(0.02e-3, 2e-3),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from bloch_chain import exact_reflection, reflection
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -38,7 +38,6 @@ def tilted_normals(most):
     return numbers.filter(lambda n: np.count_nonzero(n) > 1 and math.gcd(*n) == 1)
 
 
-@settings(max_examples=12)
 @given(
     normal=tilted_normals(4),
     offset=st.floats(0, 1),
@@ -60,7 +59,6 @@ def test_the_place_of_a_tilted_half_space_converges():
     assert fine < coarse / 4
 
 
-@settings(max_examples=12)
 @given(
     normal=tilted_normals(3),
     offset=st.floats(0, 1),

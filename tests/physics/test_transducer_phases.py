@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from small_scenes import AIR, relative_error, small_scene
 
@@ -35,7 +35,6 @@ TURNED = PLAIN.calibrated(phase=PHASES)
 PHASE = st.floats(-10, 10)
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.lists(PHASE, min_size=4, max_size=4) | PHASE, st.lists(st.floats(0.1, 3), min_size=4, max_size=4))
 def test_the_free_field_has_the_phase_and_gain_of_each_transducer(phase, gain):
     array = PLAIN.calibrated(gain, phase)

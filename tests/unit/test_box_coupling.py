@@ -33,7 +33,6 @@ def test_matrices_of_low_rank_are_exact(height, width, rank, seed):
     assert np.linalg.norm(product - matrix) <= 1e-8 * np.linalg.norm(matrix)
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.floats(1.0, 4.0), st.floats(0.3, 3.0), st.integers(0, 10**6))
 def test_waves_between_places_apart_have_low_rank(apart, size, seed):
     """In wavelengths. An approximation ends at terms of 1e-5; those left out may add up to more."""

@@ -50,7 +50,6 @@ def box_mesh(folder):
 
 
 @PRIMITIVES
-@settings(max_examples=50)  # the first call of torch takes long
 @given(st.tuples(*[st.floats(-2, 2)] * 3))
 def test_the_gradient_leads_back_to_the_nearest_point_of_the_surface(shape, point):
     # Outside a convex body the distance has a gradient everywhere: of length 1, away from the nearest point.
@@ -195,7 +194,6 @@ def test_voxels_that_fill_a_box_are_that_box():
 ANGLES = st.tuples(*[st.floats(-3, 3)] * 3)
 
 
-@settings(max_examples=30)
 @given(ANGLES, ANGLES)
 def test_obstacles_move_as_one_body(first, second):
     """Distances of points that move along stay, and the body at rest does not depend on the pose."""
@@ -302,7 +300,7 @@ def test_cavities_of_masks_and_meshes_are_filled():
     assert solid.filled() is solid
 
 
-@settings(max_examples=8)
+@settings(max_examples=4)
 @given(
     st.sampled_from(["ball", "sheet", "rod"]),
     st.floats(2.0, 7.0),

@@ -173,7 +173,6 @@ def test_names_of_rows_are_clear(rows: list[str], size: tuple[float, float]) -> 
 SIDE = st.floats(1.0, 3e3)  # mm
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     sides=st.tuples(SIDE, SIDE, SIDE),
     start=st.floats(-2e3, 2e3),

@@ -101,7 +101,7 @@ def propagator_and_matrix(method):
     return make, make().transfer_matrix()
 
 
-@settings(max_examples=6)
+@settings(max_examples=3)
 @given(st.integers(0, 30), st.sampled_from(["full", "box", "tmatrix"]))
 def test_work_that_was_stopped_at_any_step_begins_again_as_if_it_had_not(step, method):
     make, expected = propagator_and_matrix(method)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import autdtorch as at
@@ -367,7 +367,6 @@ def some_readings(draw):
     return at.Readings(drives, tensors[0], places, tensors[1])
 
 
-@settings(max_examples=60, deadline=None)
 @given(some_readings(), st.sampled_from([".csv", ".npz"]))
 def test_saved_readings_are_loaded_as_they_were(tmp_path_factory, readings, suffix):
     path = tmp_path_factory.mktemp("saved") / f"readings{suffix}"

@@ -89,7 +89,6 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("meshes")
 
 
-@settings(max_examples=50)
 @given(
     size=st.tuples(*[st.floats(0.01, 0.1)] * 3),
     normal=st.sampled_from([(1.0, 0.0, 0.0), (1.0, 1.0, 0.0)])
@@ -112,7 +111,6 @@ def test_parts_of_a_box_are_the_whole_box(folder, size, normal, diagonal, share,
     assert length_of_edges(mesh) == pytest.approx(4 * (a + b + c), rel=1e-3)
 
 
-@settings(max_examples=40)
 @given(
     shift=st.tuples(*[st.floats(0.003, 0.03)] * 2),
     angles=ANGLES,

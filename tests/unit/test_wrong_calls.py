@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import autdtorch as at
@@ -190,7 +190,6 @@ def test_each_cause_is_told_once(part):
     assert len(caught) == 1
 
 
-@settings(max_examples=30)
 @given(degrees=st.tuples(*[st.floats(-1080, 1080)] * 3))
 def test_degrees_are_radians_in_the_end(degrees):
     turned = box(rotation_degrees=degrees)

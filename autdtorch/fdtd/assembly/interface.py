@@ -239,7 +239,9 @@ def _mixed(bodies: Bodies, grown: Array, values: Array) -> Array:
     from autdtorch.fdtd.assembly.element_kernels import mix_materials  # loads numba
 
     mixed = np.empty((len(values), bodies.distance.shape[1], SUBCELLS**3))
-    mix_materials(bodies.distance, grown, bodies.material, values, mixed)
+    # numba compiles again for arrays with gaps
+    distance, grown = map(np.ascontiguousarray, (bodies.distance, grown))
+    mix_materials(distance, grown, bodies.material, values, mixed)
     return mixed
 
 

@@ -172,7 +172,8 @@ class Survey(NamedTuple):
 
         size = distance.shape[:2]
         survey = cls(np.empty(size), np.empty(size), np.empty((*size, 3), bool))
-        survey_lattices(distance, _VARIATION, *survey)
+        # numba compiles again for arrays with gaps
+        survey_lattices(np.ascontiguousarray(distance), _VARIATION, *survey)
         return survey
 
     def crossed(self, distance: Array) -> NDArray[np.bool_]:

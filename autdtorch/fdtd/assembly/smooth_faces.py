@@ -276,7 +276,8 @@ def face_forces(surface: Surface, face: int) -> Array:
     corners = fields(surface)[:, vertices]
     middle = corners.mean(axis=1)
     light, dense = surface.density.min(axis=1), surface.density.max(axis=1)
-    inner = surface.level[:, CORNERS[vertices]] < 0
+    # numba compiles again for arrays in another order
+    inner = np.ascontiguousarray(surface.level[:, CORNERS[vertices]] < 0)
     near, moments, share = np.empty((count, 4, 3)), np.empty((count, 3, 3)), np.empty(count)
     plane = _AXIS[face], _OUTWARD[face], VERTICES[vertices], _TRIANGLES[face], LATTICE - 0.5
     parts = tuple(map(np.ascontiguousarray, surface))
