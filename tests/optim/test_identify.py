@@ -22,15 +22,15 @@ from autdtorch.objectives.perturbations import Noise, Quantised
 def test_as_good_as_the_gradient_without_seeing_the_matrix(paper_objective, evaluations):
     best = gradient_ascent(paper_objective).score
     # 1e-4 is what either climb leaves.
-    assert identify(paper_objective, evaluations=evaluations, trials=2).score.min() > 0.999 * best
+    assert identify(paper_objective, evaluations=evaluations).score.item() > 0.999 * best
 
 
 @pytest.mark.parametrize(("evaluations", "share"), [(64, 0.95), (256, 0.98)])
 def test_readings_average_noise(paper_objective, evaluations, share):
     best = gradient_ascent(paper_objective).score
-    solution = identify(Noise(paper_objective, 20), evaluations=evaluations, trials=2)
+    solution = identify(Noise(paper_objective, 20), evaluations=evaluations)
     # Measured in three cubes, 60 trials: 0.989 and 0.997 (docs/decisions/identify.md).
-    assert paper_objective(solution.drive).amin(dim=1).median() > share * best
+    assert paper_objective(solution.drive).amin() > share * best
 
 
 class Lucky:
@@ -93,8 +93,8 @@ def test_levels_of_the_device_are_known_to_the_fit(paper_objective):
     best = gradient_ascent(paper_objective).score
     # Rounded to 8 levels, phases are off by 0.23 rad rms: 3 % for the mean of the foci, more for the weakest.
     # Fitted to the drives as they were asked for, the readings would seem to have noise 13 dB below them.
-    solution = identify(Quantised(paper_objective, 8), trials=3)
-    assert paper_objective(solution.drive).amin(dim=1).median() > 0.9 * best
+    solution = identify(Quantised(paper_objective, 8))
+    assert paper_objective(solution.drive).amin() > 0.9 * best
 
 
 @pytest.mark.parametrize(("points", "transducers"), [(1, 1), (2, 2), (1, 3), (8, 3), (3, 8)])
@@ -209,8 +209,7 @@ def test_good_readings_are_not_doubted(share):
     assert share(times(1, []), evaluations=47)[1] == ""
 
 
-@pytest.mark.parametrize("level", [0.1, 0.316], ids=["20 dB", "10 dB"])
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(("level", "seed"), [(0.1, 0), (0.316, 1)], ids=["20 dB", "10 dB"])
 def test_noisy_readings_are_not_doubted(make_objective, random_matrix, caplog, level, seed):
     matrix = random_matrix(3, 12, seed)
     rms = float(matrix.norm(dim=1).mean())  # of readings at random phases

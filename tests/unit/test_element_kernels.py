@@ -27,6 +27,7 @@ def distances(random, bodies, count):
     """Distances (bodies, count, 125) from bent surfaces; some bodies are far."""
     quadratic = np.concatenate((LATTICE, LATTICE**2), axis=1)
     values = random.normal(size=(bodies, count, 6)) @ quadratic.T + random.normal(size=(bodies, count, 1))
+    values /= np.maximum(1, np.ptp(values, axis=2, keepdims=True) / 3**0.5)  # over the diagonal of an element
     values[random.random((bodies, count)) < 0.2] = FAR
     return values
 
