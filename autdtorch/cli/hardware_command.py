@@ -212,7 +212,8 @@ class _Trial:
             preflight = self._preflight(limited, sensor, readings, progress)
             pictures.skip()
             progress.begin(f"running {name_of(self._method)} on {bench.device.name}")
-            solution = solve(self._method, objective, [0], self._seed, goal, readings=self._readings)
+            with objective.continued():  # of a method that is a function, too
+                solution = solve(self._method, objective, [0], self._seed, goal, readings=self._readings)
             progress.begin("the drive of the method, once more")
             rows = []
             for number in range(readings):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -64,7 +65,7 @@ class HardwareObjective:
     requested drive. The outputs are off while a method computes.
 
     To continue an interrupted trial, run the same method with the same seed again: `autdtorch.run` takes the
-    evaluations in the log from there.
+    evaluations in the log from there, and so does a function of your own in a block `continued`.
 
     Attributes:
         scene: the scene on the bench.
@@ -137,6 +138,7 @@ class HardwareObjective:
             **named,
         }
         self.log = EvaluationLog(path_of("log", log), origin, count, points)
+        self._next: int | None = None  # number of the next evaluation that is looked up in the log
         place = self.log.path.resolve()
         if self.log.goes_on and place not in link.logs:
             link.go_on(self.log.seconds_on)
@@ -160,6 +162,22 @@ class HardwareObjective:
     def evaluations(self) -> int:
         """Number of observations so far, those from the log included."""
         return self.log.count
+
+    @contextlib.contextmanager
+    def continued(self, number: int = 0) -> Iterator[None]:
+        """Take evaluations from `number` on out of the log as long as it has them; then play.
+
+        The block, `with objective.continued():`, runs a method that observes the objective, perhaps by a
+        perturbation around it; a block inside goes on with it. `LogError` if the log has another drive.
+        """
+        if self._next is not None:
+            yield
+            return
+        self._next = number
+        try:
+            yield
+        finally:
+            self._next = None
 
     def recorded(self, number: int, drive: torch.Tensor) -> torch.Tensor | None:
         """Return the pressures (P,) [Pa] of a logged evaluation, or None; see `EvaluationLog.recorded`."""
@@ -202,9 +220,17 @@ class HardwareObjective:
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
         try:
-            return torch.stack([self._measure(row) for row in drive])
+            return torch.stack([self._recorded_or_measured(row) for row in drive])
         finally:
             self._link.off()
+
+    def _recorded_or_measured(self, drive: torch.Tensor) -> torch.Tensor:
+        if self._next is None:
+            return self._measure(drive)
+        pressure = self.recorded(self._next, drive)
+        pressure = self._measure(drive) if pressure is None else pressure
+        self._next += 1
+        return pressure
 
     def _measure(self, drive: torch.Tensor) -> torch.Tensor:
         most = self._link.limits.evaluations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import cast, overload
@@ -16,6 +17,7 @@ from autdtorch.methods.solution import Solution
 from autdtorch.methods.state_file import load_state, save_state
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import GoalFunction, Objective, require_objective
+from autdtorch.objectives.perturbations import innermost
 from autdtorch.objectives.readings import Readings
 from autdtorch.utils.files import path_of
 from autdtorch.utils.hints import did_you_mean, renamed_keywords
@@ -139,25 +141,13 @@ def _run(
     else:
         state = method.start(problem, seed, trials)
     most = method.most_evaluations(problem) * len(state.best.score)
-    with show_progress(most, f"{method.label}, evaluations") as progress:
+    continued = getattr(innermost(objective), "continued", contextlib.nullcontext)  # of a `HardwareObjective`
+    with continued(state.evaluations), show_progress(most, f"{method.label}, evaluations") as progress:
         progress.advance(state.evaluations)
         while not state.done and not (stop is not None and state.evaluations and stop(state)):
             drives = method.ask(state)
-            state = method.tell(state, observed(objective, drives, state.evaluations))
+            state = method.tell(state, objective(drives))
             progress.advance(len(drives))
             if path is not None:
                 save_state(path, method, state)
     return method.best(state)
-
-
-def observed(objective: Objective, drives: torch.Tensor, number: int) -> torch.Tensor:
-    """Return pressures (B, P) [Pa] of drives (B, M), evaluations from `number` on, recorded or observed."""
-    recorded = getattr(objective, "recorded", None)  # of a `HardwareObjective`
-    if recorded is None:
-        return objective(drives)
-    pressures = [recorded(number + row, drive) for row, drive in enumerate(drives)]
-    missing = [row for row, pressure in enumerate(pressures) if pressure is None]
-    if missing:
-        for row, pressure in zip(missing, objective(drives[missing]), strict=True):
-            pressures[row] = pressure
-    return torch.stack(pressures)

@@ -6,6 +6,7 @@ import json
 import math
 import re
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -283,6 +284,20 @@ def test_an_error_in_mid_trial_says_whether_the_outputs_are_off(trial, fail_at, 
     status, _, log = trial(*GABS)
     then = "; they may still be on" if left_on else OFF
     assert (status, log.splitlines()[-1]) == (2, f"autdtorch: there.jsonl: No space left on device{then}")
+
+
+def test_a_function_with_two_searches_goes_on_where_its_log_ends(trial, write, tmp_path, monkeypatch):
+    monkeypatch.delitem(sys.modules, "twofold", raising=False)
+    search = "def search(o): return [at.gabs(o, levels=2), at.lssg(o, levels=4)][1]"
+    write("twofold.py", f"import autdtorch as at\n{search}\n")
+    write("ours/method/twofold.yaml", "_target_: twofold.search\n")
+    words = *EMULATED, "method=twofold", "modules=twofold"
+    assert trial(*words, "hardware.limits.evaluations=20")[0] == 3
+    status, _, log = trial(*words)
+    assert (status, "going on after 20 evaluations" in log) == (0, True)
+    readings = load_readings(tmp_path / "out")
+    assert trial(*words)[0] == 0
+    assert len(load_readings(tmp_path / "out")) == len(readings) == (1 + 8 * 2) + 2 * 4
 
 
 def test_a_person_reads_each_transducer_and_the_silence_once(trial, monkeypatch):

@@ -7,8 +7,7 @@ import torch
 from faulty_bus import Disturbed
 from filelock import FileLock, Timeout
 
-from autdtorch.hardware import EmulatedSensor, LogError
-from autdtorch.methods.run import observed
+from autdtorch.hardware import EmulatedSensor, HardwareObjective, LogError
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import SET_ASIDE, line_of, row_of
 
@@ -29,6 +28,12 @@ def begin(trial, bench):
         yield lambda sensor=None, **settings: trial.objective(
             link, sensor or EmulatedSensor(bench), **settings
         )
+
+
+def continued(objective: HardwareObjective, drives: torch.Tensor, number: int = 0) -> torch.Tensor:
+    """Observe drives as evaluations from a number on, as an interrupted method that goes on."""
+    with objective.continued(number):
+        return objective(drives)
 
 
 SCOPE = {"microphone": "scope", "captures": 4}
@@ -84,13 +89,13 @@ class Noisy(Disturbed):
     ],
 )
 def test_an_evaluation_that_cannot_have_been_measured_is_measured_again(trial, bench, begin, change):
-    observed(begin(), drives(), 0)
+    continued(begin(), drives())
     key = digest_of(begin().log.origin)
     lines = trial.log.read_bytes().splitlines()
     whole, lines[3] = lines[3], line_of(row_of(lines[3], key) | change, key)
     trial.log.write_bytes(b"\n".join([*lines, b""]))
     sensor = Noisy(bench)
-    observed(begin(sensor), drives(), 0)
+    continued(begin(sensor), drives())
     assert sensor.readings == 1
     assert trial.log.with_name(trial.log.name + SET_ASIDE).read_bytes() == lines[3] + b"\n"
     again = row_of(trial.log.read_bytes().splitlines()[-1], key)
@@ -108,33 +113,33 @@ def test_an_evaluation_that_cannot_have_been_measured_is_measured_again(trial, b
     ],
 )
 def test_damage_costs_the_evaluations_it_touches_alone(trial, bench, begin, damage, caplog):
-    measured = observed(begin(), drives(), 0)
+    measured = continued(begin(), drives())
     lines = trial.log.read_bytes().splitlines()
     damaged = damage(lines)
     trial.log.write_bytes(b"\n".join([*damaged, b""]))
     sensor = Noisy(bench)
-    again = observed(begin(sensor), drives(), 0)
+    again = continued(begin(sensor), drives())
     assert sensor.readings == len(set(lines[1:]) - set(damaged))
     same = (again == measured).all(dim=1)
     assert int(same.sum()) == len(set(lines[1:]) & set(damaged))
     caplog.clear()
-    assert torch.equal(observed(begin(sensor), drives(), 0), again)
+    assert torch.equal(continued(begin(sensor), drives()), again)
     assert not caplog.messages
     with pytest.raises(LogError, match="evaluation 1 is of another drive"):
-        observed(begin(sensor), 0.5 * drives(), 0)
+        continued(begin(sensor), 0.5 * drives())
 
 
 def test_where_a_reading_made_again_leads_elsewhere_the_trial_follows_it(trial, bench, begin):
     others = drives()
     others[4:] *= 0.5
-    observed(begin(), drives(), 0)
+    continued(begin(), drives())
     lines = trial.log.read_bytes().splitlines(keepends=True)
     trial.log.write_bytes(b"".join([*lines[:3], *lines[4:]]))
     sensor = Noisy(bench)
     objective = begin(sensor)
-    pressure = [observed(objective, others[:4], 0), observed(objective, others[4:], 4)]
+    pressure = [continued(objective, others[:4]), continued(objective, others[4:], 4)]
     assert sensor.readings == 1 + 2
-    assert torch.equal(observed(begin(sensor), others, 0), torch.cat(pressure))
+    assert torch.equal(continued(begin(sensor), others), torch.cat(pressure))
     assert sensor.readings == 1 + 2
 
 
@@ -181,9 +186,9 @@ def test_an_objective_that_failed_goes_on_where_its_log_ends(trial, bench, begin
     objective = begin(sensor)
     with pytest.raises(KeyboardInterrupt):
         objective(drives())
-    pressure = observed(objective, drives(), 0)
+    pressure = continued(objective, drives())
     assert sensor.readings == 6 + 1
-    assert torch.equal(observed(begin(), drives(), 0), pressure)
+    assert torch.equal(continued(begin(), drives()), pressure)
     assert trial.log.read_bytes().count(b"\n") == 1 + 6
 
 

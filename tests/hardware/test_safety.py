@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 from autdtorch import hardware as hw
 from autdtorch.hardware.sensors.sensor import checked_reading
-from autdtorch.methods.run import observed
 
 FULL = torch.ones(16, dtype=torch.complex128)
 
@@ -252,7 +251,9 @@ def test_a_link_left_open_is_switched_off_when_python_exits_and_a_closed_one_is_
 def test_the_number_of_evaluations_is_limited_over_all_of_a_trial(trial):
     def observe(rows: int, most: int) -> None:
         with trial.limited(evaluations=most) as (bench, link):
-            observed(trial.objective(link, hw.EmulatedSensor(bench)), FULL.expand(rows, -1), 0)
+            objective = trial.objective(link, hw.EmulatedSensor(bench))
+            with objective.continued():
+                objective(FULL.expand(rows, -1))
 
     observe(3, most=3)
     with pytest.raises(hw.LimitError, match="4 evaluations are made, the limit"):
@@ -264,8 +265,8 @@ def test_the_time_on_goes_on_with_the_trial(trial):
     with trial.limited(seconds=60.0) as (bench, link):  # a test does not take that long
         trial.objective(link.link, hw.EmulatedSensor(bench)).log.append(FULL, torch.ones(2), 60.0)
         objective = trial.objective(link, hw.EmulatedSensor(bench))
-        with pytest.raises(hw.LimitError, match="on for 60 s, the limit"):
-            observed(objective, FULL.expand(2, -1), 0)  # one is in the log
+        with pytest.raises(hw.LimitError, match="on for 60 s, the limit"), objective.continued():
+            objective(FULL.expand(2, -1))  # one is in the log
         assert link.seconds_on == 60.0
 
 

@@ -9,7 +9,7 @@ from faulty_bus import Disturbed
 
 from autdtorch import hardware as hw
 from autdtorch.methods.functions import gabs, identify, lssg
-from autdtorch.objectives.perturbations import random_rms
+from autdtorch.objectives.perturbations import Drift, FailedTransducers, Noise, Quantised, random_rms
 from autdtorch.scene.drive import drive_from_phases
 
 FULL = torch.ones(16, dtype=torch.complex128)
@@ -71,6 +71,33 @@ def test_drives_of_any_leading_dimensions_are_played_in_a_row(trial, leading):
     played = trial.played()
     torch.testing.assert_close(measured, played(drives), rtol=1e-12, atol=0)
     assert played.evaluations == len(asked)
+
+
+@pytest.mark.parametrize(
+    ("perturbed", "readings"),
+    [
+        (lambda objective: FailedTransducers(Quantised(objective, levels=8), [3]), 1),
+        (lambda objective: Drift(objective, phase=0.1, sensor=0.1), 1),
+        (lambda objective: Noise(objective, snr=20.0, reads=2, reference=10.0), 2),
+    ],
+    ids=["drive", "drift", "noise"],
+)
+def test_a_trial_of_a_perturbed_objective_goes_on_where_its_log_ends(trial, perturbed, readings):
+    def stop(number: int) -> None:
+        if number == 7:
+            raise KeyboardInterrupt
+
+    def measure(disturb=int):
+        with trial.limited() as (bench, link):
+            sensor = Disturbed(bench, disturb)
+            return gabs(perturbed(trial.objective(link, sensor)), levels=2), sensor.readings
+
+    with pytest.raises(KeyboardInterrupt):
+        measure(stop)
+    continued, made = measure()
+    assert made == readings * (1 + 15 * 2) - 6
+    trial.log = trial.log.with_name("uninterrupted.jsonl")
+    assert torch.equal(continued.history, measure()[0].history)
 
 
 def test_an_evaluation_is_logged_before_the_next_is_played(trial):

@@ -19,7 +19,7 @@ import torch
 from autdtorch.methods.base import Method, State
 from autdtorch.methods.gradient import GradientAscent
 from autdtorch.methods.problem import Problem
-from autdtorch.methods.run import observed, run
+from autdtorch.methods.run import run
 from autdtorch.objectives.bound import focus_bound
 from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.plot.explore.situation import Situation
@@ -248,8 +248,7 @@ class Calculator:
         objective = SimulatedObjective(propagator.scene, propagator)
         state = request.method.start(Problem.of(objective), request.seed)
         while not state.done:
-            drives = request.method.ask(state)
-            state = request.method.tell(state, observed(objective, drives, state.evaluations))
+            state = request.method.tell(state, objective(request.method.ask(state)))
             yield state
 
 
