@@ -245,6 +245,9 @@ def _from_pictures(folder: Path, points: torch.Tensor | None) -> Readings:
 def _played(origin: Mapping[str, Any], drives: torch.Tensor) -> torch.Tensor:
     """Return drives (N, M) at the levels of a trial's device; boards with their own corrections play any."""
     device = next((device for device in DEVICES.values() if device.name == origin.get("device")), None)
+    if device is None:
+        name = origin.get("device")
+        logger.warning("%r is not in hardware.DEVICES: drives are as asked for, not at its levels", name)
     if device is None or "boards" in origin:
         return drives
     transducers = origin["transducers"]

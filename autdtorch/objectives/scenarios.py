@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from autdtorch.objectives.goals import WEAKEST_FOCUS, goal_of
+from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal, goal_of, scores_pressures
 from autdtorch.objectives.objective import (
     GoalFunction,
     Objective,
@@ -200,8 +200,12 @@ def observed_goal(objective: Objective, goal: GoalFunction) -> tuple[GoalFunctio
     if isinstance(inside, Scenarios):
         each, points = observed_goal(inside.objectives[0], goal)
         return inside.over(each), len(inside) * points
+    of_readings = _goal_inside(objective)
     if goal is WEAKEST_FOCUS:
-        goal = _goal_inside(objective)
+        goal = of_readings
+    elif isinstance(goal, Goal) and goal.of_pressures and not scores_pressures(of_readings):
+        accepted = "must not be of pressures, which this objective does not read; leave it out"
+        raise invalid("goal", goal.name, accepted)
     points = len(objective.scene.control_points if matrix is None else matrix)
     return goal, getattr(inside, "readings", points)
 

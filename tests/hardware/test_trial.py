@@ -9,6 +9,7 @@ from faulty_bus import Disturbed
 
 from autdtorch import hardware as hw
 from autdtorch.methods.functions import gabs, identify, lssg
+from autdtorch.objectives.goals import MeanPressure, TargetPressures
 from autdtorch.objectives.perturbations import Drift, FailedTransducers, Noise, Quantised, random_rms
 from autdtorch.scene.drive import drive_from_phases
 
@@ -214,3 +215,16 @@ def test_links_matrices_and_settings_of_another_trial_are_refused(trial):
     with pytest.raises(ValueError, match="from 0 to 255, each once"):
         link_of([3, 3])
     assert bench.firmware.drive().abs().max() == 0
+
+
+def test_a_goal_of_pressures_is_refused_where_the_sensor_reads_forces(trial):
+    class Balance(hw.EmulatedSensor):
+        quantity = hw.Quantity("force", "mN")
+
+    with trial.limited() as (bench, link):
+        objective = trial.objective(link, Balance(bench))
+        for goal in (TargetPressures((100.0, 200.0)), MeanPressure()):
+            with pytest.raises(ValueError, match=f"goal: '{goal.name}'; must not be of pressures"):
+                gabs(objective, levels=2, goal=goal)
+        assert objective.evaluations == 0
+        gabs(objective, levels=2, goal=lambda force: force.amax(dim=-1))

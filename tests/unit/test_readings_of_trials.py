@@ -33,6 +33,16 @@ def test_a_log_has_the_drives_that_the_device_played(log):
     assert error.abs().max() <= math.pi / 32 + 1e-6  # half a level
 
 
+def test_of_a_device_that_is_not_known_the_drives_are_as_asked_with_a_warning(tmp_path, caplog):
+    origin = {"device": "mine", "transducers": [0, 1], "amplitude limit": 1.0}
+    log = EvaluationLog(tmp_path / "trial.jsonl", origin, 2, 1)
+    drive = torch.polar(torch.ones(2), torch.tensor([0.1, 2.3])).cdouble()
+    log.append(drive, torch.ones(1).double(), 0.1)
+    log.end(0.1)
+    assert torch.equal(at.load_readings(tmp_path).drives[0], drive)
+    assert "'mine' is not in hardware.DEVICES" in caplog.text
+
+
 def test_pictures_of_a_trial_are_readings_of_the_plane(log):
     """Of |p|^2 that grows along u: interpolated at any places, with the drives that the device played."""
     plane = at.Plane((0, 0, 0.1), (0, 0, 1), (0.03, 0.02))
