@@ -60,9 +60,7 @@ def stopping_when(asked: Callable[[], bool]) -> Iterator[None]:
 class Progress:
     """A counter of steps that shows the current task and the time left."""
 
-    def __init__(
-        self, steps: int, what: str, bar: tqdm[None] | None, left: _TimeLeft | None = None
-    ) -> None:
+    def __init__(self, steps: int, what: str, bar: tqdm[None] | None, left: _TimeLeft | None = None) -> None:
         """Show the progress on `bar`, or in the log if it is None; `steps` may be an estimate."""
         self._bar, self._steps, self._what, self._done = bar, steps, what, 0
         self._left = left or self._by_pace
@@ -136,7 +134,8 @@ class Progress:
         if not first < half < done:
             return (left * (now - begun) / (done - first),) * 2
         early, late = (middle - begun) / (half - first), (now - middle) / (done - half)
-        growth = max(0.0, late - early) / ((done - first) / 2)  # of the time of a step, by each step
+        # of the time of a step, by each step; at most from nothing, as the first ones may be of another kind
+        growth = min(max(0.0, late - early) / 0.5, late / 0.75) / (done - first)
         least = left * late
         return least, least + left * growth * (done - half + left) / 2
 
