@@ -214,10 +214,13 @@ def _run_scene(
         start = None if before is None else before.methods[method_name].solution.drive
 
         def solved(
-            trials: range, method: StudyMethod = method, start: torch.Tensor | None = start
+            trials: range,
+            name: str = method_name,
+            method: StudyMethod = method,
+            start: torch.Tensor | None = start,
         ) -> Solution:
             first_drives = None if start is None else start[list(trials)]
-            return solve(method, objective, trials, seed, goal, first_drives)
+            return solve(method, objective, trials, seed, goal, first_drives, name=name)
 
         _run_trials(where, size, solved, trials, progress)
     solutions = {
@@ -281,11 +284,6 @@ def _run_trials(
         begin = time.perf_counter()
         solution = solve(trials=block)
         seconds = time.perf_counter() - begin
-        if not isinstance(solution, Solution):
-            raise invalid(f"method {method}", solution, "must return a Solution")
-        if len(solution.score) != len(block):
-            accepted = f"must be the trials {list(block)}, or one where it has no random choices"
-            raise invalid(f"method {method}", len(solution.score), accepted, "trials")
         trials.append(scene, method, block, solution, seconds)
         progress.advance(len(missing.intersection(block)))
 

@@ -26,6 +26,7 @@ from autdtorch.objectives.readings import Readings
 from autdtorch.objectives.scenarios import Scenarios
 from autdtorch.propagators import Propagator
 from autdtorch.scene.scene import Scene
+from autdtorch.study.results import stored_solution
 from autdtorch.utils.array_types import COMPLEX
 from autdtorch.utils.process import require_memory
 from autdtorch.utils.validation import integer_at_least, invalid, require_kind, require_known, within
@@ -109,8 +110,14 @@ def solve(
     goal: Goal,
     start: torch.Tensor | None = None,
     readings: Readings | None = None,
+    name: str | None = None,
 ) -> Solution:
-    """Run trials of a method on an objective, from drives (T, M) and readings where it begins at any."""
+    """Run trials of a method on an objective, from drives (T, M) and readings where it begins at any.
+
+    Raises:
+        ValueError: a method that is a function returns another number of trials, no `Solution`, or one whose
+            fields do not fit the objective. The message has the `name`, by default the function's.
+    """
     if isinstance(method, Method):
         return run(method, objective, trials, seed, goal=goal, start=start, readings=readings)
     taken = inspect.signature(method).parameters
@@ -118,7 +125,24 @@ def solve(
         accepted = "must be None: only a Method goes on from them, no function"
         raise invalid("readings", readings, accepted)
     arguments = {"trials": trials, "seed": seed, goal_keyword(method) or "goal": goal}
-    return method(objective, **{key: value for key, value in arguments.items() if key in taken})
+    solution = method(objective, **{key: value for key, value in arguments.items() if key in taken})
+    _require_solution(f"method {name or name_of(method)}", solution, objective, trials)
+    return solution
+
+
+def _require_solution(where: str, solution: Solution, objective: Objective, trials: Trials) -> None:
+    """Check what the function of a user returned for trials on an objective."""
+    if not isinstance(solution, Solution):
+        raise invalid(where, solution, "must return a Solution")
+    numbers = range(trials) if isinstance(trials, int) else list(trials)
+    if len(solution.score) != len(numbers):
+        accepted = f"must be the trials {list(numbers)}, or one where it has no random choices"
+        raise invalid(where, len(solution.score), accepted, "trials")
+    with within(where):
+        points = len(objective.scene.control_points)
+        if isinstance(objective, Scenarios | ForceObjective):
+            points = solution.pressure.shape[-1]  # of all scenes, or readings of a force
+        stored_solution(vars(solution), len(objective.scene.array), points)
 
 
 def scenes_of(scenarios: Mapping[str, Any] | None, goal: Goal | ForceGoal) -> OverScenes | ForceGoal:

@@ -212,6 +212,34 @@ def test_a_trial_that_may_not_be_made_ends_with_one_line(trial, words, message):
     assert (status, message in log) == (2, True)
 
 
+FUNCTIONS = """
+import autdtorch as at
+from dataclasses import replace
+
+def tensor(objective): return at.gabs(objective, levels=4).drive
+def few(objective): return replace(s := at.gabs(objective, levels=4), drive=s.drive[:, :5])
+def loud(objective): return replace(s := at.gabs(objective, levels=4), drive=2 * s.drive)
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("tensor", "method tensor: .*; must return a Solution"),
+        ("few", "method few: drive: shape"),
+        ("loud", "method loud: drive.*amplitude"),
+    ],
+)
+def test_a_function_without_a_solution_plays_nothing(trial, write, tmp_path, monkeypatch, name, message):
+    monkeypatch.delitem(sys.modules, "mine", raising=False)
+    write("mine.py", FUNCTIONS)
+    write("ours/method/own.yaml", f"_target_: mine.{name}\n")
+    status, _, log = trial(*EMULATED, "method=own", "modules=mine")
+    assert status == 2
+    assert re.search(message, log)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_sweep_of_trials_is_refused(trial):
     status, _, log = trial(*GABS, "-m", folder="hydra.sweep.dir=out")
     assert (status, "hardware: a sweep; must be one trial at a time" in log) == (2, True)
