@@ -332,7 +332,13 @@ def _share_of_bound(scene: SceneResult, score: float) -> str:
     bound = scene.in_unit(f"{scene.bound:.4g}")
     if scene.bound <= 0:
         return f"no drive above {bound} (certified)"
-    return f"{100 * score / scene.bound:.1f} % of {bound}" if score > 0 else f"none of {bound}"
+    return f"{in_percent(score / scene.bound)} % of {bound}" if score > 0 else f"none of {bound}"
+
+
+def in_percent(share: float) -> str:
+    """Return a share > 0 in percent, rounded down, so that 100.0 is all of it."""
+    tenths = math.floor(1000 * share + 1e-9)  # 0.9 is 900 of them, not 899 and a rounding error
+    return f"{tenths / 10:.1f}" if tenths >= 10 else f"{100 * share:.2g}"
 
 
 def with_foci(results: StudyResult) -> bool:

@@ -326,7 +326,7 @@ def test_the_findings_name_the_best_method_its_share_of_the_bound_and_what_obsta
     }
     winners, nearness, cost, claims = findings(scored(results, scores), judge_claims(results))
     assert all(text in winners for text in ("8 Pa in homogeneous", "7 Pa in three_cubes", "by BO"))
-    assert "70 to 80\N{NO-BREAK SPACE}%" in nearness
+    assert "70.0 to 80.0\N{NO-BREAK SPACE}%" in nearness
     assert "12\N{NO-BREAK SPACE}% lower in three_cubes" in cost  # 12.5 %, rounded to even
     assert "LSSG loses most, 60\N{NO-BREAK SPACE}%" in cost
     assert "11 claims" in claims
@@ -339,7 +339,7 @@ def test_findings_of_one_method_are_no_comparison_and_of_many_scenes_count_them(
     winners, nearness, cost = findings(results, judge_claims(results))
     assert "4 Pa in a" in winners
     assert "best" not in winners
-    assert "40\N{NO-BREAK SPACE}%" in nearness
+    assert "40.0\N{NO-BREAK SPACE}%" in nearness
     assert "not known" in cost
     results = studied({"a": scene()})
     scenes = {f"scene_{number}": results.scenes["a"] for number in range(20)}

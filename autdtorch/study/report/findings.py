@@ -10,7 +10,7 @@ from autdtorch.io.goal_section import goal_label
 from autdtorch.methods.catalogue import label_of
 from autdtorch.study.report.claims import Claim, Verdict
 from autdtorch.study.report.tables import competitors, median_score
-from autdtorch.study.results import SceneResult, StudyResult
+from autdtorch.study.results import SceneResult, StudyResult, in_percent
 from autdtorch.study.statistics import has_shares
 
 MOST_NAMED = 4  # scenes, groups or gaps that a sentence names; more are counted
@@ -30,11 +30,12 @@ def findings(results: StudyResult, judged: Sequence[tuple[Claim, Verdict | None]
     """Return one sentence each on the best methods, the bound, the obstacles and the paper's claims.
 
     Baselines are left out where there are other methods. The last sentence is left out where the results
-    have no data on any claim.
+    have no data on any claim. One before it names methods that gained nothing, if there are any.
     """
     best = {name: _best(scene) for name, scene in results.scenes.items()}
     verdicts = [verdict for _, verdict in judged if verdict is not None]
     sentences = [_winners(results, best), _nearness(results, best), _cost_of_obstacles(results, best)]
+    sentences += [_without_gain(results)] if any(map(_stuck, results.scenes.values())) else []
     sentences += [_verdicts(verdicts, len(judged))] if verdicts else []
     return [sentence.replace(" %", "\N{NO-BREAK SPACE}%") for sentence in sentences]
 
@@ -108,9 +109,7 @@ def _in_scenes(texts: Mapping[str, str]) -> str:
 def _nearness(results: StudyResult, best: Mapping[str, _Best]) -> str:
     """Return the sentence on the distance of the best scores from the certified bound."""
     scenes = results.scenes
-    shares = [
-        100 * best[name].score / scene.bound for name, scene in scenes.items() if has_shares(scene.bound)
-    ]
+    shares = [best[name].score / scene.bound for name, scene in scenes.items() if has_shares(scene.bound)]
     parts = [f"{_range(shares)} % of the certified upper bound"] if shares else []
     below = [
         f"{scene.in_unit(f'{scene.bound - best[name].score:.3g}')} below the certified upper bound in {name}"
@@ -126,8 +125,9 @@ def _nearness(results: StudyResult, best: Mapping[str, _Best]) -> str:
     return f"{subject} {listed(parts)}{rest}; no drive can exceed the bound."
 
 
-def _range(values: Sequence[float]) -> str:
-    low, high = (f"{value:.0f}" if value >= 10 else f"{value:.2g}" for value in (min(values), max(values)))
+def _range(shares: Sequence[float]) -> str:
+    """Return the least and the largest share in percent."""
+    low, high = (in_percent(share) if share > 0 else "0" for share in (min(shares), max(shares)))
     return low if low == high else f"{low} to {high}"
 
 
@@ -179,6 +179,28 @@ def _change(share: float) -> str:
     if abs(share) < _EQUAL:
         return "unchanged"
     return f"{100 * abs(share):.{0 if abs(share) >= 0.1 else 1}f} % {'lower' if share < 0 else 'higher'}"
+
+
+def _stuck(scene: SceneResult) -> list[str]:
+    """Return the labels of the methods none of whose trials found a better drive than its first."""
+    return [
+        label_of(name)
+        for name, method in competitors(scene).items()
+        if method.solution.evaluations.min() > 1
+        and (method.solution.history[:, -1] == method.solution.history[:, 0]).all()
+    ]
+
+
+def _without_gain(results: StudyResult) -> str:
+    """Return the sentence on the methods that found no better drive than their first."""
+    labels = {name: _stuck(scene) for name, scene in results.scenes.items()}
+    parts = [f"{listed(stuck)} in {name}" for name, stuck in labels.items() if stuck]
+    more = [f"{len(parts) - MOST_NAMED} more"] if len(parts) > MOST_NAMED else []
+    lssg, why = label_of("lssg"), ""
+    if any(lssg in stuck for stuck in labels.values()):
+        # as where symmetry makes all foci equal, and a change of one offset makes one of them weaker
+        why = f": {lssg} changes one offset at a time, and no single change raised the score"
+    return f"No better drive than the first was found by {'; '.join(parts[:MOST_NAMED] + more)}{why}."
 
 
 def _verdicts(verdicts: Sequence[Verdict], claims: int) -> str:

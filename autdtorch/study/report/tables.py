@@ -102,7 +102,7 @@ def gap_rows(results: StudyResult) -> list[list[str]]:
         for name, method in scene.methods.items():
             gap = bound_gap(method, scene.bound)
             scores = [scene.in_unit(f"{gap.score:{form}}"), _gap(gap.gap, scene, form)]
-            evaluations = f"{method.solution.evaluations.double().mean():.0f}"
+            evaluations = f"{np.median(method.solution.evaluations.numpy()):.0f}"
             near = _median_of_reached(gap.evaluations) if has_shares(scene.bound) else "-"
             counts = ["-", "-"] if is_baseline(name) else [evaluations, near]
             seconds = in_digits(float(method.seconds.median()), 2)
