@@ -259,7 +259,11 @@ def _too_large(scene: SceneContents) -> Iterator[tuple[str, str]]:
     for index, obstacle in enumerate(scene.obstacles):
         corners = points.new_tensor([obstacle.lower, obstacle.upper])
         everything.append(corners)
-        if _is_too_large(scene, points, _without_slabs(corners, points)):
+        if obstacle.has_unsure_units:  # no wall: these seldom come as meshes
+            is_large = _diagonal(torch.cat([points, corners])) > _usual_reach(scene, points)
+        else:
+            is_large = _is_too_large(scene, points, _without_slabs(corners, points))
+        if is_large:
             kind = type(obstacle).__name__
             yield f"obstacles[{index}]", f": {kind} of {extent_of(obstacle)}; {obstacle.unit_question}"
     ask = "is it in m, 100 mm as 100e-3?"

@@ -89,6 +89,14 @@ def test_overlapping_obstacles_of_different_materials_are_named():
     assert caught[0].filename == __file__
 
 
+def test_a_mesh_in_centimetres_is_no_wall():
+    """A body of 1.6 cm by 10 cm, 3.3 cm from the array: in m, a wall of 10 m at 3.3 m."""
+    surface = Box((4.1, 5, 5), (1.6, 10, 10), rigid=True).surface()
+    assert paper_scene(obstacles=[Mesh.from_surface(surface, 1e-2, rigid=True)])
+    with pytest.warns(ScaleWarning, match=r"obstacles\[0\]: Mesh of .*, 1e-2 for centimetres"):
+        paper_scene(obstacles=[Mesh.from_surface(surface, rigid=True)], domain=None)
+
+
 def test_a_mesh_in_millimetres_is_told_how_to_scale_it():
     surface = Sphere((50.0, 50.0, 50.0), 8.0, rigid=True).surface()
     assert paper_scene(obstacles=[Mesh.from_surface(surface, 1e-3, rigid=True)])

@@ -134,6 +134,11 @@ class Obstacle(ABC):
         return False
 
     @property
+    def has_unsure_units(self) -> bool:
+        """True if the numbers are those of a file or a surface, which may not be in m."""
+        return False
+
+    @property
     def uncertainty(self) -> float:
         """Distance [m] by which the surface may be off (rms); 0 where it is exact."""
         return 0.0

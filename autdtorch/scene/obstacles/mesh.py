@@ -74,7 +74,7 @@ class Mesh(Obstacle):
 
     position_field: ClassVar[str] = "offset"
     orientation_field: ClassVar[str | None] = "rotation"
-    unit_question: ClassVar[str] = "take scale=1e-3 for a file in millimetres"
+    unit_question: ClassVar[str] = "take scale=1e-3 for a file in millimetres, 1e-2 for centimetres"
 
     path: str = field(compare=False)
     scale: float = field(default=1.0, compare=False)
@@ -99,6 +99,11 @@ class Mesh(Obstacle):
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", torch.from_numpy(path.faces))
         object.__setattr__(self, "digest", digest_of(vertices, self.faces)[:16])
+
+    @property
+    def has_unsure_units(self) -> bool:
+        """True without a scale."""
+        return self.scale == 1
 
     @classmethod
     @suggesting
