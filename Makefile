@@ -6,6 +6,7 @@ ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+# With -e, the targets run the clone as it is, also where an earlier installation without it had a copy.
 # Imports compile what they use: a minute less than compiling every file of every package here.
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet --no-compile -c constraints.txt -e
 # They write that to disk: images for containers often forbid it, and each process then takes seconds longer.
@@ -19,14 +20,14 @@ OVERRIDES = $(strip $(foreach name,$(filter-out PYTHON ARGS,$(.VARIABLES)),$(if 
 .PHONY: help paper test test-rest lint docs clean
 
 help:
-	@echo "make paper   run the paper's experiment and write outputs/paper/report.html"
+	@echo "make paper   run the paper's experiment, some 8 minutes, and write outputs/paper/report.html"
 	@echo "             (make paper trials=5 changes a setting, as does ARGS='trials=5 seed=1')"
 	@echo "make test    test the package (ARGS='-m unit' selects)"
 	@echo "make test-rest   test scripts, documentation and its notebooks, pages in a browser, launchers and forks"
 	@echo "make lint    ruff, mypy, import-linter"
 	@echo "make docs    build the documentation in outputs/docs, executing its notebooks"
 	@echo "make clean   remove .venv and the tools' caches; outputs/ stays"
-	@echo "PYTHON=python3.12 chooses the interpreter of .venv."
+	@echo "PYTHON=python3.12 chooses the interpreter of .venv, where the clone is installed with pip's -e."
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "autdtorch needs Python 3.11 or later; make PYTHON=python3.12 chooses one")'
