@@ -23,9 +23,8 @@ from autdtorch.utils.spatial import doubled_normals
 _CELL_BYTES, _FIELD_NUMBERS = 3.0, 2.5
 """Memory of a cell: of the assembly [bytes], and numbers in each run."""
 
-_CELL_MEMORY, _ELEMENT_BYTES, _COLUMN_BYTES = 2_000.0, 14_000.0, 18_000.0
-"""Memory [bytes] of a heterogeneous cell, of an element while its surface is assembled, and of an element
-that a surface cuts in an absorbing layer."""
+_CELL_MEMORY, _ELEMENT_BYTES = 2_000.0, 14_000.0
+"""Memory [bytes] of a heterogeneous cell, and of an element while its surface is assembled."""
 
 _ALIKE, _FORCES = 0.25, 3.0
 """Memory and time of assembling elements along the grid, nearly all of which are alike, and time of those
@@ -98,7 +97,7 @@ class Costs:
         run = _FIELD_NUMBERS * self.itemsize * grouping.cells
         run += stored_bytes(cells, self.itemsize) + self.itemsize * block * cells  # which are recorded
         judged = min(MOST_JUDGED, self.receivers) if self.in_boxes else 0
-        lasting = _CELL_BYTES * grouping.cells + _CELL_MEMORY * filled.cells + _COLUMN_BYTES * filled.columns
+        lasting = _CELL_BYTES * grouping.cells + _CELL_MEMORY * filled.cells
         assembled = min(_ELEMENTS * filled.cut / len(grouping.grids), _MOST_ELEMENTS * thread_count())
         assembled *= _ALIKE if grouping.aligned else 1
         running = 12 * judged * cells + min(self.runs, self._at_once * self._together) * run
