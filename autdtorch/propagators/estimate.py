@@ -78,7 +78,8 @@ def estimate(
 
     Symmetries are found on a coarse grid, if that fits into memory. The speed of the kernel is measured once
     in a process, on a box of air. Resonances are not known in advance: the time assumes usual ones, and is
-    within a factor of two for most scenes. An error estimate (`return_error`) takes a fifth more.
+    within a factor of two for most scenes. An error estimate (`return_error`) takes a fifth more, and the
+    first matrix of a process about two seconds more, in which kernels are loaded.
 
     Args:
         scene: the scene.

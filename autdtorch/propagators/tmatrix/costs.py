@@ -16,6 +16,9 @@ _WAVE_SECONDS, _WAVE_BYTES = 2e-7, 200.0
 _PAIR_SECONDS, _WAY_SECONDS = 7e-7, 5e-8
 """Time [s] of a pair of unknown waves in the solutions by waves of three degrees, and what an image adds."""
 
+_SCENE_SECONDS, _SCENE_BYTES = 0.02, 6e6
+"""Further time [s] and memory [bytes] of a scene."""
+
 
 @dataclass(frozen=True)
 class WaveCosts:
@@ -36,13 +39,14 @@ class WaveCosts:
     @property
     def memory(self) -> float:
         """The most memory in use at a time [bytes]."""
-        return ENTRY_BYTES * self._pairs + _WAVE_BYTES * sum(self.waves) * self.transducers
+        return _SCENE_BYTES + ENTRY_BYTES * self._pairs + _WAVE_BYTES * sum(self.waves) * self.transducers
 
     @property
     def seconds(self) -> float:
         """The time [s]."""
         single = sum(self.waves) * self.images * (self.transducers + self.points)
-        return (_PAIR_SECONDS + _WAY_SECONDS * self.images) * self._pairs + _WAVE_SECONDS * single
+        pair = _PAIR_SECONDS + _WAY_SECONDS * self.images
+        return _SCENE_SECONDS + pair * self._pairs + _WAVE_SECONDS * single
 
     @property
     def _pairs(self) -> int:
