@@ -29,6 +29,7 @@ from autdtorch.cli.settings import (
     solver_of,
 )
 from autdtorch.hardware.camera.picture import turned
+from autdtorch.hardware.log import read_log
 from autdtorch.hardware.objective import goal_of
 from autdtorch.hardware.sensors.sensor import AnySensor
 from autdtorch.io.drive_file import save_drive
@@ -145,12 +146,26 @@ class _Trial:
         self._readings = given_readings(value)
         if self._readings is None:
             return None
+        self._require_alike(Path(str(value)))
         self._readings = replace(self._readings, deviation=None)  # the sensor's are those of all
         self._settings["readings"] = digest_of(self._readings)[:16]
         earlier = Problem.of(self._simulated, readings=self._readings).readings
         assert earlier is not None
         magnitudes = self._simulated(earlier.drives).masked_fill(earlier.pressure.isnan(), torch.nan)
         return Readings(earlier.drives, magnitudes)
+
+    def _require_alike(self, path: Path) -> None:
+        """Refuse a trial whose drives of amplitude 1 were others: no method sees that from its pressures."""
+        folder = path.parent if path.name == PICTURES else path
+        log = folder / _LOG_FILE if folder.is_dir() else folder
+        if log.suffix.lower() != ".jsonl":
+            return
+        origin, bench = read_log(log)[0], self._bench
+        ours = {"device": bench.device.name, "transducers": bench.transducers, **self._settings}
+        for name in ("device", "transducers", "largest amplitude"):
+            if origin.get(name, ours[name]) != ours[name]:
+                accepted = f"must be of one with the {name} {ours[name]}, as this has"
+                raise invalid("readings", f"a trial with the {name} {origin[name]}", accepted)
 
     def run(self) -> None:
         """Play and measure; leave log, drive and report, unless the run is dry."""

@@ -314,6 +314,26 @@ def test_an_error_in_mid_trial_says_whether_the_outputs_are_off(trial, fail_at, 
     assert (status, log.splitlines()[-1]) == (2, f"autdtorch: there.jsonl: No space left on device{then}")
 
 
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        (
+            "hardware.limits.amplitude=0.6",
+            "largest amplitude 1.0'; .* the largest amplitude 0.5",
+        ),
+        ("hardware.device=autd3", "device OpenMPD'; .* the device AUTD3"),
+        ("hardware.transducers='1-9'", "transducers .*; .* the transducers .1, 2,"),
+    ],
+)
+def test_readings_of_a_trial_with_other_amplitudes_are_refused(trial, other, message):
+    words = "hardware=emulated", "hardware.device=openmpd", "method=random", "method.evaluations=3"
+    assert trial(*words, "hardware.limits.amplitude=1")[0] == 0
+    for source in ("out", "out/trial.jsonl"):
+        again = "hardware.limits.amplitude=1", other, f"readings={source}"
+        status, _, log = trial(*words, *again, folder="output=next")
+        assert (status, bool(re.search(message, log))) == (2, True), log
+
+
 def test_a_function_with_two_searches_goes_on_where_its_log_ends(trial, write, tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "twofold", raising=False)
     search = "def search(o): return [at.gabs(o, levels=2), at.lssg(o, levels=4)][1]"
