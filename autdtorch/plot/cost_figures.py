@@ -32,6 +32,7 @@ _PANEL, _HEIGHT = 2.6, 2.5  # inch
 _INSIDE = 2.0  # inch, of a panel, without labels
 _BESIDE = 0.08  # inch, between a point and its name
 _MARGIN = 0.15  # between points and the ends of an axis, as a share of what the points span
+_LEAST_DECADES = 1.0  # of costs along an axis: ticks of nearly equal ones would have many digits, and overlap
 _NAME_WIDTH, _NAME_LINES = 0.8, 3  # inch, and lines; of longer names the rest is left out
 
 OVERHEAD = 2.0  # fitted costs are at least this many times the smallest: overhead is at most half of each
@@ -119,6 +120,8 @@ def _make_room(ax: Axes, sizes: Sequence[Array]) -> None:
     ax.set_xscale("log")
     low, high = np.log10(ax.get_xlim())
     first, share = low + _MARGIN / (1 + 2 * _MARGIN) * (high - low), width / _INSIDE
+    short = max(0.0, _LEAST_DECADES - (high - low)) / 2
+    low, high = low - short, high + short
     ax.set_xlim(10 ** min(low, (first - share * high) / (1 - share)), 10**high)
 
 

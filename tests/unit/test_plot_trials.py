@@ -1,6 +1,7 @@
 """Figures of trials, costs and poses show their data, a method in one colour in all."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import matplotlib as mpl
 import matplotlib.pyplot
@@ -150,6 +151,19 @@ def test_methods_differ_in_colour_in_marker_and_in_dashes() -> None:
     for part in zip(*looks.values(), strict=True):
         assert len(set(part)) == len(looks)
     assert len(set(looks_of(["a", "b", "c"]).values()) & set(looks_of(METHODS).values())) == 3
+
+
+def test_ticks_of_nearly_equal_costs_are_short_and_apart() -> None:
+    points = {"a": {"x": [(4.02e-3, 80.0)], "y": [(4.11e-3, 30.0)]}}
+    figure = plot_pareto(points, "time [s]", "score [%]", higher_is_better=True)
+    figure.draw_without_rendering()
+    (ax,) = figure.axes
+    low, high = ax.get_xlim()
+    assert high / low >= 10
+    labels = [label for label in ax.get_xticklabels(which="both") if label.get_text()]
+    boxes = sorted((label.get_window_extent() for label in labels), key=lambda box: box.x0)
+    assert len(boxes) >= 2
+    assert all(before.x1 < after.x0 for before, after in pairwise(boxes))
 
 
 def test_pareto_draws_the_front_of_all_as_steps_and_names_its_points() -> None:
