@@ -94,6 +94,24 @@ def test_mass_of_elements_is_that_of_the_volume(speed):
     assert displaced == pytest.approx(4 / 3 * math.pi * moved**3, rel=5e-3)
 
 
+@settings(max_examples=20)
+@given(st.floats(0.01, 0.99), st.sampled_from([0.1, 3.0, 77.0, 1e5]), st.sampled_from([0.7, 1.0, 2.0]))
+def test_no_mass_is_transferred_at_flat_faces_of_fluids(place, ratio, speed):
+    """Waves are reflected exactly with the masses of the elements, and with no others."""
+    elements, cells = assembled(box((-100, -100, 3 + place), (100, 100, 6.4), ratio, speed))
+    uniform = np.repeat(elements.materials.mass[:, None] / 8, 8, axis=1)
+    masses, mass = np.concatenate((uniform, elements.interface.mass)), np.zeros(GRID.shape)
+    kind = elements.material.astype(np.int64)
+    kind.ravel()[elements.index] = len(uniform) + elements.kind
+    for number, vertex in enumerate(VERTICES):
+        ends = (slice(first, first + size) for first, size in zip(vertex, kind.shape, strict=True))
+        mass[tuple(ends)] += masses[kind, number]
+    places = np.stack(np.unravel_index(cells.index, GRID.shape))
+    faces = (np.abs(places[:2] - 11.5) < 2).all(axis=0)  # far from the box's edges
+    assert faces.sum() >= 4 * 4 * 4
+    assert cells.mass[faces] == pytest.approx(mass.ravel()[cells.index[faces]], rel=1e-12)
+
+
 CENTERS = st.tuples(*[st.floats(4.5, 5.5)] * 3)
 
 
@@ -103,9 +121,10 @@ def test_mass_transfer_conserves_mass(center, radius, ratio):
     elements, cells = assembled(sphere(center, radius, ratio))
     of_elements = elements.materials.mass[elements.material].ravel()
     of_elements[elements.index] = elements.interface.mass.sum(axis=1)[elements.kind]
-    # of the elements without the outermost half cell, which is air; rounding of the largest mass
+    # of the elements without the outermost half cell, which is air. The masses of some cells of the densest
+    # fluid, 1e-5 each, are added to light cells with nothing to take around them.
     whole = of_elements.sum() + math.prod(GRID.shape) - math.prod(elements.material.shape)
-    assert mass_of_all(elements, cells).sum() == pytest.approx(whole, rel=1e-9)
+    assert mass_of_all(elements, cells).sum() == pytest.approx(whole, rel=1e-9, abs=1e-4)
 
 
 @settings(max_examples=5)
@@ -188,7 +207,7 @@ def test_condensation_keeps_the_energy_positive(exponents, gone):
     """Coupling of all sizes, as where three materials meet."""
     coupling = 10.0 ** np.array(exponents)[None]
     interface = InterfaceElements(
-        coupling, np.full((1, 8), 0.1), np.zeros((1, 8), np.int64), np.zeros(1, bool), np.zeros((1, 0))
+        coupling, np.full((1, 8), 0.1), np.zeros((1, 8), np.int64), *np.zeros((2, 1), bool), np.zeros((1, 0))
     )
     out = np.array([gone >> vertex & 1 for vertex in range(8)], bool)
     matrix = stiffness_matrix(condensed(interface, out[None]).coupling)[0]

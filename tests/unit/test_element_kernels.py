@@ -1,6 +1,7 @@
 """Compiled loops over elements, against their definitions in NumPy."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -86,8 +87,19 @@ def test_least_masses_are_those_with_which_elements_have_the_largest_eigenvalue(
     coupling = random.random((6, len(PAIRS))) * 10 ** random.uniform(-6, 2, (6, 1))
     coupling[:2] *= random.random((2, len(PAIRS))) < 0.4  # in several parts
     coupling[2] = coupling[2, 0]  # whose eigenvalues are equal
-    masses = np.empty((6, 8))
-    least_masses(coupling, PAIRS, 1.7, masses)
-    alone = np.where(masses > 0, masses, 1)
-    scaled = stiffness_matrix(coupling) / np.sqrt(alone[:, :, None] * alone[:, None])
-    assert np.abs(np.linalg.eigvalsh(scaled)[:, -1] - 1.7).max() < ROUNDING
+    stiff = stiffness_matrix(coupling)
+    alone = np.diagonal(stiff, axis1=1, axis2=2)
+    mass = random.uniform(0.5, 2, (6, 8)) * alone  # some of which suffice
+    mass[4, 3] = 0
+    least = np.empty((6, 8))
+    least_masses(coupling, mass, PAIRS, 1.7, least)
+    assert np.abs(_largest_eigenvalue(stiff, least) - 1.7).max() < ROUNDING
+    positive = np.where((mass > 0) | (alone == 0), mass, 1e-9)
+    suffice = _largest_eigenvalue(stiff, positive) <= 1.7
+    for row, shape in enumerate(np.where(suffice[:, None], mass, alone)):
+        assert least[row] == pytest.approx(shape * least[row].sum() / shape.sum(), rel=ROUNDING)
+
+
+def _largest_eigenvalue(stiff, mass):
+    mass = np.where(mass > 0, mass, 1)
+    return np.linalg.eigvalsh(stiff / np.sqrt(mass[:, :, None] * mass[:, None]))[:, -1]

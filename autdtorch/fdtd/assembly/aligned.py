@@ -186,8 +186,8 @@ def aligned_elements(
         tend_to_mean((coupling, mass), some, singles, part, materials.alike(*pair))
     first = np.stack([each.begin[kind] for each, kind in zip(blocks.planes, kinds.T, strict=True)], axis=-1)
     vertex = blocks.at_vertices(first[:, None] + VERTICES)
-    nothing = np.zeros(len(kinds), bool), np.zeros((len(kinds), 0))
-    return InterfaceElements(coupling, mass, vertex, *nothing)
+    flat = np.ones(len(kinds), bool)
+    return InterfaceElements(coupling, mass, vertex, ~flat, flat, np.zeros((len(kinds), 0)))
 
 
 def _seams(

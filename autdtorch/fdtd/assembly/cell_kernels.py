@@ -194,35 +194,53 @@ def _largest_eigenvalue(diagonal, beside):  # type: ignore[no-untyped-def]
         value -= change
 
 
+@njit(**INNER)
+def _element_eigenvalue(coupling, ends, mass, alone, matrix, work):  # type: ignore[no-untyped-def]
+    """Return the largest eigenvalue of an element with masses (v,), infinite if a stiff vertex has none.
+
+    `alone` (v,) are the stiffnesses of a vertex that moves alone; `matrix` (v, v) and `work` (5, v) are
+    overwritten.
+    """
+    scale = work[4]
+    for vertex in range(len(mass)):
+        if mass[vertex] <= 0.0 and alone[vertex] > 0.0:
+            return np.inf
+        scale[vertex] = 1 / np.sqrt(mass[vertex]) if mass[vertex] > 0.0 else 0.0
+        matrix[vertex, vertex] = alone[vertex] * scale[vertex] * scale[vertex]
+    for pair in range(len(ends)):
+        one, other = ends[pair, 0], ends[pair, 1]
+        matrix[one, other] = matrix[other, one] = -coupling[pair] * scale[one] * scale[other]
+    _tridiagonalize(matrix, work[0], work[1], work[2], work[3])
+    return _largest_eigenvalue(work[0], work[1])
+
+
 @entry()
-def least_masses(coupling, ends, largest, masses):  # type: ignore[no-untyped-def]
+def least_masses(coupling, mass, ends, largest, least):  # type: ignore[no-untyped-def]
     """Write masses of vertices with which elements have eigenvalues up to `largest`.
 
-    They are in proportion to the stiffness of a vertex that moves alone.
+    They are in proportion to `mass` if elements with it have no larger eigenvalue, else to the stiffness of a
+    vertex that moves alone.
 
     Args:
         coupling: coefficients of pairs of vertices (k, p).
+        mass: of the vertices (k, v), or zero.
         ends: the vertices of the pairs (p, 2).
         largest: the eigenvalue.
-        masses: (k, v), to be written.
+        least: (k, v), to be written.
     """
-    count, size = masses.shape
-    matrix, scale = np.empty((size, size)), np.empty(size)
-    diagonal, beside, vector, image = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
+    count, size = mass.shape
+    alone, matrix, work = np.empty(size), np.empty((size, size)), np.empty((5, size))
     for row in range(count):
-        alone = masses[row]
         alone[:] = 0.0
         for pair in range(len(ends)):
             alone[ends[pair, 0]] += coupling[row, pair]
             alone[ends[pair, 1]] += coupling[row, pair]
         for vertex in range(size):
             alone[vertex] = max(alone[vertex], 0.0)
-            scale[vertex] = 1 / np.sqrt(alone[vertex]) if alone[vertex] > 0.0 else 0.0
-            matrix[vertex, vertex] = 1.0 if alone[vertex] > 0.0 else 0.0
-        for pair in range(len(ends)):
-            one, other = ends[pair, 0], ends[pair, 1]
-            matrix[one, other] = matrix[other, one] = -coupling[row, pair] * scale[one] * scale[other]
-        _tridiagonalize(matrix, diagonal, beside, vector, image)
-        needed = _largest_eigenvalue(diagonal, beside) / largest
+        shape = mass[row]
+        reached = _element_eigenvalue(coupling[row], ends, shape, alone, matrix, work)
+        if reached > largest:
+            shape = alone
+            reached = _element_eigenvalue(coupling[row], ends, shape, alone, matrix, work)
         for vertex in range(size):
-            alone[vertex] *= needed
+            least[row, vertex] = shape[vertex] * reached / largest

@@ -101,7 +101,8 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
             coupling[flat], mass[flat] = flat_elements(axis, distance[:, flat], material, materials, stencil)
     if len(other := np.flatnonzero(~finite & (layered < 0))):
         coupling[other], mass[other] = _oblique_elements(bodies.chosen(other), materials, stencil)
-    return InterfaceElements(coupling, mass, vertex, finite, np.zeros((len(vertex), 0)))
+    smooth, lossless = finite | (layered < 0), np.zeros((len(vertex), 0))
+    return InterfaceElements(coupling, mass, vertex, finite, ~smooth, lossless)
 
 
 def left_by_fluids(distance: Array, rigid: NDArray[np.bool_]) -> Array:

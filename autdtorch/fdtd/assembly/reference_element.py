@@ -79,6 +79,7 @@ class InterfaceElements(NamedTuple):
     mass: Array  # lumped mass at the vertices (n, 8)
     material: Index  # number of the material at each vertex (n, 8)
     finite: NDArray[np.bool_]  # mask of finite elements, whose rigid vertices remain cells (n,)
+    flat: NDArray[np.bool_]  # mask of elements of which all faces are parallel to the grid (n,)
     # damping of the pairs and vertices, and the vertices' stiffness (n, 44); none (n, 0) if nothing absorbs
     loss: Array
 
@@ -94,6 +95,7 @@ class InterfaceElements(NamedTuple):
             mass=self.mass[some],
             material=self.material[some],
             finite=self.finite[some],
+            flat=self.flat[some],
             loss=self.loss[some],
         )
 
