@@ -22,6 +22,7 @@ from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulation import PressureMap
 from autdtorch.utils.process import cached_property, one_library_thread
 
+_TINY = torch.finfo(torch.float64).tiny
 _LONGER = 1.5
 """Ratio of periods from which another grid is next to a resonance that this one is not, and is left out."""
 
@@ -35,12 +36,14 @@ class GridComparison:
         points: (P, 3) [m].
         result: their transfer matrix.
         others: those on other grids, each with its spacing [m].
+        missed: mask (P,) of the points that are silent only because cells close a gap; see `_errors`.
     """
 
     plan: Plan
     points: torch.Tensor
     result: PressureMap
     others: Sequence[tuple[PressureMap, float]]
+    missed: torch.Tensor
 
     @cached_property
     def free(self) -> torch.Tensor:
@@ -91,7 +94,10 @@ class GridComparison:
         return reading_errors(self.result.matrix, self.free, self.points, plan.region, plan.spacing)
 
     def _errors(self, form: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
-        """Return the errors of the rows of the matrices in a form: by grids, shapes and rigid bodies."""
+        """Return the errors of the rows of the matrices in a form: by grids, shapes and rigid bodies.
+
+        Sound that enters by a gap that all grids close is taken to be as loud as in free space.
+        """
         longest = _LONGER * self.result.periods
         calm = [pair for pair in self.others if pair[0].periods <= longest] or self.others[-1:]
         grids = [(form(other.matrix), spacing) for other, spacing in calm]
@@ -101,7 +107,10 @@ class GridComparison:
         errors = of_grids(matrix, free, plan.spacing, grids, plan.law)
         every = [matrix, *(form(other.matrix) for other, _ in self.others)]
         heard = torch.stack([each.any(dim=1) for each in every]).any(dim=0)
-        errors = torch.where(heard, errors, 0.0)  # silence on all grids is exact
+        errors = torch.where(heard, errors, 0.0)  # silence on all grids is exact, unless a gap is too narrow
+        if self.missed.any():
+            lost = form(self.free * self.missed[:, None]).norm(dim=1)
+            errors += lost / torch.hypot(lost, matrix.norm(dim=1)).clamp(min=_TINY)
         return errors + shape_errors(matrix, free, plan.region) + rigid_errors(matrix, free, plan.region)
 
 

@@ -180,7 +180,24 @@ class SimulatedPropagator(ScenePropagator):
         warn_of_unsettled([run for each in judged for run in each.runs], self.tolerance)
         if with_error:
             self._notices.of_ringing(max(each.periods for each in every))
-        return GridComparison(self.plan, places, result, others)
+            missed = self._missed(places, every)
+        else:
+            missed = torch.zeros(len(places), dtype=torch.bool, device="cpu")
+        return GridComparison(self.plan, places, result, others, missed)
+
+    def _missed(self, points: torch.Tensor, results: Sequence[PressureMap]) -> torch.Tensor:
+        """Return which points (P, 3) are silent in all results, but open to the air on cells half as large.
+
+        A grid that the machine cannot hold tells nothing; the notice of closed-off points says so.
+        """
+        missed = ~torch.stack([each.matrix.any(dim=1) for each in results]).any(dim=0)
+        missed[missed.clone()] = self.simulation.enclosed(points[missed])
+        if missed.any():
+            finer = self.plan.at(self.spacing / 2, self.tolerance)
+            if finer.refusal:
+                return torch.zeros_like(missed)
+            missed[missed.clone()] = ~simulation_of(finer, self._store).enclosed(points[missed])
+        return missed
 
     @one_library_thread()
     def _field(self, drive: torch.Tensor, points: torch.Tensor, is_picture: bool) -> torch.Tensor:

@@ -11,9 +11,12 @@ from hypothesis import strategies as st
 from small_scenes import AIR, relative_error, small_scene
 
 from autdtorch.propagators import make_propagator
+from autdtorch.propagators.grid_comparison import GridComparison
 from autdtorch.propagators.simulation import PressureMap
 from autdtorch.scene.arrays import TransducerArray
-from autdtorch.scene.obstacles import Box, Mesh, Sphere, VoxelMask
+from autdtorch.scene.checks import OverlapWarning
+from autdtorch.scene.geometry import rotation_matrix
+from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
 from autdtorch.scene.scene import Scene
 
 CENTER = (12.2e-3, 11.9e-3, 12.1e-3)
@@ -284,10 +287,35 @@ def test_a_scene_whose_points_are_all_enclosed_ends_without_a_run(method):
 
 def test_silence_on_one_grid_alone_is_not_exact():
     """A gap that another grid resolves: the error is the pressure there, relative to -80 dB at least."""
-    scene = small_scene(room(1.5e-3))
-    propagator = make_propagator(scene, "box", SPACING)
-    free = propagator._free(scene.control_points)
+    propagator = make_propagator(small_scene(room(1.5e-3)), "box", SPACING)
+    points, loud = propagator.scene.control_points, torch.zeros(3, dtype=torch.bool)
+    free = GridComparison(propagator.plan, points, PressureMap(torch.empty(0)), (), loud).free
     faint, nothing = (PressureMap(share * free) for share in (1e-3, 0.0))
-    assert not propagator._errors([nothing, nothing], free).any()
+
+    def errors(other: PressureMap) -> torch.Tensor:
+        return GridComparison(propagator.plan, points, nothing, [(other, 1.5 * SPACING)], loud).point_errors
+
+    assert not errors(nothing).any()
     # the pressure is 10 times -80 dB; the error of the coarser grid is 2.3 to 5 times the finer one's
-    assert (propagator._errors([nothing, faint], free) > 1).all()
+    assert (errors(faint) > 1).all()
+
+
+def test_silence_behind_a_gap_that_cells_close_is_an_error(caplog):
+    """A box with a hole of one cell in a wall of one: two grids close it, and cells half as large do not."""
+    tilt, air = (0.4, 0.3, 0.2), {"density": AIR.density, "sound_speed": AIR.sound_speed}
+    outer, within = (
+        Box(CENTER, (edge,) * 3, tilt, **kind) for edge, kind in ((8e-3, {"rigid": True}), (5e-3, air))
+    )
+    axis = rotation_matrix(tilt)[:, 2]
+    hole = Cylinder(
+        tuple((torch.tensor(CENTER) + 4e-3 * axis).tolist()), 0.7e-3, 4e-3, tuple(axis.tolist()), **air
+    )
+    array = small_scene().array
+    with pytest.warns(OverlapWarning):
+        scene = Scene(array, AIR, 40e3, [CENTER], (outer, within, hole))
+    propagator = make_propagator(scene, "box", 1.4e-3, 1e-3)
+    matrix, error = propagator.transfer_matrix(return_error=True)
+    assert not matrix.any()
+    assert "close off the point" in caplog.text
+    assert error == 1
+    assert (propagator.point_errors() == 1).all()
