@@ -52,7 +52,10 @@ _PROBE_TIMEOUT = 120.0  # s; a first import of PyVista can take tens of seconds
 
 
 class RenderingError(RuntimeError, ImportError):
-    """This machine cannot render in 3D, since it lacks a driver; the message names what to install."""
+    """This machine cannot render in 3D, since it lacks a driver; the message names what to install.
+
+    So it is an `ImportError` too, as of a missing package: the command line ends with the message alone.
+    """
 
 
 @functools.cache

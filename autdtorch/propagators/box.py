@@ -150,9 +150,8 @@ class BoxSimulation(Simulation):
         radiation = self._store.get(key, self._radiation_of_transducers)
         if not radiation.reaches(self._everywhere(points)):  # the boxes were simulated as one
             return self._matrix_of_orbits(points, orbits_of_transducers(points, self.symmetries))
-        array = self.plan.scene.array
-        alone = [self.transducers.chosen(slice(index, index + 1)) for index in range(len(array))]
-        return self._total(radiation, alone, torch.ones((len(array), 1), **COMPLEX), points)
+        alone = self.transducers.singly(range(len(self.plan.scene.array)))
+        return self._total(radiation, alone, torch.ones((len(alone), 1), **COMPLEX), points)
 
     def _fields(self, drive: torch.Tensor, points: torch.Tensor) -> PressureMap:
         if self._radiates(points):
@@ -183,7 +182,7 @@ class BoxSimulation(Simulation):
         """
         representative, symmetry = orbits_of_array(self.symmetries)
         first, place = np.unique(representative, return_inverse=True)
-        alone = [self.transducers.chosen(slice(index, index + 1)) for index in first]
+        alone = self.transducers.singly(first)
         radiation = self._radiation(alone, torch.ones((len(alone), 1), **COMPLEX))
         amplitudes = []
         for box, part in zip(radiation.boxes, radiation.amplitudes, strict=True):

@@ -295,8 +295,7 @@ class Simulation(ABC):
         begins = "points" if orbits.from_points else "transducers"
         logger.debug("transfer matrix: %d runs serve %d %s", orbits.runs, len(orbits.representative), begins)
         strength = torch.ones((orbits.runs, 1), **COMPLEX)
-        alone = [sources.chosen(slice(index, index + 1)) for index in orbits.representatives]
-        pressure, runs = self._run(alone, strength, receivers)
+        pressure, runs = self._run(sources.singly(orbits.representatives), strength, receivers)
         rows = orbits.expand(pressure)
         matrix = rows if orbits.from_points else rows.mT.contiguous()
         return PressureMap.of_runs(matrix, runs, orbits.from_points)

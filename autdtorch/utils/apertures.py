@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -61,6 +61,10 @@ class Apertures(NamedTuple):
         """Return some of the sources or receivers."""
         axes, radii = (None if part is None else part[index] for part in (self.axes, self.radii))
         return self._replace(centers=self.centers[index], axes=axes, radii=radii)
+
+    def singly(self, numbers: Iterable[int]) -> list[Self]:
+        """Return each of some sources as that of a run of its own."""
+        return [self.chosen(slice(number, number + 1)) for number in numbers]
 
     def loudest(self, points: torch.Tensor, strength: torch.Tensor, nearest: float) -> float:
         """Return the norm of the free-space pressure [Pa] at points (P, 3), as if no sources cancelled.

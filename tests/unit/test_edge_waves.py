@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from autdtorch.fdtd.assembly.edge_fit import fitted_couplings
-from autdtorch.fdtd.assembly.edge_waves import _Window, at_the_drive, rigid_corner
+from autdtorch.fdtd.assembly.edge_waves import _WaveWindow, at_the_drive, rigid_corner
 from autdtorch.fdtd.assembly.prisms import prisms
 from autdtorch.fdtd.assembly.reference_element import stiffness_matrix
 from autdtorch.fdtd.assembly.sections import COLUMN_PAIRS, MaterialKey, Section, plane_fields, uniform_columns
@@ -28,7 +28,7 @@ def test_waves_around_an_edge_miss_less_than_those_of_elements_for_long_waves(pl
     coupling = fitted_couplings(section, [(0, 0)], plane_fields(section, RIGID.mobility, 8), RIGID, stencil)[
         0
     ]
-    window, missed = _Window(section, (0, 0), RIGID, stencil), []
+    window, missed = _WaveWindow(section, (0, 0), RIGID, stencil), []
     mass = np.append(0.0, np.full(3, (1 - place[0] * place[1]) / 3))
     for values in ((coupling, mass), at_the_drive(section, (0, 0), coupling, mass, RIGID, stencil)):
         missed.append(np.linalg.norm(window.missed(*values)[0]))

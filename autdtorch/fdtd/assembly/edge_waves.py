@@ -47,7 +47,7 @@ def at_the_drive(
     stencil: Stencil,
 ) -> tuple[Array, Array]:
     """Return coupling (6,) and masses (4,) of the element at a rigid corner, from those for long waves."""
-    window = _Window(section, corner, materials, stencil)
+    window = _WaveWindow(section, corner, materials, stencil)
     fitted, masses = window.fitted(coupling, mass)
     if (masses < 0).any():  # in slivers, and where the fit diverges: the element for long waves remains
         return coupling, mass
@@ -55,7 +55,7 @@ def at_the_drive(
     return -matrix[tuple(COLUMN_PAIRS.T)], masses
 
 
-class _Window:
+class _WaveWindow:
     """The vertices around an edge, the operator of all elements but one, and the waves."""
 
     def __init__(

@@ -41,18 +41,18 @@ REPORT_FILE = "report.md"
 _FIGURE, _CALIBRATION_FIGURE, _PLANE_FIGURE = "convergence.png", "calibration.png", "plane.png"
 
 
-class Comparison(NamedTuple):
+class ScaleFit(NamedTuple):
     """A least-squares fit of simulated to measured pressures."""
 
     scale: float  # factor from simulated to measured pressures
     misfit: float  # rms of the remaining difference, divided by the measured rms
 
 
-def compare(measured: torch.Tensor, simulated: torch.Tensor) -> Comparison:
+def compare(measured: torch.Tensor, simulated: torch.Tensor) -> ScaleFit:
     """Fit one factor to pressures (..., P) [Pa]."""
     scale = (measured * simulated).sum() / simulated.square().sum()
     misfit = (measured - scale * simulated).square().mean().sqrt() / measured.square().mean().sqrt()
-    return Comparison(float(scale), float(misfit))
+    return ScaleFit(float(scale), float(misfit))
 
 
 def write_hardware_report(
