@@ -22,7 +22,7 @@ from autdtorch.objectives.perturbations import Perturbation
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import path_of
-from autdtorch.utils.validation import ArrayLike, invalid, require_callable, require_kind
+from autdtorch.utils.validation import ArrayLike, integer_at_least, invalid, require_callable, require_kind
 
 
 @dataclass(frozen=True)
@@ -163,13 +163,17 @@ class HardwareObjective:
         """Number of observations so far, those from the log included."""
         return self.log.count
 
-    @contextlib.contextmanager
-    def continued(self, number: int = 0) -> Iterator[None]:
+    def continued(self, number: int = 0) -> contextlib.AbstractContextManager[None]:
         """Take evaluations from `number` on out of the log as long as it has them; then play.
 
         The block, `with objective.continued():`, runs a method that observes the objective, perhaps by a
-        perturbation around it; a block inside goes on with it. `LogError` if the log has another drive.
+        perturbation around it; a block inside goes on with it. `ValueError` if `number` is no integer >= 0;
+        in the block `LogError` if the log has another drive.
         """
+        return self._continued(integer_at_least("number", number, 0))
+
+    @contextlib.contextmanager
+    def _continued(self, number: int) -> Iterator[None]:
         if self._next is not None:
             yield
             return

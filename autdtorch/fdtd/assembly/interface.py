@@ -390,6 +390,6 @@ def _added_thickness(kappa: float) -> float:
 
     Otherwise a wave on the grid is reflected this far behind the surface, at any tilt and incidence: the mean
     of kappa^2 (d^3 / 3 - d / 12) over all places d of a face between the cells, and higher terms. Fluids have
-    `layers.mean_air_thickness`.
+    `layered_elements.mean_air_thickness`.
     """
     return (math.tan(kappa / 2) / (kappa / 2) - 1) / 2
