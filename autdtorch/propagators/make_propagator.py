@@ -11,8 +11,8 @@ import torch
 
 from autdtorch.propagators.free_space import FreeSpacePropagator
 from autdtorch.propagators.notices import warn_of_scene
-from autdtorch.propagators.plan import plan
-from autdtorch.propagators.simulated import Budget, SimulatedPropagator, refined
+from autdtorch.propagators.plan import Budget, plan
+from autdtorch.propagators.simulated import SimulatedPropagator, refined
 from autdtorch.propagators.store import store_in
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.scene import Scene

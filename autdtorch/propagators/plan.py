@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass, fields, replace
+import time
+from dataclasses import dataclass, field, fields, replace
 from typing import Self, cast
 
 import numpy as np
@@ -213,6 +214,26 @@ class Plan:
         except ValueError as error:
             return str(error)
         return ""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The time [s] and the memory [bytes] that a choice may take; None is no limit."""
+
+    seconds: float | None = None
+    memory: float | None = None
+    begin: float = field(default_factory=time.perf_counter)
+
+    @property
+    def is_unlimited(self) -> bool:
+        """True if neither time nor memory is limited."""
+        return self.seconds is None and self.memory is None
+
+    def fits(self, plan: Plan, last: Plan, taken: float) -> bool:
+        """Return whether a plan is expected to fit, also this machine, after the `last` took `taken` [s]."""
+        spent = time.perf_counter() - self.begin
+        in_time = self.seconds is None or spent + taken * plan.work / last.work <= self.seconds
+        return in_time and (self.memory is None or plan.memory <= self.memory) and not plan.refusal
 
 
 def plan(

@@ -9,7 +9,7 @@ import logging
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -21,7 +21,7 @@ from autdtorch.propagators.free_space import PAIR_BYTES
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.propagators.grid_comparison import GridComparison
 from autdtorch.propagators.notices import Notices, warn_of_unsettled
-from autdtorch.propagators.plan import Plan
+from autdtorch.propagators.plan import Budget, Plan
 from autdtorch.propagators.propagator import ScenePropagator
 from autdtorch.propagators.simulation import PressureMap, Run, Simulation
 from autdtorch.propagators.store import Store
@@ -262,26 +262,6 @@ class SimulatedPropagator(ScenePropagator):
 def simulation_of(plan: Plan, store: Store) -> Simulation:
     """Make the simulation of a plan of method "box" or "full"."""
     return (DomainSimulation if plan.method == "full" else BoxSimulation)(plan, store)
-
-
-@dataclass(frozen=True)
-class Budget:
-    """The time [s] and the memory [bytes] that a choice may take; None is no limit."""
-
-    seconds: float | None = None
-    memory: float | None = None
-    begin: float = field(default_factory=time.perf_counter)
-
-    @property
-    def is_unlimited(self) -> bool:
-        """True if neither time nor memory is limited."""
-        return self.seconds is None and self.memory is None
-
-    def fits(self, plan: Plan, last: Plan, taken: float) -> bool:
-        """Return whether a plan is expected to fit, also this machine, after the `last` took `taken` [s]."""
-        spent = time.perf_counter() - self.begin
-        in_time = self.seconds is None or spent + taken * plan.work / last.work <= self.seconds
-        return in_time and (self.memory is None or plan.memory <= self.memory) and not plan.refusal
 
 
 def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
