@@ -167,14 +167,16 @@ class HardwareObjective:
         """Take evaluations from `number` on out of the log as long as it has them; then play.
 
         The block, `with objective.continued():`, runs a method that observes the objective, perhaps by a
-        perturbation around it; a block inside goes on with it. `ValueError` if `number` is no integer >= 0;
-        in the block `LogError` if the log has another drive.
+        perturbation around it. A block inside goes on with it, from its `number` at least, as where a state
+        file holds the evaluations before. `ValueError` if `number` is no integer >= 0; in the block
+        `LogError` if the log has another drive.
         """
         return self._continued(integer_at_least("number", number, 0))
 
     @contextlib.contextmanager
     def _continued(self, number: int) -> Iterator[None]:
         if self._next is not None:
+            self._next = max(self._next, number)
             yield
             return
         self._next = number

@@ -21,6 +21,7 @@ from autdtorch.objectives.forces import ForceGoal, ForceObjective, LeastForm
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.objectives.objective import Objective, SimulatedObjective
 from autdtorch.objectives.over_scenes import OverScenes
+from autdtorch.objectives.perturbations import innermost
 from autdtorch.objectives.quiet import QuietPoints, SeenPoints
 from autdtorch.objectives.readings import Readings
 from autdtorch.objectives.scenarios import Scenarios
@@ -140,7 +141,7 @@ def _require_solution(where: str, solution: Solution, objective: Objective, tria
         raise invalid(where, len(solution.score), accepted, "trials")
     with within(where):
         points = len(objective.scene.control_points)
-        if isinstance(objective, Scenarios | ForceObjective):
+        if isinstance(innermost(objective), Scenarios | ForceObjective):
             points = solution.pressure.shape[-1]  # of all scenes, or readings of a force
         stored_solution(vars(solution), len(objective.scene.array), points)
 

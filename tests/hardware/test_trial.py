@@ -9,6 +9,8 @@ from faulty_bus import Disturbed
 
 from autdtorch import hardware as hw
 from autdtorch.methods.functions import gabs, identify, lssg
+from autdtorch.methods.gabs import GABS
+from autdtorch.methods.run import run
 from autdtorch.objectives.goals import MeanPressure, TargetPressures
 from autdtorch.objectives.perturbations import Drift, FailedTransducers, Noise, Quantised, random_rms
 from autdtorch.scene.drive import drive_from_phases
@@ -99,6 +101,17 @@ def test_a_trial_of_a_perturbed_objective_goes_on_where_its_log_ends(trial, pert
     assert made == readings * (1 + 15 * 2) - 6
     trial.log = trial.log.with_name("uninterrupted.jsonl")
     assert torch.equal(continued.history, measure()[0].history)
+
+
+def test_a_state_file_goes_on_in_a_block_that_continues_the_log(trial, tmp_path):
+    def measure(stop=None):
+        with trial.limited() as (bench, link):
+            objective = trial.objective(link, hw.EmulatedSensor(bench))
+            with objective.continued():
+                run(GABS(levels=2), objective, stop=stop, state_file=tmp_path / "state.npz")
+            return objective.evaluations
+
+    assert measure(lambda state: state.evaluations > 4) < measure() == 1 + 15 * 2
 
 
 def test_an_evaluation_is_logged_before_the_next_is_played(trial):

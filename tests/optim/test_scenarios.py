@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -10,7 +11,9 @@ from hypothesis import strategies as st
 
 import autdtorch as at
 from autdtorch.methods.gradient import climb, random_drives
-from autdtorch.objectives.goals import derivative
+from autdtorch.objectives.goals import WEAKEST_FOCUS, derivative
+from autdtorch.objectives.perturbations import FailedTransducers
+from autdtorch.study.study_method import solve
 
 BY = ["worst", "mean", 0.3]
 
@@ -255,3 +258,9 @@ def test_scenes_that_do_not_fit_are_named(make_objective, random_matrix, scenari
     with pytest.raises(ValueError, match=r"points: .*a place is in all scenes"):
         at.run(at.Identify(20), scenarios(), readings=readings)
     assert dataclasses.replace(at.Problem.of(scenarios()), readings=None).foci == 6
+
+
+def test_a_function_may_run_on_perturbed_scenarios(scenarios):
+    perturbed = FailedTransducers(scenarios(), [1])
+    solution = solve(partial(at.gabs, levels=4), perturbed, [0], 0, WEAKEST_FOCUS)
+    assert solution.pressure.shape == (1, perturbed(solution.drive).shape[-1])

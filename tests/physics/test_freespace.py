@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from exact_fields import WAVELENGTH, K
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.special import j0, struve
@@ -262,6 +262,7 @@ def piston(angle, radius):
     return float(piston_directivity([angle], WAVENUMBER, radius).real) if radius else 1.0
 
 
+@settings(max_examples=30)
 @given(st.lists(st.floats(0.0, 6.0), min_size=2, max_size=4), st.floats(0.0, math.pi))
 def test_each_radius_has_the_directivity_of_its_piston(sizes, angle):
     """S e^{ikr}/r 2 J1(ka sin t)/(ka sin t), with ka of each transducer."""

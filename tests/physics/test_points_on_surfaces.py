@@ -6,7 +6,7 @@ Rounding must not decide: places on turned faces are up to 1e-18 m off.
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_meshes import ball, inverted, merged
 from small_scenes import relative_error
@@ -30,6 +30,7 @@ def are_rigid(bodies, points, reflectors=()):
     return in_rigid(region_of(scene_of(bodies, reflectors)), points)
 
 
+@settings(max_examples=30)
 @given(rotation=ANGLES, center=st.tuples(*[st.floats(-3e-3, 3e-3)] * 3))
 def test_faces_edges_and_corners_are_outside(rotation, center):
     size = torch.tensor([8e-3, 6e-3, 5e-3], dtype=torch.float64)
@@ -41,6 +42,7 @@ def test_faces_edges_and_corners_are_outside(rotation, center):
     assert are_rigid([box], torch.tensor(center) + 0.999 * turned).all()
 
 
+@settings(max_examples=30)
 @given(rotation=ANGLES)
 def test_no_air_is_between_bodies_that_touch(rotation):
     turn = rotation_matrix(rotation)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from emulated_gpu import gpu
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import CUBE, assembled_parts, relative_error, small_scene
 
@@ -20,6 +20,7 @@ from autdtorch.propagators.store import BODIES
 MODES = 3
 
 
+@settings(max_examples=20)
 @given(st.integers(0, 2**31), st.integers(MODES + 2, 12), st.integers(MODES + 2, 30))
 def test_limits_of_sequences_of_few_modes_are_exact(seed, most, count):
     """x_(n+1) = A x_n + b with three modes, whose differences the mean removes."""

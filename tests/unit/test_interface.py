@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
@@ -91,6 +91,7 @@ def test_eight_elements_of_air_add_up_to_the_tuned_stencil():
     assert np.allclose(sums.ravel(), STENCIL.weights, rtol=1e-14)
 
 
+@settings(max_examples=60)
 @given(NORMALS, OFFSETS, CONTRASTS, st.one_of(st.none(), st.floats(1, 30)))
 def test_energy_is_never_negative_at_any_contrast(normal, offset, density, radius):
     distance = plane(normal, offset) if radius is None else sphere(normal, offset, radius)
@@ -105,6 +106,7 @@ def test_energy_is_never_negative_at_any_contrast(normal, offset, density, radiu
 LARGE_CONTRASTS = st.floats(2.3, 5).flatmap(lambda exponent: st.sampled_from((10**-exponent, 10**exponent)))
 
 
+@settings(max_examples=60)
 @given(NORMALS, OFFSETS, LARGE_CONTRASTS)
 def test_a_field_along_a_plane_surface_has_its_exact_energy(normal, offset, density):
     cut = element(plane(normal, offset), density=(1, density), stencil=LONG)
@@ -119,6 +121,7 @@ def test_a_field_along_a_plane_surface_has_its_exact_energy(normal, offset, dens
 TILTED = NORMALS.filter(lambda n: np.count_nonzero(np.abs(n) > 0.01) > 1)
 
 
+@settings(max_examples=60)
 @given(TILTED, OFFSETS, st.floats(0, 0.45))
 def test_a_tilted_rigid_surface_leaves_the_energy_of_the_air(normal, offset, reduction):
     cut = rigid_element(plane(normal, offset))
@@ -150,6 +153,7 @@ def test_a_flow_through_a_surface_along_the_grid_meets_its_exact_resistance(axis
     assert energy(cut, kinked) == pytest.approx(resistance, rel=1e-5)
 
 
+@settings(max_examples=40)
 @given(TILTED, OFFSETS)
 def test_masses_follow_the_flow(normal, offset):
     distance = plane(normal, offset)
@@ -162,6 +166,7 @@ def test_masses_follow_the_flow(normal, offset):
             assert air.mass[0, inside].sum() <= 1e-4 * air.mass.sum() or solid.mass.sum() < 1e-4
 
 
+@settings(max_examples=40)
 @given(TILTED, OFFSETS, st.floats(1, 30))
 def test_a_surface_within_one_material_leaves_its_masses(normal, offset, radius):
     for distance in (plane(normal, offset), sphere(normal, offset, radius)):
