@@ -18,7 +18,6 @@ from typing import Any
 import hypothesis
 import pytest
 import torch
-from _pytest.mark.expression import Expression
 from PIL import Image
 
 TESTS = Path(__file__).parent
@@ -78,20 +77,6 @@ def set_threads() -> Iterator[Any]:
 def pytest_xdist_auto_num_workers() -> int:
     """Return one process more than cores, as a tenth of the time is spent in waiting."""
     return (os.cpu_count() or 1) + 1
-
-
-def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Ignore folders and files of which `-m` chooses no test: each worker would import them all."""
-    if not (chosen := config.option.markexpr) or TESTS not in collection_path.parents:
-        return None
-    folder, expression = collection_path.relative_to(TESTS).parts[0], Expression.compile(chosen)
-    plain, marked = (
-        expression.evaluate(lambda name, marks=marks, **_: name in marks)
-        for marks in ({folder}, {folder, "processes"})
-    )
-    if plain or (marked and (collection_path.is_dir() or b"mark.processes" in collection_path.read_bytes())):
-        return None
-    return True
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

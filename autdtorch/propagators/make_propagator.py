@@ -36,7 +36,7 @@ def make_propagator(
     memory: float | None = None,
     cache: str | os.PathLike[str] | Literal[False] | None = None,
 ) -> FreeSpacePropagator | TMatrixPropagator | SimulatedPropagator:
-    """Make the propagator of a scene. Nothing is simulated before its first use.
+    """Make the propagator of a scene. Nothing is simulated before its first use, unless `spacing` is None.
 
     Args:
         scene: the scene.

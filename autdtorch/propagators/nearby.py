@@ -82,7 +82,7 @@ class NearbyPoses:
         wavelength, spacing = propagator.plan.region.shortest_wavelength, propagator.spacing
         most = wavelength / MIN_CELLS_PER_WAVELENGTH / _COARSEST
         if spacing > most:
-            accepted = f"must be at most {most:.4g} m: {_COARSEST:g} times coarser grids must serve"
+            accepted = f"must be at most {most:.4g} m: a grid {_COARSEST:g} times as coarse must serve too"
             raise invalid("propagator.spacing", spacing, accepted, "m")
         self.spacings = _COARSER * spacing, _COARSEST * spacing
 
