@@ -1,9 +1,7 @@
 """The steady states of runs, extrapolated from the phasors of their blocks.
 
 A block is the fewest periods, at least three, with a whole number of steps. Phasors of windows of that
-length, a quarter of a block apart, follow x_(n+1) = A x_n + b, as the scheme is linear. Reduced rank
-extrapolation (Eddy 1979; Sidi 2017) estimates the fixed point: the mean sum g_j x_j, with sum g_j = 1, of
-least residual sum g_j (x_(j+1) - x_j). It removes the slowest modes first, such as resonances of cavities.
+length, a quarter of a block apart, follow x_(n+1) = A x_n + b, as the scheme is linear.
 """
 
 from __future__ import annotations
@@ -11,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -21,7 +19,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from autdtorch.fdtd.extrapolation import MOST_FITTED, Extrapolation
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
+from autdtorch.fdtd.resonances import Resonance
 from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_basis, drive_signal, fourier_sum
 from autdtorch.utils.array_types import REAL, Array, Index
 from autdtorch.utils.process import even_parts, spread
@@ -39,11 +39,7 @@ _PARTS = 4  # Windows per block
 # Range of the number of stored phasors, limited by `_MOST_NUMBERS`; more extrapolate better
 _FEWEST_PHASORS, _MOST_PHASORS = 12, 64
 _MOST_NUMBERS = 20_000_000  # Most complex numbers of the stored phasors: 160 MB of single precision
-_MOST_FITTED = 2048  # Most cells whose phasors decide the means
 _SUMS = 18  # Complex numbers of a cell in Fourier sums of a block, its windows and limits
-# Numbers of stored phasors that are summed at once: as many as the CPU's cache holds, and for a GPU more
-_SUMMED, _SUMMED_ON_GPU = 2**15, 2**24
-_ROUNDING = 1e-13  # Regularisation of the normal equations, relative to the mean square of the differences
 # Pressure relative to that in free space, -80 dB, below which errors are relative to this floor: behind a
 # wall or in an enclosure nothing arrives
 SILENCE = 1e-4
@@ -52,6 +48,8 @@ _JUDGED = 4  # Blocks whose changes decide whether a run has converged
 _CAUTION = 2.0
 # Ratio of the changes over successive blocks, twice, up to which the next ones are expected to fall as fast
 _FALLING = 0.1
+_FAINT = 1e-5  # Least part of a steady state that counts as a resonance
+_TINY = torch.finfo(torch.float64).tiny
 
 
 @dataclass(frozen=True)
@@ -62,6 +60,7 @@ class SteadyState:
     periods: int  # periods stepped
     residual: float  # estimated relative distance to the steady state; a bound of it if not converged
     converged: bool  # whether the residual is within the tolerance
+    resonances: tuple[Resonance, ...] = ()  # those that rang
 
 
 def run_to_steady_state(
@@ -91,6 +90,7 @@ def run_to_steady_state(
     first_judged = min(earliest, max_periods) - (_JUDGED - 1) * block
     ramp = math.ceil(RAMP_PERIODS * assembly.steps_per_period)
     unused = (math.ceil(first_judged / block) - 1) * steps - (length - 1) * _shift(steps)
+    before = (RAMP_PERIODS + assembly.grid.arrival + block) / 2  # until sound has come, about
     limit = np.array(tolerances)
 
     @torch.no_grad()  # holds in one thread only
@@ -114,9 +114,13 @@ def run_to_steady_state(
             converged = (bound <= limit[runs]) & (count >= earliest)
             residual = np.where(converged, residual, bound)
             done = converged | (count >= max_periods)
-            for place in np.flatnonzero(done):
-                state = count, float(residual[place]), bool(converged[place])
-                states[runs[place]] = SteadyState(limits[:, place].contiguous(), *state)
+            if done.any():
+                first = count - before - (len(sequences) - 1) * stepping.interval
+                parts = sequences.ringing(places[done], stepping.interval)
+                rung = judging.resonances(parts, runs, done, first)
+                for place, each in zip(np.flatnonzero(done), rung, strict=True):
+                    state = count, float(residual[place]), bool(converged[place]), tuple(each)
+                    states[runs[place]] = SteadyState(limits[:, place].contiguous(), *state)
             if done.all():
                 break
             judging.choose(~done)
@@ -180,70 +184,8 @@ def phasors_kept(cells: int) -> int:
 
 def stored_bytes(cells: int, itemsize: int) -> int:
     """Return the memory [bytes] of the phasors and sums of `cells` cells that a run on some fields stores."""
-    phasors, steps = 2 * itemsize * cells, 16 * min(cells, _MOST_FITTED)
+    phasors, steps = 2 * itemsize * cells, 16 * min(cells, MOST_FITTED)
     return phasors_kept(cells) * (phasors + steps) + 16 * _SUMS * cells
-
-
-class Extrapolation:
-    """Reduced rank extrapolation of R sequences, from the last `most` values of each."""
-
-    def __init__(self, most: int, single: bool = False) -> None:
-        """Start empty sequences, whose values are stored in double or in `single` precision."""
-        self._precision = torch.complex64 if single else torch.complex128
-        self._most, self._count = most, 0
-        # The stored values (n, R, k), and of cells that decide the means the last value (R, m), its steps
-        # (R, n - 1, m) and their products (R, n - 1, n - 1); the oldest are overwritten
-        self._values = self._last = self._steps = self._products = torch.empty(0, **REAL)
-
-    def __len__(self) -> int:
-        return min(self._count, self._most)
-
-    def append(self, values: Tensor) -> None:
-        """Append the next value (R, k) of each sequence."""
-        fitted, number = values[:, :: -(-values.shape[1] // _MOST_FITTED)].clone(), self._count
-        if number == 0:
-            runs, count = fitted.shape
-            self._values = values.new_empty((self._most, *values.shape), dtype=self._precision)
-            self._steps = values.new_empty((runs, self._most - 1, count))
-            self._products = values.new_empty((runs, self._most - 1, self._most - 1))
-        else:
-            place, filled = (number - 1) % (self._most - 1), min(number, self._most - 1)
-            self._steps[:, place] = step = fitted - self._last
-            products = (self._steps[:, :filled] @ step.conj()[..., None])[..., 0]
-            self._products[:, place, :filled], self._products[:, :filled, place] = products, products.conj()
-        self._values[number % self._most] = values
-        self._last, self._count = fitted, number + 1
-
-    def choose(self, places: Tensor) -> None:
-        """Go on with some of the sequences."""
-        self._values, self._last = self._values[:, places], self._last[places]
-        self._steps, self._products = self._steps[places], self._products[places]
-
-    def limits(self, places: Tensor) -> Tensor:
-        """Return the estimated limits (k, r) of some sequences, or last values while there are too few."""
-        values, weights = self._values[: len(self)], self._weights(places)
-        limits = weights.new_empty((len(places), values.shape[2]))
-        width = max(1, (_SUMMED if values.device.type == "cpu" else _SUMMED_ON_GPU) // len(values))
-        for place, weight, limit in zip(places.tolist(), weights, limits, strict=True):
-            parts = torch.split(values[:, place], width, dim=1), torch.split(limit, width)
-            for part, target in zip(*parts, strict=True):
-                target[:] = weight @ part.to(weight.dtype)
-        return limits.mT
-
-    def _weights(self, places: Tensor) -> Tensor:
-        """Return the weights (r, n) of the stored values of some sequences in their limits."""
-        steps = min(self._count, self._most) - 1
-        products = self._products[places, :steps, :steps].cpu().numpy()
-        size = np.trace(products, axis1=1, axis2=2).real / max(steps, 1)
-        usable = np.flatnonzero((steps > 1) & np.isfinite(size) & (size > 0))
-        regular = products[usable] + _ROUNDING * size[usable, None, None] * np.eye(steps)
-        means = np.linalg.solve(regular, np.ones((len(usable), steps, 1)))[..., 0]
-        means /= means.sum(axis=1, keepdims=True)
-        weights = np.zeros((len(places), len(self)), np.complex128)
-        weights[:, (self._count - 1) % self._most] = 1
-        numbers = np.arange(self._count - steps, self._count)  # of values that have a step
-        weights[np.ix_(usable, numbers % self._most)] = means[:, (numbers - 1) % (self._most - 1)]
-        return torch.from_numpy(weights).to(self._values.device)
 
 
 class WindowedRuns:
@@ -255,6 +197,7 @@ class WindowedRuns:
 
     Attributes:
         runs: their numbers (R,).
+        interval: time between two windows [periods].
     """
 
     def __init__(
@@ -273,6 +216,7 @@ class WindowedRuns:
         self._sources = self._before = sources
         self._steps, periods = block_of(assembly.steps_per_period)
         self._shift = self._steps if echo else _shift(self._steps)
+        self.interval = float(self._shift / assembly.steps_per_period)
         self._recorded_from = 0 if echo else max(0, unused // self._steps * self._steps)
         ones = torch.ones((len(cells), 1), dtype=assembly.dtype, device="cpu")
         self._receivers = Receivers(torch.from_numpy(cells[:, None]), ones)
@@ -348,6 +292,24 @@ class _Judging:
         each = map(_residuals, zip(*self._values, strict=True), self._floors)
         residual, bound = (torch.stack(part).amax(dim=0).numpy() for part in zip(*each, strict=True))
         return residual, bound
+
+    def resonances(
+        self, parts: Iterable[tuple[complex, Tensor]], runs: Index, mask: NDArray[np.bool_], time: float
+    ) -> list[list[Resonance]]:
+        """Return the resonances of some of the runs (R,), by a `mask`; strengths are in the first quantity.
+
+        They have rung for a `time` [periods] until their parts (k, r); see `Extrapolation.ringing`.
+        """
+        last = self._values[-1][0][:, mask]
+        whole = torch.maximum(last.norm(dim=0), self._floors[0, mask]).clamp(min=_TINY)
+        resonances: list[list[Resonance]] = [[] for _ in runs[mask]]
+        for offset, part in parts:
+            loud, still = (self._observe(each, runs[mask])[0].cpu() for each in (part, 0 * part))
+            rung = (loud - still).norm(dim=0) / whole * math.exp(-2 * math.pi * offset.imag * time)
+            for each, strength in zip(resonances, rung.tolist(), strict=True):
+                if _FAINT < strength < 1:  # more has decayed to rounding
+                    each.append(Resonance(offset, strength))
+        return resonances
 
     def choose(self, mask: NDArray[np.bool_]) -> None:
         self._floors = self._floors[:, mask]

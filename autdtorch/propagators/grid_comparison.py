@@ -17,6 +17,7 @@ from autdtorch.fdtd.grid_errors import (
     sizes,
     usual_errors,
 )
+from autdtorch.fdtd.resonances import displacement_error
 from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulation import PressureMap
@@ -59,15 +60,15 @@ class GridComparison:
             return math.inf
         reading = self._reading_errors * sizes(self.result.matrix, self.free)
         known = float(self._errors(_as_row) + reading.norm() / sizes(*self._whole))
-        return math.hypot(self.result.residual, known)
+        return math.hypot(known, self._settling_error)
 
     @property
     @one_library_thread()
     def point_errors(self) -> torch.Tensor:
         """The estimated relative error of each point's row of the matrix, float64 (P,)."""
-        matrix, residual = self.result.matrix, self.result.residual
+        matrix = self.result.matrix
         size = sizes(matrix, self.free)
-        settling = torch.where(matrix.any(dim=1), residual * matrix.norm() / size, 0.0)
+        settling = torch.where(matrix.any(dim=1), self._settling_error * matrix.norm() / size, 0.0)
         return torch.hypot(self._errors(lambda rows: rows) + self._reading_errors, settling)
 
     @property
@@ -87,6 +88,16 @@ class GridComparison:
     def _whole(self) -> tuple[torch.Tensor, torch.Tensor]:
         """The matrix and that in free space, each as one row (1, P M)."""
         return _as_row(self.result.matrix), _as_row(self.free)
+
+    @property
+    def _settling_error(self) -> float:
+        """The error relative to the norm of the whole: of the steady state, and by shifted resonances."""
+        if not self.others:
+            return self.result.residual
+        other, spacing = self.others[-1]
+        ratio = spacing / self.plan.spacing
+        shifted = displacement_error(self.result.resonances, other.resonances, ratio)
+        return math.hypot(self.result.residual, shifted)
 
     @property
     def _reading_errors(self) -> torch.Tensor:

@@ -14,6 +14,7 @@ import torch
 
 from autdtorch.fdtd.grouping import USUAL_PERIODS
 from autdtorch.fdtd.kernels import make_kernel
+from autdtorch.fdtd.resonances import Resonance, as_numbers, merged, of_numbers
 from autdtorch.fdtd.steady_state import SILENCE, SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.symmetry import Orbits, Symmetry, orbits_of_points, orbits_of_transducers, symmetries
@@ -52,18 +53,20 @@ class Run:
         remaining: estimated relative distance to the steady state.
         reached: whether that is within the tolerance.
         seconds: time taken, possibly beside other runs.
+        resonances: those that rang.
     """
 
     periods: int
     remaining: float
     reached: bool
     seconds: float
+    resonances: tuple[Resonance, ...] = ()
 
     @classmethod
     def of(cls, steady: SteadyState, seconds: float) -> Run:
         """Record a run that took `seconds`."""
         logger.debug("run of %d periods, %.1e from steady, %.1f s", steady.periods, steady.residual, seconds)
-        return cls(steady.periods, steady.residual, steady.converged, seconds)
+        return cls(steady.periods, steady.residual, steady.converged, seconds, steady.resonances)
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,7 @@ class PressureMap:
         periods: most periods of a run.
         runs: the simulations behind it; none if it was loaded.
         from_points: whether they began at the points (reciprocity), not at the transducers.
+        resonances: those that rang, relative to all runs; at most `MOST_RESONANCES`.
     """
 
     matrix: torch.Tensor
@@ -83,6 +87,7 @@ class PressureMap:
     periods: int = 0
     runs: tuple[Run, ...] = ()
     from_points: bool = True
+    resonances: tuple[Resonance, ...] = ()
 
     @property
     def nbytes(self) -> int:
@@ -93,7 +98,8 @@ class PressureMap:
     def of_runs(cls, matrix: torch.Tensor, runs: Sequence[Run], from_points: bool) -> PressureMap:
         """Return the map that runs gave."""
         residual, periods = max(run.remaining for run in runs), max(run.periods for run in runs)
-        return cls(matrix, residual, periods, tuple(runs), from_points)
+        resonances = merged([run.resonances for run in runs])
+        return cls(matrix, residual, periods, tuple(runs), from_points, resonances)
 
 
 def mean_of_images(pressure: torch.Tensor, weights: torch.Tensor | None) -> torch.Tensor:
@@ -253,19 +259,21 @@ class Simulation(ABC):
         return filled | self._in_enclosed_cells(points)
 
     def _loaded(self, key: str, points: torch.Tensor) -> PressureMap | None:
-        saved = self._store.load(key, (len(points), len(self.plan.scene.array)), 2)
+        saved = self._store.load(key, (len(points), len(self.plan.scene.array)), 2 + len(as_numbers([])))
         if saved is None:
             return None
         self.loaded_from = self._store.folder
         logger.debug("transfer matrix of %s loaded from %s", self.plan.scene.name, self.loaded_from)
-        matrix, (residual, periods) = saved
-        return PressureMap(torch.from_numpy(matrix), residual, int(periods))
+        matrix, (residual, periods, *rest) = saved
+        return PressureMap(torch.from_numpy(matrix), residual, int(periods), resonances=of_numbers(rest))
 
     def _saved(self, key: str, points: torch.Tensor) -> PressureMap:
         """Simulate the transfer matrix of unit strengths, and save it if all runs converged."""
         result = self._audible(points)
         if all(run.reached for run in result.runs):
-            self._store.save(key, result.matrix.numpy(), result.residual, result.periods)
+            self._store.save(
+                key, result.matrix.numpy(), result.residual, result.periods, *as_numbers(result.resonances)
+            )
         return result
 
     def _audible(self, points: torch.Tensor) -> PressureMap:

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 from small_scenes import CUBE, assembled_parts, relative_error, small_scene
 
 from autdtorch import Box, Reflector, make_propagator
+from autdtorch.fdtd.extrapolation import Extrapolation
 from autdtorch.fdtd.kernels.contract import CPU, Layer, Memory, Sources, WaveState
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.short_runs import short_runs
-from autdtorch.fdtd.steady_state import Extrapolation, run_to_steady_state
+from autdtorch.fdtd.steady_state import run_to_steady_state
 from autdtorch.propagators.store import BODIES
 
 MODES = 3

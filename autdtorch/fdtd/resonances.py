@@ -1,0 +1,145 @@
+"""Resonances that ring in runs, and the error of a steady state by their displacement on a grid.
+
+Each rings at a complex frequency p, and has a part of the steady state in proportion to 1 / (p - w) at the
+drive's frequency w. Grids shift p. Where that is far beyond its width, grids differ little, as on none of
+them much is left of a narrow resonance, and are wrong together if it is next to w. Two grids tell the shift.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from autdtorch.utils.array_types import ComplexArray
+
+MOST_RESONANCES = 8
+"""Most resonances that a result counts."""
+
+_WIDEST, _FARTHEST = 0.03, 0.12  # Width and distance from the drive's frequency that count, relative to it
+_NOISE = 1e-5  # Singular values relative to the largest, below which they are rounding
+_CHANNELS = 16  # Most directions of the steps that are fitted
+_FEWEST_STEPS = 7  # Shorter runs end without any that is narrow
+# The shift of a frequency falls as this power of the spacing: next to exact ones of four slow balls, as 2.1
+# to 3.3. If it falls more slowly, two grids tell less than all of it.
+_POWER = 3.0
+_SAME = 0.2  # Distance in half widths up to which two runs have told one resonance
+# Resonances of two grids that are the same one: most that it moves, relative to the drive's frequency, and
+# ratios of widths and of excitations
+_MOVED, _ALIKE_WIDTH, _ALIKE_EXCITED = 0.06, 2.5, 4.0
+
+
+class Resonance(NamedTuple):
+    """A resonance next to the frequency of the drive.
+
+    Attributes:
+        offset: its complex frequency less that of the drive, relative to the latter; the imaginary part is
+            minus half its width.
+        strength: the norm of its part of the steady state, relative to all of it.
+    """
+
+    offset: complex
+    strength: float
+
+    @property
+    def excited(self) -> float:
+        """Strength that it has at any offset, times this."""
+        return self.strength * abs(self.offset)
+
+
+def offsets_of(products: ComplexArray, interval: float) -> ComplexArray:
+    """Return the offsets of what rings in sequences, from their steps; see `Resonance`.
+
+    `products` (n, n) are those of each step with each conjugated one, summed over sequences, and `interval`
+    is the time between two [periods]. The steps of windows that are shifted in time span a space that a shift
+    multiplies by exp(-i (p - w) t): its eigenvalues tell p (ESPRIT, Roy and Kailath 1989).
+    """
+    count = len(products)
+    if count < _FEWEST_STEPS or not np.isfinite(products).all() or not products.any():
+        return np.zeros(0, np.complex128)
+    squares, directions = np.linalg.eigh(products)
+    squares, directions = squares[-_CHANNELS:], directions[:, -_CHANNELS:]
+    steps = directions * np.sqrt(squares.clip(min=0))
+    windows = sliding_window_view(steps, count * 2 // 3, axis=0)
+    basis, sizes, _ = np.linalg.svd(windows.reshape(-1, windows.shape[-1]).T, full_matrices=False)
+    basis = basis[:, : min(int((sizes > _NOISE * sizes[0]).sum()), len(basis) - 2)]
+    factors = np.linalg.eigvals(np.linalg.lstsq(basis[:-1], basis[1:])[0])
+    factors = factors[factors != 0]
+    return np.asarray(1j * np.log(factors) / (2 * math.pi * interval), np.complex128)
+
+
+def parts_of(offsets: ComplexArray, count: int, interval: float) -> ComplexArray:
+    """Return the weights (j, n) of n values, `interval` [periods] apart, of the first's parts by offsets."""
+    times = np.arange(count) * interval
+    ringing = np.exp(-2j * math.pi * np.outer(times, offsets))
+    constant = np.ones((count, 1), np.complex128)
+    return np.asarray(np.linalg.pinv(np.hstack([constant, ringing]), rcond=1e-10)[1:], np.complex128)
+
+
+def is_near(offsets: ComplexArray) -> np.ndarray:
+    """Return which offsets (j,) are of resonances that are narrow and near the drive's frequency."""
+    narrow = (offsets.imag < 0) & (offsets.imag > -_WIDEST)
+    return np.asarray(narrow & (abs(offsets) < _FARTHEST))
+
+
+def merged(runs: Sequence[Sequence[Resonance]]) -> tuple[Resonance, ...]:
+    """Return the resonances of all runs together, at most `MOST_RESONANCES`.
+
+    They are those that would be the strongest at the frequency of the drive.
+    """
+    rung = sorted(itertools.chain.from_iterable(runs), key=lambda each: each.excited / each.offset.imag)
+    together: list[Resonance] = []
+    for each in rung:
+        part = each.strength / math.sqrt(len(runs))
+        places = [n for n, other in enumerate(together) if _differ_little(each.offset, other.offset)]
+        if places:
+            other = together[places[0]]
+            together[places[0]] = other._replace(strength=math.hypot(other.strength, part))
+        else:
+            together.append(Resonance(each.offset, part))
+    return tuple(together[:MOST_RESONANCES])
+
+
+def as_numbers(resonances: Sequence[Resonance]) -> list[float]:
+    """Return resonances as numbers for a file, as many in any case."""
+    numbers = np.zeros((MOST_RESONANCES, 3))
+    for row, each in zip(numbers, resonances, strict=False):
+        row[:] = each.offset.real, each.offset.imag, each.strength
+    return [float(number) for number in numbers.flat]
+
+
+def of_numbers(numbers: Sequence[float]) -> tuple[Resonance, ...]:
+    """Return the resonances of numbers; see `as_numbers`."""
+    rows = zip(*[iter(numbers)] * 3, strict=True)
+    return tuple(Resonance(complex(real, imaginary), part) for real, imaginary, part in rows if part)
+
+
+def displacement_error(resonances: Sequence[Resonance], others: Sequence[Resonance], ratio: float) -> float:
+    """Return the relative error of a steady state by the shift of its resonances on a grid.
+
+    `others` are those on another grid, whose spacing is larger by a `ratio`. Those on one grid alone count
+    nothing.
+    """
+    squares = 0.0
+    for here in resonances:
+        alike = [other for other in others if _are_alike(here, other)]
+        if alike:
+            nearest = min(alike, key=lambda other: abs(other.offset - here.offset))
+            shift = (here.offset - nearest.offset).real / (ratio**_POWER - 1)
+            squares += (here.strength * shift / abs(here.offset + shift)) ** 2
+    return math.sqrt(squares)
+
+
+def _are_alike(one: Resonance, other: Resonance) -> bool:
+    width = math.log(one.offset.imag / other.offset.imag)
+    excited = math.log(one.excited / other.excited)
+    alike = abs(width) < math.log(_ALIKE_WIDTH) and abs(excited) < math.log(_ALIKE_EXCITED)
+    return alike and abs(one.offset - other.offset) < _MOVED
+
+
+def _differ_little(one: complex, other: complex) -> bool:
+    return abs(one - other) < _SAME * abs(other.imag)
