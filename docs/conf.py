@@ -17,7 +17,8 @@ version = release = autdtorch.__version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 nitpicky = True
 nitpick_ignore_regex = [  # not described here
-    ("py:class", r"(?!autdtorch\.).*|autdtorch\.(utils\.images|methods\.calibration\.fit)\..*")
+    ("py:class", r"(?!autdtorch\.).*"),
+    ("py:class", r"autdtorch\.(utils\.mirror_images|fdtd\.resonances|methods\.calibration\.fit)\..*"),
 ]
 default_role = "py:obj"
 

@@ -164,7 +164,7 @@ def test_corners_of_planes(count, radius):
 def test_two_planes_are_a_waveguide(height, share, reflection):
     """Heights [wavelengths] and places drawn, a round trip at least 0.1 turns from a cut-off.
 
-    What the series leaves out is below 1e-4 there (`images.py`).
+    What the series leaves out is below 1e-4 there (`mirror_images.py`).
     """
     if abs(2 * height - round(2 * height)) < 0.1:
         height += 0.15
