@@ -37,9 +37,9 @@ class Resonance(NamedTuple):
     """A resonance next to the frequency of the drive.
 
     Attributes:
-        offset: its complex frequency less that of the drive, relative to the latter; the imaginary part is
-            minus half its width.
-        strength: the norm of its part of the steady state, relative to all of it.
+        offset: the difference of its complex frequency and the drive's, over the drive's; the imaginary part
+            is minus half the width of the resonance.
+        strength: the norm of its part of the steady state, over that of the steady state.
     """
 
     offset: complex
@@ -47,7 +47,7 @@ class Resonance(NamedTuple):
 
     @property
     def excited(self) -> float:
-        """Strength that it has at any offset, times this."""
+        """The strength times the offset, which does not depend on the offset."""
         return self.strength * abs(self.offset)
 
 

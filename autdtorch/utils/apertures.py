@@ -63,7 +63,7 @@ class Apertures(NamedTuple):
         return self._replace(centers=self.centers[index], axes=axes, radii=radii)
 
     def singly(self, numbers: Iterable[int]) -> list[Self]:
-        """Return each of some sources as that of a run of its own."""
+        """Return one of these for each number, with that source alone."""
         return [self.chosen(slice(number, number + 1)) for number in numbers]
 
     def loudest(self, points: torch.Tensor, strength: torch.Tensor, nearest: float) -> float:
