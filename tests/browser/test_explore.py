@@ -23,7 +23,7 @@ from live_view import (
 )
 
 import autdtorch as at
-from autdtorch.plot.explore import calculation
+from autdtorch.objectives.objective import SimulatedObjective
 
 
 def cube_of(explorer):
@@ -40,8 +40,8 @@ def test_it_opens_with_a_good_drive_and_its_readings(live):
 
 def test_a_move_during_a_search_begins_it_again(live, monkeypatch):
     explorer, page = live
-    moved, observed = threading.Event(), calculation.observed
-    monkeypatch.setattr(calculation, "observed", lambda *call: moved.wait(PATIENCE) and observed(*call))
+    moved, measure = threading.Event(), SimulatedObjective.__call__
+    monkeypatch.setattr(SimulatedObjective, "__call__", lambda *call: moved.wait(PATIENCE) and measure(*call))
     page.click("#in_phase")
     page.click("#find")
     set_slider(page, "body_y", 47.0)

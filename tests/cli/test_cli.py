@@ -135,7 +135,8 @@ def test_runs_of_other_methods_in_a_scene_simulate_its_matrix_once(run, tmp_path
         folder = tmp_path / "outputs" / f"two_cubes_{method}"
         found = load_results(folder).scenes["two_cubes"]
         (solution,) = (own.solution for own in found.methods.values())
-        assert shares[-1] == pytest.approx(100 * float(solution.score) / found.bound, abs=0.051)
+        share = 100 * float(solution.score) / found.bound
+        assert share - 0.101 < shares[-1] <= share  # rounded down
         np.testing.assert_allclose(load_drive(folder / "drive.csv"), solution.drive[0], atol=1e-12)
     assert shares[0] < shares[1] <= 100
     assert len(list((tmp_path / "outputs" / "matrices").iterdir())) == 1

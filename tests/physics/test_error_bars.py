@@ -90,7 +90,7 @@ def test_the_usual_error_is_that_of_spheres_of_any_size_and_density(radius, rati
 
 
 @settings(max_examples=3)
-@given(st.integers(0, 10**6), st.floats(1e-3, 1.0), st.floats(0.9e-3, 1.6e-3))
+@given(st.integers(0, 10**6), st.floats(1e-3, 0.99), st.floats(0.9e-3, 1.6e-3))
 def test_points_within_a_cell_of_a_rigid_sphere_err_by_no_more_than_their_claims(seed, gap, spacing):
     """Required: three times the claims; 580 points of 8 others had 2.0 times at most."""
     direction = np.random.default_rng(seed).normal(size=(12, 3))

@@ -129,7 +129,7 @@ def test_poses_at_the_edge_of_the_domain_are_those_of_any_domain():
 def test_propagators_without_coarser_grids_are_refused():
     with pytest.raises(ValueError, match=r'propagator: .*; must be of method "box"'):
         NearbyPoses(make_propagator(SCENE, "full", 1e-3))
-    with pytest.raises(ValueError, match=r"propagator.spacing: 0.0015 m; must be at most 0.001133 m: 2.5"):
+    with pytest.raises(ValueError, match=r"spacing: 0.0015 m; must be at most 0.001133 m: a grid 2.5"):
         NearbyPoses(make_propagator(SCENE, "box", 1.5e-3))
     with pytest.raises(ValueError, match="propagator"):
         NearbyPoses(make_propagator(SCENE, "tmatrix"))
