@@ -122,7 +122,7 @@ def displacement_error(resonances: Sequence[Resonance], others: Sequence[Resonan
     """Return the relative error of a steady state by the shift of its resonances on a grid.
 
     `others` are those on another grid, whose spacing is larger by a `ratio`. Those on one grid alone count
-    nothing.
+    nothing. Neither do those wider than their shift: grids differ by such, and their estimate counts that.
     """
     squares = 0.0
     for here in resonances:
@@ -130,7 +130,8 @@ def displacement_error(resonances: Sequence[Resonance], others: Sequence[Resonan
         if alike:
             nearest = min(alike, key=lambda other: abs(other.offset - here.offset))
             shift = (here.offset - nearest.offset).real / (ratio**_POWER - 1)
-            squares += (here.strength * shift / abs(here.offset + shift)) ** 2
+            if abs(shift) > -here.offset.imag:
+                squares += (here.strength * shift / abs(here.offset + shift)) ** 2
     return math.sqrt(squares)
 
 
