@@ -28,6 +28,8 @@ AGAIN = "the same command repeats what is not finished"
 
 _REFUSALS = (ValueError, OSError, ImportError, HydraException, OmegaConfBaseException)
 
+_CUT_OFF = 128 + 13  # as a shell reports SIGPIPE, which Windows lacks
+
 _NO_SLURM = 'Could not detect "srun"'  # submitit, on a machine without Slurm
 # Names of submitit's errors, since it may be missing; and a job that ended without a report of its error.
 _SUBMITIT_ERRORS = ("FailedJobError", "UncompletedJobError")
@@ -43,14 +45,26 @@ def stop(error: BaseException) -> NoReturn:
 
     The status is 2 where a setting is refused or a file cannot be written, and 3 where a limit of a hardware
     trial is reached. After a signal it is 128 and its number, and 1 after any other error, such as one in a
-    user's method.
+    user's method. Where the reader of the output has ended, as `head` does, nothing is printed.
     """
+    if isinstance(error, BrokenPipeError) and _is_cut_off():
+        sys.exit(_CUT_OFF)
     print(f"autdtorch: {in_one_line(error)}", file=sys.stderr)
     if isinstance(error, KeyboardInterrupt):
         sys.exit(128 + getattr(error, "number", signal.SIGINT))  # as a shell reports it
     if _is_refusal(error):
         sys.exit(2)
     sys.exit(3 if isinstance(error, hardware.LimitError) else 1)  # which is imported when it is asked for
+
+
+def _is_cut_off() -> bool:
+    """Return whether nobody reads stdout any more; what is left for it then leads nowhere."""
+    try:
+        print(flush=True)  # an empty line, as a pipe shows its end to a writer alone
+    except BrokenPipeError:
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - to the end
+        return True
+    return False
 
 
 def in_one_line(error: BaseException) -> str:

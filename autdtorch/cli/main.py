@@ -101,6 +101,7 @@ def main() -> None:
                 _run_command(*_COMMANDS[command])
             if sweep:
                 print("autdtorch collect FOLDER merges the results of a sweep into one table and one report")
+        sys.stdout.flush()  # whose errors are lines without a status at the end of Python
     except _Carrier as carrier:
         error = carrier.__cause__ or carrier
     except (Exception, KeyboardInterrupt) as raised:

@@ -7,7 +7,6 @@ The first line of a file is a checksum of its name, its shape and its content.
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import logging
 import os
@@ -70,6 +69,7 @@ class Store:
         """
         self.folder, self._most_bytes, self._most_saved = folder, most_bytes, most_saved
         self._results: dict[str, Any] = {}
+        self._told_of_limit = False
 
     @property
     def nbytes(self) -> int:
@@ -136,7 +136,30 @@ class Store:
             logger.warning("%s cannot be written (%s): not kept", path, error.strerror)
         share = int(content[:8], 16) / 16**8  # of the checksum, as good as random
         if share * self._most_saved * _OVERRUN <= len(content):
-            _remove_oldest(self.folder, self._most_saved)
+            self._remove_oldest(self.folder)
+
+    def _remove_oldest(self, folder: Path) -> None:
+        """Remove the matrices of the folder that were used longest ago, until the rest is within the limit.
+
+        Log, once, if some are in use: a study that is repeated would need them first.
+        """
+        matrices = []
+        for path in folder.glob(f"*{SUFFIX}"):
+            with contextlib.suppress(OSError):  # another process removes it too
+                status = path.stat()
+                matrices.append((status.st_mtime_ns, status.st_size, path))
+        total, in_use = sum(size for _, size, _ in matrices), time.time_ns() - 1e9 * _IN_USE
+        for used, size, path in sorted(matrices):
+            if total <= self._most_saved:
+                break
+            if used > in_use and not self._told_of_limit:
+                self._told_of_limit = True
+                full = f"its limit of {self._most_saved / 1e9:g} GB is less than what was used within a day"
+                again = "results that no longer fit are computed again"
+                logger.warning("%s is full: %s; %s; %s=10 allows 10 GB", folder, full, again, LIMIT_VARIABLE)
+            with contextlib.suppress(OSError):  # or another user owns it
+                path.unlink()
+                total -= size
 
 
 BODIES = Store(most_bytes=MOST_BYTES // 4)
@@ -179,32 +202,6 @@ def _saved_limit() -> int:
         return round(1e9 * positive(LIMIT_VARIABLE, float(text), "GB"))
     except (ValueError, OverflowError):
         raise invalid(LIMIT_VARIABLE, text, "must be a number > 0, such as 10", "GB") from None
-
-
-def _remove_oldest(folder: Path, most_bytes: int) -> None:
-    """Remove the matrices of a folder that were used longest ago, until the rest takes `most_bytes`."""
-    matrices = []
-    for path in folder.glob(f"*{SUFFIX}"):
-        with contextlib.suppress(OSError):  # another process removes it too
-            status = path.stat()
-            matrices.append((status.st_mtime_ns, status.st_size, path))
-    total, in_use = sum(size for _, size, _ in matrices), time.time_ns() - 1e9 * _IN_USE
-    for used, size, path in sorted(matrices):
-        if total <= most_bytes:
-            break
-        if used > in_use:
-            _warn_of_limit(folder, most_bytes)
-        with contextlib.suppress(OSError):  # or another user owns it
-            path.unlink()
-            total -= size
-
-
-@functools.cache
-def _warn_of_limit(folder: Path, most_bytes: int) -> None:
-    """Log, once, that matrices in use are removed: a study that is repeated would need them first."""
-    full = f"its limit of {most_bytes / 1e9:g} GB is less than what was used within a day"
-    again = "results that no longer fit are computed again"
-    logger.warning("%s is full: %s; %s; %s=10 allows 10 GB", folder, full, again, LIMIT_VARIABLE)
 
 
 def _with_checksum(key: str, shape: tuple[int, ...], body: bytes) -> bytes:

@@ -170,3 +170,14 @@ def test_a_process_ends_with_its_status_and_all_that_it_wrote(setting, status, t
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == status
     assert len(f"{done.stdout}{done.stderr}".splitlines()) == 1
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a pipe without a reader is another error there")
+@pytest.mark.parametrize("option", ["--help", "--version"])  # more than a buffer, and less
+def test_a_reader_of_the_output_that_has_ended_is_no_error(option):
+    reads, writes = os.pipe()
+    os.close(reads)
+    command = [sys.executable, "-m", "autdtorch", option]
+    ended = subprocess.run(command, stdout=writes, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writes)
+    assert (ended.returncode, ended.stderr) == (141, "")

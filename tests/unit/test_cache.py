@@ -257,8 +257,9 @@ def test_a_folder_keeps_what_was_used_last(tmp_path):
 def test_a_folder_that_is_too_small_for_a_study_is_told_once(tmp_path, monkeypatch, caplog):
     """Matrices of 200 numbers, of which 12 fit into 40 kB; a day later none is missed."""
     monkeypatch.setenv("AUTDTORCH_CACHE_GB", "4e-5")
+    cache = store_in(tmp_path)
     for number in range(16):
-        store_in(tmp_path).save(str(number), np.full(199, number), number)
+        cache.save(str(number), np.full(199, number), number)
         if number == 11:
             assert len(files(tmp_path)) == 12
             assert not caplog.messages
@@ -269,8 +270,9 @@ def test_a_folder_that_is_too_small_for_a_study_is_told_once(tmp_path, monkeypat
     assert "AUTDTORCH_CACHE_GB=10" in told
     other, long_ago = tmp_path / "other", time.time() - 1e5
     caplog.clear()
+    cache = store_in(other)
     for number in range(16):
-        store_in(other).save(str(number), np.full(199, number), number)
+        cache.save(str(number), np.full(199, number), number)
         os.utime(other / f"{number}{SUFFIX}", (long_ago, long_ago + number))
     assert not caplog.messages
     for refused in ("ten", "0", "-1", "nan", "inf"):
@@ -282,7 +284,7 @@ def test_a_folder_that_is_too_small_for_a_study_is_told_once(tmp_path, monkeypat
 def test_small_matrices_seldom_list_a_folder(tmp_path, monkeypatch):
     """Once for a 64th of the limit: 400 of 64 kB for 1 GB are expected 1.6 times, and 9 times once in 1e4."""
     listed = []
-    monkeypatch.setattr("autdtorch.propagators.store._remove_oldest", lambda *_: listed.append(1))
+    monkeypatch.setattr("autdtorch.propagators.store.Store._remove_oldest", lambda *_: listed.append(1))
     cache, random = Store(tmp_path), np.random.default_rng(0)
     for number in range(400):
         cache.save(str(number % 4), random.random(4000), 0.0)
