@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import cast, overload
@@ -17,7 +16,7 @@ from autdtorch.methods.solution import Solution
 from autdtorch.methods.state_file import load_state, save_state
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import GoalFunction, Objective, require_objective
-from autdtorch.objectives.perturbations import innermost
+from autdtorch.objectives.perturbations import continued
 from autdtorch.objectives.readings import Readings
 from autdtorch.utils.files import path_of
 from autdtorch.utils.hints import did_you_mean, renamed_keywords
@@ -141,8 +140,8 @@ def _run(
     else:
         state = method.start(problem, seed, trials)
     most = method.most_evaluations(problem) * len(state.best.score)
-    continued = getattr(innermost(objective), "continued", contextlib.nullcontext)  # of a `HardwareObjective`
-    with continued(state.evaluations), show_progress(most, f"{method.label}, evaluations") as progress:
+    logged = continued(objective, state.evaluations)
+    with logged, show_progress(most, f"{method.label}, evaluations") as progress:
         progress.advance(state.evaluations)
         while not state.done and not (stop is not None and state.evaluations and stop(state)):
             drives = method.ask(state)

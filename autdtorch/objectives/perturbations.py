@@ -8,6 +8,7 @@ divided among calls. A trial that must not depend on others therefore needs a se
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 
@@ -260,6 +261,18 @@ def quantised(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
         objective = objective.inner
     known = getattr(objective, "quantised", None)  # of a `HardwareObjective`
     return drive if known is None else known(drive)
+
+
+def continued(objective: Objective, number: int) -> contextlib.AbstractContextManager[object]:
+    """Return a block in which an objective with a log takes evaluations from it, from drive `number` on.
+
+    Such are `HardwareObjective` and `Scenarios` of them, whose logs count every reading of `Noise`. Others
+    observe in the block as they do outside.
+    """
+    while isinstance(objective, Perturbation):
+        number *= getattr(objective, "reads", 1)
+        objective = objective.inner
+    return getattr(objective, "continued", contextlib.nullcontext)(number)
 
 
 def deviation_of(objective: Objective) -> Callable[[torch.Tensor], torch.Tensor] | None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +19,13 @@ from autdtorch.objectives.objective import (
     require_objective,
 )
 from autdtorch.objectives.over_scenes import By, OverScenes, checked_by
-from autdtorch.objectives.perturbations import FailedTransducers, Perturbation, innermost, simulated_matrix
+from autdtorch.objectives.perturbations import (
+    FailedTransducers,
+    Perturbation,
+    continued,
+    innermost,
+    simulated_matrix,
+)
 from autdtorch.scene.obstacles.moving import angles_of
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.text import counted
@@ -178,6 +185,18 @@ class Scenarios:
         over, _ = observed_goal(self, goal)
         assert isinstance(over, OverScenes)
         return over.by_scene(self(drive))
+
+    @contextlib.contextmanager
+    def continued(self, number: int = 0) -> Iterator[None]:
+        """Take evaluations from `number` on out of the logs of measured scenes, as `HardwareObjective` does.
+
+        `ValueError` if `number` is no integer >= 0; in the block `LogError` if a log has another drive.
+        """
+        integer_at_least("number", number, 0)
+        with contextlib.ExitStack() as logs:
+            for each in self.objectives:
+                logs.enter_context(continued(each, number))
+            yield
 
     def over(self, goal: GoalFunction = WEAKEST_FOCUS) -> OverScenes:
         """Return the goal over all scenes that methods maximise for a goal of each; one over all stays."""

@@ -13,6 +13,7 @@ from autdtorch.methods.gabs import GABS
 from autdtorch.methods.run import run
 from autdtorch.objectives.goals import MeanPressure, TargetPressures
 from autdtorch.objectives.perturbations import Drift, FailedTransducers, Noise, Quantised, random_rms
+from autdtorch.objectives.scenarios import Scenarios
 from autdtorch.scene.drive import drive_from_phases
 
 FULL = torch.ones(16, dtype=torch.complex128)
@@ -112,6 +113,34 @@ def test_a_state_file_goes_on_in_a_block_that_continues_the_log(trial, tmp_path)
             return objective.evaluations
 
     assert measure(lambda state: state.evaluations > 4) < measure() == 1 + 15 * 2
+
+
+def test_a_state_file_of_noisy_readings_goes_on_after_all_readings_of_a_drive(trial, tmp_path):
+    def measure(stop=None):
+        with trial.limited() as (bench, link):
+            objective = trial.objective(link, hw.EmulatedSensor(bench))
+            noisy = Noise(objective, snr=20.0, reads=2, reference=10.0)
+            run(GABS(levels=2), noisy, stop=stop, state_file=tmp_path / "state.npz")
+            return objective.evaluations
+
+    assert measure(lambda state: state.evaluations > 4) == 2 * 5
+    assert measure() == 2 * (1 + 15 * 2)
+
+
+def test_scenarios_of_measured_scenes_go_on_where_their_logs_end(trial):
+    def measure(stop=None):
+        with trial.limited() as (bench, link):
+            sensor = Disturbed(bench, int)
+            objectives = []
+            for name in ("near", "far"):
+                trial.log = trial.log.with_name(f"{name}.jsonl")
+                objectives.append(Noise(trial.objective(link, sensor), snr=20.0, reads=2, reference=10.0))
+            solution = run(GABS(levels=2), Scenarios(objectives), stop=stop)
+            return int(solution.evaluations), sensor.readings
+
+    evaluations, before = measure(lambda state: state.evaluations > 4)
+    assert (evaluations, before) == (5, 2 * 2 * 5)
+    assert measure() == (1 + 15 * 2, 2 * 2 * (1 + 15 * 2) - before)
 
 
 def test_an_evaluation_is_logged_before_the_next_is_played(trial):
