@@ -27,10 +27,10 @@ _EQUAL = 0.28  # Spacing [wavelengths] at which the parts of second and sixth or
 # The part of second order at edges of faces along the grid, relative to the part at cut faces. From 4 to 6.5
 # cells per wavelength, errors of 26 scenes fell with the power of 3.6 in the median, in shadows of 5.
 _ALONG = 0.4
-# Error of points on a rigid surface, relative to the scattered field and the square of a cell in wavelengths.
-# Kernels there see one side, and at edges the field varies faster than waves do. At 5 to 10 cells per
-# wavelength, 880 points within 0.7 cells of 22 boxes err by more than three times their claims in 5 %, and
-# without this in 18 %; of 320 points of other boxes 3 %, not 19 %.
+# Error of points and sources on a surface, relative to the scattered field and the square of a cell in
+# wavelengths. Kernels there see one side, and at edges the field varies faster than waves do. At 5 to 10
+# cells per wavelength, 880 points within 0.7 cells of 22 rigid boxes err by more than three times their
+# claims in 5 %, and without this in 18 %; of 320 points of other boxes 3 %, not 19 %.
 _READING = 2.0
 _USUAL, _USUAL_CUT = 0.8, 2.1  # Usual error relative to `growth`: of faces along the grid, and of cut ones
 _MOST_HELD = 5.0  # Largest ratio of densities of a fluid in a bore that counts: little enters denser ones
@@ -149,14 +149,21 @@ def shape_errors(matrix: Tensor, free: Tensor, region: Region) -> Tensor:
     return errors
 
 
-def reading_errors(matrix: Tensor, free: Tensor, points: Tensor, region: Region, spacing: float) -> Tensor:
-    """Return the relative errors (P,) of the rows of a matrix (P, M) due to reading points beside walls.
+def reading_errors(
+    matrix: Tensor, free: Tensor, points: Tensor, nodes: Tensor, region: Region, spacing: float
+) -> Tensor:
+    """Return the relative errors (P,) of the rows of a matrix (P, M) due to kernels beside surfaces.
 
-    The points (P, 3) [m] are read on cells of a `spacing` [m]; from a cell away on, other errors are larger.
+    The points (P, 3) [m] are read, and the monopoles (M, n, 3) [m] of the sources driven, on cells of a
+    `spacing` [m]; from a cell away on, other errors are larger.
     """
-    beside = np.clip(1 - np.abs(region.walls.distance(points.numpy())) / spacing, 0, None)
+    reading, driving = (
+        np.clip(1 - np.abs(region.kinked.distance(places.numpy())) / spacing, 0, None)
+        for places in (points, nodes)
+    )
     on_surface = _READING * (spacing / region.wavelength) ** 2
-    errors: Tensor = on_surface * torch.from_numpy(beside) * _scattered(matrix, free)
+    share = on_surface * torch.from_numpy(reading[:, None] + driving.mean(axis=1))
+    errors: Tensor = _scattered_size(share * matrix, share * free) / sizes(matrix, free)
     return errors
 
 
@@ -173,10 +180,14 @@ def rigid_errors(matrix: Tensor, free: Tensor, region: Region) -> Tensor:
 
 
 def _scattered(matrix: Tensor, free: Tensor) -> Tensor:
-    """Return the share (P,) of the scattered field in rows of a matrix (P, M), at most 1.
+    """Return the share (P,) of the scattered field in rows of a matrix (P, M), at most 1."""
+    share: Tensor = _scattered_size(matrix, free) / sizes(matrix, free)
+    return share
+
+
+def _scattered_size(matrix: Tensor, free: Tensor) -> Tensor:
+    """Return the norms (P,) of the scattered field in rows of a matrix (P, M), at most those of the rows.
 
     In a shadow the rest of it cancels the field in free space (P, M), wherever the surface is.
     """
-    scattered = torch.minimum((matrix - free).norm(dim=1), matrix.norm(dim=1))
-    share: Tensor = scattered / sizes(matrix, free)
-    return share
+    return torch.minimum((matrix - free).norm(dim=1), matrix.norm(dim=1))

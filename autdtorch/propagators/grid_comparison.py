@@ -101,8 +101,8 @@ class GridComparison:
 
     @property
     def _reading_errors(self) -> torch.Tensor:
-        plan = self.plan
-        return reading_errors(self.result.matrix, self.free, self.points, plan.region, plan.spacing)
+        plan, nodes = self.plan, self.plan.scene.array.nodes.positions
+        return reading_errors(self.result.matrix, self.free, self.points, nodes, plan.region, plan.spacing)
 
     def _errors(self, form: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
         """Return the errors of the rows of the matrices in a form: by grids, shapes and rigid bodies.
