@@ -67,7 +67,7 @@ from .propagators.equilibrium import equilibrium
 from .propagators.estimate import Estimate, estimate
 from .propagators.field_forces import radiation_stress
 from .propagators.gorkov import gorkov
-from .propagators.nearby import NearbyPoses
+from .propagators.nearby_poses import NearbyPoses
 from .propagators.tmatrix.force import force_matrices, radiation_force, radiation_torque
 from .propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
 from .scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray

@@ -30,7 +30,7 @@ from autdtorch.cli.settings import (
 )
 from autdtorch.hardware.camera.picture import turned
 from autdtorch.hardware.log import read_log
-from autdtorch.hardware.objective import goal_of
+from autdtorch.hardware.objective import goal_of_sensor
 from autdtorch.hardware.sensors.sensor import AnySensor
 from autdtorch.io.drive_file import save_drive
 from autdtorch.io.goal_section import goal_section, load_goal, score_label
@@ -245,7 +245,7 @@ class _Trial:
 
     def _goal_of(self, sensor: AnySensor) -> Goal:
         """Return the goal of the trial, or for a sensor of another quantity than the pressure its own."""
-        if (goal := goal_of(sensor)).of_pressures:
+        if (goal := goal_of_sensor(sensor)).of_pressures:
             return self._goal
         if self._goal != WEAKEST_FOCUS:
             accepted = f"must be {WEAKEST_FOCUS.name} with a sensor of {goal.name}, for its least reading"
@@ -277,7 +277,7 @@ class _Trial:
         self, limited: hardware.LimitedLink, sensor: AnySensor, readings: int, progress: Progress
     ) -> hardware.Preflight:
         count, points = len(self._scene.array), len(self._scene.control_points)
-        if isinstance(sensor, hardware.PulsedSensor) or not goal_of(sensor).of_pressures:
+        if isinstance(sensor, hardware.PulsedSensor) or not goal_of_sensor(sensor).of_pressures:
             logger.info("the sensor does not see a transducer alone: silence and one drive are checked")
             progress.begin("a first reading, of the simulated drive")
             check = hardware.check_picture(limited, sensor, points, self._expected.drive[0], readings)

@@ -52,7 +52,7 @@ class LeastReading(Goal):
         return self.checked(pressure).amin(dim=-1)
 
 
-def goal_of(sensor: AnySensor) -> Goal:
+def goal_of_sensor(sensor: AnySensor) -> Goal:
     """Return the goal of a sensor's readings: the weakest focus, or the least of another quantity."""
     quantity = quantity_of(sensor)
     return WEAKEST_FOCUS if quantity == PRESSURE else LeastReading(quantity)
@@ -123,7 +123,7 @@ class HardwareObjective:
         if transfer_matrix is not None:
             self.transfer_matrix = validate_matrix("transfer_matrix", transfer_matrix, points, count)
         self.scene, self._link, self._sensor, self._watch = scene, link, sensor, watch
-        self.goal = goal_of(sensor)
+        self.goal = goal_of_sensor(sensor)
         if not self.goal.of_pressures:
             if transfer_matrix is not None:
                 accepted = f"must be None with a sensor of {self.goal.name}: it gives pressures"

@@ -127,11 +127,11 @@ def solve(
         raise invalid("readings", readings, accepted)
     arguments = {"trials": trials, "seed": seed, goal_keyword(method) or "goal": goal}
     solution = method(objective, **{key: value for key, value in arguments.items() if key in taken})
-    _require_solution(f"method {name or name_of(method)}", solution, objective, trials)
+    _require_returned(f"method {name or name_of(method)}", solution, objective, trials)
     return solution
 
 
-def _require_solution(where: str, solution: Solution, objective: Objective, trials: Trials) -> None:
+def _require_returned(where: str, solution: Solution, objective: Objective, trials: Trials) -> None:
     """Check what the function of a user returned for trials on an objective."""
     if not isinstance(solution, Solution):
         raise invalid(where, solution, "must return a Solution")

@@ -11,7 +11,7 @@ from small_scenes import AIR, relative_error, small_scene
 
 from autdtorch.propagators import TMatrixPropagator, box, make_propagator
 from autdtorch.propagators.scene_changes import SceneChanges
-from autdtorch.propagators.tmatrix.body import StillBody
+from autdtorch.propagators.tmatrix.body_simulation import StillBody
 from autdtorch.propagators.tmatrix.tmatrix import TMatrixCluster
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.changes import KINDS

@@ -13,7 +13,7 @@ from autdtorch.propagators import SteadyStateWarning, TMatrixPropagator, make_pr
 from autdtorch.propagators.estimate import estimate
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.store import BODIES
-from autdtorch.propagators.tmatrix import body
+from autdtorch.propagators.tmatrix.body_simulation import StillBody
 from autdtorch.propagators.tmatrix.obstacle_groups import bodies_of
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.obstacles import Box, Sphere, VoxelMask
@@ -107,8 +107,8 @@ def moved(obstacles: tuple[Box, ...], angles: tuple[float, ...], offset: tuple[f
 
 def test_a_body_is_simulated_once_wherever_it_is(monkeypatch):
     pair = (SMALL, replace(SMALL, center=(15e-3, 13e-3, 12e-3), size=(2e-3, 2e-3, 2e-3)))
-    simulate, simulated = body.StillBody.simulated, []
-    monkeypatch.setattr(body.StillBody, "simulated", lambda still: simulated.append(still) or simulate(still))
+    simulate, simulated = StillBody.simulated, []
+    monkeypatch.setattr(StillBody, "simulated", lambda still: simulated.append(still) or simulate(still))
     BODIES.forget()
     by_tmatrix(scene_of(*pair)).transfer_matrix()
     for angles, offset in (

@@ -18,7 +18,7 @@ from autdtorch.propagators.propagator import ScenePropagator
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.propagators.simulation import Run
 from autdtorch.propagators.store import Store
-from autdtorch.propagators.tmatrix.body import Placed, Solver, placed
+from autdtorch.propagators.tmatrix.body_simulation import Placed, Solver, placed
 from autdtorch.propagators.tmatrix.obstacle_groups import (
     ObstacleGroup,
     are_outside,

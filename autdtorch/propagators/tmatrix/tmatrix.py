@@ -21,8 +21,8 @@ from autdtorch.analytic.spherical_waves import mirrored
 from autdtorch.fdtd.kernels import available_kernel
 from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.propagators.store import store_in
-from autdtorch.propagators.tmatrix.body import Solver, placed
 from autdtorch.propagators.tmatrix.body_matrix import BodyMatrix
+from autdtorch.propagators.tmatrix.body_simulation import Solver, placed
 from autdtorch.propagators.tmatrix.scattering import joined, joined_on, scattered_field
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import composed_rotation

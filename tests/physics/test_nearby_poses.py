@@ -7,8 +7,8 @@ import torch
 from small_scenes import AIR, relative_error, small_scene
 
 from autdtorch.propagators import make_propagator
-from autdtorch.propagators import nearby as nearby_module
-from autdtorch.propagators.nearby import NearbyPoses
+from autdtorch.propagators import nearby_poses as nearby_module
+from autdtorch.propagators.nearby_poses import NearbyPoses
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.changes import seen_from_obstacles
 from autdtorch.scene.obstacles import Box, Cylinder, Sphere

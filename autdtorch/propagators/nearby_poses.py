@@ -124,8 +124,9 @@ class NearbyPoses:
             offset: (3,) [m], from the propagator's scene, as in `Scene.moved`.
             rotation: angles (3,) [rad] about the fixed axes x, y, z, in this order.
             return_error: also return the estimated relative error (L2 of the whole matrix), against a
-                simulation of the pose on the propagator's grids. A new simulation may place its grids
-                otherwise: they differ by errors of grids, which `propagator` estimates.
+                simulation of the pose on the propagator's grids: 0 without a move. The error of those grids
+                comes on top, `propagator.known_error` where it is estimated. A new simulation may place its
+                grids otherwise, and differ by it.
             rotation_degrees: these angles (3,) in degrees, in place of `rotation`.
 
         Raises:
