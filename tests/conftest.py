@@ -74,6 +74,7 @@ def set_threads() -> Iterator[Any]:
     torch.set_num_threads(before)
 
 
+@pytest.hookimpl(optionalhook=True)  # pytest may run without xdist
 def pytest_xdist_auto_num_workers() -> int:
     """Return one process more than cores, as a tenth of the time is spent in waiting."""
     return (os.cpu_count() or 1) + 1

@@ -162,8 +162,8 @@ class PhaseLevels:
         A pulse one level shorter begins half a level later, and may be nearer to the drive. With such levels,
         foci of drives at full amplitude are weaker (Ultraino's 1.2 %), and pulses could exceed a limit.
 
-        Both are int64, a continuous amplitude float64. The phase level is 0 where the amplitude is 0. |q| <= 1
-        is not checked.
+        Both are int64, a continuous amplitude float64. The phase level is 0 where the amplitude is 0. That
+        |q| <= 1 is not checked.
         """
         wanted = drive.abs().clamp_max(1)  # above 1 by rounding alone
         if self.amplitudes is None:
