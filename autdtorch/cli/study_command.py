@@ -25,6 +25,7 @@ from autdtorch.propagators import CACHE_VARIABLE
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.moving import angles_of
 from autdtorch.scene.scene import Scene
+from autdtorch.study.folder import drive_files
 from autdtorch.study.results import StudyResult, summary_rows, with_prefixes
 from autdtorch.study.run_study import run_study
 from autdtorch.study.study_method import StudyMethod, name_of
@@ -171,12 +172,10 @@ def _device_of(drive: Any, scenes: Mapping[str, Scene]) -> str | None:
 
 def _save_drives(results: StudyResult, scenes: Mapping[str, Scene], folder: Path, device: str | None) -> None:
     """Write the drive of the best trial of each method in each scene."""
-    single = len(scenes) == 1 and all(len(scene.methods) == 1 for scene in results.scenes.values())
-    for name, result in results.scenes.items():
-        for method, outcome in result.methods.items():
-            best = outcome.solution.drive[int(outcome.solution.score.argmax())]
-            path = folder / ("drive.csv" if single else f"drive_{name}_{method}.csv")
-            save_drive(path, best, scenes[name].array, device)
+    for (name, method), file in drive_files(results).items():
+        solution = results.scenes[name].methods[method].solution
+        best = solution.drive[int(solution.score.argmax())]
+        save_drive(folder / file, best, scenes[name].array, device)
 
 
 def _draw_plane(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> None:

@@ -155,7 +155,7 @@ PREVIOUS = "previous-"
 
 _FILES = (RESULTS_FILE, TRIALS_FILE, PROVENANCE_FILE)
 _LOCK_FILE = ".lock"
-_MADE_OF_THEM = ("plane.png", "poses.png", "fig*.png", "report.md", "report.html", "drive*.csv")
+_MADE_OF_THEM = ("plane.png", "poses.png", "fig*.png", "report.md", "report.html")
 _ANOTHER = "of another study (other settings, source or packages)"
 
 
@@ -194,7 +194,8 @@ class StudyFolder:
         aside = {name: reason for name, reason in self._not_used.items() if (self.path / name).exists()}
         if aside:
             if len(self._not_used) == len(_FILES):  # nothing here is of this study
-                made = (file.name for pattern in _MADE_OF_THEM for file in sorted(self.path.glob(pattern)))
+                made = [file.name for pattern in _MADE_OF_THEM for file in sorted(self.path.glob(pattern))]
+                made += filter(lambda name: (self.path / name).exists(), self._drives_of_another())
                 aside |= dict.fromkeys(made, _ANOTHER)
             places = (self.path / f"{PREVIOUS}{number}" for number in itertools.count(1))
             aside_folder = next(place for place in places if not place.exists())
@@ -209,6 +210,14 @@ class StudyFolder:
         self.trials.mend()
         if len(self.trials) and len(self.scenes) < len(self._shapes):
             logger.info("re-using %s from %s", counted(len(self.trials), "trial"), self.path)
+
+    def _drives_of_another(self) -> list[str]:
+        """Return the names of the drives that another study wrote here; a user's own may lie beside them."""
+        try:
+            return list(drive_files(load_results(self.path)).values())
+        except (FileNotFoundError, ValueError) as error:
+            logger.info("drives of earlier results stay in %s: %s", self.path, error)
+            return []
 
     def _take_up(self) -> None:
         """Use the files of this study; note why others are not used."""
@@ -256,6 +265,14 @@ class StudyFolder:
         self.scenes[name] = scene
         self.scenes = {other: self.scenes[other] for other in self._shapes if other in self.scenes}
         save_results(StudyResult(self.provenance, self.scenes), self.path)
+
+
+def drive_files(results: StudyResult) -> dict[tuple[str, str], str]:
+    """Return the names of files for the best drives of a study, by scene and method."""
+    outcomes = [(name, method) for name, scene in results.scenes.items() for method in scene.methods]
+    if len(outcomes) == 1:
+        return dict.fromkeys(outcomes, "drive.csv")
+    return {(name, method): f"drive_{name}_{method}.csv" for name, method in outcomes}
 
 
 @contextlib.contextmanager

@@ -93,18 +93,18 @@ def test_a_file_of_another_study_is_not_used_and_costs_no_other(tmp_path, name):
 
 
 def test_another_study_is_kept_whole_and_a_refused_one_moves_nothing(tmp_path, warnings):
-    pictures = {"plane.png", "report.html", "drive_scene_gabs.csv"}
+    made, mine = {"plane.png", "report.html", "drive_one_gabs.csv"}, {"notes.txt", "drive_mine.csv"}
     for seed in (0, 1):
         study(tmp_path, seed)
-        for name in (*pictures, "notes.txt"):
+        for name in made | mine:
             (tmp_path / name).write_text(f"{name} of {seed}", encoding="utf-8")
         before = contents(tmp_path)
         with pytest.raises(ValueError, match="solver: dtype"):
             study(tmp_path, seed=2, solver={"method": "free_space", "dtype": "int"})
         assert contents(tmp_path) == before
     study(tmp_path, seed=2)
-    assert contents(tmp_path / f"{PREVIOUS}2") == {name: before[name] for name in {*FILES, *pictures}}
-    assert {name for name in contents(tmp_path) if not name.startswith(".")} == {*FILES, "notes.txt"}
+    assert contents(tmp_path / f"{PREVIOUS}2") == {name: before[name] for name in {*FILES, *made}}
+    assert {name for name in contents(tmp_path) if not name.startswith(".")} == {*FILES, *mine}
     assert len(warnings()) == 2
 
 
