@@ -60,28 +60,17 @@ def test_step_conserves_energy_and_reflects_all_beyond_the_critical_angle(densit
     assert reflected[0].item() == pytest.approx((ratio - 1) / (ratio + 1), abs=1e-12)
 
 
-@pytest.mark.parametrize(("density_ratio", "speed_ratio"), [*FLUIDS, (3.0, 4.3)])
-def test_slab_conserves_energy_and_sums_its_echoes(density_ratio, speed_ratio):
+@pytest.mark.parametrize("fluid", [*FLUIDS, (3.0, 4.3), *ABSORBING])
+def test_slab_conserves_or_absorbs_energy_and_sums_its_echoes(fluid):
+    density_ratio, speed_ratio = fluid
     reflected, transmitted = coefficients(ANGLES, density_ratio, speed_ratio, THICKNESS)
     power = reflected.abs() ** 2 + transmitted.abs() ** 2
     # Rounding, magnified at resonances and where cos is small.
-    assert torch.allclose(power, torch.ones_like(power), rtol=0, atol=1e-10)
-    step, _ = coefficients(ANGLES, density_ratio, speed_ratio)
-    inner = K * torch.sqrt(1 / speed_ratio**2 - torch.sin(ANGLES).to(torch.complex128) ** 2)
-    pass_once = torch.exp(1j * inner * THICKNESS)
-    echoes = 1 - step**2 * pass_once**2
-    assert torch.allclose(transmitted, (1 - step**2) * pass_once / echoes, rtol=0, atol=1e-10)
-    assert torch.allclose(reflected, step * (1 - pass_once**2) / echoes, rtol=0, atol=1e-10)
-
-
-@pytest.mark.parametrize(("density_ratio", "speed_ratio"), ABSORBING)
-def test_absorbing_slabs_absorb_and_sum_their_echoes(density_ratio, speed_ratio):
-    reflected, transmitted = coefficients(ANGLES, density_ratio, speed_ratio, THICKNESS)
-    assert (reflected.abs() ** 2 + transmitted.abs() ** 2 < 1).all()
-    outer = torch.cos(ANGLES)
+    lossless = torch.allclose(power, torch.ones_like(power), rtol=0, atol=1e-10)
+    assert (power < 1).all() if fluid in ABSORBING else lossless
     inner = torch.sqrt(1 / speed_ratio**2 - torch.sin(ANGLES).to(torch.complex128) ** 2)
+    outer = torch.cos(ANGLES)
     step = (density_ratio * outer - inner) / (density_ratio * outer + inner)
-    # Rounding, magnified where cos is small.
     assert torch.allclose(coefficients(ANGLES, density_ratio, speed_ratio)[0], step, rtol=0, atol=1e-12)
     pass_once = torch.exp(1j * K * inner * THICKNESS)
     echoes = 1 - step**2 * pass_once**2
@@ -184,25 +173,6 @@ def test_slab_of_the_mediums_sound_speed_is_a_row_of_images(density_ratio, thick
     slab = fluid_slab(density_ratio, 1.0, thickness)
     assert relative(slab(above, sources, scattered=True) - reflected, above, sources) < 1e-10
     assert relative(slab(below, sources) - transmitted, below, sources) < 1e-10
-
-
-@pytest.mark.parametrize("layer", [fluid_half_space, fluid_slab])
-@pytest.mark.parametrize("fluid", [*FLUIDS, (3.0, 0.5), *ABSORBING])
-def test_layers_are_reciprocal(layer, fluid):
-    first = above_plane([1e-3, 0.02])[0]
-    second = above_plane([5e-4, 0.03])[1:].reshape(-1, 3)
-    forth, back = layer(*fluid)(first, second), layer(*fluid)(second, first)
-    assert relative(forth - back.T, first, second) < 1e-10
-
-
-def test_slab_is_reciprocal_from_front_to_back():
-    """Seen from behind, the slab is itself with its normal turned."""
-    front, back = above_plane([0.01, 0.002])[0], above_plane([-0.01, -0.03])[1]
-    behind = above_plane([-THICKNESS])[0, 0].tolist()
-    turned = tuple(-entry for entry in NORMAL)
-    there = fluid_slab(77, 1)(back, front)
-    here = analytic.fluid_slab(front, back, K, behind, turned, THICKNESS, 77, 1)
-    assert relative(there - here.T, back, front) < 1e-10
 
 
 @pytest.mark.parametrize("layer", [fluid_half_space, fluid_slab])

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 import torch
 from exact_fields import WAVELENGTH, K
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from scipy.special import j0, struve
 from small_scenes import AIR, CUBE, relative_error, small_scene
 
 import autdtorch as at
@@ -27,37 +26,6 @@ points = hnp.arrays(float, (5, 3), elements=st.floats(-0.1, 0.1))
 ARRAY = at.TransducerArray.grid((4, 4), pitch=10e-3, center=(1e-3, 50e-3, 50e-3), source_strength=0.7)
 
 
-@pytest.mark.parametrize("target", [(17e-3, 0.0, 0.0), (10e-3, -20e-3, 30e-3), (-60e-3, 40e-3, 1e-3)])
-def test_green_solves_the_helmholtz_equation_away_from_the_source(target):
-    """Seven-point Laplacian of step h: its truncation error is h^2/12 sum d^4 g.
-
-    Far from the source that is at most (k h)^2/12 of k^2 |g|; at the nearest point, 2 wavelengths off
-    (k r = 12.6), the derivatives of 1/r add some 4/(k r), a third. Rounding adds 1e-16/(k h)^2 = 1e-12.
-    """
-    h = WAVELENGTH / 400
-    steps = torch.cat([torch.zeros(1, 3), torch.eye(3), -torch.eye(3)]).double()
-    values = at.green(torch.tensor(target, dtype=torch.float64) + h * steps, [[0.0, 0.0, 0.0]], K)[:, 0]
-    laplacian = (values[1:].sum() - 6 * values[0]) / h**2
-    residual = (laplacian + K**2 * values[0]).abs() / (K**2 * values[0].abs())
-    assert residual < 4 / 3 * (K * h) ** 2 / 12
-
-
-def test_green_is_outgoing_and_of_unit_strength():
-    r = torch.tensor([1e-6, 1e-3, 1e-3 + WAVELENGTH / 4], dtype=torch.float64)
-    values = at.green(torch.stack([r, 0 * r, 0 * r], dim=1), [[0.0, 0.0, 0.0]], K)[:, 0]
-    # Near the source g is 1/(4 pi r), up to k r = 7e-4.
-    assert abs(4 * math.pi * r[0] * values[0] - 1) < 1e-3
-    # With e^{-i w t}, a quarter of a wavelength outwards turns the phase by +90 degrees.
-    assert cmath.phase(values[2] / values[1]) == pytest.approx(math.pi / 2, rel=1e-12)
-
-
-@given(here=points, there=points)
-def test_green_is_reciprocal(here, there):
-    assume(distances(torch.from_numpy(here), torch.from_numpy(there)).min() > 1e-6)
-    # The two distances are sums of the same squares: equal to the last bit.
-    assert torch.equal(at.green(here, there, K), at.green(there, here, K).T)
-
-
 def test_matrix_is_equation_2_term_by_term_and_falls_with_absorption():
     targets = [(80e-3, 50e-3, 50e-3), (80e-3, 20e-3, 50e-3), (33e-3, 1e-3, 99e-3)]
     matrix = free_space_matrix(targets, ARRAY, K)
@@ -65,7 +33,9 @@ def test_matrix_is_equation_2_term_by_term_and_falls_with_absorption():
         for entry, source in zip(row, ARRAY.positions.tolist(), strict=True):
             r = math.dist(target, source)
             # Phases reach k r = 80 rad: 1e-14 of rounding.
-            assert cmath.isclose(entry, 0.7 * cmath.exp(1j * K * r) / r, rel_tol=1e-13)
+            wave = cmath.exp(1j * K * r) / r  # outgoing, with e^{-i w t}
+            assert cmath.isclose(entry, 0.7 * wave, rel_tol=1e-13)
+            assert cmath.isclose(at.green([target], [source], K).item(), wave / (4 * math.pi), rel_tol=1e-13)
     targets, alpha = [(80e-3, 50e-3, 50e-3), (33e-3, 1e-3, 99e-3)], 4.6
     lossless = free_space_matrix(targets, ARRAY, K)
     path = distances(torch.tensor(targets, dtype=torch.float64), ARRAY.positions)
@@ -91,6 +61,7 @@ def around_a_disc(radius, normal, apart, over, generator):
     apart=st.floats(math.log(1e-4), math.log(100 * WAVELENGTH)).map(math.exp),
     seed=st.integers(0, 1000),
 )
+@settings(max_examples=6)
 def test_a_disc_is_rayleighs_integral(size, normal, apart, seed):
     """At any k a, 0.1 mm off the rim or the disc and more, relative to the largest pressure so far off."""
     radius, place = size / K, torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64)
@@ -176,34 +147,6 @@ def test_piston_far_away_is_its_directivity(reach):
     field = piston_field(points, [[0.0, 0.0, 0.0]], K, radius, (0.0, 0.0, 1.0))
     ratio = (field / at.green(points, [[0.0, 0.0, 0.0]], K))[:, 0]
     assert (ratio - piston_directivity(angle, K, radius)).abs().max() < 1e-4
-
-
-def test_piston_near_is_the_sum_over_its_disc_and_on_its_rim_the_closed_form():
-    """Gauss quadrature in radius and trapezoids in angle: exponential at points a radius off the disc."""
-    nodes, weights = np.polynomial.legendre.leggauss(40)
-    rho, rho_weights = PISTON * (nodes + 1) / 2, PISTON * weights / 2
-    phi = np.arange(120) * 2 * math.pi / 120
-    grid = np.stack(
-        [
-            np.outer(rho, np.cos(phi)).ravel(),
-            np.outer(rho, np.sin(phi)).ravel(),
-            np.zeros(rho.size * phi.size),
-        ],
-        axis=1,
-    )
-    area = torch.tensor(np.repeat(rho * rho_weights, phi.size) * 2 * math.pi / phi.size)
-    points = [[0.3 * PISTON, 0.0, PISTON], [0.0, PISTON, -PISTON], [2.5 * PISTON, 0.0, 0.0]]
-    expected = at.green(points, grid, K) @ area.to(torch.complex128) / (math.pi * PISTON**2)
-    field = piston_field(points, [[0.0, 0.0, 0.0]], K, PISTON, (0.0, 0.0, 1.0))
-    assert torch.allclose(field[:, 0], expected, rtol=1e-10, atol=0)
-    # The disc is seen over half a turn: chords 2 a cos phi give a Bessel and a Struve function.
-    reach = 2 * K * PISTON
-    chords = j0(reach) + 1j * struve(0, reach) - 1
-    expected = chords / (4j * math.pi * K * PISTON**2)
-    point = torch.tensor([[PISTON, 0.0, 0.0]], dtype=torch.float64)
-    field = piston_field(point, [[0.0, 0.0, 0.0]], K, PISTON, (0.0, 0.0, 1.0))
-    # Rounding.
-    assert abs(field[0, 0] / expected - 1) < 1e-10
 
 
 WAVENUMBER = 2 * math.pi * 40e3 / 340.0
