@@ -67,13 +67,14 @@ class Accepted(Exception):
 
 @pytest.fixture(autouse=True)
 def the_checks_are_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    def stop(*_: Any) -> None:
+    def stop(*_: Any, **__: Any) -> None:
         raise Accepted
 
     monkeypatch.setattr("autdtorch.plot.pressure_maps.draw_plane", stop)
     monkeypatch.setattr("autdtorch.plot.view3d.require_rendering", stop)
     monkeypatch.setattr(explore, "require_rendering", stop)
     monkeypatch.setattr("autdtorch.propagators.propagator.are_shown", stop)
+    monkeypatch.setattr("autdtorch.propagators.differentiable.recorded", stop)
     monkeypatch.setattr("autdtorch.methods.run.show_progress", stop)
     monkeypatch.setattr(at.NearbyPoses, "_coarse", stop)
     monkeypatch.setattr("autdtorch.propagators.scene_changes.SceneChanges.matrix", stop)

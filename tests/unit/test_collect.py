@@ -182,14 +182,14 @@ def test_a_study_refuses_a_name_that_is_no_part_of_a_file_name(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", NAMES[4:])
-@pytest.mark.parametrize("field", ["scenes", "methods"])
-def test_results_with_such_a_name_are_refused(tmp_path, name, field):
+def test_results_with_such_a_name_are_refused(tmp_path, name):
     results = results_of()
     (scene,) = results.scenes.values()
-    other = {"air": replace(scene, methods={name: scene.methods["gabs"]})}
-    save_results(replace(results, scenes={name: scene} if field == "scenes" else other), tmp_path)
-    with pytest.raises(ValueError, match=rf"results\.h5: {field}: "):
-        load_results(tmp_path)
+    method_of_this_name = {"air": replace(scene, methods={name: scene.methods["gabs"]})}
+    for field, scenes in (("scenes", {name: scene}), ("methods", method_of_this_name)):
+        save_results(replace(results, scenes=scenes), tmp_path)
+        with pytest.raises(ValueError, match=rf"results\.h5: {field}: "):
+            load_results(tmp_path)
 
 
 def with_origin(results, **changes):

@@ -220,7 +220,6 @@ def accepted(monkeypatch):
         pytest.param(
             {"evaluations": 7, "initial": 5, "kernel": "circle", "acquisition": "log_ei"}, marks=needs_gpu
         ),
-        {"evaluations": 7, "initial": 5, "model": "foci", "kernel": "phasor"},
         {"evaluations": 13, "initial": 11, "model": "foci", "kernel": "phasor", "noise": "inferred"},
         {"evaluations": 2, "model": "foci", "kernel": "phasor", "prior": at.Prior(gain=0.1, phase=0.5)},
     ],

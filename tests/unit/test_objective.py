@@ -109,12 +109,9 @@ def test_the_end_of_a_gradient_is_logged_once_and_the_docstring_has_the_way_arou
     torch.testing.assert_close(*gradients)
 
 
-def test_an_unknown_mode_or_a_propagator_of_another_scene_is_refused(scene):
-    propagator = make_propagator(scene, "free_space")
+def test_an_unknown_mode_is_refused(scene):
     with pytest.raises(ValueError, match=r"mode: 'guess'; must be"):
-        SimulatedObjective(scene, propagator, "guess")
-    with pytest.raises(ValueError, match="propagator's scene"):
-        SimulatedObjective(small_scene(extent=30e-3), propagator)
+        SimulatedObjective(scene, make_propagator(scene, "free_space"), "guess")
 
 
 pressures = st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=6)
@@ -168,11 +165,9 @@ def test_the_area_within_half_the_intensity_is_shared_among_the_foci(shape, radi
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (([1.0, math.nan],), "pressure: .*nan.* Pa; every entry must be finite"),
         (([1.0, -0.5],), r"pressure: -0\.5 Pa; every magnitude must be >= 0"),
         ((1.0,), r"pressure: shape \(\); must be \(\.\.\., P\)"),
         (([],), r"pressure: shape \(0,\)"),
-        (([1.0 + 1j],), "pressure: .*real"),
         (([1.0], [[1.0]]), "cell_area: None"),
         (([1.0], None, 1.0), "plane_pressure: None"),
         (([1.0], [1.0], 1.0), r"plane_pressure: shape \(1,\)"),

@@ -266,8 +266,6 @@ FLAT = {"type": "box", "center": [0, 0, 0], "size": [1, 1, 0], "rigid": True}
             "unknown key 'point'; allowed keys: reflection",
         ),
         ("reflectors", [TABLE | {"point": [0.2, 0, 0]}], "behind reflector 0, must be in front of it"),
-        ("frequency", "${tone}", "Interpolation key 'tone' not found"),
-        ("frequency", "???", "Missing mandatory value: frequency"),
     ],
 )
 def test_a_wrong_entry_is_named(key, value, message):

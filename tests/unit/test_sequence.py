@@ -138,11 +138,8 @@ def test_files_of_other_things_are_refused(tmp_path):
 MISTAKES = [
     (lambda: at.Sequence(torch.zeros(0, 3, dtype=torch.complex128), 10.0), r"drives: shape \(0, 3\)"),
     (lambda: at.Sequence(DRIVE, 10.0), r"drives: shape \(3,\); must be \(T, M\)"),
-    (lambda: at.Sequence(torch.ones(2, 3), 10.0), "drives: .*complex"),
-    (lambda: at.Sequence(DRIVE[None] * math.nan, 10.0), "drives.*finite"),
     (lambda: at.Sequence(2 * DRIVE[None], 10.0), "drives: amplitude 2; "),
     (lambda: at.Sequence(DRIVE[None], 0.0), "rate: 0.0 Hz; must be finite and > 0"),
-    (lambda: at.Sequence(DRIVE[None], 10.0, loop=1), "loop: 1; must be true or false"),
     (lambda: numbered(3).at_rate(-1.0), "rate: -1.0 Hz"),
     (lambda: numbered(3).at_rate(1e12), "rate: .* Hz; must be at most .* for 100000 frames"),
     (lambda: at.modulated(DRIVE, 0.0), "frequency: 0.0 Hz"),
