@@ -1,11 +1,13 @@
 """Small scenes that several tests share: a 2 x 2 array in front of an obstacle, 24 mm across."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from autdtorch.analytic import fluid_sphere, impedance_sphere, rigid_sphere
 from autdtorch.fdtd.kernels.contract import Receivers, Sources, WaveState
 from autdtorch.fdtd.stepping import Assembly, assemble
 from autdtorch.propagators.plan import region_of
@@ -59,6 +61,23 @@ def scene_of_all_kinds(folder: Path) -> Scene:
         obstacles=obstacles,
         observation_plane=Plane((80e-3, 50e-3, 50e-3), (1, 0, 0), (0.1, 0.1)),
     )
+
+
+def matrix_of_sphere(
+    scene: Scene, points: torch.Tensor | None = None, scattered: bool = False
+) -> torch.Tensor:
+    """The transfer matrix of a scene with one sphere, by its series."""
+    (sphere,) = scene.obstacles
+    places = scene.control_points if points is None else points
+    where = places, scene.array.positions, scene.wavenumber, sphere.center, sphere.radius
+    if sphere.impedance is not None:
+        field = impedance_sphere(*where, sphere.impedance, scattered=scattered)
+    elif (fluid := sphere.fluid_at(scene.frequency)) is None:
+        field = rigid_sphere(*where, scattered=scattered)
+    else:
+        ratios = fluid[0] / scene.medium.density, fluid[1] / scene.medium.sound_speed
+        field = fluid_sphere(*where, *ratios, scattered=scattered)
+    return 4 * math.pi * scene.array.source_strength * field
 
 
 def random_frames(count: int, transducers: int, seed: int = 0) -> torch.Tensor:

@@ -55,7 +55,7 @@ def advance(kernel, dtype, steps, lossy=False):
 # float64: rounding grows with the steps and the sums of 27 terms; float32: the design's parity figure, 1e-4
 # of the peak
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
-@pytest.mark.parametrize(("steps", "lossy"), [(40, False), (41, False), (41, True)])  # all layers in 30
+@pytest.mark.parametrize(("steps", "lossy"), [(40, False), (41, True)])  # all layers in 30
 def test_cpu_kernel_is_the_reference_kernel(dtype, tolerance, steps, lossy):
     state, recorded = advance(CpuKernel(), dtype, steps, lossy)
     expected, expected_recorded = advance(ReferenceKernel(), dtype, steps, lossy)
@@ -190,8 +190,7 @@ def closed_box(dtype):
     return replace(c, layer_decay=torch.zeros_like(c.layer_decay), layer_gain=torch.zeros_like(c.layer_gain))
 
 
-@pytest.mark.parametrize("kernel", [CpuKernel(), ReferenceKernel()], ids=["cpu", "reference"])
-def test_a_mode_of_a_closed_box_keeps_its_frequency_and_amplitude(kernel):
+def test_a_mode_of_a_closed_box_keeps_its_frequency_and_amplitude():
     """p = sin(k_x x) sin(k_y y) sin(k_z z) cos(w t) is an exact solution of the scheme, with w from the
     symbol."""
     shape, steps = (24, 26, 28), 400
@@ -208,7 +207,7 @@ def test_a_mode_of_a_closed_box_keeps_its_frequency_and_amplitude(kernel):
     state.now.copy_(mode)
     state.before.copy_(mode * math.cos(turn))
     silence = torch.zeros((steps, 2), dtype=torch.float64)
-    state, _ = kernel.advance(state, c, NO_SOURCES, NO_RECEIVERS, silence)
+    state, _ = CpuKernel().advance(state, c, NO_SOURCES, NO_RECEIVERS, silence)
     # rounding of 400 steps, each of relative size 1e-16, adds up at worst in proportion to steps^2
     assert (state.now - mode * math.cos(turn * steps)).abs().max() < 1e-10
 

@@ -138,7 +138,7 @@ def test_losses_without_their_negative_part_are_as_small_as_they_were(seed, shar
     st.sampled_from([(0.4, 0.3, 0.2), (0.0, 0.0, 0.0)]),
 )
 def test_bodies_are_passive_and_stable(kind, density, speed, angle, loss, impedance, rotation):
-    size = 2.3e-3 if kind is Sphere else (5e-3, 3e-3, 4.2e-3)
+    size = 1.7e-3 if kind is Sphere else (3.6e-3, 2.2e-3, 3e-3)
     turn = {} if kind is Sphere else {"rotation": rotation}
     shape = kind(tuple(CENTER), size, rigid=True, **turn)
     rho, compressibility = (
@@ -253,7 +253,7 @@ def test_walls_with_an_impedance_reflect_obliquely_wherever_they_are(impedance, 
 # Errors of third order remain, 0.004 and less: the tolerance is twice that. Without slopes along the surface
 # the error at the normal would be 0.026.
 @pytest.mark.parametrize("impedance", [1.0, 3 - 1j])
-@pytest.mark.parametrize("incidence", [0, 45, 70])
+@pytest.mark.parametrize("incidence", [0, 60])
 @pytest.mark.parametrize(("normal", "offset"), [((1, 1, 0), 0.1), ((1, 1, 0), 0.45), ((2, 1, 0), 0.3)])
 def test_tilted_walls_with_an_impedance_reflect_as_they_should(impedance, incidence, normal, offset):
     angle = math.radians(incidence)
@@ -266,7 +266,7 @@ def test_tilted_walls_with_an_impedance_reflect_as_they_should(impedance, incide
 @pytest.mark.parametrize("impedance", [1.0, 0.1, 1e-3, 0.3j, 0.05 + 0.4j, 0.7j, -0.3j, 0.01 - 1j])
 @pytest.mark.parametrize("place", [0.1, 0.5, 0.9])
 def test_faces_along_the_grid_are_passive_and_stable(impedance, place):
-    shape = Box((place * 1e-3,) * 3, (4e-3, 3.2e-3, 3.6e-3), rigid=True)
+    shape = Box((place * 1e-3,) * 3, (2.4e-3, 1.9e-3, 2.1e-3), rigid=True)
     region = region_of_bodies(Body(shape, None, impedance=impedance))
     require_passive_and_stable(region, make_box(region, 1.1e-3))
 
@@ -278,7 +278,7 @@ def surface_of_box(x, y, z):
 # The sum of the damping is off by the square of the phase between two cells at 4 kHz, 5e-4 and less; along
 # the grid areas are exact. Elsewhere distances are linear in quarters of a cell: edges are rounded by a few
 # hundredths of a cell, 0.4 % of these bodies, and 1.6 % of the plate, whose rim is two edges.
-@pytest.mark.parametrize("spacing", [0.93e-3, 1.21e-3, 1.6e-3])
+@pytest.mark.parametrize("spacing", [0.93e-3, 1.6e-3])
 @pytest.mark.parametrize(
     ("shape", "area", "tolerance"),
     [

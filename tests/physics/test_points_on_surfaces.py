@@ -18,6 +18,10 @@ from autdtorch.scene.geometry import rotation_matrix
 
 AIR = at.Medium(1.2, 343.0)
 ANGLES = st.tuples(*[st.floats(-3, 3)] * 3) | st.just((0.0, 0.0, 0.0))
+SPHERE = at.Sphere((1e-3, 0.0, 0.0), 4e-3, rigid=True)
+VOXELS = at.VoxelMask(
+    np.pad(np.ones((8, 8, 8), bool), 1), 1e-3, (-4e-3, -5e-3, -5e-3), rigid=True, smooth=False
+)
 DIRECTIONS = torch.cat([torch.eye(3), -torch.eye(3)]).to(torch.float64)
 
 
@@ -72,17 +76,15 @@ def test_a_fluid_on_a_rigid_body_is_heard_at_its_face(fluid_first):
 
 
 @pytest.mark.parametrize(
-    "body",
+    ("method", "body"),
     [
-        at.Sphere((1e-3, 0.0, 0.0), 4e-3, rigid=True),
-        at.Cylinder((1e-3, 0.0, 0.0), 4e-3, 8e-3, rigid=True),
-        at.VoxelMask(
-            np.pad(np.ones((8, 8, 8), bool), 1), 1e-3, (-4e-3, -5e-3, -5e-3), rigid=True, smooth=False
-        ),
+        ("box", SPHERE),
+        ("full", SPHERE),
+        ("box", at.Cylinder((1e-3, 0.0, 0.0), 4e-3, 8e-3, rigid=True)),
+        ("full", VOXELS),
     ],
-    ids=["sphere", "cylinder", "voxels"],
+    ids=["box, sphere", "full, sphere", "box, cylinder", "full, voxels"],
 )
-@pytest.mark.parametrize("method", ["box", "full"])
 def test_the_pressure_has_no_step_at_any_face(body, method):
     """From a face to 1 um in front of it the pressure changes by its slope along the face at most: 1e-3."""
     propagator = at.make_propagator(scene_of([body]), method, 1.5e-3, cache=False)

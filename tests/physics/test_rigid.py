@@ -78,10 +78,9 @@ def test_others_keep_their_material(body, tolerance):
     assert plan(small_scene((body,)), "box", 0.5e-3, tolerance).region.bodies[0].fluid is not None
 
 
-@pytest.mark.parametrize(("density", "thickness"), [(60.0, 5e-3), (150.0, 3e-3)])
-def test_what_passes_a_heavy_plate_counts_in_its_shadow(density, thickness):
+def test_what_passes_a_heavy_plate_counts_in_its_shadow():
     """The sound through a plate is below the tolerance relative to the free field, and above it behind it."""
-    plate = Box((0.0, 0.0, 0.0), (60e-3, 60e-3, thickness), density=density, sound_speed=1200.0)
+    plate = Box((0.0, 0.0, 0.0), (60e-3, 60e-3, 5e-3), density=60.0, sound_speed=1200.0)
     array = TransducerArray([(x, 2e-3, -25e-3) for x in (-8e-3, 0.0, 8e-3)], (0, 0, 1))
     scene = Scene(array, AIR, 40e3, [(3e-3, 1e-3, 12e-3), (-5e-3, 4e-3, 14e-3)], (plate,))
     asked, spacing = 0.1, 1.3e-3

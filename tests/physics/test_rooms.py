@@ -3,7 +3,6 @@
 Boxes have cells of 1 mm, 8.6 a wavelength; their error beside a sphere is as in `test_reflectors.py`.
 """
 
-import math
 from itertools import combinations
 
 import numpy as np
@@ -17,7 +16,6 @@ import autdtorch as at
 from autdtorch.propagators import make_propagator
 
 AIR = at.Medium(1.2, 343.0)
-K = 2 * math.pi * 40e3 / 343.0
 RADIUS = 4e-3
 FLOOR = at.Reflector((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 SOURCES = [[-30e-3, 3e-3, 12e-3], [-25e-3, -14e-3, 30e-3]]
@@ -39,20 +37,7 @@ def with_mirrored_sources(scene, reflection=1.0, obstacles=None):
     return direct + reflection * images
 
 
-def test_half_a_sphere_on_a_plane_is_a_sphere_with_mirrored_sources():
-    scene = room([at.Sphere((0.0, 0.0, 0.0), 6e-3, rigid=True)], [FLOOR])
-    exact = np.asarray(scene.control_points), np.array(SOURCES), K
-    flipped = np.array(SOURCES) * [1, 1, -1]
-    sphere = (0.0, 0.0, 0.0), 6e-3
-    both = at.analytic.rigid_sphere(*exact, *sphere)
-    both = both + at.analytic.rigid_sphere(exact[0], flipped, K, *sphere)
-    matrix = make_propagator(scene, "box", 1e-3).transfer_matrix()
-    # the grid's error of a whole sphere of six cells
-    assert relative_error(matrix, 4 * math.pi * scene.array.source_strength * both) < 6e-3
-
-
-@pytest.mark.parametrize("reflection", [1.0, -1.0])
-@pytest.mark.parametrize("center", [0.0, 4e-3, 4.7e-3])
+@pytest.mark.parametrize(("center", "reflection"), [(0.0, 1.0), (4e-3, 1.0), (4e-3, -1.0), (4.7e-3, -1.0)])
 def test_a_box_on_a_plane_is_the_box_of_twice_the_height(center, reflection):
     """Cut at its middle, flush with the plane, or 0.7 mm in front of it: the same cells, another rounding."""
     box = at.Box((0.0, 0.0, center), (9e-3, 12e-3, 8e-3), rigid=True)
@@ -93,7 +78,6 @@ WALL = at.Reflector((-45e-3, 0.0, 0.0), (1.0, 0.0, 0.0))
 NEAR_WALL = at.Reflector((-5e-3, 0.0, 0.0), (1.0, 0.0, 0.0), -1.0)
 BEFORE = [[20e-3, 30e-3, 12e-3], [25e-3, 28e-3, 20e-3]]
 ROOMS = {
-    "two bodies": ([(0, 0, 15e-3), (0, 40e-3, 25e-3)], [FLOOR], {}),
     "two bodies, one near": ([(0, 0, 5e-3), (0, 40e-3, 25e-3)], [FLOOR], {}),
     "corner": ([(0, 0, 5e-3)], [FLOOR, WALL], {}),
     "in a corner": (
@@ -101,7 +85,6 @@ ROOMS = {
         [FLOOR, NEAR_WALL],
         {"sources": BEFORE, "points": [[30e-3, 5e-3, 10e-3], [20e-3, -20e-3, 22e-3]]},
     ),
-    "between two planes": ([(0, 0, 12e-3)], [FLOOR, SHELF], {}),
     "between two planes, near one": ([(0, 0, 5e-3)], [SHELF, FLOOR], {}),
 }
 

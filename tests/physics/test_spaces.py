@@ -70,8 +70,7 @@ def test_a_hollow_rigid_body_is_a_solid_one(hollow, solid, difference):
     assert relative_error(*matrices) < difference
 
 
-@pytest.mark.parametrize("method", ["box", "full"])
-@pytest.mark.parametrize("wall", [0.2e-3, 1.5e-3])
+@pytest.mark.parametrize(("method", "wall"), [("box", 0.2e-3), ("full", 1.5e-3)])
 def test_a_closed_room_is_silent_and_told(method, wall, caplog):
     scene = small_scene(room(wall))
     propagator = make_propagator(scene, method, SPACING, 1e-3)
@@ -98,14 +97,6 @@ def test_no_run_begins_at_a_point_in_a_closed_room(caplog):
     assert not propagator.transfer_matrix(center).any()
     assert not propagator.runs
     assert "close off the point" in caplog.text
-
-
-def test_an_open_room_is_not_silent(caplog):
-    scene = small_scene(room(0.5e-3)[1:])
-    points = with_points(scene, CENTER)
-    matrix = make_propagator(scene, "box", SPACING, 1e-3).transfer_matrix(points)
-    assert matrix[-1].norm() > 0
-    assert "close off" not in caplog.text
 
 
 def test_the_side_of_a_thin_wall_decides_not_the_nearest_cell():
@@ -231,7 +222,7 @@ def narrow_hole(edge: float, wall: float = 1.5e-3, half: float = 4e-3) -> list[B
     return [*room(wall)[:-1], *frame]
 
 
-def test_less_enters_a_room_by_a_narrower_hole():
+def test_less_enters_a_room_by_a_narrower_hole(caplog):
     """Also by one narrower than a cell, around which the section of a window is all rigid."""
     entered = []
     for edge in (1.5e-3, 1e-3, 0.7e-3):
@@ -242,6 +233,7 @@ def test_less_enters_a_room_by_a_narrower_hole():
     # the flow through a hole grows with its area (thick wall) or its edge (thin wall): 1.43 ** (1 to 2)
     ratios = [one / other for one, other in itertools.pairwise(entered)]
     assert all(1.3 < ratio < 3 for ratio in ratios)
+    assert "close off" not in caplog.text
 
 
 ACROSS = Box((15e-3, 12e-3, 12e-3), (2e-3, 1.0, 1.0), rigid=True)

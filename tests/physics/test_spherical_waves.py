@@ -83,8 +83,7 @@ def test_waves_add_up_to_a_point_source(wavenumber):
     assert relative_error(4j * math.pi * wavenumber * (regular * outgoing).sum(dim=1), exact) < 1e-10
 
 
-@pytest.mark.parametrize("wavenumber", [WAVENUMBER, complex(WAVENUMBER, 3.0)])
-@pytest.mark.parametrize("conjugate", [False, True])
+@pytest.mark.parametrize(("wavenumber", "conjugate"), [(WAVENUMBER, False), (complex(WAVENUMBER, 3.0), True)])
 def test_derivatives_of_outgoing_waves_are_those_of_finite_differences(wavenumber, conjugate):
     def waves(lengths: torch.Tensor) -> torch.Tensor:  # in units of 1 / k
         return outgoing_waves(3, wavenumber, lengths / WAVENUMBER, conjugate)

@@ -189,7 +189,7 @@ def test_energy_is_symmetric_positive_and_bounded(number):
     assert_not_negative(largest * sparse.eye_array(matrix.shape[0]) - matrix, largest)
 
 
-@pytest.mark.parametrize("number", SCENES)
+@pytest.mark.parametrize("number", SCENES[::2])
 def test_random_scenes_are_stable(number, caplog, monkeypatch):
     trial = replace(draw_trial(0, number, long_share=1.0), steps=500)
     caplog.set_level(logging.ERROR)
@@ -207,10 +207,8 @@ def cube(density, sound_speed=340.0):
 CASES = {
     "air": ((), 1e-3),
     "paper": (cube(100.0), 1e-3),
-    "paper, coarse": (cube(100.0), 2e-3),
     "paper, coarsest": (cube(100.0), 2.8e-3),
     "rigid": ((Box(CUBE.center, CUBE.size, rigid=True),), 1e-3),
-    "heavy": (cube(1.293e4), 1e-3),
     "light": (cube(1.293e-3), 1e-3),
     "fast": (cube(100.0, 4 * 340.0), 1e-3),
     "slow": (cube(3.0, 0.3 * 340.0), 0.7e-3),

@@ -114,10 +114,9 @@ def test_residuals_are_about_the_distance_to_the_steady_state():
         assert 0.25 < run.residual / relative_error(run.pressure, limit.pressure) < 20
 
 
-@pytest.mark.parametrize("spacing", [2e-3, 1.7e-3])
-def test_short_runs_approach_the_steady_state(spacing):
+def test_short_runs_approach_the_steady_state():
     """Also where the last two periods are no whole number of steps."""
-    assembly, sources, receivers = assembled_parts(small_scene((CUBE,)), spacing, torch.float64)
+    assembly, sources, receivers = assembled_parts(small_scene((CUBE,)), 2e-3, torch.float64)
     assert (2 * assembly.steps_per_period).denominator > 1
     cells, kernel, stepped = np.unique(receivers.index), Kernel(1), []
     forces = torch.stack([sources.force[0], -2 * sources.force[0]])

@@ -66,8 +66,9 @@ def test_walls_reflect_and_slabs_transmit(shift, thickness, exact, bound):
     )
 
 
-@pytest.mark.parametrize("density", [77.0, 3.0, 0.01])
-@pytest.mark.parametrize("offset", [0.0, 0.2, 0.4, 0.8])
+@pytest.mark.parametrize(
+    ("density", "offset"), [(77.0, 0.0), (77.0, 0.4), (3.0, 0.2), (3.0, 0.8), (0.01, 0.0), (0.01, 0.4)]
+)
 def test_slabs_through_the_layers_are_stable(density, offset, monkeypatch):
     """Random pressure, any place of the faces; the slab continues through two layers and their edge."""
     monkeypatch.setattr("autdtorch.fdtd.grid.grid_offset", lambda *_: (0.0, 0.0, 0.0))
@@ -155,7 +156,7 @@ def test_a_rigid_sheet_between_the_points_of_a_cell_is_there(thickness, tilt, ab
     assert relative_error(held, turned) < 0.7 * relative_error(free, turned)
 
 
-@pytest.mark.parametrize("thickness", [0.5e-3, 1.2e-3, 1.8e-3])
+@pytest.mark.parametrize("thickness", [0.5e-3, 1.8e-3])
 def test_points_beside_a_thin_wall_oblique_to_the_grid_read_their_side_of_it(thickness):
     """Cells in the wall extend the pressure of one side: points that read all of them erred by up to 80 %."""
     tilt = (0.4, 0.2, 0.0)
@@ -171,8 +172,9 @@ def test_points_beside_a_thin_wall_oblique_to_the_grid_read_their_side_of_it(thi
 
 
 @pytest.mark.filterwarnings("ignore::autdtorch.OverlapWarning")
-@pytest.mark.parametrize("fluid", [{}, {"density": 5.0, "sound_speed": 400.0}])
-@pytest.mark.parametrize("tilt", [(0.0, 0.0, 0.0), (0.4, 0.2, 0.0)])
+@pytest.mark.parametrize(
+    ("fluid", "tilt"), [({}, (0.4, 0.2, 0.0)), ({"density": 5.0, "sound_speed": 400.0}, (0.0, 0.0, 0.0))]
+)
 def test_points_in_a_cavity_that_a_fluid_cuts_read_no_cells_beyond_its_wall(tilt, fluid):
     """Cells beyond a wall of 0.6 mm, at 1 mm, made the pressure in a cup wrong by 31 %."""
     cavity = {"density": AIR.density, "sound_speed": AIR.sound_speed} | fluid
@@ -234,7 +236,7 @@ def test_the_mouth_of_a_bore_with_a_dense_fluid_lets_through_what_it_does_on_a_f
 
 @pytest.mark.parametrize(
     ("method", "material"),
-    [("box", {"rigid": True}), ("full", {"rigid": True}), ("box", {"density": 50.0, "sound_speed": 600.0})],
+    [("full", {"rigid": True}), ("box", {"density": 50.0, "sound_speed": 600.0})],
 )
 def test_points_across_a_slit_with_one_layer_of_cells(method, material):
     """Boxes add the incident field to what one layer reads: its slope made errors of 4 to 14 %, here 7 %."""
@@ -273,14 +275,13 @@ def test_the_thickness_of_a_wall_is_measured(share, tilt):
     assert wall.signed_distance(torch.from_numpy(place)).abs() < 1e-9
 
 
-@pytest.mark.parametrize("inner", [6.5, 6.9])
-def test_a_wall_that_a_later_fluid_leaves_of_a_rigid_body_is_rigid_and_told(inner, caplog):
+def test_a_wall_that_a_later_fluid_leaves_of_a_rigid_body_is_rigid_and_told(caplog):
     """No sound passes it: the field is that of the whole body."""
     sources = [(26e-3, 14e-3, 12e-3), (13e-3, 27e-3, 16e-3)]
     points = [(-3e-3, 10e-3, 14e-3), (9e-3, -2e-3, 5e-3), (25e-3, 19e-3, 10e-3)]
     whole = Mesh.from_surface(pyvista.Icosphere(radius=7.0, nsub=1), scale=1e-3, offset=CENTER, rigid=True)
     light = {"density": 0.5 * AIR.density, "sound_speed": 1.2 * AIR.sound_speed}
-    inside = Mesh.from_surface(pyvista.Icosphere(radius=inner, nsub=1), scale=1e-3, offset=CENTER, **light)
+    inside = Mesh.from_surface(pyvista.Icosphere(radius=6.9, nsub=1), scale=1e-3, offset=CENTER, **light)
 
     def matrix(*bodies):
         scene = Scene(TransducerArray(sources, (1, 0, 0)), AIR, 40e3, points, bodies)
