@@ -186,13 +186,15 @@ class Scenarios:
         assert isinstance(over, OverScenes)
         return over.by_scene(self(drive))
 
-    @contextlib.contextmanager
-    def continued(self, number: int = 0) -> Iterator[None]:
+    def continued(self, number: int = 0) -> contextlib.AbstractContextManager[None]:
         """Take evaluations from `number` on out of the logs of measured scenes, as `HardwareObjective` does.
 
         `ValueError` if `number` is no integer >= 0; in the block `LogError` if a log has another drive.
         """
-        integer_at_least("number", number, 0)
+        return self._continued(integer_at_least("number", number, 0))
+
+    @contextlib.contextmanager
+    def _continued(self, number: int) -> Iterator[None]:
         with contextlib.ExitStack() as logs:
             for each in self.objectives:
                 logs.enter_context(continued(each, number))
