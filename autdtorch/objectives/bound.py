@@ -190,7 +190,7 @@ def lowest(
             jac=True,
             method="L-BFGS-B",
             bounds=limits,
-            options={"maxcor": 40, "maxiter": iterations, "ftol": 1e-14, "gtol": 1e-10},
+            options={"maxcor": 80, "maxiter": iterations, "ftol": 1e-14, "gtol": 1e-10},
         ).x
     return x
 
@@ -253,9 +253,9 @@ def log_dual(
         mixing: (N, n), if the rows are its product with `rows` (n, M).
     """
     z = np.exp(log_z - log_z.max())
-    left, singular, right = np.linalg.svd(rows / z, full_matrices=False)
-    left = left if mixing is None else mixing @ left
-    values, vectors = np.linalg.eigh((singular[:, None] * (left.conj().T * signed) @ left) * singular)
+    orthonormal, triangle = np.linalg.qr((rows / z).T)  # in a third of an SVD's time
+    factor = triangle.T if mixing is None else mixing @ triangle.T
+    values, vectors = np.linalg.eigh((factor.conj().T * signed) @ factor)
     if values[-1] <= 0:  # no level is left
         return 2 * _NOTHING, np.zeros_like(signed), np.zeros_like(z)
     positive = np.maximum(values, 0)
@@ -263,8 +263,8 @@ def log_dual(
     norm = np.linalg.norm(ratios, order)
     # Derivative of the logarithm by the eigenvalues
     growth = (ratios / norm) ** (order - 1) / (positive[-1] * norm)
-    at_points = np.abs((left * singular) @ vectors) ** 2 @ growth
-    at_transducers = np.abs(right.T @ vectors.conj()) ** 2 @ (growth * values)
+    at_points = np.abs(factor @ vectors) ** 2 @ growth
+    at_transducers = np.abs(orthonormal @ vectors.conj()) ** 2 @ (growth * values)
     log = float(np.log(positive[-1] * norm) + np.log(np.sum(z**2)))
     return log, at_points, 2 * (z**2 / np.sum(z**2) - at_transducers)
 
