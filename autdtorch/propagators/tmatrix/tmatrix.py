@@ -326,8 +326,14 @@ class TMatrixCluster:
 
     @property
     def together(self) -> torch.Tensor | None:
-        """The map (N, N) from regular waves on all bodies to all outgoing ones, if they have moved as one."""
-        return None if self._before is None else self._before._joined
+        """The map (N, N) from regular waves on all bodies to all outgoing ones, if they have moved as one.
+
+        Of a body alone it is the T-matrix.
+        """
+        if self._before is not None:
+            return self._before._joined
+        is_alone = len(self.bodies) == 1 and not self.reflectors
+        return self.bodies[0].matrix if is_alone else None
 
     def together_on(self, number: int) -> tuple[torch.Tensor, torch.Tensor] | None:
         """Return the maps (n, N) of `joined_on` for a body, if all have moved as one."""
@@ -349,8 +355,7 @@ class TMatrixCluster:
         """
         bodies = [body.in_poses(poses) for body in self.bodies]
         waves = sum(len(body.matrix) for body in bodies)
-        is_coupled = self.together is None and (len(bodies) > 1 or self.reflectors)
-        count = max(1 + _AT_ONCE // (waves * columns), _FEWEST if is_coupled else 1)
+        count = max(1 + _AT_ONCE // (waves * columns), _FEWEST if self.together is None else 1)
         gradients = torch.is_grad_enabled()
 
         def part(first: int) -> torch.Tensor:
