@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 import autdtorch
 from autdtorch.methods.holography.algorithms import SOLVERS, within_largest
 from autdtorch.methods.holography.holography import Holography, holography
+from autdtorch.methods.holography.kernel import solved
 from autdtorch.methods.holography.sequence import drive_sequence
 from autdtorch.methods.run import run
 from autdtorch.objectives.bound import focus_bound
@@ -116,20 +117,15 @@ def test_a_batch_is_its_sets_one_by_one(random_matrix, algorithm):
 
 
 @pytest.mark.parametrize("free", [False, True])
-@pytest.mark.parametrize("algorithm", ALGORITHMS[:-1])
+@pytest.mark.parametrize("algorithm", SOLVERS)
 @pytest.mark.parametrize(("points", "transducers"), [(3, 10), (7, 3)])  # many points begin otherwise
 def test_kernels_on_cpus_are_the_definitions(random_matrix, algorithm, free, points, transducers):
     # blocks and a part
     matrix = torch.stack([random_matrix(points, transducers, seed) for seed in range(21)])
     wanted = torch.rand(21, points, 1, generator=torch.Generator().manual_seed(0)).double() + 0.5
     exact = SOLVERS[algorithm](matrix, wanted, 20, within_largest if free else torch.sgn)
-    drive = holography(matrix, wanted[..., 0], algorithm, 20, free)
-    # free amplitudes are scaled to the wanted level; twenty iterations spread rounding of 1e-16
-    assert torch.allclose(
-        torch.nn.functional.normalize(drive, dim=-1),
-        torch.nn.functional.normalize(exact[..., 0], dim=-1),
-        atol=1e-9,
-    )
+    drive = solved(matrix, wanted[..., 0], algorithm, 20, free)
+    assert torch.allclose(drive, exact[..., 0], atol=1e-9)  # twenty iterations spread rounding of 1e-16
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -200,6 +196,14 @@ def test_more_starts_find_better_drives_of_symmetric_foci(algorithm):
     assert weakest[1] >= 0.999 * weakest[0]
     if algorithm == "wgs":  # the others do not maximise the weakest
         assert weakest[1] > 0.97 * focus_bound(matrix)
+
+
+def test_eight_starts_come_near_to_the_best_of_32_ascents(random_matrix):
+    """Within 1 % in each of 20 sets; where all go on from phases chosen at points alone, one lacks 5 %."""
+    matrices = random_matrix(20 * 4, 16, 0).reshape(20, 4, 16)
+    weakest = pressures(matrices, holography(matrices, starts=8)).amin(dim=-1)
+    best = torch.tensor([float(autdtorch.gradient_ascent(matrix).score) for matrix in matrices])
+    assert (weakest > 0.97 * best).all()
 
 
 def test_each_set_has_the_best_of_its_starts(random_matrix):

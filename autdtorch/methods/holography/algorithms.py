@@ -12,6 +12,7 @@ like products by *, is taken entry by entry:
   so that phases of foci settle before weights, and falls to 0 in the end. As many iterations before, with
   q = G^H p, choose the phases of p that begin: at points alone, p = b * sgn(G G^H p), they are cheap.
   The result is the q of the highest weakest share;
+- "wgs_drives": "wgs" without the iterations before, which end in the same phases from most first guesses;
 - "gs_pat": p = G G^H (t * sgn(p)) in turns, and in the end q = sgn(G^H (t^2 * p / |p|^2)) (Martinez Plasencia
   et al. 2020), doi:10.1145/3386569.3392492;
 - "diff_pat": Adam on the phases, from those of "wgs", for the least sum of (|p| - t)^2 (Fushimi, Yamamoto and
@@ -65,12 +66,29 @@ def weight_change(number: int, iterations: int) -> float:
 
 
 def _weighted(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
-    back, number = matrix.mH.resolve_conj(), torch.arange(matrix.shape[-2], device=matrix.device)
-    turns = (number * (number + 1) // 2).double() * GOLDEN % 1  # of any two foci, in no simple relation
-    pressure = torch.polar(torch.ones_like(turns), 2 * math.pi * turns)[:, None].to(matrix.dtype)
+    pressure = _first_phases(matrix)
     if matrix.shape[-2] <= 2 * matrix.shape[-1]:  # otherwise iterations at points take longer
         both = _products(matrix)
         pressure, _ = _reweighting(pressure, wanted, iterations, lambda imposed: both @ imposed)
+    return _weighted_from(pressure, matrix, wanted, iterations, project)
+
+
+def _weighted_drives(
+    matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project
+) -> torch.Tensor:
+    return _weighted_from(_first_phases(matrix), matrix, wanted, iterations, project)
+
+
+def _first_phases(matrix: torch.Tensor) -> torch.Tensor:
+    number = torch.arange(matrix.shape[-2], device=matrix.device)
+    turns = (number * (number + 1) // 2).double() * GOLDEN % 1  # of any two foci, in no simple relation
+    return torch.polar(torch.ones_like(turns), 2 * math.pi * turns)[:, None].to(matrix.dtype)
+
+
+def _weighted_from(
+    pressure: torch.Tensor, matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project
+) -> torch.Tensor:
+    back = matrix.mH.resolve_conj()
     _, best = _reweighting(pressure, wanted, iterations, lambda imposed: matrix @ project(back @ imposed))
     return project(back @ best)
 
@@ -108,7 +126,13 @@ def _at_points(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, proj
     return project(matrix.mH @ (wanted.square() * pressure.sgn() / pressure.abs().clamp_min(TINY)))
 
 
-SOLVERS = {"naive": _naive, "gs": _in_turns, "wgs": _weighted, "gs_pat": _at_points}
+SOLVERS = {
+    "naive": _naive,
+    "gs": _in_turns,
+    "wgs": _weighted,
+    "wgs_drives": _weighted_drives,
+    "gs_pat": _at_points,
+}
 """The algorithms by name: functions of matrices (..., P, M), wanted pressures (..., P, 1), iterations and
 `torch.sgn` or `within_largest`."""
 

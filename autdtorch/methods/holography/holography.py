@@ -169,13 +169,16 @@ def _best_of(
     """
     points, transducers = matrix.shape[-2:]
     generator, count = torch.Generator("cpu").manual_seed(0), points + transducers
-    turns = torch.rand(starts, count, dtype=torch.float64, generator=generator, device="cpu")
-    turns[0] = 0
+    turns = torch.rand(starts - 1, count, dtype=torch.float64, generator=generator, device="cpu")
     phases = torch.polar(torch.ones_like(turns), 2 * math.pi * turns).to(matrix)
     rows, columns = phases[:, :points, None], phases[:, None, points:]
-    guesses = (*matrix.shape[:-2], starts, points)
+    guesses = (*matrix.shape[:-2], starts - 1, points)
     turned = matrix[..., None, :, :] * rows * columns
-    drive = _solved(turned, wanted[..., None, :].expand(guesses), algorithm, iterations, free) * columns[:, 0]
+    # iterations at points alone would bring most guesses to the phases of the first
+    other = "wgs_drives" if algorithm == "wgs" else algorithm
+    others = _solved(turned, wanted[..., None, :].expand(guesses), other, iterations, free) * columns[:, 0]
+    first = _solved(matrix, wanted, algorithm, iterations, free)
+    drive = torch.cat([first[..., None, :], others], dim=-2)
     pressure = (matrix[..., None, :, :] @ drive[..., None])[..., 0].abs()
     best = (pressure / wanted[..., None, :]).nan_to_num(math.inf).amin(dim=-1).argmax(dim=-1)
     return drive.take_along_dim(best[..., None, None], dim=-2)[..., 0, :]

@@ -23,8 +23,8 @@ from autdtorch.utils.process import even_parts, spread, thread_count
 
 _GROUP = np.uint64(4)  # Transducers whose entries are read twice while they are in the nearest cache
 _TASKS = 4  # Tasks a thread, so that none waits long for another
-_NAMES = ("gs", "wgs", "gs_pat")
-_GS, _WGS, _GS_PAT = range(3)  # places in `_NAMES`
+_NAMES = ("gs", "wgs", "wgs_drives", "gs_pat")
+_GS, _WGS, _WGS_DRIVES, _GS_PAT = range(4)  # places in `_NAMES`
 _INTRINSICS = Path(cpu_intrinsics.__file__).parent
 
 _weight_change = njit(**INNER)(weight_change)
@@ -246,8 +246,8 @@ def _solve(matrix, wanted, first, last, algorithm, iterations, free, drive):  # 
     points, count, kind = np.uint64(matrix.shape[1]), np.uint64(matrix.shape[2]), matrix.dtype
     lanes = np.uint64(VECTOR // matrix.itemsize)
     transducers = (count + _GROUP - np.uint64(1)) // _GROUP * _GROUP  # those added have no pressure
-    weighted = algorithm == _WGS
-    at_points = algorithm == _GS_PAT or (weighted and points <= np.uint64(2) * count)
+    weighted = algorithm in (_WGS, _WGS_DRIVES)
+    at_points = algorithm == _GS_PAT or (algorithm == _WGS and points <= np.uint64(2) * count)
     entries, drives, places = points * transducers * lanes, transducers * lanes, points * lanes
     squares = points * places if at_points else np.uint64(1)
     a, b = np.zeros(entries, kind), np.zeros(entries, kind)
