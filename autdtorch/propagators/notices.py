@@ -63,6 +63,11 @@ class Notices:
                 gaps = f"gaps narrower than a cell, {1e3 * self._plan.spacing:.2g} mm, may count as closed"
                 self._once("cavity", text, _in_mm(enclosed[0]), more, gaps)
 
+    def of_unknown_gaps(self, spacing: float, reason: str) -> None:
+        """Log that cells of a spacing [m], which may open gaps to silent points, are refused for a reason."""
+        text = "the error takes silent points as closed off; cells of %.2g mm, which may open gaps,"
+        self._once("gaps", f"{text} are refused: %s", 1e3 * spacing, reason)
+
     def of_faint_points(self, matrix: torch.Tensor, free: torch.Tensor) -> None:
         """Log that the matrix at control points is rounding, relative to free space: methods would use it."""
         size = matrix.norm(dim=1)

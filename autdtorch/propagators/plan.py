@@ -134,6 +134,11 @@ class Plan:
         """The plan on a second grid, for an estimate of the grid's error."""
         return self.at(self.region.second_spacing(self.spacing), self.tolerance)
 
+    @property
+    def halved(self) -> Self:
+        """The plan on cells half as large, which open gaps that these close."""
+        return self.at(self.spacing / 2, self.tolerance)
+
     @cached_property
     def key(self) -> str:
         """A digest of everything that affects the pressure of transducers of unit strength."""

@@ -83,16 +83,20 @@ class SimulatedPropagator(ScenePropagator):
         plan: the plan.
     """
 
-    def __init__(self, plan: Plan, store: Store | None = None, others: Sequence[Simulation] = ()) -> None:
+    def __init__(
+        self, plan: Plan, store: Store | None = None, others: Sequence[Simulation] = (), may_look: bool = True
+    ) -> None:
         """Use `make_propagator`, which checks its arguments. A plan with a refusal raises it.
 
         `others` are simulations of the scene on other grids, for error estimates; by default one is made.
+        These look for gaps to silent points on cells half as large, unless a budget does not allow that.
         """
         if plan.refusal:
             raise ValueError(plan.refusal)
         self.scene, self.method, self.spacing = plan.scene, plan.method, plan.spacing
         self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
         self.plan, self._store, self._coarser = plan, store or Store(), tuple(others)
+        self._may_look = may_look
 
     def __repr__(self) -> str:
         settings = f"{self.method}, spacing {1e3 * self.spacing:.4g} mm, steady to {self.tolerance:g}"
@@ -178,23 +182,23 @@ class SimulatedPropagator(ScenePropagator):
         every = [result, *(other for other, _ in others)]
         judged = [result] if self._coarser else every  # coarse grids on the way do not matter
         warn_of_unsettled([run for each in judged for run in each.runs], self.tolerance)
+        missed = torch.zeros(len(places), dtype=torch.bool, device="cpu")
         if with_error:
             self._notices.of_ringing(max(each.periods for each in every))
             missed = self._missed(places, every)
-        else:
-            missed = torch.zeros(len(places), dtype=torch.bool, device="cpu")
         return GridComparison(self.plan, places, result, others, missed)
 
     def _missed(self, points: torch.Tensor, results: Sequence[PressureMap]) -> torch.Tensor:
         """Return which points (P, 3) are silent in all results, but open to the air on cells half as large.
 
-        A grid that the machine cannot hold tells nothing; the notice of closed-off points says so.
+        Where such cells are refused, none is, and the log says why.
         """
         missed = ~torch.stack([each.matrix.any(dim=1) for each in results]).any(dim=0)
         missed[missed.clone()] = self.simulation.enclosed(points[missed])
         if missed.any():
-            finer = self.plan.at(self.spacing / 2, self.tolerance)
-            if finer.refusal:
+            finer = self.plan.halved
+            if reason := finer.refusal if self._may_look else "seconds or memory do not allow them":
+                self._notices.of_unknown_gaps(finer.spacing, reason)
                 return torch.zeros_like(missed)
             missed[missed.clone()] = ~simulation_of(finer, self._store).enclosed(points[missed])
         return missed
@@ -275,8 +279,9 @@ def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
     if plan.refusal:
         raise ValueError(f"tolerance: {tolerance}; its first grid has {plan.refusal}")
     others: list[Simulation] = []
+    may_look = budget.is_unlimited
     while True:
-        begin, propagator = time.perf_counter(), SimulatedPropagator(plan, store, others)
+        begin, propagator = time.perf_counter(), SimulatedPropagator(plan, store, others, may_look)
         comparison = propagator._compared(with_error=bool(others))
         error, (shape, rigid_error) = comparison.error, comparison.lasting_errors
         taken = time.perf_counter() - begin
@@ -307,6 +312,7 @@ def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
             logger.warning("time or memory end at %.3g mm: %s, tolerance %g", *shown)
             return propagator
         _log_cost(plan, ahead, taken, grid_error, budget, is_second=len(others) == 1)
+        may_look = budget.is_unlimited or budget.fits(finer.halved, plan, taken)
         # the store has its matrix: a simulation without grids, whose memory is given back
         plan, others = finer, [*others, simulation_of(plan, store)]
 

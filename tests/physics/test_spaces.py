@@ -12,6 +12,7 @@ from small_scenes import AIR, relative_error, small_scene
 
 from autdtorch.propagators import make_propagator
 from autdtorch.propagators.grid_comparison import GridComparison
+from autdtorch.propagators.plan import plan
 from autdtorch.propagators.simulation import PressureMap
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.checks import OverlapWarning
@@ -292,22 +293,39 @@ def test_silence_on_one_grid_alone_is_not_exact():
     assert (errors(faint) > 1).all()
 
 
-def test_silence_behind_a_gap_that_cells_close_is_an_error(caplog):
-    """A box with a hole of one cell in a wall of one: two grids close it, and cells half as large do not."""
+def box_with_a_hole(radius: float, wall: float) -> Scene:
+    """Return a scene with a point in a box with a hole in its wall; sizes in m."""
     tilt, air = (0.4, 0.3, 0.2), {"density": AIR.density, "sound_speed": AIR.sound_speed}
     outer, within = (
-        Box(CENTER, (edge,) * 3, tilt, **kind) for edge, kind in ((8e-3, {"rigid": True}), (5e-3, air))
+        Box(CENTER, (edge,) * 3, tilt, **kind)
+        for edge, kind in ((5e-3 + 2 * wall, {"rigid": True}), (5e-3, air))
     )
     axis = rotation_matrix(tilt)[:, 2]
-    hole = Cylinder(
-        tuple((torch.tensor(CENTER) + 4e-3 * axis).tolist()), 0.7e-3, 4e-3, tuple(axis.tolist()), **air
-    )
-    array = small_scene().array
+    middle = torch.tensor(CENTER) + (2.5e-3 + wall) * axis
+    hole = Cylinder(tuple(middle.tolist()), radius, 2 * wall + 1e-3, tuple(axis.tolist()), **air)
     with pytest.warns(OverlapWarning):
-        scene = Scene(array, AIR, 40e3, [CENTER], (outer, within, hole))
-    propagator = make_propagator(scene, "box", 1.4e-3, 1e-3)
+        return Scene(small_scene().array, AIR, 40e3, [CENTER], (outer, within, hole))
+
+
+def test_silence_behind_a_gap_that_cells_close_is_an_error(caplog):
+    """Two grids close a hole of one cell, and cells half as large do not."""
+    propagator = make_propagator(box_with_a_hole(0.7e-3, 1.5e-3), "box", 1.4e-3, 1e-3)
     matrix, error = propagator.transfer_matrix(return_error=True)
     assert not matrix.any()
     assert "close off the point" in caplog.text
     assert error == 1
     assert (propagator.point_errors() == 1).all()
+
+
+def test_cells_that_open_gaps_are_within_the_budget_of_a_choice(caplog):
+    """Grids of 2 and 1.6 mm close a hole of 1.4 mm in a thick wall; cells half as large open it."""
+    scene = box_with_a_hole(0.7e-3, 4e-3)
+    coarsest = plan(scene, "box", None)
+    memory = 1.2 * coarsest.at(coarsest.spacing / 1.3, 0.1).memory
+    propagator = make_propagator(scene, "box", None, 0.1, memory=memory)
+    assert propagator.spacing < coarsest.spacing
+    assert propagator.plan.halved.memory > memory
+    matrix, error = propagator.transfer_matrix(return_error=True)
+    assert not matrix.any()
+    assert error == 0
+    assert "may open gaps, are refused: seconds or memory" in caplog.text
