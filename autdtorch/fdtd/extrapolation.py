@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from autdtorch.fdtd.resonances import is_near, offsets_of, parts_of
+from autdtorch.fdtd.resonances import are_resonances, offsets_of, parts_of
 from autdtorch.utils.array_types import REAL
 
 MOST_FITTED = 2048
@@ -71,11 +71,11 @@ class Extrapolation:
             return
         numbers = np.arange(self._count - len(self), self._count)
         steps = (numbers[1:] - 1) % (self._most - 1)
-        products = self._products[places].sum(dim=0).cpu().numpy()[np.ix_(steps, steps)]
-        offsets = offsets_of(products.conj(), interval)
+        products = self._products[places].sum(dim=0).cpu().numpy()[np.ix_(steps, steps)].conj()
+        offsets = offsets_of(products, interval)
         weights = np.zeros((len(offsets), len(self)), np.complex128)
         weights[:, numbers % self._most] = parts_of(offsets, len(self), interval)
-        for number in np.flatnonzero(is_near(offsets)):
+        for number in np.flatnonzero(are_resonances(offsets, products, interval)):
             same = torch.from_numpy(weights[number]).to(self._values.device).expand(len(places), -1)
             yield complex(offsets[number]), self._combined(same, places)
 

@@ -24,6 +24,10 @@ _WIDEST, _FARTHEST = 0.03, 0.12  # Width and distance from the drive's frequency
 _NOISE = 1e-5  # Singular values relative to the largest, below which they are rounding
 _CHANNELS = 16  # Most directions of the steps that are fitted
 _FEWEST_STEPS = 7  # Shorter runs end without any that is narrow
+# Windows of the steps, and shorter ones that have to tell a resonance too, up to a distance relative to the
+# drive's frequency. What a fit makes of large plates, which ring at many frequencies at once, moves by 0.008
+# to 0.02; resonances of balls move by up to 0.002
+_WINDOW, _SHORTER, _UNSURE = 2 / 3, 1 / 2, 0.004
 # The shift of a frequency falls as this power of the spacing: next to exact ones of four slow balls, as 2.1
 # to 3.3. If it falls more slowly, two grids tell less than all of it.
 _POWER = 3.0
@@ -51,12 +55,13 @@ class Resonance(NamedTuple):
         return self.strength * abs(self.offset)
 
 
-def offsets_of(products: ComplexArray, interval: float) -> ComplexArray:
+def offsets_of(products: ComplexArray, interval: float, share: float = _WINDOW) -> ComplexArray:
     """Return the offsets of what rings in sequences, from their steps; see `Resonance`.
 
     `products` (n, n) are those of each step with each conjugated one, summed over sequences, and `interval`
-    is the time between two [periods]. The steps of windows that are shifted in time span a space that a shift
-    multiplies by exp(-i (p - w) t): its eigenvalues tell p (ESPRIT, Roy and Kailath 1989).
+    is the time between two [periods]. The steps of windows, each a `share` of them, that are shifted in time
+    span a space that a shift multiplies by exp(-i (p - w) t): its eigenvalues tell p (ESPRIT, Roy and
+    Kailath 1989).
     """
     count = len(products)
     if count < _FEWEST_STEPS or not np.isfinite(products).all() or not products.any():
@@ -64,7 +69,7 @@ def offsets_of(products: ComplexArray, interval: float) -> ComplexArray:
     squares, directions = np.linalg.eigh(products)
     squares, directions = squares[-_CHANNELS:], directions[:, -_CHANNELS:]
     steps = directions * np.sqrt(squares.clip(min=0))
-    windows = sliding_window_view(steps, count * 2 // 3, axis=0)
+    windows = sliding_window_view(steps, int(count * share), axis=0)
     basis, sizes, _ = np.linalg.svd(windows.reshape(-1, windows.shape[-1]).T, full_matrices=False)
     basis = basis[:, : min(int((sizes > _NOISE * sizes[0]).sum()), len(basis) - 2)]
     factors = np.linalg.eigvals(np.linalg.lstsq(basis[:-1], basis[1:])[0])
@@ -80,10 +85,15 @@ def parts_of(offsets: ComplexArray, count: int, interval: float) -> ComplexArray
     return np.asarray(np.linalg.pinv(np.hstack([constant, ringing]), rcond=1e-10)[1:], np.complex128)
 
 
-def is_near(offsets: ComplexArray) -> np.ndarray:
-    """Return which offsets (j,) are of resonances that are narrow and near the drive's frequency."""
-    narrow = (offsets.imag < 0) & (offsets.imag > -_WIDEST)
-    return np.asarray(narrow & (abs(offsets) < _FARTHEST))
+def are_resonances(offsets: ComplexArray, products: ComplexArray, interval: float) -> np.ndarray:
+    """Return which offsets (j,) are narrow, near the drive's frequency, and told by shorter windows too.
+
+    `products` and `interval` are those of `offsets_of`.
+    """
+    near = (offsets.imag < 0) & (offsets.imag > -_WIDEST) & (abs(offsets) < _FARTHEST)
+    others = offsets_of(products, interval, _SHORTER)
+    moved = abs(offsets[:, None] - others).min(axis=1, initial=math.inf)
+    return np.asarray(near & (moved < _UNSURE))
 
 
 def merged(runs: Sequence[Sequence[Resonance]]) -> tuple[Resonance, ...]:
@@ -122,7 +132,7 @@ def displacement_error(resonances: Sequence[Resonance], others: Sequence[Resonan
     """Return the relative error of a steady state by the shift of its resonances on a grid.
 
     `others` are those on another grid, whose spacing is larger by a `ratio`. Those on one grid alone count
-    nothing. Neither do those wider than their shift: grids differ by such, and their estimate counts that.
+    nothing.
     """
     squares = 0.0
     for here in resonances:
@@ -130,8 +140,7 @@ def displacement_error(resonances: Sequence[Resonance], others: Sequence[Resonan
         if alike:
             nearest = min(alike, key=lambda other: abs(other.offset - here.offset))
             shift = (here.offset - nearest.offset).real / (ratio**_POWER - 1)
-            if abs(shift) > -here.offset.imag:
-                squares += (here.strength * shift / abs(here.offset + shift)) ** 2
+            squares += (here.strength * shift / abs(here.offset + shift)) ** 2
     return math.sqrt(squares)
 
 
