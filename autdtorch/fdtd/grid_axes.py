@@ -100,8 +100,7 @@ def _axes_with(first: Array, second: Array | None = None) -> Array:
     return usual * np.where(np.diag(usual) < 0, -1.0, 1.0)[:, None]
 
 
-# Largest radius [cells] of such a cylinder: elements across it are fitted together, at most four by four
-_LARGEST_RADIUS = 1.25
+_LARGEST_RADIUS = 1.25  # of such a cylinder [cells]
 _FEWEST_CORNERS = 16  # Fewest corners of a polygon that represents a circle
 _ROUND = 1e-6  # Largest deviation of corners from the circle, relative to the radius
 _STEPS = np.cos((np.arange(4) + 0.5) * np.pi / 8)  # Faces of the staircase, relative to its radius

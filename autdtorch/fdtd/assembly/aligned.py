@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label
 
 from autdtorch.fdtd.assembly.layered_elements import layered_elements
 from autdtorch.fdtd.assembly.prisms import Prisms, prisms, stacked
@@ -72,11 +71,9 @@ class Planes:
         begin = np.flatnonzero(new)
         return cls(places, first[begin], last[begin], begin, np.cumsum(new) - 1)
 
-    def cuts(self, kinds: slice | int) -> Array:
-        """Return the planes within a kind, or a run of kinds, relative to its first element [cells]."""
-        some = np.arange(len(self.begin))[kinds]
-        first, last = (some, some) if np.ndim(some) == 0 else (some[0], some[-1])
-        return np.asarray(self.places[self.first[first] : self.last[last]] - self.begin[first])
+    def cuts(self, kind: int) -> Array:
+        """Return the planes within a kind, relative to its first element [cells]."""
+        return np.asarray(self.places[self.first[kind] : self.last[kind]] - self.begin[kind])
 
     @property
     def parts(self) -> Parts:
@@ -165,8 +162,6 @@ def varies(material: Index, planes: Sequence[Planes], axis: int) -> NDArray[np.b
     return np.asarray(changes)
 
 
-# Most elements along an axis of those that are fitted together; edges farther apart are fitted as if alone
-_TOGETHER = 4
 _RIGID_DENSITY = 1e12
 # Stiffness added to elements at corners, relative to the difference of the mean of their slices from air
 _STIFFER = 0.2
@@ -306,15 +301,11 @@ def _stacked(
     A slice of an element is at a level, and has a width [cells]; see `stacked`.
     """
     across = [other for other in range(3) if other != axis]
-    key, sections, stacks = _key(materials), dict[int, _Sections](), list[list[Prisms]]()
-    for kind, of_kind in zip(kinds[:, across], levels, strict=True):
-        slices = []
-        for level in of_kind:
-            if level not in sections:
-                sections[level] = _Sections(blocks, axis, level)
-            section, place = sections[level].around(kind)
-            slices.append(Prisms(*(part[place] for part in prisms(section, key, stencil))))
-        stacks.append(slices)
+    key = _key(materials)
+    stacks = [
+        [prisms(_section(blocks, axis, level, kind), key, stencil) for level in of_kind]
+        for kind, of_kind in zip(kinds[:, across], levels, strict=True)
+    ]
     coupling, mass = np.zeros((len(stacks), 28)), np.zeros((len(stacks), 8))
     layers = np.array([len(slices) for slices in stacks], np.int64)
     for count in np.unique(layers):
@@ -325,30 +316,16 @@ def _stacked(
     return coupling, mass
 
 
-class _Sections:
-    """Sections across an axis, at the level of one block, around elements that vary along both other axes."""
-
-    def __init__(self, blocks: MaterialBlocks, axis: int, level: int) -> None:
-        self._material = np.take(blocks.material, [level], axis=axis).squeeze(axis)
-        self._planes = [planes for other, planes in enumerate(blocks.planes) if other != axis]
-        varied = [varies(self._material, self._planes, each) for each in (0, 1)]
-        self._group = np.asarray(label(varied[0] & varied[1], np.ones((3, 3)))[0])
-
-    def around(self, kind: Index) -> tuple[Section, tuple[int, int]]:
-        """Return the section of elements of a kind (2,) and those that touch them, and their place in it."""
-        x, y = map(int, kind)
-        ends = [(x, x), (y, y)]
-        if self._group[x, y]:
-            group = np.nonzero(self._group == self._group[x, y])
-            together = [(int(places.min()), int(places.max())) for places in group]
-            ends = together if max(b - a for a, b in together) < _TOGETHER else ends
-        runs = list(zip(self._planes, ends, strict=True))
-        rows, columns = (slice(planes.first[a], planes.last[b] + 1) for planes, (a, b) in runs)
-        part, cuts = self._material[rows, columns], []
-        for axis, (planes, (first, last)) in enumerate(runs):
-            faces = (np.diff(part, axis=axis) != 0).any(axis=1 - axis)
-            cuts.append(tuple(planes.cuts(slice(first, last + 1))[faces].tolist()))
-            part = np.compress(np.append(True, faces), part, axis=axis)
-        size = ends[0][1] - ends[0][0] + 1, ends[1][1] - ends[1][0] + 1
-        section = Section(size, (cuts[0], cuts[1]), tuple(map(tuple, part.tolist())))
-        return section, (x - ends[0][0], y - ends[1][0])
+def _section(blocks: MaterialBlocks, axis: int, level: int, kind: Index) -> Section:
+    """Return the section across an axis, at the level of one block, through elements of a kind (2,)."""
+    planes = [each for other, each in enumerate(blocks.planes) if other != axis]
+    place: list[slice | int] = [
+        slice(each.first[k], each.last[k] + 1) for each, k in zip(planes, kind, strict=True)
+    ]
+    place.insert(axis, level)
+    part, cuts = blocks.material[tuple(place)], []
+    for along, (each, k) in enumerate(zip(planes, kind, strict=True)):
+        faces = (np.diff(part, axis=along) != 0).any(axis=1 - along)
+        cuts.append(tuple(each.cuts(k)[faces].tolist()))
+        part = np.compress(np.append(True, faces), part, axis=along)
+    return Section((cuts[0], cuts[1]), tuple(map(tuple, part.tolist())))

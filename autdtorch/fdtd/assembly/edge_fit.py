@@ -1,4 +1,4 @@
-"""Couplings of the elements at an edge, fitted to the fields of long waves in the window around them."""
+"""Couplings of the element at an edge, fitted to the fields of long waves in the window around them."""
 
 from __future__ import annotations
 
@@ -42,40 +42,33 @@ def importance(order: Array) -> Array:
 
 
 def fitted_couplings(
-    section: Section,
-    varied: list[tuple[int, int]],
-    fields: PlaneFields,
-    materials: MaterialKey,
-    stencil: Stencil,
+    section: Section, fields: PlaneFields, materials: MaterialKey, stencil: Stencil
 ) -> Array:
-    """Return the couplings (k, 6) between the columns of the elements `varied` of a section.
+    """Return the couplings (6,) between the columns of a section.
 
-    The stiffness matrix of an element is B R R^T B^T with R triangular, so that no energy is negative. B
+    The stiffness matrix of the element is B R R^T B^T with R triangular, so that no energy is negative. B
     spans the differences of its columns outside rigid materials.
     """
-    window = _Window(section, varied, fields, materials, stencil)
-    means = np.stack([mean_densities(section, *place, materials) for place in varied])
-    guess = uniform_columns(stencil) * np.maximum(1 / means, _LEAST_START)
-    roots = _Roots([window.present[columns] for columns in window.columns])
+    window = _Window(section, fields, materials, stencil)
+    guess = uniform_columns(stencil) * np.maximum(1 / mean_densities(section, materials), _LEAST_START)
+    roots = _Roots(window.present[window.columns])
     start = roots.of(guess)
-    if not len(start):  # at most one column of each element is outside rigid materials
+    if not len(start):  # at most one column is outside rigid materials
         return np.zeros_like(guess)
 
     def missed(root: Array) -> Array:
         coupling = roots.couplings(root)
-        return np.concatenate((window.missed(coupling), _PRIOR * (coupling / guess - 1).ravel()))
+        return np.concatenate((window.missed(coupling), _PRIOR * (coupling / guess - 1)))
 
     def slopes(root: Array) -> Array:
         by_coupling = window.slopes(roots.couplings(root))
-        by_coupling = np.concatenate((by_coupling, _PRIOR * np.diag(1 / guess.ravel())))
+        by_coupling = np.concatenate((by_coupling, _PRIOR * np.diag(1 / guess)))
         return np.asarray(by_coupling @ roots.slopes(root))
 
     fit = least_squares(
         missed, start, slopes, ftol=_FIT_EXACT, xtol=_FIT_EXACT, gtol=_FIT_EXACT, max_nfev=_MOST_FIT_STEPS
     )
-    parts = [section.parts(*place, materials.rigid) for place in varied]
-    couplings = roots.couplings(fit.x)
-    return np.stack([_apart(coupling, part) for coupling, part in zip(couplings, parts, strict=True)])
+    return _apart(roots.couplings(fit.x), section.parts(materials.rigid))
 
 
 def _apart(coupling: Array, part: Index) -> Array:
@@ -94,26 +87,20 @@ class _Window:
     """The vertices of a window, the stiffness of its known elements, and the fields."""
 
     def __init__(
-        self,
-        section: Section,
-        varied: list[tuple[int, int]],
-        fields: PlaneFields,
-        materials: MaterialKey,
-        stencil: Stencil,
+        self, section: Section, fields: PlaneFields, materials: MaterialKey, stencil: Stencil
     ) -> None:
-        """Assemble all elements but those `varied`."""
+        """Assemble all elements but those that vary along both axes."""
         self.present = fields.present.ravel()
         inside = np.zeros(fields.present.shape, bool)
         inside[1:-1, 1:-1] = True
         self._fixed, self._free = self.present & ~inside.ravel(), self.present & inside.ravel()
         self._fields = (fields.values[:, :, 1:] * importance(fields.order[1:])).reshape(len(self.present), -1)
         self._matrix = known_elements(section, materials, stencil)[0][self._free]
-        self.columns = [columns_of(section, place) for place in varied]
+        self.columns = columns_of((0, 0))
         judged = self._free.copy()
-        judged[np.concatenate(self.columns)] = False
+        judged[self.columns] = False
         self._judged = judged[self._free]
-        # the vertices that each coupling connects
-        self._pairs = np.concatenate([columns[COLUMN_PAIRS] for columns in self.columns])
+        self._pairs = self.columns[COLUMN_PAIRS]  # the vertices that each coupling connects
 
     def missed(self, coupling: Array) -> Array:
         """Return the difference of the pressure at the vertices of other elements from the fields."""
@@ -121,7 +108,7 @@ class _Window:
         return np.asarray((solution - self._fields)[self._free][self._judged].ravel())
 
     def slopes(self, coupling: Array) -> Array:
-        """Return the derivatives (n, 6 k) of `missed` by the couplings."""
+        """Return the derivatives (n, 6) of `missed` by the couplings."""
         solution, inverse = self._solved(coupling)
         one, other = self._pairs.T
         change = solution[one] - solution[other]
@@ -139,9 +126,9 @@ class _Window:
         return solution, np.asarray(inverse)
 
 
-def columns_of(section: Section, place: Sequence[int]) -> Index:
+def columns_of(place: Sequence[int]) -> Index:
     """Return the flat indices (4,) of the columns of an element among the vertices of the window."""
-    return np.asarray((COLUMNS + place + RING) @ (section.size[1] + 2 * RING + 1, 1))
+    return np.asarray((COLUMNS + place + RING) @ (2 * RING + 2, 1))
 
 
 def known_elements(
@@ -149,21 +136,20 @@ def known_elements(
 ) -> tuple[Array, Array]:
     """Return stiffness matrix (n, n) and masses (n,) of the elements of a window that `layered_element` has.
 
-    Elements beyond the section continue those beside it.
+    Elements farther from the section continue those beside it.
     """
-    wide, tall = section.size
     alike = {
         (x, y): layered_element(section, x, y, materials, stencil, air)
-        for x, y in itertools.product(range(-1, wide + 1), range(-1, tall + 1))
+        for x, y in itertools.product((-1, 0, 1), repeat=2)
     }
     columns, couplings, masses = [], [], []
-    for x, y in itertools.product(range(-RING, wide + RING), range(-RING, tall + RING)):
-        element = alike[min(max(x, -1), wide), min(max(y, -1), tall)]
+    for x, y in itertools.product(range(-RING, 1 + RING), repeat=2):
+        element = alike[min(max(x, -1), 1), min(max(y, -1), 1)]
         if element is not None:
-            columns.append(columns_of(section, (x, y)))
+            columns.append(columns_of((x, y)))
             couplings.append(element.coupling)
             masses.append(element.mass.ravel())
-    count, place = (wide + 2 * RING + 1) * (tall + 2 * RING + 1), np.stack(columns)
+    count, place = (2 * RING + 2) ** 2, np.stack(columns)
     mass = np.bincount(place.ravel(), np.concatenate(masses), count).astype(np.float64)
     return stiffness_between(place[:, COLUMN_PAIRS], np.stack(couplings), count), mass
 
@@ -178,41 +164,30 @@ def stiffness_between(pairs: Index, coupling: Array, count: int) -> Array:
 
 
 class _Roots:
-    """The triangular matrices, flat and joined, of the couplings of k elements."""
+    """The triangular matrices, flat, of the couplings of an element."""
 
-    def __init__(self, present: list[NDArray[np.bool_]]) -> None:
-        """Start from masks (4,) of the columns of each element outside rigid materials."""
-        self._bases = [_differences(columns) for columns in present]
-        counts = [basis.shape[1] * (basis.shape[1] + 1) // 2 for basis in self._bases]
-        self._ends = list(itertools.pairwise(np.cumsum([0, *counts])))
+    def __init__(self, present: NDArray[np.bool_]) -> None:
+        """Start from a mask (4,) of its columns outside rigid materials."""
+        self._basis = _differences(present)
 
     def of(self, coupling: Array) -> Array:
-        """Return the roots of couplings (k, 6) of positive energy between the columns that are present."""
-        roots = []
-        for basis, of_element in zip(self._bases, coupling, strict=True):
-            present = np.asarray(basis.any(axis=1))[COLUMN_PAIRS].all(axis=1)
-            matrix = stiffness_matrix(np.where(present, of_element, 0), COLUMN_PAIRS)
-            roots.append(np.linalg.cholesky(basis.T @ matrix @ basis)[np.tril_indices(basis.shape[1])])
-        return np.concatenate(roots)
+        """Return the root of couplings (6,) of positive energy between the columns that are present."""
+        basis = self._basis
+        present = np.asarray(basis.any(axis=1))[COLUMN_PAIRS].all(axis=1)
+        matrix = stiffness_matrix(np.where(present, coupling, 0), COLUMN_PAIRS)
+        return np.asarray(np.linalg.cholesky(basis.T @ matrix @ basis)[np.tril_indices(basis.shape[1])])
 
     def couplings(self, root: Array) -> Array:
-        """Return the couplings (k, 6) of roots."""
-        halves = [
-            basis @ _triangle(root[first:last], basis)
-            for basis, (first, last) in zip(self._bases, self._ends, strict=True)
-        ]
-        return np.stack([-(half @ half.T)[tuple(COLUMN_PAIRS.T)] for half in halves])
+        """Return the couplings (6,) of a root."""
+        half = self._basis @ _triangle(root, self._basis)
+        return np.asarray(-(half @ half.T)[tuple(COLUMN_PAIRS.T)])
 
     def slopes(self, root: Array) -> Array:
-        """Return the derivatives (6 k, n) of the couplings by the roots."""
-        slopes = np.zeros((6 * len(self._bases), len(root)))
-        for number, (basis, (first, last)) in enumerate(zip(self._bases, self._ends, strict=True)):
-            half = basis @ _triangle(root[first:last], basis)
-            for place, unit in enumerate(np.eye(last - first)):
-                change = basis @ _triangle(unit, basis) @ half.T
-                by_pairs = -(change + change.T)[tuple(COLUMN_PAIRS.T)]
-                slopes[6 * number : 6 * number + 6, first + place] = by_pairs
-        return slopes
+        """Return the derivatives (6, n) of the couplings by the root."""
+        basis = self._basis
+        half = basis @ _triangle(root, basis)
+        changes = [basis @ _triangle(unit, basis) @ half.T for unit in np.eye(len(root))]
+        return np.stack([-(change + change.T)[tuple(COLUMN_PAIRS.T)] for change in changes], axis=1)
 
 
 def _triangle(root: Array, basis: Array) -> Array:

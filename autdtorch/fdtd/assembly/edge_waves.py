@@ -26,9 +26,9 @@ _SUM = 100.0  # Weight of the sum of masses, which is the volume of air
 
 
 def rigid_corner(section: Section, materials: MaterialKey) -> tuple[int, int] | None:
-    """Return the only rigid block of a section of one element in air, at a convex edge, or None."""
+    """Return the only rigid block of a section in air, at a convex edge, or None."""
     blocks = np.array(section.material)
-    if section.size != (1, 1) or blocks.shape != (2, 2):
+    if blocks.shape != (2, 2):
         return None
     rigid = np.array(materials.rigid)[blocks]
     others = blocks[~rigid]
@@ -68,7 +68,7 @@ class _WaveWindow:
         present = (from_edge > 0).any(axis=1)
         inside = ((places > -RING) & (places < RING + 1)).all(axis=1)
         self._present, self._rim = present, present & ~inside
-        self._columns = columns_of(section, (0, 0))
+        self._columns = columns_of((0, 0))
         self._air = np.flatnonzero(present[self._columns])
         self._pairs = np.flatnonzero(present[self._columns][COLUMN_PAIRS].all(axis=1))
         self._judged = present.copy()

@@ -1,10 +1,12 @@
 """Elements that do not vary along one axis, as at edges of bodies whose faces are parallel to the grid.
 
-The field at an edge is singular. In a plane across it, the couplings of the elements at the edge are fitted:
-the scheme must reproduce the smoothest fields of long waves in the window of cells around them, given their
-pressure at its rim. Edges closer than a cell, as of a thin plate or at the mouth of a slit, are fitted
-together. Without the fit the error of a cuboid depends on where its faces fall, and is up to twenty times as
-large. Single edges of rigid bodies are then fitted to waves of the drive's frequency (`edge_waves.py`).
+The field at an edge is singular. In a plane across it, the couplings of the element at the edge are fitted:
+the scheme must reproduce the smoothest fields of long waves in the window of cells around it, given their
+pressure at its rim. Without the fit the error of a cuboid depends on where its faces fall, and is up to
+twenty times as large. Each element is fitted as if its edges were alone in the window. Long waves do not
+determine the couplings of several: fitted together, those of a grating of bars let 20 % more pass than there
+is, and erred by 10 %, not 1. Single edges of rigid bodies are then fitted to waves of the drive's frequency
+(`edge_waves.py`).
 """
 
 from __future__ import annotations
@@ -37,8 +39,7 @@ from autdtorch.fdtd.assembly.sections import (
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array
 
-# Fields of the fit of one element; each further one needs two more, up to a limit
-_FIELDS, _MOST_FIELDS = 8, 12
+_FIELDS = 8  # Fields of the fit beside the constant one
 # Largest mass of a column in a heavy body, relative to its material's or to its coupling (air: 1). A column
 # that air reaches weakly would otherwise be a pipe that resonates.
 _REACHED = 2.0
@@ -51,11 +52,11 @@ _SIDES = np.abs(COLUMNS[:, None] - COLUMNS).sum(axis=2).reshape((2,) * 4)
 
 
 class Prisms(NamedTuple):
-    """The elements (a, b) of a section, one cell long."""
+    """The element of a section, one cell long."""
 
-    coupling: Array  # between columns (a, b, 2, 2, 2, 2), relative to the stencil's
-    mass: Array  # mass of each column (a, b, 2, 2)
-    mobility: Array  # mobility along each column (a, b, 2, 2)
+    coupling: Array  # between columns (2, 2, 2, 2), relative to the stencil's
+    mass: Array  # mass of each column (2, 2)
+    mobility: Array  # mobility along each column (2, 2)
 
 
 SquareSymmetry: TypeAlias = tuple[bool, bool, bool]
@@ -66,7 +67,7 @@ _IMAGES = [(a, b, c) for a, b, c in itertools.product((False, True), repeat=3)]
 
 @lru_cache(maxsize=4096)
 def prisms(section: Section, materials: MaterialKey, stencil: Stencil) -> Prisms:
-    """Return the fitted elements of a section.
+    """Return the fitted element of a section.
 
     Images of a section share a fit, and the fit of a symmetric one is the mean over its images: symmetric
     scenes stay symmetric.
@@ -81,22 +82,22 @@ def prisms(section: Section, materials: MaterialKey, stencil: Stencil) -> Prisms
 def _image_of_section(section: Section, image: SquareSymmetry) -> Section:
     """Return an image of a section, rounded."""
     exchanged, *mirrored = image
-    (a, b), (one, other), blocks = section.size, section.cuts, np.array(section.material)
+    (one, other), blocks = section.cuts, np.array(section.material)
     if exchanged:
-        a, b, one, other, blocks = b, a, other, one, blocks.T
+        one, other, blocks = other, one, blocks.T
     blocks = np.flip(blocks, tuple(axis for axis, mirror in enumerate(mirrored) if mirror))
-    cuts = _mirrored(one, a, mirrored[0]), _mirrored(other, b, mirrored[1])
-    return Section((a, b), cuts, tuple(map(tuple, blocks.tolist())))
+    cuts = _mirrored(one, mirrored[0]), _mirrored(other, mirrored[1])
+    return Section(cuts, tuple(map(tuple, blocks.tolist())))
 
 
-def _mirrored(cuts: tuple[float, ...], size: int, mirror: bool) -> tuple[float, ...]:
+def _mirrored(cuts: tuple[float, ...], mirror: bool) -> tuple[float, ...]:
     """Return the places of faces along an axis, or their mirror images, rounded."""
-    places = [size - cut for cut in reversed(cuts)] if mirror else cuts
+    places = [1 - cut for cut in reversed(cuts)] if mirror else cuts
     return tuple(round(cut, _DECIMALS) for cut in places)
 
 
 def _original(fit: Prisms, image: SquareSymmetry) -> Prisms:
-    """Return the elements of the section that an image was fitted for."""
+    """Return the element of the section that an image was fitted for."""
     exchanged, *mirrored = image
     axes = [axis for axis, mirror in enumerate(mirrored) if mirror]
 
@@ -150,35 +151,25 @@ def _stiffness(coupling: Array) -> Array:
 
 @lru_cache(maxsize=4096)
 def _fitted(section: Section, materials: MaterialKey, stencil: Stencil) -> Prisms:
-    """Return the elements of a section, those that vary along both axes fitted in the window around it."""
-    uniform, varied = uniform_columns(stencil), []
-    fit = Prisms(np.zeros((*section.size, 2, 2, 2, 2)), *np.zeros((2, *section.size, 2, 2)))
-    for x, y in np.ndindex(section.size):
-        if (element := layered_element(section, x, y, materials, stencil)) is None:
-            varied.append((x, y))
-        else:
-            fit.coupling[x, y] = _by_columns(element.coupling / uniform)
-            fit.mass[x, y], fit.mobility[x, y] = element.mass, element.mobility
-    if not varied:
-        return fit
-    fields = plane_fields(section, materials.mobility, min(_FIELDS + 2 * (len(varied) - 1), _MOST_FIELDS))
-    couplings = fitted_couplings(section, varied, fields, materials, stencil)
-    corner = rigid_corner(section, materials)
-    for (x, y), coupling in zip(varied, couplings, strict=True):
-        reached = np.bincount(COLUMN_PAIRS.ravel(), np.repeat(coupling, 2), 4) / (2 * uniform.sum() / 4)
-        values = fields.values[RING + x : RING + x + 2, RING + y : RING + y + 2].reshape(4, -1)
-        for part, weight in ((fit.mass, materials.masses), (fit.mobility, materials.mobility)):
-            at_columns = weight[section.at_columns(x, y)]
-            most = np.maximum(at_columns, _REACHED * reached) / 4
-            most = np.where(at_columns < weight.max(), most, np.inf)
-            part[x, y] = _lumped(values, fields.over_element(weight, x, y), fields.order, most)
-        if corner is not None:
-            coupling, mass = at_the_drive(
-                section, corner, coupling, fit.mass[x, y].ravel(), materials, stencil
-            )
-            fit.mass[x, y] = fit.mobility[x, y] = mass.reshape(2, 2)  # in air, both are volumes
-        fit.coupling[x, y] = _by_columns(coupling / uniform)
-    return fit
+    """Return the element of a section, fitted in the window around it if it varies along both axes."""
+    uniform = uniform_columns(stencil)
+    if (element := layered_element(section, 0, 0, materials, stencil)) is not None:
+        return Prisms(_by_columns(element.coupling / uniform), element.mass, element.mobility)
+    fields = plane_fields(section, materials.mobility, _FIELDS)
+    coupling = fitted_couplings(section, fields, materials, stencil)
+    reached = np.bincount(COLUMN_PAIRS.ravel(), np.repeat(coupling, 2), 4) / (2 * uniform.sum() / 4)
+    values = fields.values[RING : RING + 2, RING : RING + 2].reshape(4, -1)
+    lumped = []
+    for weight in (materials.masses, materials.mobility):
+        at_columns = weight[section.at_columns]
+        most = np.maximum(at_columns, _REACHED * reached) / 4
+        most = np.where(at_columns < weight.max(), most, np.inf)
+        lumped.append(_lumped(values, fields.over_section(weight), fields.order, most))
+    mass, mobility = lumped
+    if (corner := rigid_corner(section, materials)) is not None:
+        coupling, masses = at_the_drive(section, corner, coupling, mass.ravel(), materials, stencil)
+        mass = mobility = masses.reshape(2, 2)  # in air, both are volumes
+    return Prisms(_by_columns(coupling / uniform), mass, mobility)
 
 
 def _by_columns(coupling: Array) -> Array:

@@ -22,7 +22,7 @@ from autdtorch.fdtd.assembly.reference_element import coupling_by_edges
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 
-RING = 3  # Elements of a window on each side of its section
+RING = 3  # Elements of a window on each side of the one at the edge
 COLUMNS = np.array(list(itertools.product((0, 1), repeat=2)))  # Columns of an element (4, 2)
 COLUMN_PAIRS = np.array(list(itertools.combinations(range(4), 2)))  # The six pairs of columns
 # Number of sides between the columns of each pair
@@ -49,9 +49,8 @@ class MaterialKey(NamedTuple):
 
 
 class Section(NamedTuple):
-    """Elements across bodies, from (0, 0) to `size`; the blocks at its ends are infinite."""
+    """An element across bodies, from (0, 0) to (1, 1); the blocks at its ends are infinite."""
 
-    size: tuple[int, int]  # elements along both axes
     cuts: tuple[tuple[float, ...], tuple[float, ...]]  # places of the faces along both axes [cells]
     material: tuple[tuple[int, ...], ...]  # material of each block, (f + 1) by (g + 1)
 
@@ -59,15 +58,14 @@ class Section(NamedTuple):
         """Return the blocks at coordinates along both axes."""
         return np.searchsorted(self.cuts[0], x), np.searchsorted(self.cuts[1], y)
 
-    def at_columns(self, x: int, y: int) -> Index:
-        """Return the materials (4,) at the columns of an element."""
-        places = np.array((x, y)) + COLUMNS
-        return np.array(self.material)[self.blocks_at(*places.T)]
+    @property
+    def at_columns(self) -> Index:
+        """The materials (4,) at its columns."""
+        return np.array(self.material)[self.blocks_at(*COLUMNS.T)]
 
-    def parts(self, x: int, y: int, rigid: Sequence[bool]) -> Index:
-        """Return the part of an element, between rigid materials, that holds each column (4,), else 0."""
-        *_, material = self.element(x, y)
-        part, _ = label(~np.array(rigid)[material])
+    def parts(self, rigid: Sequence[bool]) -> Index:
+        """Return the part of it, between rigid materials, that holds each column (4,), else 0."""
+        part, _ = label(~np.array(rigid)[np.array(self.material)])
         return np.asarray(part[np.ix_((0, -1), (0, -1))].ravel(), np.int64)
 
     def ends(self, axis: int, begin: int) -> Array:
@@ -76,7 +74,7 @@ class Section(NamedTuple):
         return np.array([begin, *inner, begin + 1.0])
 
     def element(self, x: int, y: int) -> tuple[Array, Array, Index]:
-        """Return the ends of the blocks in an element along both axes, and their materials."""
+        """Return the ends of the blocks in the element at (x, y) along both axes, and their materials."""
         ends = self.ends(0, x), self.ends(1, y)
         middles = [(end[1:] + end[:-1]) / 2 for end in ends]
         return *ends, np.array(self.material)[np.ix_(*self.blocks_at(*middles))]
@@ -99,7 +97,7 @@ def uniform_columns(stencil: Stencil) -> Array:
 def layered_element(
     section: Section, x: int, y: int, materials: MaterialKey, stencil: Stencil, air: float | None = None
 ) -> Layered | None:
-    """Return an element, or None if it varies along both axes.
+    """Return the element at (x, y) in the window, or None if it varies along both axes.
 
     It is for long waves, or for a wavenumber `air` [rad/cell] if its materials are air or rigid.
     """
@@ -123,11 +121,11 @@ def layered_element(
     return Layered(coupling, *of_columns)
 
 
-def mean_densities(section: Section, x: int, y: int, materials: MaterialKey) -> Array:
-    """Return the mean densities (6,) along the lines between the columns of an element."""
+def mean_densities(section: Section, materials: MaterialKey) -> Array:
+    """Return the mean densities (6,) along the lines between the columns of a section."""
     share = (np.arange(_ALONG_LINE) + 0.5) / _ALONG_LINE
     begin, end = (COLUMNS[COLUMN_PAIRS[:, side]][:, None] for side in (0, 1))
-    places = np.array((x, y)) + begin + share[:, None] * (end - begin)
+    places = begin + share[:, None] * (end - begin)
     block = section.blocks_at(places[..., 0], places[..., 1])
     return np.asarray(np.array(materials.density)[np.array(section.material)[block]].mean(axis=1))
 
@@ -150,18 +148,17 @@ _ALONG_Y = np.einsum("ab,cd->acbd", _MASS, _STIFFNESS).reshape(9, 9)
 class PlaneFields(NamedTuple):
     """m fields of long waves in the window around a section; the first one is constant."""
 
-    values: Array  # at the vertices of the window's elements (p, q, m); zero in rigid materials
-    present: NDArray[np.bool_]  # mask of the vertices outside rigid materials (p, q)
+    values: Array  # at the vertices of the window's elements (p, p, m); zero in rigid materials
+    present: NDArray[np.bool_]  # mask of the vertices outside rigid materials (p, p)
     order: Array  # power of the distance with which each field grows (m,)
     lines: tuple[Array, Array]  # lines of the mesh, in the coordinates of the section
     material: Index  # material of each cell of the mesh (c, d)
     integrals: Array  # integral of each field over each cell of the mesh (c, d, m)
 
-    def over_element(self, weight: Array, x: int, y: int) -> Array:
-        """Return the integrals (m,) over the element at (x, y), with a weight for each material."""
+    def over_section(self, weight: Array) -> Array:
+        """Return the integrals (m,) over the section, with a weight for each material."""
         (first, last), (low, high) = (
-            np.searchsorted(line, (begin - _ROUNDING, begin + 1 - _ROUNDING))
-            for line, begin in zip(self.lines, (x, y), strict=True)
+            np.searchsorted(line, (-_ROUNDING, 1 - _ROUNDING)) for line in self.lines
         )
         weights = weight[self.material[first:last, low:high]]
         return np.asarray(np.einsum("cd,cdm->m", weights, self.integrals[first:last, low:high]))
@@ -169,7 +166,7 @@ class PlaneFields(NamedTuple):
 
 def plane_fields(section: Section, mobility: Array, count: int) -> PlaneFields:
     """Return the constant field and `count` others, by the mobility of each material, zero if rigid."""
-    x, y = (_mesh_lines(np.array(cuts), size) for cuts, size in zip(section.cuts, section.size, strict=True))
+    x, y = (_mesh_lines(np.array(cuts)) for cuts in section.cuts)
     middles = [(line[1:] + line[:-1]) / 2 for line in (x, y)]
     material = np.array(section.material)[np.ix_(*section.blocks_at(*middles))]
     nodes = [np.sort(np.concatenate(pair)) for pair in zip((x, y), middles, strict=True)]
@@ -189,7 +186,7 @@ def plane_fields(section: Section, mobility: Array, count: int) -> PlaneFields:
     if len(order) > 1:
         field[free, 1:] = _solved(matrix[free][:, free], matrix[free][:, fixed] @ -field[fixed, 1:])
     share = width[:, :, None] * height[:, :, None] * np.outer(_INTEGRAL, _INTEGRAL).ravel()
-    at = np.ix_(*map(_places_of_vertices, nodes, section.size))
+    at = np.ix_(*map(_places_of_vertices, nodes))
     return PlaneFields(
         field.reshape(*shape, -1)[at],
         used[at],
@@ -200,13 +197,13 @@ def plane_fields(section: Section, mobility: Array, count: int) -> PlaneFields:
     )
 
 
-def _places_of_vertices(nodes: Array, size: int) -> Index:
-    return np.searchsorted(nodes, np.arange(-RING, size + RING + 1) - _ROUNDING)
+def _places_of_vertices(nodes: Array) -> Index:
+    return np.searchsorted(nodes, np.arange(-RING, RING + 2) - _ROUNDING)
 
 
-def _mesh_lines(cuts: Array, size: int) -> Array:
+def _mesh_lines(cuts: Array) -> Array:
     """Return the lines of the mesh along an axis: vertices, faces, and lines graded towards the faces."""
-    fixed = np.unique(np.concatenate((np.arange(-_REACH, size + _REACH + 1.0), cuts)))
+    fixed = np.unique(np.concatenate((np.arange(-_REACH, _REACH + 2.0), cuts)))
     distance = _FARTHEST * _NEARER ** np.arange(_LINES)
     lines = [fixed]
     for cut in cuts:
