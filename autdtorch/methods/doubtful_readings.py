@@ -86,6 +86,10 @@ class Magnitudes:
         """Return the readings of one control point (N, 1)."""
         return Magnitudes(self.value[:, point, None], self.limit[:, point, None])
 
+    def rows(self, chosen: torch.Tensor) -> Magnitudes:
+        """Return the readings of `chosen` drives (n, P), int64."""
+        return Magnitudes(self.value[chosen], self.limit[chosen])
+
     def first(self, count: int) -> Magnitudes:
         """Return the readings of the first drives (count, P)."""
         return Magnitudes(self.value[:count], self.limit[:count])

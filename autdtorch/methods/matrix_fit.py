@@ -22,6 +22,7 @@ _GUESSES = 16  # rows from which the search for each row begins
 _LEAST_READINGS = 2.3  # for each transducer, so that a long search finds the row
 _APART = 0.5  # random part of these rows, relative to the common part
 _RELAXATION = 0.7  # of the splitting; 1 takes half as many steps again
+_SEARCHED = 500  # readings for each transducer, at most; the fit that follows has all
 _SEARCH_STEPS = 300
 _LONG_SEARCH_STEPS = 1000  # with fewer than 3 M - 2 readings, unless all are explained; 10,000 find as many
 _CHECKED = 100  # steps of a long search after which the rows are compared with the readings
@@ -177,23 +178,30 @@ def retrieve(drives: torch.Tensor, read: Magnitudes, generator: torch.Generator)
 
     Relaxed Douglas-Rachford splitting (Elser, SIAM J. Appl. Algebra Geometry 2 (2018) 150) seeks phasors that
     have the observed magnitudes and that some row produces, from spectral estimates of the rows. The rows are
-    then fitted, and the best fit is taken.
+    then fitted, and the best fit is taken. Of many readings of a point, a random part decides its row.
     """
-    inverse = torch.linalg.pinv(drives)
-    short = len(drives) < 3 * drives.shape[1] - 2
+    most = _SEARCHED * drives.shape[1]
+    played, inverse = drives, None
     best = []
     for point in range(read.value.shape[1]):
         magnitude = read.column(point)
-        rows = _searched(drives, inverse, magnitude, short, generator)
-        rows = _least_squares(drives, inverse, magnitude, rows)
-        best.append(rows[:, _misfit(drives, magnitude, rows).argmin()])
+        if len(drives) > most:
+            readings = torch.nonzero(~magnitude.outliers[:, 0])[:, 0]
+            chosen = readings[torch.randperm(len(readings), generator=generator, device="cpu")[:most]]
+            played, magnitude, inverse = drives[chosen], magnitude.rows(chosen), None
+        if inverse is None:
+            inverse = torch.linalg.pinv(played)
+        rows = _searched(played, inverse, magnitude, generator)
+        rows = _least_squares(played, inverse, magnitude, rows)
+        best.append(rows[:, _misfit(played, magnitude, rows).argmin()])
     return torch.stack(best, dim=1)
 
 
 def _searched(
-    drives: torch.Tensor, inverse: torch.Tensor, read: Magnitudes, short: bool, generator: torch.Generator
+    drives: torch.Tensor, inverse: torch.Tensor, read: Magnitudes, generator: torch.Generator
 ) -> torch.Tensor:
-    """Return candidates (M, K) for a row that explains magnitudes (N, 1), after a long search if `short`."""
+    """Return candidates (M, K) for a row that explains magnitudes (N, 1); few take a long search."""
+    short = len(drives) < 3 * drives.shape[1] - 2
     start = _spectral(drives, read)[:, None]
     guesses = torch.randn((len(start), _GUESSES), dtype=torch.complex128, generator=generator, device="cpu")
     phasors = drives @ (start + _APART * start.norm() / guesses.norm(dim=0) * guesses)

@@ -255,6 +255,18 @@ def test_phases_are_retrieved_once_for_all_screenings(paper_objective, monkeypat
     assert len(calls) == 1
 
 
+def test_a_part_of_many_readings_finds_the_rows_where_each_reads_one_point(random_matrix, monkeypatch):
+    """Three of four readings of each point are gaps; without noise the rows are exact up to a phase."""
+    monkeypatch.setattr("autdtorch.methods.matrix_fit._SEARCHED", 20)
+    matrix, draws = random_matrix(4, 6, 0), torch.Generator().manual_seed(0)
+    drives = random_drives(600, 6, draws)
+    gaps = torch.arange(600)[:, None] % 4 != torch.arange(4)
+    read = Magnitudes.of((drives @ matrix.mT).abs(), gaps, torch.full((4,), torch.inf))
+    rows = retrieve(drives, read, draws).mT
+    overlap = (rows.conj() * matrix).sum(dim=1).abs() / (rows.norm(dim=1) * matrix.norm(dim=1))
+    assert overlap.min() > 1 - 1e-6  # the search ends at 1e-3 of the readings
+
+
 @pytest.mark.parametrize("factor", [0, 100])
 def test_a_last_reading_that_cannot_be_is_told(share, factor):
     reached, said = share(times(factor, [51], 1), evaluations=52)
