@@ -104,7 +104,7 @@ def estimate(
         *before, last = _plans_by_tolerance(planned.on_grids)
         spacing = last.spacing
         if planned.method == "tmatrix":
-            before, last = [*before, last], planned.at(spacing, tolerance)
+            before, last = [*before, last], planned.by_waves(spacing)
         planned = last
     # a multiple of the spacing: a scene that is symmetric on one grid mostly is on the other
     factor = max(1, math.floor(planned.region.wavelength / _PILOT_CELLS / spacing))

@@ -98,7 +98,7 @@ def make_propagator(
         return TMatrixPropagator(planned, store, on_grids)
     propagator: TMatrixPropagator | SimulatedPropagator
     if planned.method == "tmatrix":
-        settled = planned if spacing else planned.at(on_grids().spacing, tolerance, time_step)
+        settled = planned if spacing else planned.by_waves(on_grids().spacing, time_step)
         propagator = TMatrixPropagator(settled, store, on_grids)
     elif planned.method == "free_space":
         return FreeSpacePropagator(scene, planned.device)

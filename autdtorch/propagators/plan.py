@@ -42,6 +42,9 @@ rigid ones by 0.5 %."""
 _SLACK = 1.05
 """Room for the change of a body's difference from a rigid one, where a scene changes a little."""
 
+_OF_WAVES = 0.3
+"""Error of the waves left out, relative to a tolerance of which grids take up to 0.7."""
+
 # Ratio of sound speeds from which heavy bodies have no sharp resonances at the drive's frequency
 _STIFF = 2.0
 # Relative difference of a sphere from a rigid one, times its density ratio. Narrow resonances have up to half
@@ -94,6 +97,10 @@ class Plan:
         """Return the plan at a spacing [m] near one, not above a limit, with which flat faces fall best."""
         regions = [grid.part.unbounded.turned(grid.axes) for grid in self.grouping.grids]
         return self.at(fitting_spacing(regions, spacing, coarsest), self.tolerance, self.time_step)
+
+    def by_waves(self, spacing: float, time_step: float | None = None) -> Self:
+        """Return the plan of T-matrices on grids whose spacing [m] was chosen by this plan's tolerance."""
+        return self.at(spacing, _OF_WAVES * self.tolerance, time_step)
 
     def of(self, scene: Scene) -> Self:
         """Return a plan of a changed scene with these settings, which takes the same bodies as rigid."""
