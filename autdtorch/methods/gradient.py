@@ -86,7 +86,7 @@ def climb(goal: GoalFunction, matrix: torch.Tensor, drive: torch.Tensor, steps: 
         drive = goal.climbed(matrix, drive, steps)
     else:
         drive = climbed(goal, matrix, drive, steps)
-    return drive[scores_of(goal, _pressure(matrix, drive).abs()).argmax()]
+    return drive[scores_of(goal, _product(drive, matrix.mT).abs()).argmax()]
 
 
 @one_library_thread()
@@ -95,12 +95,12 @@ def climbed(goal: GoalFunction, matrix: torch.Tensor, drive: torch.Tensor, steps
 
     All ascents are on one matrix (P, M), or each is on one of (S, P, M). The goal is smoothed less and less.
     """
-    velocity = torch.zeros_like(drive)
+    back, velocity = matrix.conj_physical(), torch.zeros_like(drive)
     for progress in torch.linspace(0, 1, steps, **REAL).tolist():
         smoothing, step = (first * (last / first) ** progress for first, last in (_SMOOTHING, _STEP))
-        pressure = _pressure(matrix, drive)
+        pressure = _product(drive, matrix.mT)
         weights = slope_of(goal, pressure.abs(), smoothing)
-        slope = ((weights * pressure.sgn())[..., None] * matrix.conj()).sum(dim=-2)
+        slope = _product(weights * pressure.sgn(), back)
         slope = slope / slope.abs().mean(dim=-1, keepdim=True).clamp_min(_TINY)
         velocity = _MOMENTUM * velocity + (1 - _MOMENTUM) * slope
         drive = drive + step * velocity
@@ -122,5 +122,6 @@ def highest_drive(
     return climb(goal, matrix, starts, _STEPS_FROM_ANYWHERE)
 
 
-def _pressure(matrix: torch.Tensor, drive: torch.Tensor) -> torch.Tensor:
-    return (drive[:, None] * matrix).sum(dim=-1)
+def _product(vectors: torch.Tensor, matrix: torch.Tensor) -> torch.Tensor:
+    """Return vectors (S, n) times one matrix (n, m), or each times its own of (S, n, m)."""
+    return (vectors[:, None] @ matrix)[:, 0]
