@@ -29,7 +29,7 @@ _AIR_SPACING, _AIR_RIM = 1e-3, 28
 """Timed steps on a small and a large grid of so many cells; their spacing [m] and cells beside the domain."""
 
 _PILOT_CELLS = 6
-"""Cells per wavelength of the coarse grid that symmetries are found on."""
+"""Cells per wavelength in air of the coarse grid that symmetries are found on."""
 
 _PILOT_POINTS, _PILOT_TOLERANCE, _PILOT_SECONDS = 4, 0.05, 10.0
 """Most points whose scattered field is simulated on a first grid, where runs end, and their most time [s]."""
@@ -107,7 +107,8 @@ def estimate(
             before, last = [*before, last], planned.by_waves(spacing)
         planned = last
     # a multiple of the spacing: a scene that is symmetric on one grid mostly is on the other
-    factor = max(1, math.floor(planned.region.wavelength / _PILOT_CELLS / spacing))
+    coarse = min(planned.region.wavelength / _PILOT_CELLS, planned.region.coarsest_spacing)
+    factor = max(1, math.floor(coarse / spacing))
     pilot = planned.at(spacing * factor, planned.tolerance)
     kind = TMatrixPropagator if planned.method == "tmatrix" else SimulatedPropagator
     without_symmetries = planned.work

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_scenes import CUBE, relative_error, small_scene
+from small_scenes import AIR, CUBE, relative_error, small_scene
 
 import autdtorch as at
 from autdtorch.propagators import FreeSpacePropagator, simulated
@@ -85,6 +85,12 @@ def test_symmetric_points_share_a_run_unless_memory_is_short(monkeypatch):
     assert at.estimate(scene, 2e-3, method="box").runs == 1
     monkeypatch.setattr(simulation_estimate, "available_memory", lambda: 0)  # for a coarse grid
     assert at.estimate(scene, 2e-3, method="box").runs == 4
+
+
+def test_the_grid_that_finds_symmetries_resolves_slow_fluids():
+    """Six cells per wavelength of air are two in a fluid where sound is a third as fast, which is refused."""
+    ball = at.Sphere((12e-3,) * 3, 2e-3, density=10 * AIR.density, sound_speed=AIR.sound_speed / 3)
+    assert at.estimate(small_scene((ball,)), 0.4e-3, method="box").runs > 0
 
 
 def test_memory_and_time_grow_with_the_cells(monkeypatch):
