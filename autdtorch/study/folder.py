@@ -215,9 +215,10 @@ class StudyFolder:
         """Return the names of the drives that another study wrote here; a user's own may lie beside them."""
         try:
             return list(drive_files(load_results(self.path)).values())
-        except (FileNotFoundError, ValueError) as error:
-            logger.info("drives of earlier results stay in %s: %s", self.path, error)
-            return []
+        except FileNotFoundError:
+            return []  # drives are written after results
+        except ValueError:  # which are its drives is unknown, and those of this study must not replace them
+            return sorted(file.name for file in self.path.glob("drive*.csv"))
 
     def _take_up(self) -> None:
         """Use the files of this study; note why others are not used."""

@@ -108,6 +108,15 @@ def test_another_study_is_kept_whole_and_a_refused_one_moves_nothing(tmp_path, w
     assert len(warnings()) == 2
 
 
+def test_drives_of_another_study_are_not_replaced_where_its_results_cannot_be_read(tmp_path):
+    study(tmp_path)
+    (tmp_path / RESULTS_FILE).write_bytes(b"of an earlier version")
+    (tmp_path / "drive_one_gabs.csv").write_text("of the first", encoding="utf-8")
+    study(tmp_path, seed=1)
+    aside = tmp_path / f"{PREVIOUS}1" / "drive_one_gabs.csv"
+    assert aside.read_text(encoding="utf-8") == "of the first"
+
+
 @pytest.mark.parametrize("missing", [RESULTS_FILE, PROVENANCE_FILE])
 def test_lines_of_trials_are_set_aside_where_another_file_is_of_the_study(tmp_path, missing):
     undisturbed = study(tmp_path)
