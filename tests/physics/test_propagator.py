@@ -11,6 +11,7 @@ from small_scenes import AIR, CUBE, assembled_parts, relative_error, small_scene
 
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.steady_state import WindowedRuns, block_of
+from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.propagators import (
     FreeSpacePropagator,
     SteadyStateWarning,
@@ -120,6 +121,17 @@ def test_reciprocity(scene, points, settings, bound):
     forward = propagator.transfer_matrix(more)[:count]
     assert len(propagator.runs) == count + 4
     assert relative_error(backward, forward) < bound
+
+
+def test_replay_and_transfer_objectives_agree():
+    scene = small_scene((CUBE,))
+    propagator = full(scene, tolerance=1e-5, dtype="float64")
+    drive = random_drive(3, 4, seed=1)
+    transfer = SimulatedObjective(scene, propagator, mode="transfer")(drive)
+    before = len(propagator.runs)
+    replay = SimulatedObjective(scene, propagator, mode="replay")(drive)
+    assert len(propagator.runs) == before + 3  # one simulation an evaluation
+    assert float((replay - transfer).norm() / transfer.norm()) < 1e-4
 
 
 @pytest.mark.parametrize("method", ["full", "box"])
