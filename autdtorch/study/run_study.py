@@ -309,7 +309,7 @@ def _accuracy(propagator: SimulatedPropagator | TMatrixPropagator, simulation: S
     """Return the number of simulations, and the relative error as far as it is known."""
     if isinstance(propagator, TMatrixPropagator):
         waves = f"{propagator.planned_runs} waves" if propagator.cells else "exact waves"
-        return f"{waves}, error {propagator.tolerance:g}"
+        return f"{waves}, within {propagator.tolerance:g}"
     count, error = len(simulation.runs), propagator.known_error
     runs = counted(count, "run")
     if math.isfinite(error):

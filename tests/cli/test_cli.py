@@ -292,7 +292,7 @@ NUMBER = r"[\d.e-]+"
     ("given", "work"),
     [
         (["scene=homogeneous"], "homogeneous: free space"),
-        (["scene=sphere"], f"sphere: tmatrix, exact waves, error {NUMBER}"),
+        (["scene=sphere"], f"sphere: tmatrix, exact waves, within {NUMBER}"),
         (
             ["scene=two_cubes", "solver.spacing=2.1e-3", "solver.tolerance=0.1"],
             rf"two_cubes: box, \d runs?, within {NUMBER} of steady, [\d,]+ cells of 2.1 mm",
