@@ -218,8 +218,8 @@ def test_a_method_of_small_steps_takes_one_thread_and_gives_the_others_back(
 ):
     used = set()
     monkeypatch.setattr(
-        "autdtorch.methods.gradient._pressure",
-        lambda matrix, drive: used.add(torch.get_num_threads()) or (drive[:, None] * matrix).sum(dim=-1),
+        "autdtorch.methods.gradient._product",
+        lambda vectors, matrix: used.add(torch.get_num_threads()) or vectors @ matrix,
     )
     set_threads(2)
     method(objective)
