@@ -311,8 +311,8 @@ def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
             shown = 1e3 * plan.spacing, known, tolerance
             logger.warning("time or memory end at %.3g mm: %s, tolerance %g", *shown)
             return propagator
-        _log_cost(plan, ahead, taken, grid_error, budget, is_second=len(others) == 1)
         may_look = budget.is_unlimited or budget.fits(finer.halved, plan, taken)
+        _log_cost(plan, ahead, taken, grid_error, budget, is_second=len(others) == 1)
         # the store has its matrix: a simulation without grids, whose memory is given back
         plan, others = finer, [*others, simulation_of(plan, store)]
 
