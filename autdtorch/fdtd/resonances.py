@@ -43,7 +43,7 @@ class Resonance(NamedTuple):
     Attributes:
         offset: the difference of its complex frequency and the drive's, over the drive's; the imaginary part
             is minus half the width of the resonance.
-        strength: the norm of its part of the steady state, over that of the steady state.
+        strength: the norm of its part of the steady state, relative to the norm of the whole.
     """
 
     offset: complex
@@ -91,6 +91,8 @@ def are_resonances(offsets: ComplexArray, products: ComplexArray, interval: floa
     `products` and `interval` are those of `offsets_of`.
     """
     near = (offsets.imag < 0) & (offsets.imag > -_WIDEST) & (abs(offsets) < _FARTHEST)
+    if not near.any():
+        return np.asarray(near)
     others = offsets_of(products, interval, _SHORTER)
     moved = abs(offsets[:, None] - others).min(axis=1, initial=math.inf)
     return np.asarray(near & (moved < _UNSURE))

@@ -86,13 +86,9 @@ class Magnitudes:
         """Return the readings of one control point (N, 1)."""
         return Magnitudes(self.value[:, point, None], self.limit[:, point, None])
 
-    def rows(self, chosen: torch.Tensor) -> Magnitudes:
-        """Return the readings of `chosen` drives (n, P), int64."""
+    def rows(self, chosen: torch.Tensor | slice) -> Magnitudes:
+        """Return the readings (n, P) of `chosen` drives, int64 or a slice."""
         return Magnitudes(self.value[chosen], self.limit[chosen])
-
-    def first(self, count: int) -> Magnitudes:
-        """Return the readings of the first drives (count, P)."""
-        return Magnitudes(self.value[:count], self.limit[:count])
 
     def nearest(self, magnitude: torch.Tensor) -> torch.Tensor:
         """Return the magnitudes nearest to some (N, ...) [Pa] that the readings allow."""

@@ -185,7 +185,7 @@ class Identify(Method):
         count = len(search["outliers"])  # of readings that were fitted
         outliers = torch.nn.functional.pad(search["outliers"], (0, 0, 0, len(drives) - count))
         read = Magnitudes.of(observed, outliers, search["ends"])
-        yield from sensor_doubts(drives[:count], read.first(count), fitted[:count])
+        yield from sensor_doubts(drives[:count], read.rows(slice(count)), fitted[:count])
         if state.done:
             numbers = search["numbers"].tolist()
             names = [f"evaluation {n}" if n >= 0 else f"earlier reading {-1 - n}" for n in numbers]

@@ -6,12 +6,12 @@ like products by *, is taken entry by entry:
 - "naive": q = sgn(G^H t), back-propagation;
 - "gs": p = t * sgn(G q), q = sgn(G^H p) in turns (Gerchberg and Saxton 1972), iterative back-propagation of
   Marzo and Drinkwater (2019), doi:10.1073/pnas.1813047115;
-- "wgs": p = b * sgn(G q), q = sgn(G^H p), after which b is multiplied by 1 + c (s / r - 1), with the shares
-  r = |G q| / t and their largest s, and divided by its largest entry. Di Leonardo, Ianni and Ruocco (2007),
-  doi:10.1364/OE.15.001913, have c = 1, with which close foci change places for ever. Here c grows from 0,
-  so that phases of foci settle before weights, and falls to 0 in the end. As many iterations before, with
-  q = G^H p, choose the phases of p that begin: at points alone, p = b * sgn(G G^H p), they are cheap.
-  The result is the q of the highest weakest share;
+- "wgs": p = b * sgn(G q), q = sgn(G^H p) in turns. After each, b is multiplied by 1 + c (s / r - 1) and
+  divided by its largest entry; r = |G q| / t are the shares, s is their largest. Di Leonardo, Ianni and
+  Ruocco (2007), doi:10.1364/OE.15.001913, have c = 1, with which close foci change places for ever. Here c
+  grows from 0, so that phases of foci settle before weights, and falls to 0 in the end. As many iterations
+  before, with q = G^H p, choose the phases of p that begin: at points alone, p = b * sgn(G G^H p), they are
+  cheap. The result is the q of the highest weakest share;
 - "wgs_drives": "wgs" without the iterations before, which end in the same phases from most first guesses;
 - "gs_pat": p = G G^H (t * sgn(p)) in turns, and in the end q = sgn(G^H (t^2 * p / |p|^2)) (Martinez Plasencia
   et al. 2020), doi:10.1145/3386569.3392492;
