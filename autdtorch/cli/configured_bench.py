@@ -50,7 +50,8 @@ class Bench:
         self.device = hardware.DEVICES[section["device"]].configured(section)
         self.transducers = self._wired(len(scene.array))
         failed = section["failed"]
-        self._failed = indices_of("hardware.failed", failed, len(scene.array)) if failed else []
+        count = len(scene.array)
+        self._failed = indices_of("hardware.failed", failed, count, "the scene's") if failed else []
         self.by_hand = self._sensor.by_hand
         self._bench: hardware.EmulatedBench | None = None
         self._matrix_of: Callable[[torch.Tensor], torch.Tensor] = _no_matrix
@@ -98,7 +99,7 @@ class Bench:
                 f"must say which {count} of the {most} transducers of {self.device.name} the scene's are"
             )
             raise invalid(field, None, accepted)
-        wired = list(range(count)) if chosen is None else indices_of(field, chosen, most)
+        wired = list(range(count)) if chosen is None else indices_of(field, chosen, most, "the device's")
         if len(wired) != count:
             raise invalid(field, f"{len(wired)} transducers", f"must be {count}, as many as the scene has")
         return wired
@@ -108,8 +109,9 @@ def _no_matrix(points: torch.Tensor) -> torch.Tensor:
     raise NotImplementedError("a real bench has no transfer matrix")
 
 
-def indices_of(field: str, value: object, count: int) -> list[int]:
-    """Return indices below `count`, each once, from a list or from text such as "3,7-9"."""
+def indices_of(field: str, value: object, count: int, whose: str) -> list[int]:
+    """Return indices of transducers below `count`, each once, from a list or text such as "3,7-9"."""
+    numbers = f"numbers of {whose} transducers"
     if not isinstance(value, list):
         try:
             parts = [part.partition("-") for part in str(value).split(",")]
@@ -117,10 +119,10 @@ def indices_of(field: str, value: object, count: int) -> list[int]:
         except ValueError:
             ranges = []
         if not ranges or not all(ranges) or sum(map(len, ranges)) > count:
-            accepted = f"must be numbers from 0 to {count - 1}, each once, and ranges that go up, as 3,7-9"
+            accepted = f"must be {numbers} from 0 to {count - 1}, each once, and ranges that go up, as 3,7-9"
             raise invalid(field, value, accepted)
         value = [index for some in ranges for index in some]
-    return indices(field, value, count)
+    return indices(field, value, count, numbers)
 
 
 def _require_keys(

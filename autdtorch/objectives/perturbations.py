@@ -270,7 +270,8 @@ def continued(objective: Objective, number: int) -> contextlib.AbstractContextMa
     observe in the block as they do outside.
     """
     while isinstance(objective, Perturbation):
-        number *= getattr(objective, "reads", 1)
+        if isinstance(objective, Noise):
+            number *= objective.reads
         objective = objective.inner
     return getattr(objective, "continued", contextlib.nullcontext)(number)
 

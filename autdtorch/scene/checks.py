@@ -91,9 +91,13 @@ def require_waves(scene: SceneContents) -> None:
     """Refuse absorptions that leave no wave, in the medium or in an obstacle."""
     most = _MOST_ABSORPTION / scene.wavelength
     if scene.medium.absorption > most:
-        accepted = f"must be at most {most:.4g} dB/m, {_MOST_ABSORPTION:g} dB per wavelength"
-        if scene.frequency < _LOWEST:
-            accepted += f"; is the frequency, {scene.frequency:g}, in Hz, 40 kHz as 40e3?"
+        limit = f"{_MOST_ABSORPTION:g} dB per wavelength"
+        if scene.frequency < _LOWEST and scene.medium.absorption <= 1e3 * most:  # a frequency in kHz
+            absorbed = scene.medium.absorption / most * _MOST_ABSORPTION
+            accepted = f"the medium absorbs {absorbed:.3g} dB per wavelength, must be at most {limit}"
+            accepted += f"; is it in Hz, {scene.frequency:g} kHz as {scene.frequency:g}e3?"
+            raise invalid("Scene.frequency", scene.frequency, accepted, "Hz")
+        accepted = f"must be at most {most:.4g} dB/m, {limit}"
         raise invalid("Scene.medium.absorption", scene.medium.absorption, accepted, "dB/m")
     for index, obstacle in enumerate(scene.obstacles):
         if obstacle.absorption and obstacle.sound_speed is not None:

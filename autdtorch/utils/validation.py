@@ -189,11 +189,12 @@ def positive_integers(name: str, value: object, count: int) -> tuple[int, ...]:
     return tuple(entries)
 
 
-def indices(name: str, value: object, count: int) -> list[int]:
-    """Return `value` as indices from 0 to `count` - 1: at least one, without repetition."""
-    chosen = integers(name, value, 0, f"must be indices from 0 to {count - 1}")
+def indices(name: str, value: object, count: int, what: str = "indices") -> list[int]:
+    """Return `value` as indices from 0 to `count` - 1, named by `what`: at least one, each once."""
+    accepted = f"must be {what} from 0 to {count - 1}"
+    chosen = integers(name, value, 0, accepted)
     if not chosen or len(set(chosen)) < len(chosen) or max(chosen) >= count:
-        raise invalid(name, chosen, f"must be indices from 0 to {count - 1}, each once")
+        raise invalid(name, chosen, f"{accepted}, each once")
     return chosen
 
 

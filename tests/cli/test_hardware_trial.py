@@ -185,12 +185,15 @@ OPENMPD = ("hardware=openmpd", "hardware.limits.amplitude=1", "hardware.transduc
         (OPENMPD, "hardware.sensor.chip: None; must be the oscilloscope's VID:PID"),
         ((*OPENMPD, "hardware.sensor.chip=1:2:3"), "hardware.sensor.chip: '1:2:3'; must be VID:PID"),
         ((*OPENMPD, "hardware/sensor=manual", "hardware.failed=[1]"), "hardware.failed: (1,); must be null"),
-        ((*GABS, "hardware.failed='0-9'"), "hardware.failed: '0-9'; must be numbers from 0 to 8"),
+        ((*GABS, "hardware.failed='0-9'"), "must be numbers of the scene's transducers from 0 to 8"),
         ((*GABS, "hardware.transducers='0-7'"), "hardware.transducers: '8 transducers'; must be 9"),
-        ((*GABS, "hardware.transducers='5-3'"), "hardware.transducers: '5-3'; must be numbers from 0 to 255"),
+        (
+            (*GABS, "hardware.transducers='5-3'"),
+            "hardware.transducers: '5-3'; must be numbers of the device's",
+        ),
         (
             (*GABS, "hardware.transducers='0-99999999999'"),
-            "must be numbers from 0 to 255, each once, and ranges",
+            "must be numbers of the device's transducers from 0 to 255, each once, and ranges",
         ),
         ((*GABS, "hardware.boards=2"), "hardware.boards: 2; must be null: it is for autd3, openmpd and"),
         ((*GABS, "hardware.network=eth0"), "hardware.network: 'eth0'; must be null: it is for autd3"),

@@ -12,7 +12,14 @@ from autdtorch.methods.functions import gabs, identify, lssg
 from autdtorch.methods.gabs import GABS
 from autdtorch.methods.run import run
 from autdtorch.objectives.goals import MeanPressure, TargetPressures
-from autdtorch.objectives.perturbations import Drift, FailedTransducers, Noise, Quantised, random_rms
+from autdtorch.objectives.perturbations import (
+    Drift,
+    FailedTransducers,
+    Noise,
+    Perturbation,
+    Quantised,
+    random_rms,
+)
 from autdtorch.objectives.scenarios import Scenarios
 from autdtorch.scene.drive import drive_from_phases
 
@@ -102,6 +109,15 @@ def test_a_trial_of_a_perturbed_objective_goes_on_where_its_log_ends(trial, pert
     assert made == readings * (1 + 15 * 2) - 6
     trial.log = trial.log.with_name("uninterrupted.jsonl")
     assert torch.equal(continued.history, measure()[0].history)
+
+
+def test_a_perturbation_of_another_kind_may_have_reads_of_its_own(trial):
+    class Reading(Perturbation):
+        reads = "a column of a file"
+
+    with trial.limited() as (bench, link):
+        objective = Reading(trial.objective(link, hw.EmulatedSensor(bench)))
+        assert int(gabs(objective, levels=2).evaluations) == 1 + 15 * 2
 
 
 def test_a_state_file_goes_on_in_a_block_that_continues_the_log(trial, tmp_path):

@@ -220,6 +220,11 @@ REFUSED = {
         lambda _: at.analytic.rigid_sphere(FOCI, ARRAY.positions, 739 + 1j, MIDDLE, 0.01),
         r"wavenumber.*real.*scene\.wavenumber",
     ),
+    "kHz in damp air": (lambda _: scene(frequency=40.0, medium=at.Medium.air()), r"Scene\.frequency.*40e3\?"),
+    "a medium that no wave crosses": (
+        lambda _: scene(medium=at.Medium(1.2, 340.0, absorption=400.0)),
+        r"Scene\.medium\.absorption.*352.9 dB/m",
+    ),
     "maps": (lambda _: at.plot_planes({"a": {"b": MAP}}, PLANE), "pressure.*by name"),
     "map": (lambda _: at.plot_planes(MAP, PLANE), "pressure.*plot_plane"),
 }
