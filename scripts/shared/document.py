@@ -93,13 +93,6 @@ def percent(share: float) -> str:
     return f"{100 * share:.3g} %"
 
 
-def spread(values: Any) -> str:
-    """Format the mean and the range of a tensor."""
-    if len(values) == 1:
-        return f"{values.item():.2f}"
-    return f"{values.mean():.2f} ({values.min():.2f} to {values.max():.2f})"
-
-
 def quartiles(values: Any, form: str = ".3f") -> str:
     """Format the median and the quartiles of an array or a tensor, each number in a `form`."""
     low, middle, high = statistics.quantiles(values.tolist(), n=4, method="inclusive")

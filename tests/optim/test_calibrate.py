@@ -271,11 +271,19 @@ def test_symmetric_drives_show_sums_of_their_transducers_only(matrix):
     assert calibration.determined < 17
 
 
+BALLS = [at.Sphere((40e-3, side, 0.0), 6e-3, rigid=True) for side in (-9e-3, 9e-3)]
+
+
 @pytest.mark.parametrize(
-    "names", [{"points.x": 1e-3, "points.z": 1e-3}, {"temperature": 3.0, "array.y": 1e-3}]
+    ("bodies", "names"),
+    [
+        ((), {"points.x": 1e-3, "points.z": 1e-3}),
+        ((), {"temperature": 3.0, "array.y": 1e-3}),
+        (BALLS, {"obstacles.x": 1e-3, "obstacles.y": 1e-3, "obstacles.turn_z": 0.05}),
+    ],
 )
-def test_named_changes_are_found(names):
-    simulated = at.make_propagator(scene())
+def test_named_changes_are_found(bodies, names):
+    simulated = at.make_propagator(scene(obstacles=bodies))
     amounts = {name: 1.3 * width for name, width in names.items()}
     true = SceneChanges(simulated, [*names]).matrix([*amounts.values()])
     bench = Bench(true, 9, gain=0.02, phase=0.05)
