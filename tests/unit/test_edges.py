@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from autdtorch.fdtd.assembly.edge_energy import _reduction, changes
 from autdtorch.fdtd.assembly.edges import edges_of, rims_of
-from autdtorch.fdtd.assembly.reference_element import tuning_of
 from autdtorch.fdtd.stencil import tuned_stencil
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles import Box, Cylinder
@@ -26,7 +25,7 @@ def test_the_change_at_an_edge_is_that_of_its_image_and_of_its_faces_in_any_orde
     normals, way = np.array([first, second]), x * first + y * np.cross(along, first)
     mirror = np.where(np.arange(3) == axis, -1.0, 1.0)
     ways = np.array([way, way, way * mirror])
-    change = _reduction(ways, np.array([normals, normals[::-1], normals * mirror]), tuning_of(STENCIL))
+    change = _reduction(ways, np.array([normals, normals[::-1], normals * mirror]), STENCIL)
     assert change[1:] == pytest.approx(change[0], abs=1e-6)
 
 

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from autdtorch.fdtd.assembly.edges import Edge
 from autdtorch.fdtd.assembly.reference_element import (
     LATTICE,
-    SLOPES,
+    PAIRS,
     SUBCELLS,
+    SUBCENTERS,
     VERTICES,
-    subcell_means,
-    tuning_of,
+    cut_coupling,
     volume_coverage,
 )
 from autdtorch.fdtd.stencil import Stencil
@@ -75,8 +75,10 @@ def changes(edges: Sequence[Edge], centers: Array, spacing: float, stencil: Sten
         parts.append((near[some], way[some], normals[some], part[some], np.full(len(some), edge.share)))
     if not parts:
         return Changes(total, beside)
-    element, way, normals, part, share = map(np.concatenate, zip(*parts, strict=True))
-    reduction = share * _reduction(way, normals, tuning_of(stencil))
+    joined = [np.concatenate(each) for each in zip(*parts, strict=True)]
+    order = np.argsort(joined[0], kind="stable")
+    element, way, normals, part, share = (each[order] for each in joined)
+    reduction = share * _reduction(way, normals, stencil)
     along = np.cross(normals[:, 0], normals[:, 1])
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     across = np.eye(3) - along[:, :, None] * along[:, None, :]
@@ -89,41 +91,28 @@ def changes(edges: Sequence[Edge], centers: Array, spacing: float, stencil: Sten
 def _weights(element: Index, way: Array, normals: Array, part: Array) -> Array:
     """Return the weights (k,) of edges that are a `way` (k, 3) [cells] from the centres of elements (k,).
 
-    An edge between faces with `normals` (k, 2, 3) is beside a `part` (k,) of the element's length. Pieces of
-    an edge, of which the faces agree, have weights as the whole one. Beside others that are near, an edge
-    counts less: where they meet, the field is less singular than at each.
+    Elements are ascending. An edge between faces with `normals` (k, 2, 3) is beside a `part` (k,) of the
+    element's length. Pieces of an edge, of which the faces agree, have weights as the whole one. Beside
+    others that are near, an edge counts less: where they meet, the field is less singular than at each.
     """
-    near = 1 - (way**2).sum(axis=1) / _REACH**2
-    one, other = _pairs(element)
-    together = np.maximum(0, 1 - ((way[one] - way[other]) ** 2).sum(axis=1) / _REACH**2) * part[other]
-    cosines = np.maximum(0, normals[one] @ normals[other].mT)
-    agree = np.maximum(cosines[:, 0, 0] * cosines[:, 1, 1], cosines[:, 0, 1] * cosines[:, 1, 0])
-    pieces = np.bincount(one, agree * together, len(element))
-    others = np.bincount(one, (1 - agree) * together * near[other], len(element))
+    from autdtorch.fdtd.assembly.element_kernels import sum_edges  # loads numba
+
+    near, sums = 1 - (way**2).sum(axis=1) / _REACH**2, np.empty((2, len(element)))
+    sum_edges(element, way / _REACH, normals, part, near, sums)
+    pieces, others = sums
     return np.asarray(part / np.maximum(1, pieces) * near / (near + _MEETING * others))
 
 
-def _pairs(element: Index) -> tuple[Index, Index]:
-    """Return all pairs of entries (k,) of the same element, each entry with itself too."""
-    order = np.argsort(element, kind="stable")
-    _, first, count = np.unique(element[order], return_index=True, return_counts=True)
-    size, begin = np.repeat(count, count), np.repeat(first, count)  # of the group of each entry
-    one = np.repeat(np.arange(len(element)), size)
-    other = np.arange(len(one)) - np.repeat(np.cumsum(size) - size, size) + np.repeat(begin, size)
-    return order[one], order[other]
-
-
-def _reduction(way: Array, normals: Array, tuning: Array) -> Array:
+def _reduction(way: Array, normals: Array, stencil: Stencil) -> Array:
     """Return the relative reduction (k,) of the stiffness of elements beside an edge in air.
 
-    The edge is a `way` (k, 3) [cells] from their centre, between faces with `normals` (k, 2, 3). `tuning` as
-    of `tuning_of`.
+    The edge is a `way` (k, 3) [cells] from their centre, between faces with `normals` (k, 2, 3).
     """
     cosine = (normals[:, 0] * normals[:, 1]).sum(axis=1)
     power = np.pi / (np.pi + np.arccos(np.clip(cosine, -1, 1)))
-    level = (normals @ (LATTICE.T - 0.5 - way[:, :, None])).max(axis=1)
+    level = (normals @ (LATTICE.T - 0.5) - normals @ way[:, :, None]).max(axis=1)
     air = 1 - volume_coverage(level)
-    radius, angle = _polar(subcell_means(LATTICE.T - 0.5 - way[:, :, None]), normals)
+    radius, _ = _polar(SUBCENTERS.T - 0.5 - way[:, :, None], normals)
     slope = power[:, None] * np.maximum(radius, _NEAREST) ** (power[:, None] - 1)
     exact = (air * slope**2).mean(axis=1)
     places = VERTICES.T - 0.5 - way[:, :, None]
@@ -131,9 +120,8 @@ def _reduction(way: Array, normals: Array, tuning: Array) -> Array:
     field = radius ** power[:, None] * np.cos(power[:, None] * angle)
     heights = normals @ places
     field[(np.abs(heights[:, 0] - heights[:, 1]) < _HALF_WAY) & (heights[:, 0] < 0)] = 0
-    slopes = np.einsum("qvx,kv->kqx", SLOPES, field)
-    energy = (air[:, :, None] * slopes**2).sum(axis=2).mean(axis=1)
-    energy += air.mean(axis=1) * np.einsum("kv,vw,kw->k", field, tuning, field)
+    drops = field[:, PAIRS[:, 0]] - field[:, PAIRS[:, 1]]
+    energy = (cut_coupling(air / SUBCELLS**3, stencil) * drops**2).sum(axis=1)
     return np.asarray(np.clip(_SHARE * (1 - exact / np.maximum(energy, _TINY)), _LEAST, _MOST))
 
 

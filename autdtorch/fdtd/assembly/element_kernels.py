@@ -116,6 +116,41 @@ def survey_lattices(distance, most_variation, least, most, layered):  # type: ig
                 layered[body, row, axis] = flat
 
 
+@entry()
+def sum_edges(element, way, normals, part, near, sums):  # type: ignore[no-untyped-def]
+    """Write sums over the edges beside each element, as each edge sees them.
+
+    Args:
+        element: number of the element (k,), ascending.
+        way: from its centre to the edge, relative to the distance of edges that see each other (k, 3).
+        normals: of the edge's faces (k, 2, 3).
+        part: of the element's length that the edge is beside (k,).
+        near: how near the edge is (k,).
+        sums: lengths of the edges, as far as their faces agree; of others times how near these are (2, k), to
+            be written.
+    """
+    first, cosines = 0, np.empty(4)
+    for one in range(len(element)):
+        if element[one] != element[first]:
+            first = one
+        sums[0, one] = sums[1, one] = 0.0
+        other = first
+        while other < len(element) and element[other] == element[one]:
+            together = 1.0
+            for space in range(3):
+                together -= (way[one, space] - way[other, space]) ** 2
+            if together > 0.0:
+                cosines[:] = 0.0
+                for pair in range(4):
+                    for space in range(3):
+                        cosines[pair] += normals[one, pair // 2, space] * normals[other, pair % 2, space]
+                    cosines[pair] = max(cosines[pair], 0.0)
+                agree = max(cosines[0] * cosines[3], cosines[1] * cosines[2])
+                sums[0, one] += agree * together * part[other]
+                sums[1, one] += (1 - agree) * together * part[other] * near[other]
+            other += 1
+
+
 @njit(**INNER)
 def _cut(depth, outer, inner):  # type: ignore[no-untyped-def]
     """Write the centres (3,) of the parts of a triangle outside a body and inside, and return their shares.

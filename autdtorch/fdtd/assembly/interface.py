@@ -38,6 +38,7 @@ from autdtorch.fdtd.assembly.reference_element import (
     SUBCELLS,
     InterfaceElements,
     Materials,
+    cut_coupling,
     distance_to_material,
     line_coverage,
     shares,
@@ -354,20 +355,13 @@ def _balanced_mass(surface: Surface, whole_cell: Array, mass: Array) -> Array:
     return np.asarray(mass * (1 + change * np.minimum(1, _MOST_TAKEN / np.maximum(-least, 1e-12))))
 
 
-_PRODUCTS = np.einsum("qix,qjx->qij", SLOPES, SLOPES)[:, PAIRS[:, 0], PAIRS[:, 1]]
-
-
 def _cut_coupling(mobility: Array, reductions: Array, stencil: Stencil) -> Array:
-    """Return the coupling (n, 28) of elements, from the mobility of sub-cells (n, 64).
-
-    `reductions` (n, 3, 3) is the relative reduction of the stiffness near edges.
-    """
-    near = np.trace(reductions, axis1=1, axis2=2) / 2
-    tuning = tuning_of(stencil)[PAIRS[:, 0], PAIRS[:, 1]]
-    coupling = -(mobility @ _PRODUCTS) - np.outer((1 - near) * mobility.sum(axis=1), tuning)
+    """Return the coupling (n, 28) of elements, less `reductions` (n, 3, 3) of the stiffness near edges."""
+    near, coupling = np.trace(reductions, axis1=1, axis2=2) / 2, cut_coupling(mobility, stencil)
     some = np.flatnonzero(near)
     across = SLOPES @ reductions[some, None]
     reduced = np.einsum("nq,nqix,qjx->nij", mobility[some], across, SLOPES, optimize=True)
+    reduced += (near[some] * mobility[some].sum(axis=1))[:, None, None] * tuning_of(stencil)
     coupling[some] += reduced[:, PAIRS[:, 0], PAIRS[:, 1]]
     return np.asarray(coupling)
 

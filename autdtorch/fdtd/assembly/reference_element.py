@@ -164,6 +164,15 @@ def tuning_of(stencil: Stencil) -> Array:
     return np.asarray(stiffness_matrix(uniform_coupling(stencil)) - trilinear)
 
 
+_PRODUCTS = np.einsum("qix,qjx->qij", SLOPES, SLOPES)[:, PAIRS[:, 0], PAIRS[:, 1]]
+
+
+def cut_coupling(mobility: Array, stencil: Stencil) -> Array:
+    """Return the coupling (n, 28) of finite elements, from the mobility of their sub-cells (n, 64)."""
+    tuning = tuning_of(stencil)[PAIRS[:, 0], PAIRS[:, 1]]
+    return np.asarray(-(mobility @ _PRODUCTS) - np.outer(mobility.sum(axis=1), tuning))
+
+
 def without_negative(matrices: Array) -> Array:
     """Return symmetric matrices (..., m, m) without their negative eigenvalues."""
     value, vector = np.linalg.eigh(matrices)
