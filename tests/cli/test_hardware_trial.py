@@ -345,7 +345,7 @@ def test_the_documented_scene_lies_in_the_middle_of_a_sonicsurface(tmp_path):
     path = tmp_path / "my_bench.yaml"
     path.write_text(block[1], "utf-8")
     device = TransducerArray.sonicsurface(center=(0, 0, 0), angle=math.pi / 2)
-    places = device.positions[indices_of("transducers", chosen[1], 256)]
+    places = device.positions[indices_of("transducers", chosen[1], 256, "the device's")]
     # Rounding, of a pitch of 1e-2 m.
     assert torch.allclose(load_scene(path).array.positions, places, rtol=0, atol=1e-9)
 
