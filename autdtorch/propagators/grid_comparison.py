@@ -95,8 +95,8 @@ class GridComparison:
         if not self.others:
             return self.result.residual
         other, spacing = self.others[-1]
-        ratio = spacing / self.plan.spacing
-        shifted = displacement_error(self.result.resonances, other.resonances, ratio)
+        ratio, share = spacing / self.plan.spacing, self.plan.spacing / self.plan.law.wavelength
+        shifted = displacement_error(self.result.resonances, other.resonances, ratio, share)
         return math.hypot(self.result.residual, shifted)
 
     @property

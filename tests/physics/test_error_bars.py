@@ -45,10 +45,12 @@ def test_the_estimate_is_honest(sphere, method, spacing):
 
 
 @pytest.mark.filterwarnings("ignore::autdtorch.ScaleWarning")  # of a light fluid of a low sound speed
-def test_a_resonance_narrower_than_its_shift_on_both_grids_is_claimed():
-    """Required: within a factor of 3. Where it is next to the drive's frequency, it is on neither grid.
+@pytest.mark.parametrize(("spacing", "factor"), [(0.377e-3, 3), (0.496e-3, 4)])
+def test_a_resonance_narrower_than_its_shift_on_both_grids_is_claimed(spacing, factor):
+    """Required: within a factor. Where it is next to the drive's frequency, it is on neither grid.
 
-    Its width is 0.4 %, and the grids shift it by 6 and 2 %: they agree to 0.5 % and are 9 % off.
+    Its width is 0.4 %, and the grids shift it by 6 and 2 %: they agree to 0.5 % and are 9 % off. On cells of
+    0.5 mm it moves too far to be the same resonance on both, and only its usual shift is known.
     """
     center, radius, density, speed = (-0.65e-3, 0.12e-3, 1.77e-3), 2.344e-3, 0.2384, 0.35145
     air = at.Medium(1.2, 343.0)
@@ -56,10 +58,10 @@ def test_a_resonance_narrower_than_its_shift_on_both_grids_is_claimed():
     array = at.TransducerArray([[20e-3, 0, 10e-3], [-15e-3, 18e-3, 0], [0, -22e-3, -9e-3]], (1, 0, 0))
     points = [[-20e-3, -6e-3, 12e-3], [8e-3, 24e-3, -7e-3], [5e-3, 3e-3, 27e-3]]
     scene = at.Scene(array, air, 40e3, points, [ball])
-    matrix, error = make_propagator(scene, "box", 0.377e-3, tolerance=1e-3).transfer_matrix(return_error=True)
+    matrix, error = make_propagator(scene, "box", spacing, tolerance=1e-3).transfer_matrix(return_error=True)
     true = relative_error(matrix, matrix_of_sphere(scene))
     assert true > 0.03  # the resonance is there
-    assert true / 3 < error < 3 * true
+    assert true / factor < error < factor * true
 
 
 @pytest.mark.filterwarnings("ignore::autdtorch.ScaleWarning")  # of a light fluid with a high sound speed

@@ -61,8 +61,24 @@ def test_a_shift_as_the_cube_of_the_spacing_is_known_from_two_grids(real, width,
     here, other = (complex(true + shift * each) for each in (1.0, ratio**3))
     fine, coarse = (Resonance(offset, excited / abs(offset)) for offset in (here, other))
     expected = abs(excited / true - excited / here)
-    assert displacement_error([fine], [coarse], ratio) == pytest.approx(expected, rel=1e-6)
-    assert displacement_error([fine], [], ratio) == displacement_error([], [coarse], ratio) == 0
+    assert displacement_error([fine], [coarse], ratio, 0.1) == pytest.approx(expected, rel=1e-6)
+    assert displacement_error([], [coarse], ratio, 0.1) == 0
+
+
+@given(st.floats(-0.05, 0.05), st.floats(1e-4, 0.02), st.floats(0.03, 0.2))
+def test_a_resonance_on_one_grid_alone_may_be_next_to_the_drive(real, width, spacing):
+    """The error is the mean over shifts towards the drive, up to twice the usual 10 spacing^3."""
+    fine = Resonance(complex(real, -width), 0.01)
+    shifts = -math.copysign(20 * spacing**3, real) * (torch.arange(20000) + 0.5) / 20000
+    changes = shifts / (fine.offset + shifts.to(torch.complex128))
+    expected = fine.strength * float((changes.abs() ** 2).mean().sqrt())
+    # steps of up to 8e-6, a twelfth of the least width
+    assert displacement_error([fine], [], 1.3, spacing) == pytest.approx(expected, rel=1e-2)
+
+
+def test_a_resonance_that_another_grid_excites_otherwise_counts_nothing():
+    one, other = Resonance(0.02 - 0.003j, 0.01), Resonance(0.021 - 0.003j, 0.1)
+    assert displacement_error([one], [other], 1.3, 0.1) == 0
 
 
 def test_resonances_of_runs_are_merged_and_survive_a_file():
