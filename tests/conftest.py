@@ -19,6 +19,7 @@ import hypothesis
 import pytest
 import torch
 from PIL import Image
+from threadpoolctl import threadpool_limits
 
 TESTS = Path(__file__).parent
 
@@ -41,6 +42,7 @@ if not torch.cuda.is_available():
 if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
     THREADS = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
     torch.set_num_threads(THREADS)
+    threadpool_limits(THREADS)  # of NumPy's BLAS, which is loaded, and spins while it waits
     os.environ["OMP_NUM_THREADS"] = str(THREADS)  # of the processes that tests start
 
 
