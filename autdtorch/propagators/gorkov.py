@@ -113,16 +113,6 @@ def gorkov(
     return Gorkov(*(part.to(device) for part in parts))
 
 
-def factors(particle: Particle, scene: Scene) -> tuple[float, float]:
-    """Return alpha and beta of U = alpha |p|^2 - beta |grad p|^2."""
-    medium = scene.medium
-    f1, f2 = particle.contrasts(medium)
-    volume = 4 / 3 * math.pi * particle.radius**3
-    alpha = volume * f1 / (4 * medium.density * medium.sound_speed**2)
-    beta = volume * 3 * f2 / (8 * medium.density * scene.angular_frequency**2)
-    return alpha, beta
-
-
 def warn_of_large(particle: Particle, scene: Scene) -> None:
     """Warn if a particle is not small against the wavelength."""
     size = particle.radius / scene.wavelength
@@ -134,7 +124,10 @@ def warn_of_large(particle: Particle, scene: Scene) -> None:
 def _of(
     field: Derivatives, particle: Particle, scene: Scene
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    alpha, beta = factors(particle, scene)
+    medium, volume = scene.medium, 4 / 3 * math.pi * particle.radius**3
+    f1, f2 = particle.contrasts(medium)
+    alpha = volume * f1 / (4 * medium.density * medium.sound_speed**2)
+    beta = volume * 3 * f2 / (8 * medium.density * scene.angular_frequency**2)
     p, first, second, third = field
     potential = alpha * p.abs().square() - beta * first.abs().square().sum(dim=-1)
     by_pressure = p.conj()[..., None] * first

@@ -11,8 +11,7 @@ like products by *, is taken entry by entry:
   Ruocco (2007), doi:10.1364/OE.15.001913, have c = 1, with which close foci change places for ever. Here c
   grows from 0, so that phases of foci settle before weights, and falls to 0 in the end. As many iterations
   before, with q = G^H p, choose the phases of p that begin: at points alone, p = b * sgn(G G^H p), they are
-  cheap. The result is the q of the highest weakest share;
-- "wgs_drives": "wgs" without the iterations before, which end in the same phases from most first guesses;
+  cheap, and end in the same phases from most first guesses. The result is the q of the highest weakest share;
 - "gs_pat": p = G G^H (t * sgn(p)) in turns, and in the end q = sgn(G^H (t^2 * p / |p|^2)) (Martinez Plasencia
   et al. 2020), doi:10.1145/3386569.3392492;
 - "diff_pat": Adam on the phases, from those of "wgs", for the least sum of (|p| - t)^2 (Fushimi, Yamamoto and
@@ -23,6 +22,7 @@ With free amplitudes, drives are divided by their largest entry in place of sgn.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Literal, TypeAlias
@@ -65,29 +65,15 @@ def weight_change(number: int, iterations: int) -> float:
     return min(1.0, 2 * progress, 4 * (1 - progress))
 
 
-def _weighted(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
-    pressure = _first_phases(matrix)
-    if matrix.shape[-2] <= 2 * matrix.shape[-1]:  # otherwise iterations at points take longer
-        both = _products(matrix)
-        pressure, _ = _reweighting(pressure, wanted, iterations, lambda imposed: both @ imposed)
-    return _weighted_from(pressure, matrix, wanted, iterations, project)
-
-
-def _weighted_drives(
-    matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project
+def _weighted(
+    matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project, at_points: bool = True
 ) -> torch.Tensor:
-    return _weighted_from(_first_phases(matrix), matrix, wanted, iterations, project)
-
-
-def _first_phases(matrix: torch.Tensor) -> torch.Tensor:
     number = torch.arange(matrix.shape[-2], device=matrix.device)
     turns = (number * (number + 1) // 2).double() * GOLDEN % 1  # of any two foci, in no simple relation
-    return torch.polar(torch.ones_like(turns), 2 * math.pi * turns)[:, None].to(matrix.dtype)
-
-
-def _weighted_from(
-    pressure: torch.Tensor, matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project
-) -> torch.Tensor:
+    pressure = torch.polar(torch.ones_like(turns), 2 * math.pi * turns)[:, None].to(matrix.dtype)
+    if at_points and matrix.shape[-2] <= 2 * matrix.shape[-1]:  # otherwise they take longer
+        both = _products(matrix)
+        pressure, _ = _reweighting(pressure, wanted, iterations, lambda imposed: both @ imposed)
     back = matrix.mH.resolve_conj()
     _, best = _reweighting(pressure, wanted, iterations, lambda imposed: matrix @ project(back @ imposed))
     return project(back @ best)
@@ -126,12 +112,12 @@ def _at_points(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, proj
     return project(matrix.mH @ (wanted.square() * pressure.sgn() / pressure.abs().clamp_min(TINY)))
 
 
-SOLVERS = {
+SOLVERS: dict[str, Callable[[torch.Tensor, torch.Tensor, int, Project], torch.Tensor]] = {
     "naive": _naive,
     "gs": _in_turns,
     "wgs": _weighted,
-    "wgs_drives": _weighted_drives,
     "gs_pat": _at_points,
+    "wgs_drives": functools.partial(_weighted, at_points=False),  # of further starts; users do not ask for it
 }
 """The algorithms by name: functions of matrices (..., P, M), wanted pressures (..., P, 1), iterations and
 `torch.sgn` or `within_largest`."""
