@@ -292,6 +292,16 @@ def test_a_layer_thinner_than_a_cell_reflects_and_transmits_exactly(density, slo
             assert abs(simulated - exact) < kappa**4 / min(1, density)
 
 
+@given(PLACES, st.floats(0.01, 0.95), st.floats(20.0, 1e4), st.floats(0.1, 0.9))
+def test_sound_goes_along_a_gap_between_heavy_layers_as_through_its_width(share, width, density, kappa):
+    """No plane of cells is in the gap. Both have its volume and its mobility; the rest is the walls' part."""
+    place = share * (1 - width)
+    layers = np.array([[place, width, 1 - width - place]]), np.array([[density, 1.0, density]])
+    port = two_port(*layers, np.full((1, 3), kappa), kappa)
+    volume, mobility = port.thickness.sum() / density, port.mobility.sum() / 2
+    assert (volume, mobility) == pytest.approx((width, width), abs=1.01 / density)
+
+
 def corner(place):
     """Return an element with material 1 in the quarter before the faces at `place`."""
     return Section(((place[0],), (place[1],)), ((1, 0), (0, 0)))

@@ -29,6 +29,9 @@ from autdtorch.utils.spatial import distinct_rows
 # Square s of the sine of the second angle of incidence. The second-order term of the exact mass is (1 - s)^2.
 # The scheme has 1 - 1.25 s, which is nearest to it for s of 0 to 1: equal at 0 and 0.75.
 _OBLIQUE = 0.75
+# Density, relative to air, up to which a layer between heavier ones is a gap. Sound goes along it, which is
+# exact without terms of second order; those for sound across it are several times as large in a slit.
+_AS_AIR = 1.1
 # Largest relative change by terms of second order: coarse grids of slow materials stay stable
 _LARGEST_CHANGE = 0.5
 _SMALL = 0.1  # Wavenumber, relative to the drive's, at which second derivatives by it are evaluated
@@ -52,12 +55,22 @@ def two_port(width: Array, density: Array, wavenumber: Array, air: float) -> Two
     """
     still = long_wave_port(width, density, wavenumber)
     near = _exact_port(width, density, _SMALL * wavenumber, _SMALL * air)
-    return TwoPort(*(_corrected(*pair) for pair in zip(still, near, strict=True)))
+    largest = np.where(_has_gap(width, density), 0.0, _LARGEST_CHANGE)
+    return TwoPort(*(_corrected(*pair, largest) for pair in zip(still, near, strict=True)))
 
 
-def _corrected(still: Array, near: Array) -> Array:
-    """Return a value at the drive's wavenumber, from values for long waves and at `_SMALL` times it."""
-    most = _LARGEST_CHANGE * still
+def _has_gap(width: Array, density: Array) -> NDArray[np.bool_]:
+    """Return which stacks (n,) have a layer as light as air between heavier materials."""
+    heavy = (density[:, [0, -1]] > _AS_AIR).all(axis=1)
+    return np.asarray(heavy & ((density < _AS_AIR) & (width > 0)).any(axis=1))
+
+
+def _corrected(still: Array, near: Array, largest: Array) -> Array:
+    """Return a value at the drive's wavenumber, from values for long waves and at `_SMALL` times it.
+
+    Relative changes are at most the `largest` (n,).
+    """
+    most = (largest * still.T).T
     return np.asarray(still + np.clip((near - still) / _SMALL**2, -most, most))
 
 
