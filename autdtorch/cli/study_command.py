@@ -20,7 +20,8 @@ from omegaconf import OmegaConf
 from autdtorch.cli.settings import folder_of, is_given, load_method, scene_of, section_of, solver_of
 from autdtorch.hardware import DEVICES
 from autdtorch.io.drive_file import save_drive
-from autdtorch.io.goal_section import load_goal
+from autdtorch.io.goal_section import goal_label, load_goal
+from autdtorch.methods.catalogue import label_of
 from autdtorch.propagators import CACHE_VARIABLE
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.moving import angles_of
@@ -180,13 +181,19 @@ def _save_drives(results: StudyResult, scenes: Mapping[str, Scene], folder: Path
 
 def _draw_plane(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> None:
     from autdtorch.plot.pressure_maps import plot_plane
+    from autdtorch.plot.style import TITLE_SIZE, readable, wrapped
 
-    (scene,) = scenes.values()
+    ((name, scene),) = scenes.items()
     (result,) = results.scenes.values()
-    (method,) = result.methods.values()
+    ((label, method),) = result.methods.items()
     if method.plane_pressure is not None and scene.observation_plane is not None:
         seen = scene.observation_plane, scene.control_points, scene.obstacles
         figure = plot_plane(method.plane_pressure, *seen, reflectors=scene.reflectors)
+        score = result.in_unit(f"{float(method.solution.score[method.shown_trial]):.3g}")
+        median = ", of a median trial" if method.trials > 1 else ""
+        lines = f"{readable(name)}, {label_of(label)}", f"{goal_label(result.goal)} {score}{median}"
+        width = figure.get_figwidth() - 1.0  # without the colour bar
+        figure.axes[0].set_title("\n".join(wrapped(line, width) for line in lines), fontsize=TITLE_SIZE)
         figure.savefig(folder / "plane.png")
 
 

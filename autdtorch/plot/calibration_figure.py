@@ -31,7 +31,7 @@ _FLAT = 0.5  # least ratio of the distance of neighbours in a drawing to their d
 _FILLED = 0.44  # radius of a dot, in distances of neighbours
 _UNSURE = 0.55  # radius of the dot of a transducer that the readings hardly determine, in those of others
 _HARDLY = 0.5  # share of the prior's variance that is left of such a transducer, at least
-_LEAST_RANGE = 0.01  # of the colours of gains and of phases [rad]; equal transducers differ by rounding alone
+_LEAST_RANGE = 0.01  # of the colours of gains and of phases [rad]; values and deviations may be smaller
 
 
 @styled
@@ -43,6 +43,7 @@ def plot_calibration(calibration: Calibration) -> Figure:
 
     Gains and phases are drawn at the places of the transducers, in the two axes along which the array extends
     farthest. Small dots are transducers of which the readings left more than half of the prior's variance.
+    Colours span at least twice the median deviation of the others, so that noise alone is pale.
     Without a scene, or where transducers would cover each other, gains and phases are drawn by index, with
     their standard deviations.
 
@@ -79,7 +80,9 @@ def plot_calibration(calibration: Calibration) -> Figure:
             _draw_by_index(ax, value, deviation, middle)
             ax.set_ylabel(title)
         else:
-            _draw_on_array(ax, places, value, unsure, middle, title)
+            known = deviation[~unsure] if not unsure.all() else deviation
+            reach = max(np.abs(value - middle).max(), 2 * float(np.median(known)), _LEAST_RANGE)
+            _draw_on_array(ax, places, value, unsure, (middle, reach), title)
     if places is not None and np.any(hardly):
         style: Any = {
             "marker": "o",
@@ -158,16 +161,17 @@ def _draw_on_array(
     places: tuple[Array, tuple[str, str], float],
     values: Array,
     unsure: Array,
-    middle: float,
+    colours_around: tuple[float, float],
     title: str,
 ) -> None:
+    """Draw transducers, coloured from a middle by a largest difference to either side."""
     centres, axes, radius = places
     radii = np.where(unsure, _UNSURE, 1.0) * radius
     dots = [Circle(tuple(place), size) for place, size in zip(centres.tolist(), radii.tolist(), strict=True)]
     drawn = PatchCollection(
         dots,
         cmap=colours.WAVE_MAP,
-        norm=CenteredNorm(middle, max(np.abs(values - middle).max(), _LEAST_RANGE)),
+        norm=CenteredNorm(*colours_around),
         edgecolors=colours.EDGE_COLOUR,
         linewidths=0.3,
     )

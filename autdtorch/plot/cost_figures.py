@@ -17,6 +17,7 @@ from autdtorch.plot.style import (
     TICK_SIZE,
     Look,
     add_legend,
+    begin_at_zero,
     label_of,
     log_axes,
     looks_of,
@@ -86,7 +87,7 @@ def plot_pareto(
         ends = np.vstack([everything[best], (ax.get_xlim()[1], everything[best[-1], 1])])
         ax.step(*ends.T, where="post", scalex=False, scaley=False, **_FRONT)
     if higher_is_better:  # after all panels, which share the axis, are drawn
-        panels[0].set_ylim(bottom=min(0.0, panels[0].get_ylim()[0]))
+        begin_at_zero(panels[0])
     handles = [
         Line2D([], [], color=look.colour, marker=look.marker, markersize=5, label=label_of(method))
         for method, look in looks.items()

@@ -51,9 +51,10 @@ _SPARE_LOOKS = (  # colours of Tol's muted scheme
     Look("#999999", ">", (0, (3, 3))),
 )
 
+TITLE_SIZE = 9.0
 _STYLE: Any = {  # Any: Matplotlib types every key by itself
     "font.size": 9.0,
-    "axes.titlesize": 9.0,
+    "axes.titlesize": TITLE_SIZE,
     "axes.labelsize": 9.0,
     "legend.fontsize": 8.5,
     "legend.title_fontsize": 8.5,
@@ -177,6 +178,14 @@ def round_numbers(low: float, high: float, fits: Callable[[str, float], bool]) -
         if intervals <= _TICKS and fits(longest, intervals):
             return places, decimals
     return places[len(places) // 2 :][:1], decimals
+
+
+def begin_at_zero(ax: Axes) -> None:
+    """Extend the vertical axis of what is drawn to 0, with the usual room above equal values too."""
+    ax.update_datalim([(0.0, 0.0)], updatex=False)
+    ax.autoscale_view(scalex=False)
+    if all(each.dataLim.y0 >= 0 for each in ax.get_shared_y_axes().get_siblings(ax)):
+        ax.set_ylim(bottom=0.0)
 
 
 def log_axes(ax: Axes, which: str = "xy") -> None:

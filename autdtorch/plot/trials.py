@@ -34,7 +34,7 @@ _BOX = 0.22  # least width of a box with its margin [inch]
 _ROW = 1.75  # height of a panel of boxes [inch]
 _LOW_ROW = 1.3  # without boxes
 _FEWEST = 6  # trials for a box; of fewer, each is a dot
-_PANEL = (2.7, 2.3)  # convergence of a scene [inch]
+_PANEL = (2.7, 2.5)  # convergence of a scene [inch]
 _ALIKE = 5.0  # largest ratio of the highest scores of scenes that share an axis
 _POSES = (4.6, 3.2)  # a figure of scores along a path [inch]
 
@@ -71,7 +71,7 @@ def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
                 most[method] = max(most[method], values.size)
         for border in range(1, len(scenes)):
             ax.axvline(border - 0.5, color="0.9", linewidth=0.8, zorder=0)
-        ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
+        style.begin_at_zero(ax)
         ax.set_ylabel(style.wrapped(label, height))
         ax.tick_params(labelsize=TICK_SIZE)
         ax.set_xlim(-0.5, len(scenes) - 0.5)
@@ -141,7 +141,7 @@ def plot_poses(
         if np.isfinite(limits).any():
             ax.plot(along, limits, "k:", label="bound")
     ax.set(xlabel=style.wrapped(xlabel, width - 1.0), ylabel=style.wrapped(ylabel, height - 1.0))
-    ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
+    style.begin_at_zero(ax)
     ax.tick_params(labelsize=TICK_SIZE)
     add_legend(figure, ax.get_legend_handles_labels()[0])
     return figure
@@ -199,7 +199,7 @@ def plot_convergence(
         ax.set_xlim(left=0.0)
     # After all panels are drawn: they share the axis, and a limit set earlier would keep it from growing.
     for ax in panels:
-        ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
+        style.begin_at_zero(ax)
     handles = [
         Line2D([], [], color=look.colour, linestyle=look.dashes, label=label_of(method))
         for method, look in looks.items()

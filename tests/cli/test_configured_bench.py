@@ -50,7 +50,7 @@ def test_devices_of_boards_find_the_drive_of_the_simulation(trial, tmp_path, dev
     words = (f"hardware.device={device}", f"hardware.boards={boards}", "hardware.transducers='251-259'")
     assert trial(*EMULATED, "method.levels=4", *words)[0] == 0
     report = (tmp_path / "out" / "report.md").read_text()
-    assert "transducers driven as in the simulated trial: 9 of 9" in report
+    assert "transducers driven as in the simulated trial, up to a phase common to all: 9 of 9" in report
     assert report.count("| 1.000 |\n") == 3
     if device == "openmpd":  # another file of the same name is another board
         write_board(tmp_path, "left", gain=0.5)
@@ -206,7 +206,7 @@ def test_a_device_and_a_sensor_are_one_entry_each(trial, write, tmp_path, monkey
     write("ours/hardware/mine.yaml", f"defaults: [base, _self_]\n{bench}")
     assert trial("hardware=mine", "hardware.emulated=true", "method.levels=4")[0] == 0
     report = (tmp_path / "out" / "report.md").read_text()
-    assert "transducers driven as in the simulated trial: 9 of 9" in report
+    assert "transducers driven as in the simulated trial, up to a phase common to all: 9 of 9" in report
     origin = json.loads((tmp_path / "out" / "trial.jsonl").read_text().splitlines()[0])["origin"]
     assert (origin["device"], origin["phases"], origin["sensor"], origin["fraction"]) == (
         "Row",

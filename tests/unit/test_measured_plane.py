@@ -10,7 +10,7 @@ from autdtorch.hardware.camera.picture import Picture
 from autdtorch.io.picture_file import PICTURES
 from autdtorch.propagators import Propagator
 from autdtorch.scene.geometry import cell_centers_of
-from autdtorch.study.report.hardware_report import measured_plane
+from autdtorch.study.report.hardware_report import alike, measured_plane
 
 PLANE = at.Plane((0.12, 0.0, 0.0), (1, 0, 0), (0.08, 0.08))
 FOCI = at.circle_points(PLANE.center, 20e-3, 4, PLANE.normal)
@@ -32,6 +32,20 @@ def pictured(folder: Path, shift: float = 0.0, factor: float = 1.0) -> tuple[Pro
         picture = Picture(PLANE, pressure, (pressure.square() + noise).sqrt() - pressure)
         at.save_picture(folder / PICTURES / f"again_{number}.npz", picture)
     return propagator, drive
+
+
+def test_drives_are_alike_up_to_a_phase_in_common() -> None:
+    draws = torch.Generator().manual_seed(0)
+    levels = torch.randint(8, (16,), generator=draws)
+    drive = at.drive_from_phases(2 * torch.pi * levels / 8)
+    assert alike(drive, drive) == 16
+    assert alike(drive * torch.tensor(0.6 + 0.8j), drive) == 16
+    changed = drive.clone()
+    changed[:3] *= torch.tensor([1j, -1, 0.5])  # two phases and an amplitude
+    assert alike(1j * changed, drive) == 13
+    changed[:3] = 0
+    assert alike(changed, drive) == 13
+    assert alike(0 * drive, 0 * drive) == 16
 
 
 def test_a_trial_without_a_camera_has_no_plane(tmp_path: Path) -> None:

@@ -89,6 +89,28 @@ def test_scenes_of_other_scales_have_their_own_axis(factor: float, shared: bool)
     assert first.get_ylim()[1] >= 2.0
 
 
+def test_curves_that_never_rise_have_room_above_them() -> None:
+    """As of a method that begins at its best drive."""
+    for heights in ([8.17, 8.18], [8.0, 8.0]):
+        (ax,) = plot_convergence({"a": {"identify": [heights]}}).axes
+        assert ax.get_ylim()[0] == 0
+        assert ax.get_ylim()[1] > 1.02 * heights[-1]
+    (ax,) = plot_convergence({"a": {"identify": [[-2.0, -1.0]]}}).axes
+    assert ax.get_ylim()[0] < -2.0
+
+
+def test_gains_within_their_uncertainty_are_pale() -> None:
+    propagator = at.make_propagator(small_scene())
+    drives = at.drive_from_phases(6 * RANDOM.random((6, 4)))
+    readings = at.Readings(drives, (drives @ propagator.transfer_matrix().T).abs())
+    calibration = at.calibrate(propagator, readings, at.Prior(gain=0.2, phase=0.5), folds=0)
+    _, gains, _ = at.plot_calibration(calibration).axes[:3]
+    (dots,) = gains.collections
+    off = (dots.get_array() - 1).max()
+    assert off < 0.5 * float((calibration.gain * calibration.gain_deviation).min())
+    assert dots.norm(1 + off) - 0.5 < 0.125  # of 0.5, the end of the colours
+
+
 def test_a_calibration_is_drawn_on_the_array_or_by_index() -> None:
     propagator = at.make_propagator(small_scene())
     matrix = propagator.transfer_matrix()

@@ -270,7 +270,7 @@ class Calibration:
             ("scale", f"{self.scale.value:.4g} +- {self.scale.deviation:.2g}"),
             ("gains", f"spread {_percent(gains)}, each +- {_percent(gain_error)}"),
             ("phases", f"spread {phases:.3f} rad, each +- {phase_error:.3f} rad"),
-            ("noise", f"{self.noise:.3g} Pa"),
+            ("noise", f"{self.noise:.3g} Pa, standard deviation of a reading"),
             ("determined", f"{self.determined:.0f} of {2 * len(self.gain)} directions of gains and phases"),
         ]
         changes = self.simulation.changes

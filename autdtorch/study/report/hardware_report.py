@@ -118,7 +118,7 @@ def write_hardware_report(
         unit=goal.unit and f" {goal.unit}",
         score_again=float(goal(again_mean)),
         readings=len(again),
-        same=int(torch.isclose(solution.drive, expected.drive, rtol=0, atol=1e-9).sum()),
+        same=alike(solution.drive[0], expected.drive[0]),
         points=_points(names, readings, preflight.unit),
         **compared,
         **_calibrated(calibration),
@@ -132,6 +132,16 @@ def write_hardware_report(
     path = folder / REPORT_FILE
     replace_file(path, text.encode())
     return path
+
+
+def alike(drive: torch.Tensor, expected: torch.Tensor) -> int:
+    """Return how many transducers two drives (M,) drive alike, up to a phase that all have in common."""
+    turns = (drive * expected.conj()).sgn()
+    sounding = torch.cat([turns[turns != 0], turns.new_ones(1)])  # 1 where there is no other
+    rounded = (1e6 * torch.view_as_real(sounding)).round()
+    values, counts = torch.unique(rounded, dim=0, return_counts=True)
+    common = torch.view_as_complex(values[counts.argmax()].contiguous()).sgn()
+    return int(torch.isclose(drive, common * expected, rtol=0, atol=1e-5).sum())
 
 
 def _calibrated(calibration: Calibration | str) -> dict[str, Any]:

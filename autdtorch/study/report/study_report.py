@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -103,6 +104,7 @@ def _markdown(
         trials=", ".join(f"{label_of(name)} {tables.extent(numbers)}" for name, numbers in counts.items()),
         few=[label_of(name) for name in (BO, GABS) if max(counts.get(name, [_FEW_TRIALS])) < _FEW_TRIALS],
         fewest_trials=FEWEST_TRIALS,
+        most_trials=max(itertools.chain(*counts.values())),
         rendering_problem=_draw_scenes(scenes, folder),
         scenes=[
             (name, picture(f"fig1_{name}.png", alt_texts.of_scene(name, scenes[name]))) for name in scenes
