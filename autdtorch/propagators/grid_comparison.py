@@ -80,6 +80,13 @@ class GridComparison:
 
     @property
     @one_library_thread()
+    def resonance_error(self) -> float:
+        """The error by shifted resonances, relative to the norm of what is scattered."""
+        matrix = self.result.matrix
+        return float(self._of_resonances * matrix.norm() / (matrix - self.free).norm().clamp(min=_TINY))
+
+    @property
+    @one_library_thread()
     def usual_error(self) -> float:
         """The usual error of grids of this spacing, without any other."""
         return float(usual_errors(*self._whole, self.plan.spacing, self.plan.law))
@@ -92,12 +99,14 @@ class GridComparison:
     @property
     def _settling_error(self) -> float:
         """The error relative to the norm of the whole: of the steady state, and by shifted resonances."""
-        if not self.others:
-            return self.result.residual
+        return math.hypot(self.result.residual, self._of_resonances) if self.others else self.result.residual
+
+    @property
+    def _of_resonances(self) -> float:
+        """The error by shifted resonances, relative to the norm of the whole."""
         other, spacing = self.others[-1]
         ratio, share = spacing / self.plan.spacing, self.plan.spacing / self.plan.law.wavelength
-        shifted = displacement_error(self.result.resonances, other.resonances, ratio, share)
-        return math.hypot(self.result.residual, shifted)
+        return displacement_error(self.result.resonances, other.resonances, ratio, share)
 
     @property
     def _reading_errors(self) -> torch.Tensor:

@@ -168,6 +168,11 @@ class SimulatedPropagator(ScenePropagator):
         """The error of the control points' matrix by the grids given; infinite without any."""
         return self._compared(with_error=bool(self._coarser)).error
 
+    @property
+    def resonance_error(self) -> float:
+        """The error of the control points' matrix by shifted resonances, relative to what is scattered."""
+        return self._compared(with_error=True).resonance_error
+
     def usual_error(self, points: ArrayLike | None = None) -> float:
         """Simulate points, by default the control points; return the usual error of grids of this spacing."""
         return self._compared(points).usual_error

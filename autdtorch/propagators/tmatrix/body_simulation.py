@@ -54,6 +54,9 @@ logger = logging.getLogger(__name__)
 
 _ENTRY_BYTES = 48.0  # of T and what makes it
 _TOGETHER = 16  # Runs whose forces are computed together
+# Distances of the transducer and of points from a body [radii], and the transducer's direction, in no plane
+# of symmetry
+_TRANSDUCER, _POINTS, _DIRECTION = 4.0, 3.0, (0.36, 0.48, 0.8)
 _DIGITS = 10  # Decimals of the places [m] of obstacles in their body, so that poses are the same body
 
 
@@ -101,14 +104,15 @@ class StillBody:
 
     @cached_property
     def scene(self) -> Scene:
-        """The body alone, with a transducer and a point that play no part."""
+        """The body alone, and a transducer and points around it, where its resonances are heard."""
         center, radius = self.sphere
-        aside = center.new_tensor([[3 * radius, 0.0, 0.0]])
+        aside = center.new_tensor([_DIRECTION]) * _TRANSDUCER * radius
         array = TransducerArray(center + aside, (-1.0, 0.0, 0.0), radius=0)
+        points = sphere_points(center, _POINTS * radius, MOST_JUDGED)
         with warnings.catch_warnings():  # of the scene that it is part of
             warnings.simplefilter("ignore", OverlapWarning)
             warnings.simplefilter("ignore", ScaleWarning)
-            return Scene(array, self.medium, self.frequency, center - aside, self.obstacles, name="body")
+            return Scene(array, self.medium, self.frequency, points, self.obstacles, name="body")
 
     @cached_property
     def degree(self) -> int:
@@ -120,7 +124,7 @@ class StillBody:
     @cached_property
     def axes(self) -> torch.Tensor:
         """The axes of the grid, along which waves are taken: the columns of a matrix (3, 3)."""
-        return torch.from_numpy(self._plan.grouping.grids[0].axes).mT.contiguous()
+        return torch.from_numpy(self.plan.grouping.grids[0].axes).mT.contiguous()
 
     @cached_property
     def runs(self) -> list[list[int]]:
@@ -136,7 +140,7 @@ class StillBody:
         logger.debug("simulating a T-matrix: %d waves, cells of %.3g mm", size, spacing)
         if not len(self._box.assembly.heterogeneous.index):  # obstacles of the medium's own material
             return SimulatedT(torch.zeros((size, size), **COMPLEX), self.axes, 0.0)
-        box, plan, count = self._box, self._plan, len(self.runs)
+        box, plan, count = self._box, self.plan, len(self.runs)
         mixing = real_waves(self.degree)
         incoming = self._regular(box.driven) @ mixing
         strength = incoming.norm(dim=0).clamp_min(torch.finfo(torch.float64).tiny)
@@ -166,13 +170,14 @@ class StillBody:
         return SimulatedT(mixing @ matrix @ mixing.mH, self.axes, residual)
 
     @cached_property
-    def _plan(self) -> Plan:
+    def plan(self) -> Plan:
+        """The plan of its simulation."""
         chosen = plan(self.scene, "box", *self.solver)
         return replace(chosen, grids=one_box(chosen.region, chosen.spacing))
 
     @cached_property
     def _box(self) -> ScatteredField:
-        return BoxSimulation(self._plan, Store()).boxes[0]
+        return BoxSimulation(self.plan, Store()).boxes[0]
 
     @cached_property
     def _kinds(self) -> torch.Tensor:

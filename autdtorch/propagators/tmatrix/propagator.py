@@ -171,7 +171,14 @@ class TMatrixPropagator(ScenePropagator):
         others = [(other, second.spacing)]
         errors = grid_errors(matrix, free, self.spacing, others, self.plan.law)
         known = shape_errors(matrix, free, region) + rigid_errors(matrix, free, region)
-        return self.tolerance + errors + known
+        resonances = self._resonance_error * (matrix - free).norm(dim=1) / sizes(matrix, free)
+        return self.tolerance + torch.hypot(errors, resonances) + known
+
+    @cached_property
+    def _resonance_error(self) -> float:
+        """The error of what bodies scatter by the shift of their resonances, which a run of each tells."""
+        bodies = [each.body for each in placed_bodies(self.plan) if each.runs]
+        return max(SimulatedPropagator(body.plan, self._store).resonance_error for body in bodies)
 
     @one_library_thread()
     def _field(self, drive: torch.Tensor, points: torch.Tensor, is_picture: bool) -> torch.Tensor:
