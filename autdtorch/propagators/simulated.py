@@ -107,8 +107,9 @@ class SimulatedPropagator(ScenePropagator):
         return SimulatedPropagator(self.plan.of(scene), self._store)
 
     def coarser(self, factor: float) -> SimulatedPropagator:
-        """Return the propagator of the same scene with cells larger by a factor."""
-        return SimulatedPropagator(self.plan.at(factor * self.spacing, self.tolerance), self._store)
+        """Return the propagator of the same scene with cells larger by a factor, as far as they are fine."""
+        spacing = max(self.spacing, min(factor * self.spacing, self.plan.region.coarsest_spacing))
+        return SimulatedPropagator(self.plan.at(spacing, self.tolerance), self._store)
 
     @cached_property
     def simulation(self) -> Simulation:
