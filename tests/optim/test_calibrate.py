@@ -294,6 +294,32 @@ def test_named_changes_are_found(bodies, names):
         assert abs(value - amounts[name]) < 4 * deviation
 
 
+@settings(deadline=None, max_examples=3)
+@given(aside=st.floats(2.5e-3, 4.5e-3), side=st.sampled_from([1, -1]), seed=st.integers(0, 10**6))
+def test_a_body_nearly_half_a_wavelength_aside_is_found(aside, side, seed):
+    """The echo between it and the panel is alike there: the posterior has a maximum each half wavelength."""
+    ball = at.Sphere((25e-3, 2e-3, -1e-3), radius=4e-3, rigid=True)
+    room = scene(obstacles=[ball], reflectors=[at.Reflector.behind(array())])
+    simulated = at.make_propagator(room, method="tmatrix", tolerance=1e-5)
+    true = SceneChanges(simulated, ["obstacles.x"]).matrix([side * aside])
+    bench = Bench(true, seed, phase=0.3)
+    prior = at.Prior(variants={"obstacles.x": 2e-3}, phase=0.3, rest=0.02)
+    calibration = at.calibrate(simulated, bench.readings(60), prior, folds=0)
+    value, deviation = calibration.amounts["obstacles.x"]
+    assert abs(value - side * aside) < 5 * deviation  # a wrong maximum is 20 or more off
+
+
+def test_half_wavelengths_that_grids_do_not_look_at_are_told():
+    ball = at.Sphere((25e-3, 2e-3, -1e-3), radius=4e-3, rigid=True)
+    simulated = at.make_propagator(scene(obstacles=[ball], shape=(2, 2)), method="box", spacing=2e-3)
+    drives = torch.eye(4, dtype=torch.complex128).repeat(2, 1)
+    readings = at.Readings(drives, (drives @ simulated.transfer_matrix().T).abs())
+    for width in (1e-3, 2e-3):
+        prior = at.Prior(variants={"obstacles.x": width})
+        doubts = at.calibrate(simulated, readings, prior, folds=0).doubts
+        assert any("half a wavelength" in doubt for doubt in doubts) == (width > 1e-3)
+
+
 def test_the_prior_for_methods_varies_the_calibrated_matrix():
     simulated = at.make_propagator(scene())
     names = {"points.y": 1e-3}

@@ -49,9 +49,9 @@ def calibrate(
 
     The model is p = c G(t) diag(g e^{i b}) q, with errors of single entries of the matrix besides, all with
     the widths of the prior. Readings of the magnitude constrain it, and phases where they were read, up to a
-    common one. The likeliest values are sought by Gauss-Newton steps, and deviations are those of the
-    posterior linearised there (Laplace's approximation). Readings that stay beyond six deviations are left
-    out and named.
+    common one. The likeliest values are sought by Gauss-Newton steps, without simulations on grids also from
+    amounts half a wavelength aside. Deviations are those of the posterior linearised there (Laplace's
+    approximation). Readings that stay beyond six deviations are left out and named.
 
     Args:
         propagator_or_matrix: of the scene, or its transfer matrix G (P, M) [Pa].
@@ -86,6 +86,8 @@ def calibrate(
     if not fit.converged:
         names = ", ".join(simulation.changes.names)
         doubts.append(f"the amounts of {names} have not converged: their deviations are too small")
+    if simulation.changes.simulates and simulation.aside:
+        doubts.append('amounts half a wavelength aside may fit better: method "tmatrix" looks there, too')
     for point in range(len(failed)):
         doubts += saturation_doubts(fit.read, point)
     calibration = Calibration(simulation, start, used, prior, fit, None, tuple(doubts))

@@ -20,6 +20,7 @@ from autdtorch.methods.prior import Prior, gaussian_prior
 from autdtorch.objectives.readings import Readings
 from autdtorch.propagators import Propagator
 from autdtorch.propagators.scene_changes import SceneChanges
+from autdtorch.scene.changes import lever
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.process import cached_property
@@ -36,6 +37,8 @@ _HALVINGS = 3  # of a step of the amounts that fits worse, or that the scene can
 _TEMPERED = (1000.0, 300.0, 100.0, 30.0, 10.0, 3.0)
 """Factors of the assumed noise in the first fits: the maximum is followed from one that noise makes wide, and
 fewer fits end in a local one (64 drives of 249 transducers: twice the negative logarithm is 232 for 261)."""
+
+_EXPECTED = 2.5  # standard deviations within which amounts are sought
 
 _FAR = 6.0  # standard deviations of the prior beyond which a reading is an outlier at first
 
@@ -96,15 +99,38 @@ class CalibrationFit:
 
 
 def fitted(simulation: CalibrationStart, readings: Readings, prior: Prior) -> CalibrationFit:
-    """Fit a simulation to readings.
+    """Fit a simulation to readings, from the scene itself and from amounts aside, and return the likeliest.
 
-    The matrix is linearised by the amounts of changes, fitted, and linearised again at the fitted amounts
-    until they no longer change (Gauss-Newton). A step that fits worse than the one before is halved.
+    Where matrices are simulated, the scene itself is the only start.
     """
     tangent = Tangent.at(simulation.changes, torch.zeros_like(simulation.widths))
     around = prior_around(tangent, simulation.widths, prior)
     unit = around.unit_of(readings.drives, readings.pressure)
-    fit = _first(around.times(unit), readings, unit)
+    best = _climbed(simulation, readings, prior, unit, tangent)
+    for amounts in [] if simulation.changes.simulates else simulation.aside:
+        try:
+            start = Tangent.at(simulation.changes, amounts)
+            fit = _climbed(simulation, readings, prior, unit, start)
+        except ValueError as error:  # on the way, too
+            logger.info("calibration: no fit from amounts %s: %s", amounts.tolist(), error)
+            continue
+        # both with the noise and the outliers of the best
+        here = replace(fit.posterior, variance=best.posterior.variance)
+        if here.misfit(best.drives, best.read) < best.posterior.misfit(best.drives, best.read):
+            best = fit
+    return best
+
+
+def _climbed(
+    simulation: CalibrationStart, readings: Readings, prior: Prior, unit: float, tangent: Tangent
+) -> CalibrationFit:
+    """Return the fit that begins at a tangent.
+
+    The matrix is linearised by the amounts of changes, fitted, and linearised again at the fitted amounts
+    until they no longer change (Gauss-Newton). A step that fits worse than the one before is halved.
+    """
+    around = prior_around(tangent, simulation.widths, prior).times(unit)
+    fit = _first(around, tangent.amounts, readings, unit)
     enough = _ENOUGH_ON_GRIDS if simulation.changes.simulates else _ENOUGH
     for left in reversed(range(_ROUNDS)):
         before, around = fit, prior_around(tangent, simulation.widths, prior).times(unit)
@@ -124,11 +150,12 @@ def prior_around(tangent: Tangent, widths: torch.Tensor, prior: Prior) -> Matrix
     return gaussian_prior(prior, tangent.matrix, tangent.derivatives, widths, tangent.amounts)
 
 
-def _first(prior: MatrixPrior, readings: Readings, unit: float) -> CalibrationFit:
-    """Return the maximum of the prior, with the common phase of the readings and without outliers far off."""
+def _first(prior: MatrixPrior, amounts: torch.Tensor, readings: Readings, unit: float) -> CalibrationFit:
+    """Return a fit near amounts (K,), with the common phase of the readings and without outliers far off."""
     drives, observed = readings.drives, readings.pressure
-    expected = drives @ prior.rows.T
+    expected = drives @ (prior.rows + (amounts[:, None, None] * prior.changes).sum(dim=0)).T
     shift = torch.zeros_like(prior.widths)
+    shift[len(shift) - len(amounts) :] = amounts
     if readings.phase is not None:
         parts = torch.polar(observed, readings.phase) * expected.conj()
         shift[2 * drives.shape[1] + 1] = parts[parts.abs().isfinite()].sum().angle()
@@ -274,6 +301,23 @@ class CalibrationStart:
     def scene(self) -> Scene | None:
         """The scene of the propagator."""
         return None if self.propagator is None else self.propagator.scene
+
+    @property
+    def aside(self) -> list[torch.Tensor]:
+        """Amounts (K,) with one change of half wavelengths, as far as its width lets expect.
+
+        The echo between a panel and a body half a wavelength aside is alike, and a fit ends at the nearest
+        such amount.
+        """
+        scene, amounts = self.scene, list[torch.Tensor]()
+        if scene is None or not isinstance(self.changes, SceneChanges):
+            return amounts
+        changes = torch.eye(len(self.widths), **REAL)
+        for name, width, change in zip(self.changes.names, self.widths, changes, strict=True):
+            step = scene.wavelength / 2 / lever(name, scene)
+            for count in range(1, 1 + int(_EXPECTED * width / step)):
+                amounts += [count * step * change, -count * step * change]
+        return amounts
 
     def changed_scene(self, amounts: torch.Tensor) -> Scene | None:
         """Return the scene with amounts (K,) of the changes; None where there is a matrix alone."""
