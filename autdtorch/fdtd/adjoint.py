@@ -73,16 +73,13 @@ class _Run:
         state, record = self.kernel.advance(deepcopy(state), c, sources, receivers, signal)
         return state, record[0].cpu()
 
-    def single(self, cells: Tensor) -> Receivers:
-        return Receivers(cells[:, None], torch.ones((len(cells), 1), dtype=self.assembly.dtype, device="cpu"))
-
     def fields(
         self, state: WaveState, sources: Sources, cells: Tensor, signal: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the two pressures in cells (k,) before the first step (2, k), and after each (steps, k)."""
         both = torch.stack((state.before.reshape(-1), state.now.reshape(-1)))
         first = both[:, cells.to(state.now.device)].cpu()
-        return first, self.advance(state, sources, self.single(cells), signal)[1]
+        return first, self.advance(state, sources, Receivers.at(cells, self.assembly.dtype), signal)[1]
 
     def mass(self, cells: Tensor) -> Tensor:
         """Return the mass of distinct cells (k,)."""
@@ -202,7 +199,8 @@ class _Recorded(torch.autograd.Function):
         totals = _Totals(*(by_force.new_zeros(size) for size in ((rows, 27), (lossy, 27), (lossy,))))
         if slope.any():
             cells = [run.driven] if around is None else [run.driven, around.index]
-            mass, read = torch.cat([run.mass(group) for group in cells]), run.single(torch.cat(cells))
+            mass = torch.cat([run.mass(group) for group in cells])
+            read = Receivers.at(torch.cat(cells), run.assembly.dtype)
             sources, signal = run.adjoint_sources(slope)
             state = run.assembly.silence(sources)
             for number in reversed(range(len(ctx.cuts) - 1)):

@@ -24,23 +24,8 @@ from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells
 from autdtorch.fdtd.assembly.losses import LARGEST_TANGENT
 from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue
 from autdtorch.fdtd.stencil import Stencil
-from autdtorch.utils.array_types import REAL, Index
 
 _TRIALS = 8  # Largest number of time steps that are tried
-
-
-class Damping(NamedTuple):
-    """Damping coefficients of l lossy cells, as tensors; see `heterogeneous.LossyCells`."""
-
-    place: Tensor
-    coupling: Tensor
-    mass: Tensor
-    ground: Tensor
-
-    @classmethod
-    def of(cls, place: Index, losses: Tensor) -> Damping:
-        """Return the damping of cells at `place` (l,), from coupling, mass and ground (l, 29)."""
-        return cls(torch.from_numpy(place), losses[:, :27], losses[:, 27], losses[:, 28])
 
 
 class SteppedCells(NamedTuple):
@@ -56,22 +41,25 @@ def at_time_step(
     cells: HeterogeneousCells, stencil: Stencil, steps_per_period: float
 ) -> tuple[HeterogeneousCells, Tensor, Tensor]:
     """Return the cells with rows and masses at a time step, and `loss` and `ground` of `SteppedCells`."""
-    if (losses := cells.losses) is None:
-        return cells, torch.zeros((0, 27), **REAL), torch.zeros(0, **REAL)
-    damping = Damping(*map(torch.from_numpy, (losses.place, losses.coupling, losses.mass, losses.ground)))
-    rows = torch.from_numpy(cells.weight), torch.from_numpy(cells.mass)
-    weight, mass, loss, ground = stepped_cells(*rows, damping, stencil, steps_per_period)
+    rows, losses = (torch.from_numpy(part) for part in (cells.weight, cells.loss))
+    masses, place = torch.from_numpy(cells.mass), torch.from_numpy(cells.lossy)
+    weight, mass, loss, ground = stepped_cells(rows, masses, place, losses, stencil, steps_per_period)
     return replace(cells, weight=weight.numpy(), mass=mass.numpy()), loss, ground
 
 
 def stepped_cells(
-    weight: Tensor, mass: Tensor, damping: Damping, stencil: Stencil, steps_per_period: float
+    weight: Tensor, mass: Tensor, place: Tensor, losses: Tensor, stencil: Stencil, steps_per_period: float
 ) -> SteppedCells:
-    """Return heterogeneous cells with rows (n, 27), mass (n,) and damping at a time step; differentiable."""
+    """Return cells with rows (n, 27) and mass (n,), lossy ones at `place` (l,), at a time step.
+
+    `losses` (l, 29) are as in `HeterogeneousCells`. Differentiable by all but the place.
+    """
+    if not len(place):
+        return SteppedCells(weight, mass, losses[:, :27], losses[:, 28])
     turn = 2 * math.pi / steps_per_period
     tangent, of_air = math.tan(turn / 2), stencil.damping(steps_per_period)
     factor = stencil.time_factor(steps_per_period) / (1 + of_air)
-    place, coupling, damped, ground = damping
+    coupling, damped, ground = losses[:, :27], losses[:, 27], losses[:, 28]
     lost = tangent / stencil.symbol * damped
     before, here = mass[place], mass[place] + lost / (1 + of_air)
     whole = mass.index_add(0, place, lost / (1 + of_air))
@@ -90,15 +78,15 @@ def fewest_stable_steps(cells: HeterogeneousCells, stencil: Stencil, shape: tupl
     """
     largest = largest_eigenvalue(cells.index, cells.weight, stencil, shape, cells.largest)
     fewest = fewest_steps(stencil, largest)
-    losses = cells.losses
-    if losses is None or not (losses.coupling.any() or losses.ground.any()):
+    lossy, coupling, ground = cells.lossy, cells.loss[:, :27], cells.loss[:, 28]
+    if not (coupling.any() or ground.any()):
         return fewest
     steps = max(fewest, math.pi / math.atan(LARGEST_TANGENT / max(cells.tangent, 1e-9)))
-    damped = losses.coupling / cells.mass[losses.place, None]
+    damped = coupling / cells.mass[lossy, None]
     for _ in range(_TRIALS):
         rows = cells.weight.copy()
-        rows[losses.place] += damped / math.tan(math.pi / steps)
-        rows[losses.place, 13] = losses.ground / cells.mass[losses.place]
+        rows[lossy] += damped / math.tan(math.pi / steps)
+        rows[lossy, 13] = ground / cells.mass[lossy]
         needed = fewest_steps(stencil, largest_eigenvalue(cells.index, rows, stencil, shape))
         if needed <= steps:
             break

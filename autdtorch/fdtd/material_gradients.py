@@ -18,13 +18,8 @@ import torch
 from torch import Tensor
 
 from autdtorch.fdtd.assembly.elements import elements_of
-from autdtorch.fdtd.assembly.heterogeneous import (
-    CellMasses,
-    HeterogeneousCells,
-    heterogeneous_cells,
-    lossy_cells,
-)
-from autdtorch.fdtd.damping import Damping, SteppedCells, stepped_cells
+from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
+from autdtorch.fdtd.damping import SteppedCells, stepped_cells
 from autdtorch.fdtd.grid import Grid, domain_extent
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.region import Fluid, Region
@@ -44,7 +39,7 @@ class DifferentiableCells:
     heterogeneous: HeterogeneousCells
     weight: Tensor  # their stencil rows (n, 27), differentiable
     mass: Tensor  # their mass (n,), differentiable
-    damping: Damping | None = None  # of the lossy ones, differentiable
+    loss: Tensor  # losses of the lossy ones (l, 29), differentiable
 
     def assembly(self, grid: Grid, region: Region, dtype: torch.dtype, time_step: float | None) -> Assembly:
         """Return an assembly that is differentiable by its stencil rows; see `assembly_of`."""
@@ -61,10 +56,8 @@ class DifferentiableCells:
         return replace(assembly, coefficients=rows)
 
     def _at_time_step(self, assembly: Assembly) -> SteppedCells:
-        if self.damping is None:
-            return SteppedCells(self.weight, self.mass, torch.zeros((0, 27), **REAL), torch.zeros(0, **REAL))
-        steps = float(assembly.steps_per_period)
-        return stepped_cells(self.weight, self.mass, self.damping, assembly.stencil, steps)
+        rows = self.weight, self.mass, torch.from_numpy(self.heterogeneous.lossy), self.loss
+        return stepped_cells(*rows, assembly.stencil, float(assembly.steps_per_period))
 
     def driven(self, sources: Sources, assembly: Assembly) -> Sources:
         """Return the assembly's sources, differentiable also by the mass of the cells they are in."""
@@ -104,10 +97,11 @@ def cells_of_obstacles(
         weight = weight.index_add(0, places, shift * torch.from_numpy(rows[changed]))
         mass = mass.index_add(0, places, shift * torch.from_numpy(masses[changed]))
         loss = loss.index_add(0, places, shift * torch.from_numpy(losses[changed]))
-    damping = Damping.of(np.flatnonzero(lossy), loss[torch.from_numpy(lossy)]) if lossy.any() else None
-    numbers = replace(base, index=index, weight=weight.detach().numpy(), mass=mass.detach().numpy())
-    cells = replace(numbers, losses=lossy_cells(loss.detach().numpy()))
-    return DifferentiableCells(cells, weight, mass, damping)
+    loss = loss[torch.from_numpy(lossy)]
+    rows, masses, losses = (each.detach().numpy() for each in (weight, mass, loss))
+    place = np.flatnonzero(lossy)
+    cells = replace(base, index=index, weight=rows, mass=masses, lossy=place, loss=losses)
+    return DifferentiableCells(cells, weight, mass, loss)
 
 
 def _differences(
@@ -182,8 +176,8 @@ def cells_of_maps(
     axes = [np.arange(part.start - 1, part.stop + 1) for part in cells]
     index = np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), grid.shape).ravel()
     no, numbers = np.zeros(0, np.int64), (weight.detach().numpy(), mass.detach().numpy())
-    heterogeneous = HeterogeneousCells(index, *numbers, no, no, no, CellMasses(no, np.zeros(0)))
-    return DifferentiableCells(heterogeneous, weight, mass)
+    heterogeneous = HeterogeneousCells(index, *numbers, no, no, no, no, np.zeros(0))
+    return DifferentiableCells(heterogeneous, weight, mass, torch.zeros((0, 29), **REAL))
 
 
 def _speed_factor(stencil: Stencil, speed_ratio: Tensor) -> Tensor:

@@ -261,10 +261,8 @@ class ScatteredField:
     def _driven(self) -> tuple[Index, NDArray[np.int32]]:
         """Cells where the incident field is needed, and the neighbours (n, 27) by their place among them."""
         shape, index = self.assembly.grid.shape, self.assembly.heterogeneous.index
-        near = np.zeros(shape, bool)
-        near.ravel()[index] = True
-        cells = np.flatnonzero(with_neighbours(near))
-        place, around = places_among(cells, near.size), np.empty((len(index), 27), np.int32)
+        cells = np.flatnonzero(with_neighbours(index, shape))
+        place, around = places_among(cells, math.prod(shape)), np.empty((len(index), 27), np.int32)
 
         def look(ends: tuple[int, int]) -> None:
             around[slice(*ends)] = place[index[slice(*ends), None] + flat_offsets(shape)]

@@ -46,9 +46,7 @@ def short_runs(
     # least squares, as the steps of a period may be no whole number
     basis = torch.from_numpy(np.linalg.pinv(np.stack((np.cos(turn), np.sin(turn)), axis=1)))
     signal = drive_signal(assembly.steps_per_period, 0, steps, _RAMP).to(assembly.dtype)
-    ones = torch.ones((len(cells), 1), dtype=assembly.dtype, device="cpu")
-    receivers = Receivers(torch.from_numpy(cells[:, None]), ones)
-    nothing = Receivers(receivers.index[:0], ones[:0])
+    receivers, nothing = (Receivers.at(torch.from_numpy(some), assembly.dtype) for some in (cells, cells[:0]))
 
     @torch.no_grad()  # holds in one thread only
     def together(bounds: tuple[int, int]) -> list[SteadyState]:

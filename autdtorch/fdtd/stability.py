@@ -123,10 +123,8 @@ def _shortened(
 
 def _with_rim(index: Index, shape: tuple[int, int, int]) -> tuple[Index, NDArray[np.int32]]:
     """Return cells `index` and their neighbours, ascending, and the place of each grid cell among them."""
-    near = np.zeros(shape, bool)
-    near.ravel()[index] = True
-    rows = inner_cells(with_neighbours(near))
-    place = np.full(near.size, -1, np.int32)
+    rows = inner_cells(with_neighbours(index, shape))
+    place = np.full(math.prod(shape), -1, np.int32)
     place[rows] = np.arange(len(rows))
     return rows, place
 

@@ -218,9 +218,8 @@ class WindowedRuns:
         self._shift = self._steps if echo else _shift(self._steps)
         self.interval = float(self._shift / assembly.steps_per_period)
         self._recorded_from = 0 if echo else max(0, unused // self._steps * self._steps)
-        ones = torch.ones((len(cells), 1), dtype=assembly.dtype, device="cpu")
-        self._receivers = Receivers(torch.from_numpy(cells[:, None]), ones)
-        self._nothing = Receivers(self._receivers.index[:0], ones[:0])
+        self._receivers = Receivers.at(torch.from_numpy(cells), assembly.dtype)
+        self._nothing = Receivers.at(torch.from_numpy(cells[:0]), assembly.dtype)
         self._state, self._basis = assembly.silence(sources, kernel.device), drive_basis(self._steps, periods)
         self._time = 0
         # Fourier sums (R, k) from the first recorded step, until now and to where windows begin and end

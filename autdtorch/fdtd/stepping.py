@@ -255,7 +255,6 @@ def assembly_of(
     if dtype == torch.float32 and steps > _MOST_SINGLE:
         logger.info("%d steps in a period: in double precision, as rounding would grow in single", steps)
         dtype = torch.float64
-    losses = cells.losses
     cells, loss, ground = at_time_step(cells, stencil, steps)
     damping = stencil.damping(steps)
     factor = stencil.time_factor(steps) / (1 + damping)
@@ -284,7 +283,7 @@ def assembly_of(
         columns=columns,
         crossed=crossed,
         crossing=crossing,
-        loss_index=torch.from_numpy(cells.index[:0] if losses is None else cells.index[losses.place]),
+        loss_index=torch.from_numpy(cells.index[cells.lossy]),
         loss_weight=loss.to(dtype),
         loss_ground=ground.to(dtype),
         idle=torch.from_numpy(_idle(grid, cells)),

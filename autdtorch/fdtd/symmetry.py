@@ -173,7 +173,7 @@ def _maps_cells(cells: HeterogeneousCells, grid: Grid, matrix: Index, rounding: 
     turned = (np.array(OFFSETS) @ matrix + 1) @ (9, 3, 1)
     if not (np.abs(cells.weight - cells.weight[order][:, turned]) <= rounding).all():
         return False
-    if cells.losses is None:
+    if not len(cells.lossy):
         return True
     losses = cells.loss_rows
     images_of_losses = losses[order][:, [*turned, 27, 28]]

@@ -160,9 +160,9 @@ def absorption(
     one a row (3, 3).
     """
     cells, grid, stencil = assembly.heterogeneous, assembly.grid, assembly.stencil
-    if (losses := cells.losses) is None:
+    if not len(cells.lossy):
         return None
-    index = cells.index[losses.place]
+    index = cells.index[cells.lossy]
     around = index[:, None] + flat_offsets(grid.shape)
     used, place = np.unique(around, return_inverse=True)
     # on the grid the flow of a wave of unit pressure is less than in air by slope / 2 kappa
@@ -173,12 +173,11 @@ def absorption(
     body, nearest = _owners(places, region, turned, grid.spacing)
     # of a fluid the mass also absorbs as air does, which its losses leave out
     in_fluid = np.array([each.fluid is not None for each in region.bodies], bool)[nearest]
-    mass = losses.mass + np.where(in_fluid, stencil.loss * cells.mass[losses.place], 0)
+    mass = cells.loss[:, 27] + np.where(in_fluid, stencil.loss * cells.mass[cells.lossy], 0)
     obstacle = np.array([each.number for each in region.bodies], np.int64)[body]
     everywhere = torch.from_numpy(grid.centers_of(used) @ turned)
-    return Absorption(
-        used, everywhere, obstacle, place.reshape(around.shape), watts * mass, watts / 2 * losses.coupling
-    )
+    by_pairs = watts / 2 * cells.loss[:, :27]
+    return Absorption(used, everywhere, obstacle, place.reshape(around.shape), watts * mass, by_pairs)
 
 
 def _owners(places: torch.Tensor, region: Region, axes: Array, spacing: float) -> tuple[Index, Index]:

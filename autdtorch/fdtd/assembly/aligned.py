@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from autdtorch.fdtd.assembly.layered_elements import layered_elements
-from autdtorch.fdtd.assembly.prisms import Prisms, prisms, stacked
+from autdtorch.fdtd.assembly.prisms import prisms, stacked
 from autdtorch.fdtd.assembly.reference_element import (
     VERTICES,
     InterfaceElements,
@@ -24,7 +24,7 @@ from autdtorch.fdtd.assembly.reference_element import (
     tend_to_mean,
     uniform_coupling,
 )
-from autdtorch.fdtd.assembly.sections import MaterialKey, Section
+from autdtorch.fdtd.assembly.sections import MaterialKey, Prisms, Section
 from autdtorch.fdtd.stencil import Stencil, places_of
 from autdtorch.utils.array_types import AnyArray, Array, Index, triple
 from autdtorch.utils.process import cached_property

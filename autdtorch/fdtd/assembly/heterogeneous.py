@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass
-from typing import NamedTuple, Self
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,24 +50,6 @@ _MASS_TRANSFERS = 6  # Largest number of mass transfers to light cells; one is n
 
 
 @dataclass(frozen=True)
-class LossyCells:
-    """Damping coefficients of l lossy cells, and their stiffness against silence; see `losses.py`."""
-
-    place: Index  # places of the cells among the heterogeneous ones (l,), ascending
-    coupling: Array  # c_ij with the 27 neighbours (l, 27)
-    mass: Array  # g_i beyond absorbing air's (l,)
-    ground: Array  # stiffness against silence (l,)
-
-
-@dataclass(frozen=True, eq=False)
-class CellMasses:
-    """Cells and their masses."""
-
-    index: Index  # flat cell indices (n,), ascending
-    mass: Array  # m_i (n,), 1 in air
-
-
-@dataclass(frozen=True)
 class HeterogeneousCells:
     """Cells whose stencil rows differ from those of uniform air."""
 
@@ -78,26 +60,28 @@ class HeterogeneousCells:
     rigid: Index  # flat indices of the rigid cells, ascending
     shell: Index  # rigid cells next to other cells; no cell reads those behind them
     enclosed: Index  # rigid cells of air, which no sound reaches, ascending
-    inner: CellMasses  # cells inside obstacles whose rows are those of air, but not their mass
+    inner: Index  # cells inside obstacles whose rows are those of air (k,), ascending
+    inner_mass: Array  # and their mass (k,), which is not
     largest: float = math.inf  # upper bound of the eigenvalues of the rows, by their elements
-    losses: LossyCells | None = None  # None if nothing absorbs
+    lossy: Index = field(default_factory=lambda: np.zeros(0, np.int64))  # those that absorb (l,), ascending
+    # their losses (l, 29): damping coefficients c_ij with the 27 neighbours and g_i beyond absorbing air's,
+    # and stiffness against silence; see `losses.py`
+    loss: Array = field(default_factory=lambda: np.zeros((0, 29)))
     tangent: float = 0.0  # largest ratio of damping to stiffness in a material
 
     @property
     def loss_rows(self) -> Array:
-        """Losses of all cells (n, 29): coupling, mass and ground of `LossyCells`, zero elsewhere."""
+        """Losses of all cells (n, 29)."""
         rows = np.zeros((len(self.index), 29))
-        if self.losses is not None:
-            losses = self.losses
-            rows[losses.place] = np.column_stack((losses.coupling, losses.mass, losses.ground))
+        rows[self.lossy] = self.loss
         return rows
 
     def mass_of(self, cells: Index) -> Array:
         """Return the mass (k,) of distinct cells (k,)."""
         mass = np.ones(len(cells))
-        for part in (self, self.inner):
-            _, ours, theirs = np.intersect1d(part.index, cells, return_indices=True)
-            mass[theirs] = part.mass[ours]
+        for index, masses in ((self.index, self.mass), (self.inner, self.inner_mass)):
+            _, ours, theirs = np.intersect1d(index, cells, return_indices=True)
+            mass[theirs] = masses[ours]
         return mass
 
 
@@ -135,38 +119,20 @@ def heterogeneous_cells(
 
     spread(divide, parts_of_size(len(touched), _TOGETHER))
     changed &= ~hard[touched]
-    cells = _CellRows(touched[changed], weight[changed], mass[changed], loss[changed])
-    uniform, inner = _uniform_cells(elements, touched, hard, shape, stencil)
-    cells = cells.joined(uniform) if len(uniform.cell) else cells
-    around[:] = False
-    around.ravel()[touched] = True
-    shell = inner_cells(with_neighbours(around) & hard.reshape(shape))
-    losses = elements.materials.losses
+    cells = [part[changed] for part in (touched, weight, mass, loss)]
+    uniform, inner, inner_mass = _uniform_cells(elements, touched, hard, shape, stencil)
+    if len(uniform[0]):
+        cells = [np.concatenate(parts) for parts in zip(cells, uniform, strict=True)]
+        order = np.argsort(cells[0], kind="stable")  # of two runs
+        cells = [part[order] for part in cells]
+    index, weight, mass, loss = cells
+    shell = inner_cells(with_neighbours(touched, shape) & hard.reshape(shape))
+    losses, lossy = elements.materials.losses, np.flatnonzero(loss.any(axis=1))
     tangent = 0.0 if losses is None else losses.tangent
     return HeterogeneousCells(
-        cells.cell, cells.weight, cells.mass, np.flatnonzero(hard), shell, enclosed, inner,
-        largest=largest, losses=lossy_cells(cells.loss), tangent=tangent,
+        index, weight, mass, np.flatnonzero(hard), shell, enclosed, inner, inner_mass,
+        largest, lossy, loss[lossy].reshape(len(lossy), 29), tangent,
     )  # fmt: skip
-
-
-class _CellRows(NamedTuple):
-    """Cells with what `HeterogeneousCells` has of each."""
-
-    cell: Index  # flat indices (n,), ascending
-    weight: Array  # (n, 27)
-    mass: Array  # (n,)
-    loss: Array  # (n, 29), or (n, 0) if nothing absorbs
-
-    def joined(self, others: Self) -> Self:
-        both = [np.concatenate(parts) for parts in zip(self, others, strict=True)]
-        order = np.argsort(both[0], kind="stable")  # of two runs
-        return type(self)(*(part[order] for part in both))
-
-
-def lossy_cells(loss: Array) -> LossyCells | None:
-    """Return the lossy of n cells, from the losses of all (n, 29): coupling, mass and ground."""
-    place = np.flatnonzero(loss.any(axis=1))
-    return LossyCells(place, loss[place, :27], *loss[place, 27:].T) if len(place) else None
 
 
 def _vertices(elements: Elements, shape: GridShape) -> Index:
@@ -208,7 +174,7 @@ class _ElementSums(NamedTuple):
         return self._sums(cells, hard, self.kinds.coupling, self.kinds.mass, self.least)
 
     def losses(self, cells: Index, hard: NDArray[np.bool_]) -> Array:
-        """Return the losses of cells (n, 29), as of `lossy_cells`; none (n, 0) if nothing absorbs."""
+        """Return the losses of cells (n, 29), of `HeterogeneousCells`; none (n, 0) if nothing absorbs."""
         if not self.kinds.loss.shape[1]:
             return np.zeros((len(cells), 0))
         parts = (self.kinds.loss[:, part] for part in (COUPLING, MASS, GROUND))
@@ -354,8 +320,11 @@ def _transferred_mass(coupling: Array, mass: Array, need: Array, touched: Index,
 
 def _uniform_cells(
     elements: Elements, touched: Index, hard: NDArray[np.bool_], shape: GridShape, stencil: Stencil
-) -> tuple[_CellRows, CellMasses]:
-    """Return the cells inside obstacles: those that absorb or have another speed, and those of air's rows."""
+) -> tuple[list[Array], Index, Array]:
+    """Return the cells inside obstacles that have rows of their own, and others with their mass.
+
+    Of the former, which absorb or have another speed, indices, rows, masses and losses.
+    """
     materials = elements.materials
     factor, losses = materials.speed, materials.losses
     loss = np.zeros((len(factor), 0))
@@ -368,7 +337,7 @@ def _uniform_cells(
     index = inner_cells(inside.reshape(shape))
     number = material[index]
     differs = stepped[number]
-    inner = CellMasses(index[~differs], materials.mass[number[~differs]])
+    inner = index[~differs], materials.mass[number[~differs]]
     index, number = index[differs], number[differs]
     rows = factor[number, None] * stencil.weights
-    return _CellRows(index, rows, materials.mass[number], loss[number]), inner
+    return [index, rows, materials.mass[number], loss[number]], *inner

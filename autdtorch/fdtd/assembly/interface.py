@@ -122,15 +122,6 @@ def is_near(distance: Array) -> NDArray[np.bool_]:
     return np.asarray((distance.min(axis=2) < FAR) & (distance.max(axis=2) > -FAR))
 
 
-class _Cut(NamedTuple):
-    """Elements that surfaces intersect; their coupling and mass are set in place."""
-
-    vertex: Index  # material at the vertices (n, 8)
-    volumes: Array  # shares of the materials in the sub-cells (n, 64, m)
-    coupling: Array  # (n, 28)
-    mass: Array  # (n, 8)
-
-
 def _oblique_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -> tuple[Array, Array]:
     """Return coupling (n, 28) and mass (n, 8) of elements that vary along several axes, not finite ones.
 
@@ -159,48 +150,32 @@ def _oblique_elements(bodies: Bodies, materials: Materials, stencil: Stencil) ->
 
 
 def _elements_in_series(bodies: Bodies, materials: Materials, stencil: Stencil) -> tuple[Array, Array]:
-    """Return coupling (n, 28) and mass (n, 8): in series, or local fields at a smooth surface of two."""
+    """Return coupling (n, 28) and mass (n, 8) of elements in series.
+
+    Those of two materials, between which the surface has one normal, have local fields instead.
+    """
     count, distance, material = len(materials.density), bodies.distance, bodies.material
     vertex = _vertex_materials(distance, material)
     grow = np.repeat(mean_air_thickness(materials, stencil)[material, None], len(vertex), axis=1)
     volumes = np.moveaxis(_mixed(bodies, grow, np.eye(count)), 0, -1)
     lines = shares(line_coverage, distance, material, count)
-    coupling, mass = _series_coupling(lines, materials, stencil), _lumped_mass(vertex, volumes, materials)
-    at_vertices = (vertex[:, :, None] == np.arange(count)).any(axis=1)
+    along = (lines @ materials.density).reshape(-1, len(PAIRS), SUBCELLS).mean(axis=2)
+    coupling, mass = uniform_coupling(stencil) / along, _lumped_mass(vertex, volumes, materials)
+    used = (vertex[:, :, None] == np.arange(count)).any(axis=1)
     present = volumes.mean(axis=1) > _ABSENT_SHARE
-    two = (at_vertices.sum(axis=1) == 2) & (present <= at_vertices).all(axis=1)
-    cut = _Cut(vertex, volumes, coupling, mass)
-    _set_smooth(cut, bodies, at_vertices, np.flatnonzero(two), materials, stencil)
-    return coupling, mass
-
-
-def _set_smooth(
-    cut: _Cut,
-    bodies: Bodies,
-    at_vertices: NDArray[np.bool_],
-    chosen: Index,
-    materials: Materials,
-    stencil: Stencil,
-) -> None:
-    """Set the `chosen` elements of two materials in which the surface between them has one normal.
-
-    `at_vertices` (n, m) is a mask of the materials at the vertices.
-    """
-    count, used = len(materials.density), at_vertices[chosen]
-    inner = count - 1 - used[:, ::-1].argmax(axis=1)
-    level = distance_to_material(bodies.distance[:, chosen], bodies.material, inner)
-    sides = np.stack((used.argmax(axis=1), inner), axis=1)
+    two = np.flatnonzero((used.sum(axis=1) == 2) & (present <= used).all(axis=1))
+    sides = np.stack((used[two].argmax(axis=1), count - 1 - used[two, ::-1].argmax(axis=1)), axis=1)
+    level = distance_to_material(distance[:, two], material, sides[:, 1])
     flat, surface = surfaces(level, materials.density[sides])
-    cells, pair = chosen[flat], sides[flat]
-    mobility = cut.volumes[cells] @ (1 / materials.density) / SUBCELLS**3
-    cut.coupling[cells], weight = smooth_stiffness(
-        surface, mobility, cut.coupling[cells], uniform_coupling(stencil)
-    )
+    cells, pair = two[flat], sides[flat]
+    mobility = volumes[cells] @ (1 / materials.density) / SUBCELLS**3
+    coupling[cells], weight = smooth_stiffness(surface, mobility, coupling[cells], uniform_coupling(stencil))
     some = weight > 0
     cells, pair, surface, weight = cells[some], pair[some], surface.chosen(some), weight[some, None]
     part = _moved_shares(surface, pair, _added_thickness(stencil.kappa), count)
-    lumped = _lumped_mass(cut.vertex[cells], part, materials)
-    cut.mass[cells] += weight * (_balanced_mass(surface, materials.mass[pair], lumped) - cut.mass[cells])
+    lumped = _lumped_mass(vertex[cells], part, materials)
+    mass[cells] += weight * (_balanced_mass(surface, materials.mass[pair], lumped) - mass[cells])
+    return coupling, mass
 
 
 def _finite_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -> tuple[Array, Array]:
@@ -253,12 +228,6 @@ def _vertex_materials(distance: Array, material: Index) -> Index:
     for far, number in zip(distance, material, strict=True):
         vertex[far[:, CORNERS] < 0] = number
     return vertex
-
-
-def _series_coupling(lines: Array, materials: Materials, stencil: Stencil) -> Array:
-    """Return coupling coefficients (n, 28) with the density averaged along each line (n, 112, m)."""
-    density = (lines @ materials.density).reshape(-1, len(PAIRS), SUBCELLS).mean(axis=2)
-    return np.asarray(uniform_coupling(stencil) / density)
 
 
 def _moved_shares(surface: Surface, pair: Index, thickness: float, count: int) -> Array:

@@ -21,8 +21,10 @@ def neighbours(index: Index, shape: GridShape) -> Index:
     return np.asarray(index[:, None] + flat_offsets(shape), np.int64)
 
 
-def with_neighbours(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a mask (nx, ny, nz) of cells and all their neighbours; none of the cells is outermost."""
+def with_neighbours(index: Index, shape: GridShape) -> NDArray[np.bool_]:
+    """Return a mask (nx, ny, nz) of cells `index` (n,) and all their neighbours; none is outermost."""
+    cells = np.zeros(shape, bool)
+    cells.ravel()[index] = True
     for axis in range(3):
         near = np.moveaxis(cells, axis, 0)
         cells = cells.copy()

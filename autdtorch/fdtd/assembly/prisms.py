@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from functools import lru_cache
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -28,9 +28,10 @@ from autdtorch.fdtd.assembly.reference_element import (
 )
 from autdtorch.fdtd.assembly.sections import (
     COLUMN_PAIRS,
-    COLUMNS,
     RING,
+    SIDES,
     MaterialKey,
+    Prisms,
     Section,
     layered_element,
     plane_fields,
@@ -47,17 +48,8 @@ _LEAST_WEIGHT, _EXACT, _MOST_STEPS = 1e-12, 1e-14, 100
 _SUM = 100.0  # Weight of the sum of masses, relative to their moments
 _LEAST_MOBILITY = 1e-9  # Mobility of a column that a rigid material closes
 _DECIMALS = 9  # Sections that agree to so many decimals [cells] share their fit
-# Number of sides between two columns (2, 2, 2, 2)
-_SIDES = np.abs(COLUMNS[:, None] - COLUMNS).sum(axis=2).reshape((2,) * 4)
-
-
-class Prisms(NamedTuple):
-    """The element of a section, one cell long."""
-
-    coupling: Array  # between columns (2, 2, 2, 2), relative to the stencil's
-    mass: Array  # mass of each column (2, 2)
-    mobility: Array  # mobility along each column (2, 2)
-
+_PAIR_OF = np.zeros((4, 4), np.int64)  # Number of each pair of columns in `COLUMN_PAIRS`
+_PAIR_OF[tuple(COLUMN_PAIRS.T)] = _PAIR_OF[tuple(COLUMN_PAIRS.T[::-1])] = np.arange(len(COLUMN_PAIRS))
 
 SquareSymmetry: TypeAlias = tuple[bool, bool, bool]
 """A symmetry of the square: exchange the axes, then mirror the first, then mirror the second."""
@@ -99,15 +91,11 @@ def _mirrored(cuts: tuple[float, ...], mirror: bool) -> tuple[float, ...]:
 def _original(fit: Prisms, image: SquareSymmetry) -> Prisms:
     """Return the element of the section that an image was fitted for."""
     exchanged, *mirrored = image
-    axes = [axis for axis, mirror in enumerate(mirrored) if mirror]
-
-    def turned(part: Array) -> Array:
-        for axis in axes:
-            part = np.flip(part, tuple(range(axis, part.ndim, 2)))
-        order = [axis + 1 - 2 * (axis % 2) for axis in range(part.ndim)]
-        return part.transpose(order) if exchanged else part
-
-    return Prisms(*map(turned, fit))
+    axes = tuple(axis for axis, mirror in enumerate(mirrored) if mirror)
+    columns = np.flip(np.arange(4).reshape(2, 2), axes)
+    columns = columns.T if exchanged else columns
+    pairs = _PAIR_OF[tuple(columns.ravel()[COLUMN_PAIRS].T)]
+    return Prisms(fit.coupling[pairs], *(part.ravel()[columns] for part in fit[1:]))
 
 
 def stacked(width: Array, slices: Prisms, axis: int, stencil: Stencil) -> tuple[Array, Array]:
@@ -123,7 +111,9 @@ def stacked(width: Array, slices: Prisms, axis: int, stencil: Stencil) -> tuple[
     end, drop = np.cumsum(resistance, axis=1) / total, resistance / total
     middle = end - drop / 2
     by_edges = coupling_by_edges(stencil)
-    straight, oblique = by_edges[_SIDES], by_edges[_SIDES + 1]
+    straight, oblique = by_edges[SIDES], by_edges[SIDES + 1]
+    # share of a coupling in the difference of the stencil from pressures that vary linearly along the columns
+    further = ((straight + oblique) / 3 - oblique) / (2 * (straight + oblique))
     number = np.moveaxis(np.arange(8).reshape(2, 2, 2), axis, 0).reshape(2, 4)  # vertices at both ends
     matrix, masses = np.zeros((len(width), 8, 8)), np.zeros((len(width), 8))
     low, high = np.eye(8)[number]
@@ -132,9 +122,7 @@ def stacked(width: Array, slices: Prisms, axis: int, stencil: Stencil) -> tuple[
         part, place, change = (each[:, layer].reshape(-1, 4, 1) for each in (mass, middle, drop))
         at_middle = (1 - place) * low + place * high
         along = change * (high - low)
-        across = _stiffness(2 * (straight + oblique) * coupling)
-        # difference of the stencil from pressures that vary linearly along the columns
-        beyond = _stiffness(((straight + oblique) / 3 - oblique) * coupling)
+        across, beyond = (stiffness_matrix(each, COLUMN_PAIRS) for each in (coupling, further * coupling))
         conductance = np.eye(4) * (1 / resistance[:, layer].reshape(-1, 1, 4))
         lengthwise = conductance + thick / 12 * across + beyond / thick
         between = thick * at_middle.mT @ across @ at_middle
@@ -143,21 +131,15 @@ def stacked(width: Array, slices: Prisms, axis: int, stencil: Stencil) -> tuple[
     return -matrix[:, PAIRS[:, 0], PAIRS[:, 1]], masses
 
 
-def _stiffness(coupling: Array) -> Array:
-    """Return the stiffness matrices (n, 4, 4) of coupling between columns (n, 2, 2, 2, 2)."""
-    pairs = coupling.reshape(-1, 4, 4)[:, COLUMN_PAIRS[:, 0], COLUMN_PAIRS[:, 1]]
-    return stiffness_matrix(pairs, COLUMN_PAIRS)
-
-
 @lru_cache(maxsize=4096)
 def _fitted(section: Section, materials: MaterialKey, stencil: Stencil) -> Prisms:
     """Return the element of a section, fitted in the window around it if it varies along both axes."""
-    uniform = uniform_columns(stencil)
     if (element := layered_element(section, 0, 0, materials, stencil)) is not None:
-        return Prisms(_by_columns(element.coupling / uniform), element.mass, element.mobility)
+        return element
     fields = plane_fields(section, materials.mobility, _FIELDS)
     coupling = fitted_couplings(section, fields, materials, stencil)
-    reached = np.bincount(COLUMN_PAIRS.ravel(), np.repeat(coupling, 2), 4) / (2 * uniform.sum() / 4)
+    of_air = 2 * uniform_columns(stencil).sum() / 4  # coupling of a column
+    reached = np.bincount(COLUMN_PAIRS.ravel(), np.repeat(coupling, 2), 4) / of_air
     values = fields.values[RING : RING + 2, RING : RING + 2].reshape(4, -1)
     lumped = []
     for weight in (materials.masses, materials.mobility):
@@ -169,15 +151,7 @@ def _fitted(section: Section, materials: MaterialKey, stencil: Stencil) -> Prism
     if (corner := rigid_corner(section, materials)) is not None:
         coupling, masses = at_the_drive(section, corner, coupling, mass.ravel(), materials, stencil)
         mass = mobility = masses.reshape(2, 2)  # in air, both are volumes
-    return Prisms(_by_columns(coupling / uniform), mass, mobility)
-
-
-def _by_columns(coupling: Array) -> Array:
-    """Return coupling (6,) of pairs by the places of their columns (2, 2, 2, 2)."""
-    square = np.zeros((2,) * 4)
-    for (one, other), value in zip(COLUMNS[COLUMN_PAIRS], coupling, strict=True):
-        square[(*one, *other)] = square[(*other, *one)] = value
-    return square
+    return Prisms(coupling, mass, mobility)
 
 
 def _lumped(values: Array, integrals: Array, order: Array, most: Array) -> Array:

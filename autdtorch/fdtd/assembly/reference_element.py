@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,14 +90,8 @@ class InterfaceElements(NamedTuple):
 
     def chosen(self, some: Index | slice) -> InterfaceElements:
         """Return some of the elements."""
-        return self._replace(
-            coupling=self.coupling[some],
-            mass=self.mass[some],
-            material=self.material[some],
-            finite=self.finite[some],
-            flat=self.flat[some],
-            loss=self.loss[some],
-        )
+        parts: list[Any] = [part[some] for part in self]
+        return InterfaceElements(*parts)
 
 
 def hats(places: Array) -> Array:

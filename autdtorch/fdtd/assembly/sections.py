@@ -26,7 +26,7 @@ RING = 3  # Elements of a window on each side of the one at the edge
 COLUMNS = np.array(list(itertools.product((0, 1), repeat=2)))  # Columns of an element (4, 2)
 COLUMN_PAIRS = np.array(list(itertools.combinations(range(4), 2)))  # The six pairs of columns
 # Number of sides between the columns of each pair
-_SIDES = np.abs(COLUMNS[COLUMN_PAIRS[:, 0]] - COLUMNS[COLUMN_PAIRS[:, 1]]).sum(axis=1)
+SIDES = np.abs(COLUMNS[COLUMN_PAIRS[:, 0]] - COLUMNS[COLUMN_PAIRS[:, 1]]).sum(axis=1)
 _ALONG_LINE = 32  # Points along a line between two columns for its mean density
 
 
@@ -80,10 +80,10 @@ class Section(NamedTuple):
         return *ends, np.array(self.material)[np.ix_(*self.blocks_at(*middles))]
 
 
-class Layered(NamedTuple):
-    """An element that varies along one axis at most."""
+class Prisms(NamedTuple):
+    """The element of a section, one cell long."""
 
-    coupling: Array  # between its columns (6,)
+    coupling: Array  # of the `COLUMN_PAIRS` (6,)
     mass: Array  # of each column (2, 2)
     mobility: Array  # along each column (2, 2)
 
@@ -91,12 +91,12 @@ class Layered(NamedTuple):
 def uniform_columns(stencil: Stencil) -> Array:
     """Return the coupling (6,) between the columns of an element of air."""
     by_edges = coupling_by_edges(stencil)
-    return np.asarray(2 * by_edges[_SIDES] + 2 * by_edges[_SIDES + 1])
+    return np.asarray(2 * by_edges[SIDES] + 2 * by_edges[SIDES + 1])
 
 
 def layered_element(
     section: Section, x: int, y: int, materials: MaterialKey, stencil: Stencil, air: float | None = None
-) -> Layered | None:
+) -> Prisms | None:
     """Return the element at (x, y) in the window, or None if it varies along both axes.
 
     It is for long waves, or for a wavenumber `air` [rad/cell] if its materials are air or rigid.
@@ -118,7 +118,7 @@ def layered_element(
     along = port.mobility[0, one] * (uniform[0] + uniform[2]) - port.link[0] * uniform[2]
     coupling = np.where(one != other, uniform * port.link[0], along)
     of_columns = [np.expand_dims(part, 1 - axis).repeat(2, axis=1 - axis) / 2 for part in (mass, mobility)]
-    return Layered(coupling, *of_columns)
+    return Prisms(coupling, *of_columns)
 
 
 def mean_densities(section: Section, materials: MaterialKey) -> Array:
@@ -186,7 +186,8 @@ def plane_fields(section: Section, mobility: Array, count: int) -> PlaneFields:
     if len(order) > 1:
         field[free, 1:] = _solved(matrix[free][:, free], matrix[free][:, fixed] @ -field[fixed, 1:])
     share = width[:, :, None] * height[:, :, None] * np.outer(_INTEGRAL, _INTEGRAL).ravel()
-    at = np.ix_(*map(_places_of_vertices, nodes))
+    vertices = np.arange(-RING, RING + 2) - _ROUNDING
+    at = np.ix_(*(np.searchsorted(each, vertices) for each in nodes))
     return PlaneFields(
         field.reshape(*shape, -1)[at],
         used[at],
@@ -195,10 +196,6 @@ def plane_fields(section: Section, mobility: Array, count: int) -> PlaneFields:
         material,
         np.einsum("cdn,cdnm->cdm", share, field[number], optimize=True),
     )
-
-
-def _places_of_vertices(nodes: Array) -> Index:
-    return np.searchsorted(nodes, np.arange(-RING, RING + 2) - _ROUNDING)
 
 
 def _mesh_lines(cuts: Array) -> Array:

@@ -179,21 +179,13 @@ def _lumped(
     The air between a vertex and the surface, a distance d away, is in the element's mass. With t = tan(k d),
     the admittance Y behind it acts as Y (1 + t^2) / (1 - i Y t).
     """
-    depth, share = _outer_side(surface, out)
+    depth = ((VERTICES - surface.place[:, :, None]) * surface.normal[:, :, None]).sum(axis=3)
+    share = hats(surface.place) * (~out[:, None] & (depth > 0))  # vertices behind have none
+    whole = share.sum(axis=2, keepdims=True)
+    share = np.divide(share, whole, out=np.zeros_like(share), where=whole > 0)
     slope = np.tan(np.minimum(kappa * depth, _LARGEST_PHASE))
     behind = admittance * (1 + slope**2) / (1 - 1j * admittance * slope)
     return np.zeros((len(share), 28), complex), (surface.area[:, :, None] * share * behind).sum(axis=1)
-
-
-def _outer_side(surface: _Facets, solid: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Return the depths (n, 64, 8) [cells] of vertices in front of a surface, and their shares in its flow.
-
-    `solid` (n, 8) is the mask of the vertices in rigid bodies. These, and vertices behind, have no share.
-    """
-    depth = ((VERTICES - surface.place[:, :, None]) * surface.normal[:, :, None]).sum(axis=3)
-    share = hats(surface.place) * (~solid[:, None] & (depth > 0))
-    whole = share.sum(axis=2, keepdims=True)
-    return depth, np.divide(share, whole, out=np.zeros_like(share), where=whole > 0)
 
 
 class _Faces(NamedTuple):

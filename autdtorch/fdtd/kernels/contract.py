@@ -54,12 +54,6 @@ class Columns:
     offset: Tensor  # flat offsets from a cell to w cells across the column (m, w) int64
     weight: Tensor  # differences of their weights from those of air (m, w)
 
-    @classmethod
-    def none(cls, layer_cells: int, dtype: torch.dtype, width: int = 9) -> Columns:
-        """Return no columns, for layers of air."""
-        index = torch.zeros((0, layer_cells + 2), dtype=torch.int64, device="cpu")
-        return cls(index, index[:, :1].expand(0, width), torch.zeros((0, width), dtype=dtype, device="cpu"))
-
 
 BLOCK = 8
 """Cells of a block. Sums over a rigid hand at 1 mm take half the time that they take cell by cell, and those
@@ -143,7 +137,9 @@ class Coefficients:
     @classmethod
     def of_air(cls, dtype: torch.dtype) -> Coefficients:
         """Return coefficients without heterogeneous cells and layers, for air in which nothing moves."""
-        none, numbers, columns = _empty(0, dtype=torch.int64), _empty(1, dtype=dtype), Columns.none(0, dtype)
+        none, numbers = _empty(0, dtype=torch.int64), _empty(1, dtype=dtype)
+        index, offset = _empty(0, 2, dtype=torch.int64), _empty(0, 9, dtype=torch.int64)
+        columns = Columns(index, offset, _empty(0, 9, dtype=dtype))
         return cls(
             0.0, 0.0, 0.0, 0.0, 0.0, none, _empty(0, 27, dtype=dtype), none, numbers, numbers,
             none, numbers[:0], columns, columns, columns.index,
@@ -233,6 +229,11 @@ class Receivers:
 
     index: Tensor
     weight: Tensor
+
+    @classmethod
+    def at(cls, cells: Tensor, dtype: torch.dtype) -> Receivers:
+        """Return receivers at the centres of cells (q,)."""
+        return cls(cells[:, None], torch.ones((len(cells), 1), dtype=dtype, device="cpu"))
 
 
 class Kernel(Protocol):
