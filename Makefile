@@ -50,13 +50,15 @@ $(VENV)/.kernels: $(wildcard autdtorch/fdtd/kernels/*.py autdtorch/methods/holog
 	@touch $@
 
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 8
+# Files alone that hold such tests: to import all files takes each process seconds.
+REST = tests/browser tests/docs $(shell grep -rl --include='test_*.py' mark.processes tests)
 
 test: $(INSTALLED)-dev $(VENV)/.kernels
 	$(PYTEST) --dist worksteal -m 'not (docs or browser or processes)' $(ARGS)
 
 # By file, as the live view, the documentation and reports take 5 to 20 s to make
 test-rest: $(INSTALLED)-dev $(VENV)/.kernels
-	$(PYTEST) --dist loadfile -m 'docs or browser or processes' $(ARGS)
+	$(PYTEST) --dist loadfile -m 'docs or browser or processes' $(REST) $(ARGS)
 
 lint: $(INSTALLED)-dev
 	$(BIN)/ruff check .
