@@ -34,6 +34,7 @@ from autdtorch.fdtd.stability import whole_steps
 from autdtorch.fdtd.stencil import Stencil, places_of, tuned_stencil
 from autdtorch.utils.array_types import REAL, Array, Index
 from autdtorch.utils.process import cached_property
+from autdtorch.utils.spatial import distinct_cells, places_among
 from autdtorch.utils.validation import LENGTH_TOLERANCE, invalid
 
 logger = logging.getLogger(__name__)
@@ -146,20 +147,25 @@ class Assembly:
         around = solids.distance(points)
         farthest = math.sqrt(3) * spacing * round(cells.shape[1] ** (1 / 3))
         near = np.flatnonzero((around > -LENGTH_TOLERANCE) & (around < farthest))
+        if not len(near):
+            return behind
+        count = math.prod(self.grid.shape)
+        numbers = distinct_cells(cells[near], count)
+        place_of, centers = places_among(numbers, count), self.grid.centers_of(numbers)
+        free = solids.distance(centers)
+        centers, outward = (np.ascontiguousarray(each.T) for each in (centers, self._outward(numbers)))
         for first in range(0, len(near), _LOOKING):
             some = near[first : first + _LOOKING]
-            numbers, place = np.unique(cells[some], return_inverse=True)
-            place = place.reshape(len(some), -1)
-            centers = self.grid.centers_of(numbers)
-            free, ends = solids.distance(centers), centers[place]
-            way = ends - points[some, None]
-            seen = np.linalg.norm(way, axis=2) <= around[some, None] + free[place]
-            off = np.abs(way).max(axis=2)
-            row, cell = np.nonzero((off < reach) & (free[place] > 0) & ~seen)
-            seen[row, cell] = sees(points[some[row]], ends[row, cell], solids, spacing)
-            seen |= (self._outward(numbers)[place] * way).sum(axis=2) < 0
+            place = place_of[cells[some]]
+            ends, clear = centers[:, place], free[place]
+            way = ends - points[some].T[..., None]
+            seen = np.sqrt((way * way).sum(axis=0)) <= around[some, None] + clear
+            off = np.abs(way).max(axis=0)
+            row, cell = np.nonzero((off < reach) & (clear > 0) & ~seen)
+            seen[row, cell] = sees(points[some[row]], ends[:, row, cell].T, solids, spacing)
+            seen |= (outward[:, place] * way).sum(axis=0) < 0
             beside = (seen & ~rigid[some] & (off < (1 - AT_CENTRE) * spacing)).any(axis=1)
-            behind[some] = ~seen & ((off < reach) | (free[place] <= 0)) & beside[:, None]
+            behind[some] = ~seen & ((off < reach) | (clear <= 0)) & beside[:, None]
         return behind
 
     def _outward(self, cells: Index) -> Array:
