@@ -344,6 +344,7 @@ class Region:
                 accepted = f"must be 1 or -1 where an obstacle is within {beside}; or move the obstacle"
                 raise invalid(f"reflectors[{number}].reflection", self.mirrors[number].reflection, accepted)
         accepted = f"must be {beside} or more from one of reflectors {[*near]}, of which two face each other"
+        accepted += "; or take a rigid Box across the domain in place of one of the two"
         raise invalid("obstacles", "one grid next to both", accepted)
 
     def require_domain(self, name: str = "method", value: str = "full") -> None:

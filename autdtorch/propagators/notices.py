@@ -97,6 +97,12 @@ def warn_of_scene(plan: Plan) -> None:
     scene, region, spacing = plan.scene, plan.region, plan.spacing
     warn_if_coarse(region.sound_speeds, scene.frequency, spacing)
     warn_of_ending_walls(scene)
+    if hard := [body for body in region.bodies if body.rigid_error]:
+        logger.info(
+            "obstacle %s is simulated as rigid: the material changes the field by about %.2g %%, within the"
+            " tolerance", ", ".join(str(body.number) for body in hard),
+            100 * max(body.rigid_error for body in hard),
+        )  # fmt: skip
     grids: list[tuple[Sequence[int], Array]] = [(grid.group, grid.axes) for grid in plan.grouping.grids]
     if plan.method == "tmatrix":  # each body has a grid along its faces
         grids = [([body.number], axes_along([body.faces])) for body in region.bodies]

@@ -333,19 +333,16 @@ def with_rigid(region: Region, tolerance: float) -> Region:
     may cut into keeps its material: what is left of it may be thin. No sound enters the cavities of rigid
     bodies, so they are filled.
     """
-    bodies, hard = [], []
+    bodies = []
     for index, body in enumerate(region.bodies):
         whole = not any(_overlap(body.shape, later.shape) for later in region.bodies[index + 1 :])
         if body.fluid is not None and whole:
             difference = difference_from_rigid(body, region)
             if difference <= tolerance:
-                hard.append(str(index))
                 body = replace(body, fluid=None, rigid_error=difference)
         if body.fluid is None and whole:
             body = replace(body, shape=cast(Obstacle, body.shape).filled())
         bodies.append(body)
-    if hard:
-        logger.debug("obstacle %s is taken as rigid: the difference is below the tolerance", ", ".join(hard))
     return replace(region, bodies=tuple(bodies))
 
 

@@ -1,5 +1,7 @@
 """Hard bodies are simulated as rigid."""
 
+import logging
+
 import pytest
 import torch
 from hypothesis import given
@@ -38,13 +40,18 @@ def test_the_difference_from_a_rigid_sphere_is_known(radius, heavier, stiffer, s
 EMPTY = small_scene()
 
 
-def test_steel_is_rigid():
+def test_steel_is_rigid_and_a_log_says_so(caplog):
+    caplog.set_level(logging.INFO, "autdtorch")
     steel, rigid = (Box(CENTER, (5e-3,) * 3, **each) for each in (STEEL, {"rigid": True}))
     inside = torch.tensor([CENTER], dtype=torch.float64)
     heavy, expected = (make_propagator(small_scene((box,)), "box", 1.3e-3) for box in (steel, rigid))
     assert torch.equal(heavy.transfer_matrix(), expected.transfer_matrix())
     assert heavy.time_step == expected.time_step
     assert heavy.transfer_matrix(inside).abs().max() == 0
+    (told,) = (record for record in caplog.records if "as rigid" in record.message)
+    assert told.message.startswith(
+        "obstacle 0 is simulated as rigid: the material changes the field by about 0.0"
+    )
 
 
 def test_a_finger_is_rigid_on_cells_that_err_by_more(caplog):

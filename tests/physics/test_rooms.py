@@ -117,7 +117,7 @@ def test_a_column_between_two_planes_is_refused():
     column = at.Box((0.0, 0.0, 8e-3), (6e-3, 6e-3, 16e-3), rigid=True)
     roof = at.Reflector((0.0, 0.0, 16e-3), (0.0, 0.0, -1.0))
     scene = room([column], [FLOOR, roof], [[-30e-3, 3e-3, 12e-3]], [[30e-3, 5e-3, 10e-3]])
-    with pytest.raises(ValueError, match="face each other"):
+    with pytest.raises(ValueError, match="face each other; or take a rigid Box"):
         make_propagator(scene, "box", 1e-3).transfer_matrix()
 
 
