@@ -132,9 +132,10 @@ def _with_rim(index: Index, shape: tuple[int, int, int]) -> tuple[Index, NDArray
 def _lanczos(parts: Sequence[csr_array], size: int, enough: float) -> float:
     """Return a lower bound of the largest eigenvalue of a symmetric matrix: its largest Ritz value.
 
-    Iteration ends at a value that is `enough`. Rows (size, size) are those of all parts. Without
-    reorthogonalisation Ritz values repeat, but none leaves the spectrum (Paige 1980). The sums do not use
-    BLAS, whose result depends on the number of threads.
+    Iteration ends at a value that is `enough`: a pivot of `enough` times the identity less the tridiagonal
+    matrix is then no longer positive. Rows (size, size) are those of all parts. Without reorthogonalisation
+    Ritz values repeat, but none leaves the spectrum (Paige 1980). The sums do not use BLAS, whose result
+    depends on the number of threads.
     """
 
     def product(vector: Array) -> Array:
@@ -142,20 +143,20 @@ def _lanczos(parts: Sequence[csr_array], size: int, enough: float) -> float:
 
     vector = np.random.default_rng(0).standard_normal(size)
     vector /= math.sqrt((vector * vector).sum())
-    previous, beta = np.zeros_like(vector), 0.0
+    previous, beta, pivot = np.zeros_like(vector), 0.0, math.inf
     diagonal: list[float] = []
     beside: list[float] = []
     for _ in range(_LANCZOS_STEPS):
         image = product(vector) - beta * previous
         diagonal.append(float((vector * image).sum()))
-        reached = float(eigvalsh_tridiagonal(diagonal, beside)[-1])
+        pivot = enough - diagonal[-1] - beta**2 / pivot
         image -= diagonal[-1] * vector
         beta = math.sqrt((image * image).sum())
-        if reached >= enough or beta <= 1e-12 * abs(diagonal[0]):  # the vectors span an invariant space
+        if pivot <= 0 or beta <= 1e-12 * abs(diagonal[0]):  # the vectors span an invariant space
             break
         beside.append(beta)
         previous, vector = vector, image / beta
-    return reached
+    return float(eigvalsh_tridiagonal(diagonal, beside[: len(diagonal) - 1])[-1])
 
 
 def fewest_steps(stencil: Stencil, largest: float) -> float:
