@@ -1,8 +1,8 @@
 """Run tests with the newest versions that pip finds, instead of those in constraints.txt.
 
 A new environment in a temporary folder holds the packages that are newer, over those of the environment that
-runs the script. Without one, it holds all packages. Prints the differences, and runs tests there. The newest
-PyTorch may bring 5 GB of CUDA; `--keep torch` takes the version of constraints.txt.
+runs the script, whose pip installs them. Without one, it holds all packages. Prints the differences, and runs
+tests there. The newest PyTorch may bring 5 GB of CUDA; `--keep torch` takes the version of constraints.txt.
 
     python scripts/check.py newest --keep torch -- tests/unit tests/optim
     python3.13 scripts/check.py newest                         another Python; all tests
@@ -20,12 +20,13 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 
 OPTIONS = {
+    "--install": {"nargs": "+", "default": [".[dev]"], "help": "what pip installs, with what that needs"},
     "--keep": {"nargs": "*", "default": [], "help": "packages that stay at the version of constraints.txt"},
     "arguments": {"nargs": "*", "help": "arguments of pytest"},
 }
 
 
-def main(keep: list[str], arguments: list[str]) -> int:
+def main(install: list[str], keep: list[str], arguments: list[str]) -> int:
     """Install, compare and test; return the status of pytest."""
     pinned = pins((ROOT / "constraints.txt").read_text(encoding="utf-8"))
     with tempfile.TemporaryDirectory() as name:
@@ -33,9 +34,9 @@ def main(keep: list[str], arguments: list[str]) -> int:
         python = new_environment(folder / "environment")
         constraints = folder / "constraints.txt"
         constraints.write_text("".join(f"{name}=={pinned[name]}\n" for name in keep), encoding="utf-8")
-        pip = [python, "-m", "pip", "--disable-pip-version-check", "-qq"]
+        pip = [sys.executable, "-m", "pip", "--python", python, "--disable-pip-version-check", "-qq"]
         newest = ["install", "--no-compile", "--upgrade", "--upgrade-strategy", "eager", "-c", constraints]
-        subprocess.run([*pip, *newest, "-e", f"{ROOT}[dev]"], check=True)
+        subprocess.run([*pip, *newest, "-e", *install], cwd=ROOT, check=True)
         frozen = subprocess.run([*pip, "freeze"], capture_output=True, text=True, check=True).stdout
         versions = pins(frozen).items()  # constraints.txt need not name all
         newer = [f"{name} {version}" for name, version in versions if pinned.get(name, version) != version]
@@ -48,7 +49,7 @@ def main(keep: list[str], arguments: list[str]) -> int:
 
 def new_environment(folder: Path) -> Path:
     """Make an environment that also sees the packages of this process; return its Python."""
-    venv.create(folder, with_pip=True)
+    venv.create(folder)
     if sys.prefix != sys.base_prefix:
         base = {"base": str(folder), "platbase": str(folder)}
         packages = Path(sysconfig.get_path("purelib", "venv", base))
