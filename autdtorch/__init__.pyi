@@ -57,8 +57,7 @@ from .plot.calibration_figure import plot_calibration
 from .plot.cost_figures import plot_pareto, plot_scaling
 from .plot.explore import explore
 from .plot.haptics_figure import plot_haptics
-from .plot.plane_figures import plot_force
-from .plot.pressure_maps import plot_plane, plot_planes
+from .plot.plane_maps import plot_force, plot_plane, plot_planes
 from .plot.scene_figure import plot_scene
 from .plot.trials import plot_convergence, plot_poses, plot_trials
 from .plot.view3d import animate3d, view3d

@@ -180,7 +180,7 @@ def _save_drives(results: StudyResult, scenes: Mapping[str, Scene], folder: Path
 
 
 def _draw_plane(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> None:
-    from autdtorch.plot.pressure_maps import plot_plane
+    from autdtorch.plot.plane_maps import plot_plane
     from autdtorch.plot.style import TITLE_SIZE, readable, wrapped
 
     ((name, scene),) = scenes.items()

@@ -70,7 +70,7 @@ def the_checks_are_all(monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(*_: Any, **__: Any) -> None:
         raise Accepted
 
-    monkeypatch.setattr("autdtorch.plot.pressure_maps.draw_plane", stop)
+    monkeypatch.setattr("autdtorch.plot.plane_maps.draw_plane", stop)
     monkeypatch.setattr("autdtorch.plot.view3d.require_rendering", stop)
     monkeypatch.setattr(explore, "require_rendering", stop)
     monkeypatch.setattr("autdtorch.propagators.propagator.are_shown", stop)

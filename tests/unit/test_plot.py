@@ -19,7 +19,7 @@ from small_scenes import AIR, scene_of_all_kinds, small_scene
 import autdtorch as at
 from autdtorch.plot.cost_figures import plot_pareto
 from autdtorch.plot.data import clipped, parts_of_reflectors
-from autdtorch.plot.pressure_maps import plot_plane, plot_planes
+from autdtorch.plot.plane_maps import plot_plane, plot_planes
 from autdtorch.plot.scene_figure import plot_scene
 from autdtorch.plot.trials import plot_convergence, plot_trials
 

@@ -14,7 +14,7 @@ from autdtorch.hardware.camera.picture import Picture
 from autdtorch.io.drive_file import load_drive
 from autdtorch.io.picture_file import PICTURES, load_picture, newest_picture
 from autdtorch.plot.explore.calculation import Result
-from autdtorch.plot.plane_figures import camera_figure
+from autdtorch.plot.plane_maps import camera_figure
 from autdtorch.scene.geometry import cell_centers_of
 from autdtorch.utils.array_types import Array
 

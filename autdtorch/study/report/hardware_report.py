@@ -26,7 +26,7 @@ from autdtorch.objectives.objective import Objective
 from autdtorch.objectives.readings import deviation_by_square, deviation_of_square
 from autdtorch.plot.calibration_figure import plot_calibration
 from autdtorch.plot.data import outside_on_plane
-from autdtorch.plot.plane_figures import camera_figure
+from autdtorch.plot.plane_maps import camera_figure
 from autdtorch.plot.trials import plot_convergence
 from autdtorch.propagators import Propagator
 from autdtorch.scene.geometry import cell_centers_of

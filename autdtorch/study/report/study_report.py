@@ -16,7 +16,7 @@ from PIL import Image, ImageOps
 from autdtorch.io.goal_section import goal_label, score_label
 from autdtorch.methods.catalogue import label_of
 from autdtorch.plot.cost_figures import plot_pareto
-from autdtorch.plot.pressure_maps import plot_planes
+from autdtorch.plot.plane_maps import plot_planes
 from autdtorch.plot.scene_figure import plot_scene
 from autdtorch.plot.trials import plot_convergence, plot_trials
 from autdtorch.plot.view3d import rendering_problem, view3d
