@@ -7,19 +7,13 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from autdtorch.objectives.forces import ForceGoal, GoalOfForce, Levitate, Push, Trap
-from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal, MeanPressure, TargetPressures, WeakestFocus
+from autdtorch.objectives.forces import ForceGoal, GoalOfForce
+from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
+from autdtorch.objectives.kinds import GOALS
 from autdtorch.objectives.over_scenes import OverScenes
-from autdtorch.objectives.quiet import Contrast, QuietPoints, SeenPoints
 from autdtorch.scene.particle import Particle
 from autdtorch.utils.files import require_name
 from autdtorch.utils.validation import invalid, require_known, require_one_of, within
-
-_PRESSURES = WeakestFocus, MeanPressure, TargetPressures, QuietPoints, SeenPoints, Contrast, OverScenes
-GOALS: dict[str, type[Goal] | type[ForceGoal]] = {
-    goal.name: goal for goal in (*_PRESSURES, Trap, Levitate, Push)
-}
-"""The goals by name, those of pressures and those of force."""
 
 
 def load_goal(where: str, section: object) -> Goal | ForceGoal:

@@ -19,7 +19,8 @@ import h5py
 import torch
 
 import autdtorch
-from autdtorch.io.goal_section import GOALS, PAPERS_GOAL, load_goal, require_score
+from autdtorch.io.goal_section import PAPERS_GOAL, load_goal, require_score
+from autdtorch.objectives.kinds import GOALS
 from autdtorch.objectives.metrics import FocusMetrics
 from autdtorch.propagators import Run
 from autdtorch.study.results import (

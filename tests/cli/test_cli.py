@@ -20,10 +20,11 @@ from autdtorch.cli.config_files import CONFIGS
 from autdtorch.cli.settings import load_method
 from autdtorch.hardware import DEVICES, Limits
 from autdtorch.io.drive_file import load_drive, save_drive
-from autdtorch.io.goal_section import GOALS, load_goal
+from autdtorch.io.goal_section import load_goal
 from autdtorch.io.scene_file import load_scene
 from autdtorch.methods.base import Method
 from autdtorch.objectives.goals import MeanPressure, TargetPressures, WeakestFocus
+from autdtorch.objectives.kinds import GOALS
 from autdtorch.objectives.quiet import Contrast, QuietPoints
 from autdtorch.propagators import make_propagator
 from autdtorch.study.results_file import load_results

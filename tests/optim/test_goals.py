@@ -14,11 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import autdtorch as at
-from autdtorch.io.goal_section import GOALS, goal_section, load_goal
+from autdtorch.io.goal_section import goal_section, load_goal
 from autdtorch.methods import functions
 from autdtorch.methods.catalogue import METHODS, VARIANTS
 from autdtorch.methods.gradient import climb, random_drives
 from autdtorch.objectives.goals import derivative, goal_of
+from autdtorch.objectives.kinds import GOALS
 from autdtorch.study.run_study import run_study
 
 PRESSURE = torch.tensor([[4.0, 2.0, 0.3, 1.0], [1.0, 8.0, 0.1, 4.0]], dtype=torch.float64)
