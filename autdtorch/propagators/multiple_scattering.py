@@ -10,12 +10,13 @@ passes contribute little, and are simulated to looser tolerances.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
 
 from autdtorch.fdtd.grouping import MOST_PASSES
+from autdtorch.fdtd.resonances import Resonance
 from autdtorch.fdtd.steady_state import Observe, SteadyState
 from autdtorch.propagators.box_scatterer import BoxScatterer
 from autdtorch.utils.array_types import REAL
@@ -59,6 +60,7 @@ def iterated(
     largest = torch.stack([waves.norm(dim=0) for waves in incident]).amax(dim=0).clamp_min(_TINY)
     periods, reached, unsettled = np.zeros(runs, np.int64), np.ones(runs, bool), torch.zeros(runs, **REAL)
     orders: list[torch.Tensor] = []
+    rung: list[list[tuple[Resonance, ...]]] = []  # by body and run
     settled = False
     for number in range(1, MOST_PASSES + 1):
         parts, residuals = [], torch.zeros((len(bodies), runs), **REAL)
@@ -67,6 +69,8 @@ def iterated(
             looser = (tolerance / 2 ** (number + 1) / share).clamp(max=_LOOSEST)  # half of it in all passes
             steady = body.answers(waves, looser.tolist())
             parts.append(torch.stack([each.pressure for each in steady], dim=1).cpu())
+            if number == 1:
+                rung.append([each.resonances for each in steady])
             periods += [each.periods for each in steady]
             reached &= [each.converged for each in steady]
             residuals[index] = share * torch.tensor([each.residual for each in steady], **REAL)
@@ -74,6 +78,7 @@ def iterated(
         orders.append(torch.cat(parts))
         if number == 1:
             silent = observe(torch.zeros_like(orders[0]), numbers)
+            heard = [(observe(alone, numbers)[0] - silent[0]).norm(dim=0) for alone in _alone(parts)]
         else:
             phasors, left = extrapolated(orders)
             observed = zip(observe(left, numbers), silent, observe(phasors, numbers), floors, strict=True)
@@ -93,8 +98,30 @@ def iterated(
     logger.debug("%d boxes, %d passes of multiple scattering", len(bodies), number)
     residual = (unsettled + remaining).tolist()
     reached &= (remaining <= tolerance / 2).numpy()
-    states = map(SteadyState, phasors.mT, periods.tolist(), residual, reached.tolist())
+    whole = torch.maximum(observe(phasors, numbers)[0].norm(dim=0), floors[0]).clamp_min(_TINY)
+    resonances = _shared(rung, [(part / whole).tolist() for part in heard])
+    states = map(SteadyState, phasors.mT, periods.tolist(), residual, reached.tolist(), resonances)
     return list(states), settled
+
+
+def _alone(parts: Sequence[torch.Tensor]) -> Iterator[torch.Tensor]:
+    """Yield the phasors (K, R) of all bodies where only one radiates, from those of each."""
+    for index in range(len(parts)):
+        yield torch.cat([part if n == index else torch.zeros_like(part) for n, part in enumerate(parts)])
+
+
+def _shared(
+    rung: Sequence[Sequence[tuple[Resonance, ...]]], shares: Sequence[Sequence[float]]
+) -> list[tuple[Resonance, ...]]:
+    """Return what rang in each run from what rang in each body, by the share (B, R) heard of that body.
+
+    A resonance counts as much in what is heard of a body as in what leaves its box.
+    """
+    runs: list[list[Resonance]] = [[] for _ in shares[0]]
+    for bodies, heard in zip(rung, shares, strict=True):
+        for run, resonances, share in zip(runs, bodies, heard, strict=True):
+            run += [each._replace(strength=share * each.strength) for each in resonances]
+    return list(map(tuple, runs))
 
 
 def extrapolated(orders: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
