@@ -3,7 +3,7 @@
 Elements at faces and edges are accurate to second order wherever these fall (`assembly/prisms.py`). The
 remaining error is least for a face half-way, as rigid faces there are mirrors of the stencil. At 8.5 cells
 per wavelength, a rigid strip with faces half-way errs by 0.02 %. With faces 0.3 cells behind the last centre
-it errs by 0.5 %, at 0.9 by 6 % (measured once). A slit narrower than a cell is open only if it contains a
+it errs by 0.5 %, at 0.9 by 6 % (measured once). A slit narrower than a cell is more exact if it contains a
 layer of centres. Among similar placements the grid takes a symmetric one: a symmetric scene needs fewer runs
 (`symmetry.py`).
 """

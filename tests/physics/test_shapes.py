@@ -104,10 +104,12 @@ def test_gratings_of_fluid_bars_about_a_cell_apart(kind, spacing):
     assert relative_error(matrix, fine) < 0.025
 
 
-def test_a_slit_of_fluid_bodies_between_planes_of_cells_is_as_right_as_one_that_holds_a_plane():
-    """Cells of 1.2 mm have a plane in one of the two slits. Measured: 1.1 %, and 9 % if waves along a slit
-    have the mass and mobility of those across it."""
-    material = {"density": 20.0 * AIR.density, "sound_speed": 1.2 * AIR.sound_speed}
+@pytest.mark.parametrize(
+    "material", [{"density": 20.0 * AIR.density, "sound_speed": 1.2 * AIR.sound_speed}, {"rigid": True}]
+)
+def test_a_slit_between_planes_of_cells_is_as_right_as_one_that_holds_a_plane(material):
+    """Cells of 1.2 mm have a plane in one of the two slits. Measured: 1.1 and 1.6 %. Fluids err by 9 % if
+    waves along a slit have the mass of those across it, and rigid bodies by 30 % if it is closed."""
     plates = [(-4.67e-3, 3.45e-3), (0.0, 4.83e-3), (5.27e-3, 4.52e-3)]
     bodies = [Box((place, 0.0, 0.0), (width, 11e-3, 2.17e-3), **material) for place, width in plates]
     array = TransducerArray(((3e-3, 6e-3, -16e-3), (-4e-3, -3e-3, -16e-3)), (0.0, 0.0, 1.0))

@@ -31,6 +31,7 @@ from autdtorch.utils.process import cached_property
 from autdtorch.utils.spatial import distinct_cells, places_among
 
 _ROUNDING = 1e-6  # Distance [cells] up to which planes are one
+_LEAST_GAP = 0.05  # Width of a gap [cells] below which little passes
 # Distance [cells] to which planes move from vertices: an edge then lies in an element
 _OFF_VERTICES = 1e-5
 
@@ -124,6 +125,16 @@ class MaterialBlocks:
     def varied(self) -> NDArray[np.bool_]:
         """Mask (3, k, l, m) of the kinds of elements that vary along each axis."""
         return np.stack([varies(self.material, self.planes, axis) for axis in range(3)])
+
+    def closes_gap(self, closed: NDArray[np.bool_]) -> bool:
+        """Return whether a gap between blocks of `closed` materials (m,) has no plane of vertices in it."""
+        of_blocks = closed[self.material]
+        for axis, planes in enumerate(self.planes):
+            blocks, places = np.moveaxis(of_blocks, axis, 2), planes.places
+            within = (np.diff(places) > _LEAST_GAP) & (np.diff(np.floor(places)) == 0)
+            if (blocks[..., :-2] & ~blocks[..., 1:-1] & blocks[..., 2:] & within).any():
+                return True
+        return False
 
     def over_elements(self, of_kinds: AnyArray) -> AnyArray:
         """Return the values (nx, ny, nz) of all elements, from values (k, l, m) of their kinds."""
