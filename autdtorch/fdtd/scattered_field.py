@@ -169,8 +169,9 @@ class ScatteredField:
         nodes = targets.positions[~far]
         within = self.inside(nodes)
         inner = self.assembly.interpolation(self._on_axes(nodes[within]))
-        around = np.unique(inner.index)
-        cells = distinct_cells(np.concatenate((surface, around)), math.prod(self.assembly.grid.shape))
+        count = math.prod(self.assembly.grid.shape)
+        around = distinct_cells(inner.index, count)
+        cells = distinct_cells(np.concatenate((surface, around)), count)
         outward = slice(None) if len(cells) == len(surface) else np.searchsorted(cells, surface)
         read, matrix = np.searchsorted(cells, around), inner.matrix(around)
         return NearToFar(self, targets, far, within, cells, outward, read, matrix)

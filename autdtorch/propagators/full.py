@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 
 from autdtorch.fdtd.kernels.contract import Sources
@@ -20,6 +19,7 @@ from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import REAL, Index
 from autdtorch.utils.mirror_images import Mirror
 from autdtorch.utils.process import cached_property, one_library_thread
+from autdtorch.utils.spatial import distinct_cells
 
 
 class DomainSimulation(Simulation):
@@ -64,7 +64,7 @@ class DomainSimulation(Simulation):
     ) -> tuple[torch.Tensor, list[Run]]:
         (assembly,), plan = self.assemblies, self.plan
         points = assembly.interpolation(receivers.positions, receivers.weights)
-        cells = np.unique(points.index)
+        cells = distinct_cells(points.index, math.prod(assembly.grid.shape))
         every = math.ceil(len(receivers.centers) / MOST_JUDGED)
         reading, drives = points.matrix(cells), list(zip(sources, strength, strict=True))
         judged = reading[::every]
