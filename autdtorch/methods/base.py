@@ -167,6 +167,8 @@ class Method(ABC):
         self.check(problem)
         whole = {name: value for name, value in vars(self).items() if isinstance(value, int)}
         whole = whole or {"evaluations": self.most_evaluations(problem)}
+        if problem.readings is not None:
+            whole["readings"] = len(problem.readings)
         largest = max(whole, key=whole.__getitem__)
         require_memory(largest, whole[largest], 8 * trials * self.numbers_kept(problem))
 

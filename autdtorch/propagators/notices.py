@@ -99,8 +99,8 @@ def warn_of_scene(plan: Plan) -> None:
     warn_of_ending_walls(scene)
     if hard := [body for body in region.bodies if body.rigid_error]:
         logger.info(
-            "obstacle %s is simulated as rigid: the material changes the field by about %.2g %%, within the"
-            " tolerance", ", ".join(str(body.number) for body in hard),
+            "obstacle %s is simulated as rigid: the material changes the field by about %.2g %%, less than"
+            " the error to expect", ", ".join(str(body.number) for body in hard),
             100 * max(body.rigid_error for body in hard),
         )  # fmt: skip
     grids: list[tuple[Sequence[int], Array]] = [(grid.group, grid.axes) for grid in plan.grouping.grids]
@@ -114,8 +114,9 @@ def warn_of_scene(plan: Plan) -> None:
         )  # fmt: skip
     if not plan.grouping.aligned and region.largest_density > _ALMOST_RIGID:
         logger.warning(
-            "a round or tilted obstacle is %.3g times as dense as the air: on these cells it errs up to four"
-            " times as much as is estimated; rigid=True is more accurate if what passes it may be neglected",
+            "a round or tilted obstacle is %.3g times as dense as the air: its error is estimated less well,"
+            " true ones were mostly 0.5 to 2 times the estimate, at most 5 times; rigid=True is more accurate"
+            " if what passes it may be neglected",
             region.largest_density,
         )  # fmt: skip
     warn_of_near_points(scene, "array.positions", scene.array.positions, spacing)

@@ -141,6 +141,15 @@ def test_too_much_memory_is_refused_with_both_figures(what: str) -> None:
         call()
 
 
+def test_too_many_earlier_readings_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    drives = at.drive_from_phases(torch.rand((10**4, 4), dtype=torch.float64))
+    readings = at.Readings(drives, torch.ones((10**4, len(AIR.control_points)), dtype=torch.float64))
+    monkeypatch.setattr(process, "available_memory", lambda: 1e6)
+    monkeypatch.setattr(process, "_NEGLIGIBLE", 0)
+    with pytest.raises(ValueError, match=r"^readings: 10000; needs about 0\.0.* GB of memory"):
+        at.identify(OBJECTIVE, readings=readings)
+
+
 @pytest.mark.parametrize("obstacles", [(), (CUBE,)], ids=["free space", "box"])
 def test_many_points_are_refused(obstacles: tuple[at.Box, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     propagator = at.make_propagator(small_scene(obstacles), "box" if obstacles else "free_space", 2e-3)
