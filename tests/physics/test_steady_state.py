@@ -80,7 +80,7 @@ TOLERANCES = 1e-2, 1e-6, 1e-2, 1e-4, 1e-9
 
 def states_of_five_runs(kernel, most_periods, loudness=1.0, tolerances=TOLERANCES):
     """Runs of different forces, the last one `loudness` times as loud, and of different tolerances."""
-    assembly, sources, receivers = assembled_parts(small_scene((CUBE,)), 2e-3, torch.float64)
+    assembly, sources, receivers = assembled_parts(small_scene((CUBE,)), 2.8e-3, torch.float64)
     cells = np.unique(receivers.index)
     random = torch.Generator().manual_seed(1)
     forces = sources.force * torch.randn((5, len(sources.index), 1), generator=random, dtype=torch.float64)
