@@ -49,6 +49,8 @@ class Estimate:
         runs: number of simulations, with symmetries.
         memory: most memory in use at a time, without what is in use already [bytes].
         seconds: time on this machine, as busy as it is now [s].
+        resonates: whether sound is slower in an obstacle than in the medium. Then `seconds` is the least:
+            such obstacles may ring, which takes longer runs and by a tolerance finer grids.
     """
 
     method: str
@@ -57,10 +59,12 @@ class Estimate:
     runs: int
     memory: float
     seconds: float
+    resonates: bool = False
 
     def __repr__(self) -> str:
         grid = "" if self.spacing is None else f" at {1e3 * self.spacing:.4g} mm, {self.cells:,} cells"
-        cost = f"{counted(self.runs, 'run')}, {self.memory / 1e6:,.0f} MB, {self.seconds:.2g} s"
+        least = "at least " if self.resonates else ""
+        cost = f"{counted(self.runs, 'run')}, {self.memory / 1e6:,.0f} MB, {least}{self.seconds:.2g} s"
         return f"Estimate({self.method}{grid}, {cost})"
 
 
@@ -77,9 +81,10 @@ def estimate(
     """Estimate the cost of the transfer matrix of a scene's control points from its plan.
 
     Symmetries are found on a coarse grid, if that fits into memory. The speed of the kernel is measured once
-    in a process, on a box of air. Resonances are not known in advance: the time assumes usual ones, and is
-    within a factor of two for most scenes. An error estimate (`return_error`) takes a fifth more, and the
-    first matrix of a process about two seconds more, in which kernels are loaded.
+    in a process, on a box of air. The time is within a factor of two for most scenes. Resonances are not
+    known in advance: where sound is slow in an obstacle, the time is the least. An error estimate
+    (`return_error`) takes a fifth more, and the first matrix of a process about two seconds more, in which
+    kernels are loaded.
 
     Args:
         scene: the scene.
@@ -116,7 +121,8 @@ def estimate(
         planned = replace(planned, runs=kind(pilot).planned_runs)
     work = planned.work + planned.work / without_symmetries * sum(each.work for each in before)
     memory, seconds = max(memory, planned.memory), seconds + work / _rate_of(planned)
-    return Estimate(planned.method, spacing, planned.cells, planned.runs, memory, seconds)
+    resonates = planned.region.shortest_wavelength < planned.region.wavelength
+    return Estimate(planned.method, spacing, planned.cells, planned.runs, memory, seconds, resonates)
 
 
 def _without_runs(planned: Plan) -> tuple[float, float]:

@@ -104,6 +104,14 @@ def test_memory_and_time_grow_with_the_cells(monkeypatch):
     assert 1.3 < double.memory / coarse.memory < 2  # less than twice: what is recorded is in double anyway
 
 
+@pytest.mark.parametrize("ratio", [0.5, 1.0])
+def test_the_time_of_slow_obstacles_is_the_least(ratio):
+    """They may resonate: foam took 8 to 11 times as long as was told."""
+    ball = at.Sphere((12e-3,) * 3, 2e-3, density=2 * AIR.density, sound_speed=ratio * AIR.sound_speed)
+    cost = at.estimate(small_scene((ball,)), 0.5e-3, method="box")
+    assert cost.resonates == ("at least" in repr(cost)) == (ratio < 1)
+
+
 def test_free_space_takes_no_cells_and_infeasible_simulations_are_estimated():
     assert isinstance(at.make_propagator(small_scene()), FreeSpacePropagator)
     cost = at.estimate(small_scene())
