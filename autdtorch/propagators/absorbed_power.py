@@ -9,8 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.special import spherical_jn
 
 from autdtorch.analytic.green import directivity
+from autdtorch.analytic.spherical_waves import degrees, outgoing_radial
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
@@ -121,6 +123,27 @@ def _half_sphere(degree: int, mirror: Mirror, count: int) -> Iterator[tuple[torc
         yield directions.reshape(-1, 3), area * 2 * math.pi / len(turns)
 
 
+def power_into_sphere(
+    regular: torch.Tensor, outgoing: torch.Tensor, radius: float, scene: Scene
+) -> torch.Tensor:
+    """Return the power (R,) [W] that flows into a sphere, by the waves (N, R) [Pa] around its centre."""
+    degree = math.isqrt(len(regular)) - 1
+    size = torch.full((1, 1), scene.complex_wavenumber * radius, **COMPLEX)
+    inner = [
+        spherical_jn(np.arange(degree + 1), size[0].numpy(), derivative=slope) for slope in (False, True)
+    ]
+    rows = outgoing_radial(degree + 1, size)[..., 0]
+    slope = torch.arange(degree + 1)[:, None] / size * rows[:-1] - rows[1:]
+    every = degrees(degree)
+    pressure, change = (
+        torch.from_numpy(here)[every, None] * regular + there[every] * outgoing
+        for here, there in zip(inner, (rows[:-1], slope), strict=True)
+    )
+    flow = (pressure.conj() * scene.complex_wavenumber * change).sum(dim=0).imag
+    power: torch.Tensor = -(radius**2) * flow / (2 * scene.medium.density * scene.angular_frequency)
+    return power
+
+
 @dataclass(frozen=True)
 class Absorption:
     """The power that obstacles absorb on a grid, a form of the pressure in its cells.
@@ -170,19 +193,22 @@ def absorption(
     watts *= 2 * stencil.kappa / stencil.slope.real * 0.5 ** len(mirrors)
     turned = np.eye(3) if axes is None else axes
     places = torch.from_numpy(grid.centers_of(index) @ turned)
-    body, nearest = _owners(places, region, turned, grid.spacing)
-    # of a fluid the mass also absorbs as air does, which its losses leave out
+    body, nearest, distance = _owners(places, region, turned, grid.spacing)
+    # of a fluid the mass also absorbs as air does, which its losses leave out; the air beside it is no part
     in_fluid = np.array([each.fluid is not None for each in region.bodies], bool)[nearest]
-    mass = cells.loss[:, 27] + np.where(in_fluid, stencil.loss * cells.mass[cells.lossy], 0)
+    air = (0.5 + distance / grid.spacing).clip(0, 1)
+    of_fluid = (cells.mass[cells.lossy] - air).clip(min=0)
+    mass = cells.loss[:, 27] + np.where(in_fluid, stencil.loss * of_fluid, 0)
     obstacle = np.array([each.number for each in region.bodies], np.int64)[body]
     everywhere = torch.from_numpy(grid.centers_of(used) @ turned)
     by_pairs = watts / 2 * cells.loss[:, :27]
     return Absorption(used, everywhere, obstacle, place.reshape(around.shape), watts * mass, by_pairs)
 
 
-def _owners(places: torch.Tensor, region: Region, axes: Array, spacing: float) -> tuple[Index, Index]:
+def _owners(places: torch.Tensor, region: Region, axes: Array, spacing: float) -> tuple[Index, Index, Array]:
     """Return the numbers of the bodies that absorb at places (n, 3) [m], and that are nearest to them (n,).
 
+    Third is the signed distance [m] to the nearest.
     Later bodies replace earlier ones where they overlap. The nearest body absorbs, except in the cells that
     represent a surface with an impedance, which may be in a fluid: one layer, or two along the grid.
     """
@@ -198,5 +224,5 @@ def _owners(places: torch.Tensor, region: Region, axes: Array, spacing: float) -
         if body.impedance is not None or (body.fluid is not None and body.fluid.is_lossy):
             nearness[number] = torch.maximum(distance, -later)
         later = torch.minimum(later, distance)
-    nearest, (least, beside) = nearness.argmin(dim=0), surface.min(dim=0)
-    return torch.where(least < math.inf, beside, nearest).numpy(), nearest.numpy()
+    (distance, nearest), (least, beside) = nearness.min(dim=0), surface.min(dim=0)
+    return torch.where(least < math.inf, beside, nearest).numpy(), nearest.numpy(), distance.numpy()

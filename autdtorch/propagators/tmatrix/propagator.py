@@ -11,7 +11,7 @@ from itertools import pairwise
 import torch
 
 from autdtorch.fdtd.grid_errors import grid_errors, rigid_errors, shape_errors, sizes
-from autdtorch.propagators.absorbed_power import AbsorbedPower
+from autdtorch.propagators.absorbed_power import AbsorbedPower, power_into_sphere
 from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.propagator import ScenePropagator
@@ -25,7 +25,7 @@ from autdtorch.propagators.tmatrix.obstacle_groups import (
     bodies_of,
     has_closed_form,
 )
-from autdtorch.propagators.tmatrix.scattering import scattered_waves, waves_at
+from autdtorch.propagators.tmatrix.scattering import scattered_waves, waves_at, waves_of_body
 from autdtorch.propagators.tmatrix.tmatrix import TMatrix, TMatrixCluster
 from autdtorch.scene.checks import require_clear
 from autdtorch.scene.reflectors import require_in_front
@@ -194,8 +194,17 @@ class TMatrixPropagator(ScenePropagator):
             field[..., ~served] = self._box._field(drive, places[~served].detach(), is_picture)
         return field
 
+    @one_library_thread()
     def _absorbed(self, drive: torch.Tensor) -> AbsorbedPower:
-        return self._box._absorbed(drive)
+        scene, bodies = self.scene, self._spheres
+        absorb = any(abs(reflector.reflection) < 1 for reflector in scene.reflectors)
+        if absorb or not all(has_closed_form(body.obstacles) for body in bodies):
+            return self._box._absorbed(drive)
+        power = torch.zeros((len(drive), len(scene.obstacles)), **REAL)
+        for number, body in enumerate(bodies):
+            waves = waves_of_body(self.bodies.bodies, number, scene.array, scene.images, drive)
+            power[:, list(body.numbers)] = power_into_sphere(*waves, body.radius, scene)[:, None]
+        return AbsorbedPower(power, torch.zeros((len(drive), len(scene.reflectors)), **REAL))
 
     @cached_property
     def _box(self) -> SimulatedPropagator:
