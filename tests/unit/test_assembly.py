@@ -5,9 +5,10 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from autdtorch.fdtd.assembly.aligned import MaterialBlocks
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import condensed, heterogeneous_cells
 from autdtorch.fdtd.assembly.layered_elements import mean_air_thickness, two_port
@@ -300,6 +301,18 @@ def test_sound_goes_along_a_gap_between_heavy_layers_as_through_its_width(share,
     port = two_port(*layers, np.full((1, 3), kappa), kappa)
     volume, mobility = port.thickness.sum() / density, port.mobility.sum() / 2
     assert (volume, mobility) == pytest.approx((width, width), abs=1.01 / density)
+
+
+@given(st.floats(1.0, 6.9), st.floats(0.06, 1.5), PLACES)
+def test_a_gap_without_a_plane_of_cells_is_one_whatever_planes_others_have_in_it(begin, width, share):
+    end = begin + width
+    assume(min(abs(place - round(place)) for place in (begin, end)) > 1e-4)  # planes move off vertices
+    walls = MaterialBlocks.between(
+        [np.array([begin, begin + share * width, end]), np.zeros(0), np.zeros(0)],
+        (9, 2, 2),
+        lambda cells: ((cells[..., 0] < begin) | (cells[..., 0] > end)).astype(np.int64),
+    )
+    assert walls.closes_gap(np.array([False, True])) == (math.floor(begin) == math.floor(end))
 
 
 def corner(place):

@@ -127,12 +127,17 @@ class MaterialBlocks:
         return np.stack([varies(self.material, self.planes, axis) for axis in range(3)])
 
     def closes_gap(self, closed: NDArray[np.bool_]) -> bool:
-        """Return whether a gap between blocks of `closed` materials (m,) has no plane of vertices in it."""
+        """Return whether a gap between blocks of `closed` materials (m,) has no plane of vertices in it.
+
+        Planes of bodies elsewhere may divide it.
+        """
         of_blocks = closed[self.material]
         for axis, planes in enumerate(self.planes):
-            blocks, places = np.moveaxis(of_blocks, axis, 2), planes.places
-            within = (np.diff(places) > _LEAST_GAP) & (np.diff(np.floor(places)) == 0)
-            if (blocks[..., :-2] & ~blocks[..., 1:-1] & blocks[..., 2:] & within).any():
+            ends = np.concatenate(([-np.inf], planes.places, [np.inf]))
+            blocks = np.moveaxis(of_blocks, axis, 2)
+            begin = np.maximum.accumulate(np.where(blocks, ends[1:], -np.inf), axis=2)
+            end = np.minimum.accumulate(np.where(blocks, ends[:-1], np.inf)[..., ::-1], axis=2)[..., ::-1]
+            if (~blocks & (end - begin > _LEAST_GAP) & (np.floor(begin) == np.floor(end))).any():
                 return True
         return False
 
