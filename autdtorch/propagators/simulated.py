@@ -14,13 +14,12 @@ from pathlib import Path
 
 import torch
 
-from autdtorch.fdtd.region import Region
 from autdtorch.propagators.absorbed_power import AbsorbedPower
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.free_space import PAIR_BYTES
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.propagators.grid_comparison import GridComparison
-from autdtorch.propagators.notices import Notices, warn_of_unsettled
+from autdtorch.propagators.notices import Notices, warn_of_shape, warn_of_unsettled
 from autdtorch.propagators.plan import Budget, Plan
 from autdtorch.propagators.propagator import ScenePropagator
 from autdtorch.propagators.simulation import PressureMap, Run, Simulation
@@ -280,7 +279,7 @@ def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
     Where the budget does not suffice, it is the finest that fits. Where the surface of an obstacle is not
     known well enough, it is one that does not add to that error. Warnings name the error.
     """
-    tolerance, region = pilot.tolerance, pilot.region
+    tolerance = pilot.tolerance
     plan = first_plan(pilot, budget.is_unlimited)
     if plan.refusal:
         raise ValueError(f"tolerance: {tolerance}; its first grid has {plan.refusal}")
@@ -300,7 +299,7 @@ def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
         grid_error = error - aim.known if others else comparison.usual_error
         if others:
             if aim.is_met(grid_error, len(others)):
-                _warn_of_shape(region, shape, error, tolerance)
+                warn_of_shape(pilot.region, shape, error, tolerance)
                 return propagator
             if not math.isfinite(error):
                 reason = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
@@ -392,15 +391,4 @@ def _log_cost(
         "spacing %.3g mm: estimated error %.2g; %s down to %.3g mm for a tolerance of %g: about %.2g s%s",
         1e3 * plan.spacing, error, counted(len(ahead), "finer grid"), 1e3 * ahead[-1].spacing,
         plan.tolerance / _SETTLED, seconds, "; limit them by seconds=" if is_long else "",
-    )  # fmt: skip
-
-
-def _warn_of_shape(region: Region, shape: float, error: float, tolerance: float) -> None:
-    """Log that the surface of an obstacle is not known well enough for a tolerance."""
-    if error <= tolerance:
-        return
-    number, body = max(enumerate(region.bodies), key=lambda pair: pair[1].uncertainty)
-    logger.warning(
-        "the surface of obstacle %d is known to %.2g mm, which leaves an error of %.2g: estimated error %.2g,"
-        " tolerance %g; smaller voxels are needed", number, 1e3 * body.uncertainty, shape, error, tolerance,
     )  # fmt: skip

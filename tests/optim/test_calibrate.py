@@ -8,54 +8,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from noisy_bench import Bench, error, scene
 
 import autdtorch as at
 from autdtorch.propagators.scene_changes import SceneChanges
-
-GAIN, PHASE, NOISE = 0.1, 0.5, 0.03  # of the bench; noise relative to the rms pressure
-
-
-def array(shape=(4, 4)):
-    return at.TransducerArray.grid(shape, 10e-3, (0.0, 0.0, 0.0), source_strength=2.0, radius=4.5e-3)
-
-
-def scene(points=3, shape=(4, 4), **fields):
-    places = [[80e-3, 12e-3 * (number - 1), 3e-3 * number] for number in range(points)]
-    return at.Scene(array(shape), at.Medium(1.2, 340.0), 40e3, control_points=places, **fields)
-
-
-class Bench:
-    """Transducers with gains and phases that differ, and a noisy microphone."""
-
-    def __init__(self, matrix, seed, gain=GAIN, phase=PHASE, noise=NOISE, unit=1.0):
-        self.draws = torch.Generator().manual_seed(seed)
-        log_gain, angle = torch.randn(2, matrix.shape[1], dtype=torch.float64, generator=self.draws)
-        self.log_gain, self.phase = gain * log_gain, phase * angle
-        self.matrix = unit * matrix * torch.polar(self.log_gain.exp(), self.phase)
-        self.noise = noise * float(self.matrix.abs().square().sum(dim=1).mean().sqrt())
-
-    def drives(self, count):
-        phases = (
-            2 * math.pi * torch.rand(count, self.matrix.shape[1], dtype=torch.float64, generator=self.draws)
-        )
-        return torch.polar(torch.ones_like(phases), phases)
-
-    def pressure(self, drives):
-        pressure = drives @ self.matrix.T
-        return pressure + self.noise * torch.randn(
-            pressure.shape, dtype=torch.complex128, generator=self.draws
-        )
-
-    def readings(self, count, phase=False, **fields):
-        drives = self.drives(count)
-        pressure = self.pressure(drives)
-        return at.Readings(drives, pressure.abs(), phase=pressure.angle() if phase else None, **fields)
-
-
-def error(calibration, matrix):
-    """Relative error of the calibrated matrix (P, M), up to a phase of each row."""
-    turn = (calibration.transfer_matrix.conj() * matrix).sum(dim=1, keepdim=True).sgn()
-    return float((calibration.transfer_matrix * turn - matrix).norm() / matrix.norm())
 
 
 @pytest.fixture(scope="module")
@@ -244,21 +200,6 @@ def test_each_reading_is_held_back_once(matrix, folds):
     assert held.readings == 40
 
 
-def test_changes_of_a_microphone_do_not_move_other_points():
-    simulated = at.make_propagator(scene())
-    readings = Bench(SceneChanges(simulated, ["points[1].y"]).matrix([2e-3]), 14).readings(60)
-    calibration = at.calibrate(simulated, readings, at.Prior(variants={"points[1].y": 2e-3}), folds=0)
-    place = simulated.scene.control_points[1]
-    moved = place + torch.tensor([0.0, calibration.amounts["points[1].y"].value, 0.0])
-    alone, beside = (
-        calibration.predict(readings.drives, p) for p in (moved[None], torch.stack([place, moved]))
-    )
-    assert torch.allclose(alone.pressure[:, 0], beside.pressure[:, 1])
-    matrix = at.make_propagator(calibration.scene).transfer_matrix(moved[None])
-    expected = (readings.drives @ matrix.T).abs()
-    assert torch.allclose(alone.pressure, expected, rtol=1e-6)
-
-
 def test_symmetric_drives_show_sums_of_their_transducers_only(matrix):
     bench = Bench(matrix[1:2], 8, phase=0.1)
     drives = bench.drives(80)
@@ -269,55 +210,6 @@ def test_symmetric_drives_show_sums_of_their_transducers_only(matrix):
     calibration = at.calibrate(symmetric, readings, folds=0)
     assert sorted(map(len, calibration.together)) == [2] * 8
     assert calibration.determined < 17
-
-
-BALLS = [at.Sphere((40e-3, side, 0.0), 6e-3, rigid=True) for side in (-9e-3, 9e-3)]
-
-
-@pytest.mark.parametrize(
-    ("bodies", "names"),
-    [
-        ((), {"points.x": 1e-3, "points.z": 1e-3}),
-        ((), {"temperature": 3.0, "array.y": 1e-3}),
-        (BALLS, {"obstacles.x": 1e-3, "obstacles.y": 1e-3, "obstacles.turn_z": 0.05}),
-    ],
-)
-def test_named_changes_are_found(bodies, names):
-    simulated = at.make_propagator(scene(obstacles=bodies))
-    amounts = {name: 1.3 * width for name, width in names.items()}
-    true = SceneChanges(simulated, [*names]).matrix([*amounts.values()])
-    bench = Bench(true, 9, gain=0.02, phase=0.05)
-    prior = at.Prior(variants=names, gain=0.02, phase=0.05, rest=0.01)
-    calibration = at.calibrate(simulated, bench.readings(150), prior, folds=0)
-    for name, (value, deviation) in calibration.amounts.items():
-        assert deviation < names[name]
-        assert abs(value - amounts[name]) < 4 * deviation
-
-
-@settings(deadline=None, max_examples=3)
-@given(aside=st.floats(2.5e-3, 4.5e-3), side=st.sampled_from([1, -1]), seed=st.integers(0, 10**6))
-def test_a_body_nearly_half_a_wavelength_aside_is_found(aside, side, seed):
-    """The echo between it and the panel is alike there: the posterior has a maximum each half wavelength."""
-    ball = at.Sphere((25e-3, 2e-3, -1e-3), radius=4e-3, rigid=True)
-    room = scene(obstacles=[ball], reflectors=[at.Reflector.behind(array())])
-    simulated = at.make_propagator(room, method="tmatrix", tolerance=1e-5)
-    true = SceneChanges(simulated, ["obstacles.x"]).matrix([side * aside])
-    bench = Bench(true, seed, phase=0.3)
-    prior = at.Prior(variants={"obstacles.x": 2e-3}, phase=0.3, rest=0.02)
-    calibration = at.calibrate(simulated, bench.readings(60), prior, folds=0)
-    value, deviation = calibration.amounts["obstacles.x"]
-    assert abs(value - side * aside) < 5 * deviation  # a wrong maximum is 20 or more off
-
-
-def test_half_wavelengths_that_grids_do_not_look_at_are_told():
-    ball = at.Sphere((25e-3, 2e-3, -1e-3), radius=4e-3, rigid=True)
-    simulated = at.make_propagator(scene(obstacles=[ball], shape=(2, 2)), method="box", spacing=2e-3)
-    drives = torch.eye(4, dtype=torch.complex128).repeat(2, 1)
-    readings = at.Readings(drives, (drives @ simulated.transfer_matrix().T).abs())
-    for width in (1e-3, 2e-3):
-        prior = at.Prior(variants={"obstacles.x": width})
-        doubts = at.calibrate(simulated, readings, prior, folds=0).doubts
-        assert any("half a wavelength" in doubt for doubt in doubts) == (width > 1e-3)
 
 
 def test_the_prior_for_methods_varies_the_calibrated_matrix():
