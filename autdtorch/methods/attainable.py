@@ -30,7 +30,7 @@ from autdtorch.objectives.bound import checked_matrix
 from autdtorch.objectives.forces import LeastForm
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.objectives.hermitian import ascended
-from autdtorch.objectives.objective import GoalFunction, Objective, magnitudes
+from autdtorch.objectives.objective import GoalFunction, Objective
 from autdtorch.utils.array_types import Array, ComplexArray
 from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import finite_number, require_kind
@@ -79,7 +79,8 @@ def attainable(
     these leave open.
 
     Args:
-        objective: with a transfer matrix, such as a `ForceObjective` of a trap.
+        objective: with a transfer matrix, such as a `ForceObjective` of a trap. Perturbations around it
+            change the scores of drives, not the bound.
         least: the score.
         goal: with a bound; the default gives way to a goal of the objective.
         seed: of the drives that ascents start from, >= 0.
@@ -100,17 +101,21 @@ def attainable(
         if best.answer is not None:
             break
         if isinstance(problem.goal, LeastForm) and problem.transducers <= _FEW and least >= 0:
-            return _by_cells(best, matrix, problem.goal)
+            return _by_cells(best, objective, problem, problem.goal)
     return best
 
 
-def _by_cells(best: Attainable, matrix: torch.Tensor, goal: LeastForm) -> Attainable:
-    """Return what cells of drives decide of a force, by the rows (N, M)."""
-    drive, excluded = search_above(checked_matrix(matrix), goal.weights, best.least)
-    if drive is not None:
-        played = torch.from_numpy(drive)
-        return replace(best, score=float(goal(magnitudes(matrix, played[None]))[0]), drive=played)
-    return replace(best, bound=best.least) if excluded else best
+def _by_cells(best: Attainable, objective: Objective, problem: Problem, goal: LeastForm) -> Attainable:
+    """Return what cells of drives decide of a force.
+
+    They know the simulation alone, so that the score is as observed: transducers may have failed.
+    """
+    drive, excluded = search_above(checked_matrix(known_matrix(problem)), goal.weights, best.least)
+    if drive is None:
+        return replace(best, bound=best.least) if excluded else best
+    played = problem.quantise(torch.from_numpy(drive)[None])
+    score = float(goal(objective(played))[0])
+    return replace(best, score=score, drive=played[0]) if score > best.score else best
 
 
 class _Cell(NamedTuple):

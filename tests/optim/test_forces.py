@@ -192,6 +192,19 @@ def test_whether_a_trap_exists_is_decided(propagator):
     assert heavy.answer is False
 
 
+@pytest.mark.parametrize("failed", [[0], [0, 1]])
+def test_a_trap_of_failed_transducers_is_not_claimed(failed):
+    """A trap between two transducers that face each other: one alone only pushes, none does nothing."""
+    facing = at.TransducerArray([(0, 0, 0), (0, 0, 0.04)], [(0, 0, 1), (0, 0, -1)], source_strength=1.0)
+    propagator = at.make_propagator(at.Scene(facing, MEDIUM, 40e3, [(0, 0, 0.03)]), "free_space")
+    objective = at.ForceObjective(propagator, at.Trap([(0, 0, 0.02)]))
+    assert at.attainable(objective).answer is True
+    broken = at.FailedTransducers(objective, failed)
+    found = at.attainable(broken)
+    assert found.answer is not True
+    assert found.score == pytest.approx(objective.goal(broken(found.drive)).item(), abs=1e-20)
+
+
 def octahedron(mean):
     """Rows and weights of six forms: mean |q|^2 plus and minus each Pauli matrix.
 
