@@ -23,7 +23,7 @@ _ALIKE = 0.999  # overlap of drives above which they count as one
 
 _LONE = 3.0  # ratio of the highest score to the next one above which it may be an outlier
 _COMPARED = 8  # least number of scores to compare
-_RESPONSE = 2.0  # variance that each unknown of a row explains over the rest's; noise alone has 1
+_RESPONSE = 4.0  # variance that each unknown of a row explains over the rest's; noise has 1, by chance 3
 _CONSTANT = 1e-6  # relative deviation of constant readings
 _UNEXPLAINED = 0.3  # rms residual of the fit over rms readings; noise 10 dB below them leaves 0.22
 _SURPRISE = 6.0  # deviation of the last reading, in standard deviations of the noise, of an outlier

@@ -141,7 +141,7 @@ class MatrixPosterior:
         for _ in range(_NOISE_ROUNDS if infer_noise else 0):
             before, now = now.variance[0], now._with_noise(line, self.prior.variance_of(read))
             if not 1 / _NOISE_FACTOR < now.variance[0] / before < _NOISE_FACTOR:
-                now, line = now._maximum(line, drives, read)
+                now, line = now._maximum(now.linearised(drives, read), drives, read)
         return now
 
     def _maximum(

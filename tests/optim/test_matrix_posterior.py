@@ -3,6 +3,8 @@ from functools import partial
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import autdtorch as at
 from autdtorch.methods.doubtful_readings import Magnitudes
@@ -105,6 +107,28 @@ def test_samples_have_the_magnitudes_of_readings_that_determine_a_row(random_mat
     (sample,) = fit.posterior.samples(drives, fit.read, generator(3), 1)
     # The noise, assumed from few readings, is half a per cent.
     torch.testing.assert_close((drives @ sample.T).abs(), observed, rtol=0.02, atol=0.03)
+
+
+@settings(deadline=None, max_examples=4)
+@given(st.integers(0, 10**6), st.booleans(), st.floats(0.002, 0.01))
+def test_errors_of_entries_are_found_in_noise_below_them(seed, with_phase, level):
+    draws = generator(seed)
+
+    def noise(*shape):
+        return torch.randn(*shape, dtype=torch.complex128, generator=draws)
+
+    simulated = noise(2, 8)
+    matrix = torch.polar(1 + 0.1 * noise(8).real, 0.5 * noise(8).real) * simulated + 0.01 * noise(2, 8)
+    level *= float(matrix.norm()) / 2**0.5  # relative to the rms pressure
+    drives, others = random_drives(120, 8, draws), random_drives(200, 8, draws)
+    pressure = drives @ matrix.T + level * noise(120, 2)
+    phase = pressure.angle() if with_phase else None
+    readings = at.Readings(drives, pressure.abs(), phase=phase)
+    prediction = at.calibrate(simulated, readings, at.Prior(rest=0.01), folds=0).predict(others)
+    off = prediction.pressure - (others @ matrix.T).abs()
+    # 240 readings of at most 50 unknowns leave sqrt(50 / 240) = 0.46 of a magnitude's noise, level / sqrt(2).
+    assert off.square().mean().sqrt() < 1.5 * 0.46 * level / 2**0.5
+    assert (off / prediction.deviation).square().mean().sqrt() < 1.5
 
 
 def test_a_simulation_is_corrected_by_few_readings(make_objective, random_matrix):
