@@ -168,7 +168,7 @@ def level_bound(
     bound = alone.min() * math.sqrt(square) * (1 + _MARGIN)
     if norm:  # |z|^2 is the number of transducers
         bound /= math.sqrt(len(start))
-    return bound, float(x[count : count + len(silent)].sum())
+    return float(bound), float(x[count : count + len(silent)].sum())
 
 
 def lowest(

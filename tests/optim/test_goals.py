@@ -98,6 +98,7 @@ def test_bounds_are_met_where_the_best_drive_is_known():
     matrix = torch.polar(torch.ones(8, 8).double(), 2 * math.pi * turns / 8)
     assert at.QuietPoints(at.WeakestFocus(), range(1, 8), 1e-3).bound(matrix) == pytest.approx(8, rel=1e-5)
     assert at.MeanPressure().bound(matrix) == pytest.approx(math.sqrt(8), rel=1e-5)
+    assert type(at.MeanPressure().bound(matrix)) is float  # YAML writes no number of NumPy
     assert at.TargetPressures([8]).bound(matrix[:1]) == pytest.approx(0, abs=1e-9)
     assert at.TargetPressures([16]).bound(matrix[:1]) == pytest.approx(-0.5, rel=1e-5)
     matrix = torch.polar(torch.ones(1, 5).double(), torch.arange(5).double()[None]).expand(2, -1)
