@@ -49,9 +49,9 @@ def calibrate(
 
     The model is p = c G(t) diag(g e^{i b}) q, with errors of single entries of the matrix besides, all with
     the widths of the prior. Readings of the magnitude constrain it, and phases where they were read, up to a
-    common one. The likeliest values are sought by Gauss-Newton steps, without simulations on grids also from
-    amounts half a wavelength aside. Deviations are those of the posterior linearised there (Laplace's
-    approximation). Readings that stay beyond six deviations are left out and named.
+    common one. The likeliest values are sought by Gauss-Newton steps, with echoes and without simulations on
+    grids also from amounts half a wavelength aside. Deviations are those of the posterior linearised there
+    (Laplace's approximation). Readings that stay beyond six deviations are left out and named.
 
     Args:
         propagator_or_matrix: of the scene, or its transfer matrix G (P, M) [Pa].

@@ -307,10 +307,12 @@ class CalibrationStart:
         """Amounts (K,) with one change of half wavelengths, as far as its width lets expect.
 
         The echo between a panel and a body half a wavelength aside is alike, and a fit ends at the nearest
-        such amount.
+        such amount. Free space has no echoes.
         """
         scene, amounts = self.scene, list[torch.Tensor]()
         if scene is None or not isinstance(self.changes, SceneChanges):
+            return amounts
+        if not (scene.obstacles or scene.reflectors):
             return amounts
         changes = torch.eye(len(self.widths), **REAL)
         for name, width, change in zip(self.changes.names, self.widths, changes, strict=True):
