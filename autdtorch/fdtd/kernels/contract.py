@@ -54,6 +54,12 @@ class Columns:
     offset: Tensor  # flat offsets from a cell to w cells across the column (m, w) int64
     weight: Tensor  # differences of their weights from those of air (m, w)
 
+    @classmethod
+    def none(cls, layer_cells: int, dtype: torch.dtype, width: int = 9) -> Columns:
+        """Return no columns, for layers of air."""
+        index = _empty(0, layer_cells + 2, dtype=torch.int64)
+        return cls(index, index[:, :1].expand(0, width), _empty(0, width, dtype=dtype))
+
 
 BLOCK = 8
 """Cells of a block. Sums over a rigid hand at 1 mm take half the time that they take cell by cell, and those
@@ -137,9 +143,7 @@ class Coefficients:
     @classmethod
     def of_air(cls, dtype: torch.dtype) -> Coefficients:
         """Return coefficients without heterogeneous cells and layers, for air in which nothing moves."""
-        none, numbers = _empty(0, dtype=torch.int64), _empty(1, dtype=dtype)
-        index, offset = _empty(0, 2, dtype=torch.int64), _empty(0, 9, dtype=torch.int64)
-        columns = Columns(index, offset, _empty(0, 9, dtype=dtype))
+        none, numbers, columns = _empty(0, dtype=torch.int64), _empty(1, dtype=dtype), Columns.none(0, dtype)
         return cls(
             0.0, 0.0, 0.0, 0.0, 0.0, none, _empty(0, 27, dtype=dtype), none, numbers, numbers,
             none, numbers[:0], columns, columns, columns.index,
