@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
+from scipy.special import fdtri
 
 logger = logging.getLogger(__name__)
 
@@ -23,7 +24,8 @@ _ALIKE = 0.999  # overlap of drives above which they count as one
 
 _LONE = 3.0  # ratio of the highest score to the next one above which it may be an outlier
 _COMPARED = 8  # least number of scores to compare
-_RESPONSE = 4.0  # variance that each unknown of a row explains over the rest's; noise has 1, by chance 3
+_BY_CHANCE = 0.999  # share of sensors of noise alone below the ratio of variances that tells a response
+_RESPONSE = 4.0  # that ratio at most: few readings beyond the unknowns tell nothing of sensors above it
 _CONSTANT = 1e-6  # relative deviation of constant readings
 _UNEXPLAINED = 0.3  # rms residual of the fit over rms readings; noise 10 dB below them leaves 0.22
 _SURPRISE = 6.0  # deviation of the last reading, in standard deviations of the noise, of an outlier
@@ -187,7 +189,8 @@ def _silent(observed: torch.Tensor, fitted: torch.Tensor, unknowns: int) -> torc
     spare = len(observed) - unknowns
     if unknowns == 1 or spare < 1:  # one transducer alone makes the same magnitude at any phase
         return constant & (observed.amax(dim=0) == 0)
-    return constant | ((total - rest) / unknowns < _RESPONSE * rest / spare)
+    ratio = min(float(fdtri(unknowns, spare, _BY_CHANCE)), _RESPONSE)  # of Fisher's F test
+    return constant | ((total - rest) / unknowns < ratio * rest / spare)
 
 
 def _differ(drives: torch.Tensor) -> torch.Tensor:
