@@ -9,7 +9,7 @@ import torch
 
 from autdtorch.fdtd.assembly.unions import warn_of_thin_walls
 from autdtorch.fdtd.grid_axes import axes_along
-from autdtorch.fdtd.region import Region, warn_if_coarse
+from autdtorch.fdtd.region import warn_if_coarse
 from autdtorch.propagators.plan import Plan, walls_of
 from autdtorch.propagators.simulation import Run, Simulation
 from autdtorch.scene.scene import Scene
@@ -165,17 +165,6 @@ def warn_of_no_steady_state(
     """Warn that runs ended before their steady state; `what` tells when, and the advice what to raise."""
     error = f"estimated relative error up to {residual:.1e}, tolerance {tolerance:g}"
     warn_user(f"no steady state {what}: {error}; raise {advice}", SteadyStateWarning)
-
-
-def warn_of_shape(region: Region, shape: float, error: float, tolerance: float) -> None:
-    """Log that the surface of an obstacle is not known well enough for a tolerance."""
-    if error <= tolerance:
-        return
-    number, body = max(enumerate(region.bodies), key=lambda pair: pair[1].uncertainty)
-    logger.warning(
-        "the surface of obstacle %d is known to %.2g mm, which leaves an error of %.2g: estimated error %.2g,"
-        " tolerance %g; smaller voxels are needed", number, 1e3 * body.uncertainty, shape, error, tolerance,
-    )  # fmt: skip
 
 
 def _in_mm(point: torch.Tensor) -> tuple[float, ...]:

@@ -19,7 +19,7 @@ from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.free_space import PAIR_BYTES
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.propagators.grid_comparison import GridComparison
-from autdtorch.propagators.notices import Notices, warn_of_shape, warn_of_unsettled
+from autdtorch.propagators.notices import Notices, warn_of_unsettled
 from autdtorch.propagators.plan import Budget, Plan
 from autdtorch.propagators.propagator import ScenePropagator
 from autdtorch.propagators.simulation import PressureMap, Run, Simulation
@@ -70,8 +70,7 @@ class SimulatedPropagator(ScenePropagator):
     """A propagator that simulates the steady state of the drive by FDTD.
 
     A result depends on the scene, the settings and the arguments of its call alone. The last ones are kept,
-    up to 1 GB: transfer matrices, and by method "box" the outgoing fields of drives, from which other points
-    outside the boxes take sums and no runs.
+    up to 1 GB: transfer matrices and, by method "box", fields of drives: other points take no runs.
 
     Attributes:
         scene: the scene it was made for.
@@ -291,15 +290,14 @@ def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
         error, (shape, rigid_error) = comparison.error, comparison.lasting_errors
         taken = time.perf_counter() - begin
         if rigid_error > _RIGID_SHARE * tolerance:
-            logger.debug(
-                "obstacles taken as rigid would leave an error of %.2g: their materials count", rigid_error
-            )
+            logger.debug("obstacles as rigid leave an error of %.2g: their materials count", rigid_error)
             return refined(pilot.with_materials, budget, store)
         aim = _Aim(tolerance, shape, shape + rigid_error)
         grid_error = error - aim.known if others else comparison.usual_error
         if others:
             if aim.is_met(grid_error, len(others)):
-                warn_of_shape(pilot.region, shape, error, tolerance)
+                if error > tolerance:
+                    _warn_of_shape(pilot, shape, error)
                 return propagator
             if not math.isfinite(error):
                 reason = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
@@ -313,8 +311,8 @@ def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
             known = f"estimated error {error:.2g}"
             if not others:
                 known = f"error not estimated, which takes a second grid (usually {grid_error:.2g})"
-            shown = 1e3 * plan.spacing, known, tolerance
-            logger.warning("time or memory end at %.3g mm: %s, tolerance %g", *shown)
+            cells = 1e3 * plan.spacing
+            logger.warning("time or memory end at %.3g mm: %s, tolerance %g", cells, known, tolerance)
             return propagator
         may_look = budget.is_unlimited or budget.fits(finer.halved, plan, taken)
         _log_cost(plan, ahead, taken, grid_error, budget, is_second=len(others) == 1)
@@ -391,4 +389,12 @@ def _log_cost(
         "spacing %.3g mm: estimated error %.2g; %s down to %.3g mm for a tolerance of %g: about %.2g s%s",
         1e3 * plan.spacing, error, counted(len(ahead), "finer grid"), 1e3 * ahead[-1].spacing,
         plan.tolerance / _SETTLED, seconds, "; limit them by seconds=" if is_long else "",
+    )  # fmt: skip
+
+
+def _warn_of_shape(pilot: Plan, shape: float, error: float) -> None:
+    number, body = max(enumerate(pilot.region.bodies), key=lambda pair: pair[1].uncertainty)
+    logger.warning(
+        "the surface of obstacle %d is known to %.2g mm, an error of %.2g: estimated %.2g, tolerance %g;"
+        " smaller voxels are needed", number, 1e3 * body.uncertainty, shape, error, pilot.tolerance,
     )  # fmt: skip
