@@ -133,7 +133,7 @@ def power_into_sphere(
         spherical_jn(np.arange(degree + 1), size[0].numpy(), derivative=slope) for slope in (False, True)
     ]
     rows = outgoing_radial(degree + 1, size)[..., 0]
-    slope = torch.arange(degree + 1)[:, None] / size * rows[:-1] - rows[1:]
+    slope = torch.arange(degree + 1, device=size.device)[:, None] / size * rows[:-1] - rows[1:]
     every = degrees(degree)
     pressure, change = (
         torch.from_numpy(here)[every, None] * regular + there[every] * outgoing
