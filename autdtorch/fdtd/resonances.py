@@ -138,9 +138,9 @@ def displacement_error(
 ) -> float:
     """Return the relative error of a steady state by the shift of its resonances on a grid.
 
-    `spacing` is that of the grid [wavelengths]. `others` are those on another grid, whose spacing is larger
-    by a `ratio`. A resonance without any like it there has moved too far to tell: its shift is taken to be
-    between none and twice the usual one, towards the drive's frequency.
+    `spacing` is the edge of the grid's cells [wavelengths]. `others` are those on another grid, whose spacing
+    is larger by a `ratio`. One without any like it there has moved too far to tell: its shift is taken
+    to be between none and twice the usual one, towards the drive's frequency.
     """
     squares = 0.0
     for here in resonances:

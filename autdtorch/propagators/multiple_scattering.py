@@ -113,9 +113,9 @@ def _alone(parts: Sequence[torch.Tensor]) -> Iterator[torch.Tensor]:
 def _shared(
     rung: Sequence[Sequence[tuple[Resonance, ...]]], shares: Sequence[Sequence[float]]
 ) -> list[tuple[Resonance, ...]]:
-    """Return what rang in each run from what rang in each body, by the share (B, R) heard of that body.
+    """Return the resonances in each run, from those of each body and its shares (B, R) of the pressures.
 
-    A resonance counts as much in what is heard of a body as in what leaves its box.
+    A resonance has the same part in the pressure of a body at the points as in the waves that leave its box.
     """
     runs: list[list[Resonance]] = [[] for _ in shares[0]]
     for bodies, heard in zip(rung, shares, strict=True):

@@ -105,7 +105,7 @@ class SimulatedPropagator(ScenePropagator):
         return SimulatedPropagator(self.plan.of(scene), self._store)
 
     def coarser(self, factor: float) -> SimulatedPropagator:
-        """Return the propagator of the same scene with cells larger by a factor, as far as they are fine."""
+        """Return the propagator of the scene with cells larger by a factor, at most the coarsest allowed."""
         spacing = max(self.spacing, min(factor * self.spacing, self.plan.region.coarsest_spacing))
         return SimulatedPropagator(self.plan.at(spacing, self.tolerance), self._store)
 

@@ -104,7 +104,7 @@ class StillBody:
 
     @cached_property
     def scene(self) -> Scene:
-        """The body alone, and a transducer and points around it, where its resonances are heard."""
+        """The body alone, with a transducer and points around it: their pressures contain its resonances."""
         center, radius = self.sphere
         aside = center.new_tensor([_DIRECTION]) * _TRANSDUCER * radius
         array = TransducerArray(center + aside, (-1.0, 0.0, 0.0), radius=0)
