@@ -48,9 +48,8 @@ class Bench:
         self._sensor, self._kind = _sensor(sensor, self.is_emulated or silent), sensor["kind"]
         _require_fit(section, self.is_emulated)
         self.device = hardware.DEVICES[section["device"]].configured(section)
-        self.transducers = self._wired(len(scene.array))
-        failed = section["failed"]
-        count = len(scene.array)
+        failed, count = section["failed"], len(scene.array)
+        self.transducers = self._wired(count)
         self._failed = indices_of("hardware.failed", failed, count, "the scene's") if failed else []
         self.by_hand = self._sensor.by_hand
         self._bench: hardware.EmulatedBench | None = None

@@ -21,6 +21,7 @@ from autdtorch.scene.scene import Scene
 from autdtorch.utils.apertures import Discs, centers_of, image_of
 from autdtorch.utils.array_types import COMPLEX, REAL, Array, Index
 from autdtorch.utils.mirror_images import Mirror, images_of
+from autdtorch.utils.spatial import distinct_cells, places_among
 from autdtorch.utils.validation import invalid
 
 _MORE = 20
@@ -187,7 +188,8 @@ def absorption(
         return None
     index = cells.index[cells.lossy]
     around = index[:, None] + flat_offsets(grid.shape)
-    used, place = np.unique(around, return_inverse=True)
+    count = math.prod(grid.shape)
+    used = distinct_cells(around, count)
     # on the grid the flow of a wave of unit pressure is less than in air by slope / 2 kappa
     watts = grid.spacing / (2 * 2 * np.pi * region.frequency * region.fluid.density.real)
     watts *= 2 * stencil.kappa / stencil.slope.real * 0.5 ** len(mirrors)
@@ -202,7 +204,8 @@ def absorption(
     obstacle = np.array([each.number for each in region.bodies], np.int64)[body]
     everywhere = torch.from_numpy(grid.centers_of(used) @ turned)
     by_pairs = watts / 2 * cells.loss[:, :27]
-    return Absorption(used, everywhere, obstacle, place.reshape(around.shape), watts * mass, by_pairs)
+    place = places_among(used, count)[around]
+    return Absorption(used, everywhere, obstacle, place, watts * mass, by_pairs)
 
 
 def _owners(places: torch.Tensor, region: Region, axes: Array, spacing: float) -> tuple[Index, Index, Array]:

@@ -93,7 +93,7 @@ def require_waves(scene: SceneContents) -> None:
     if scene.medium.absorption > most:
         limit = f"{_MOST_ABSORPTION:g} dB per wavelength"
         if scene.frequency < _LOWEST and scene.medium.absorption <= 1e3 * most:  # a frequency in kHz
-            absorbed = scene.medium.absorption / most * _MOST_ABSORPTION
+            absorbed = scene.medium.absorption * scene.wavelength
             accepted = f"the medium absorbs {absorbed:.3g} dB per wavelength, must be at most {limit}"
             accepted += f"; is it in Hz, {scene.frequency:g} kHz as {scene.frequency:g}e3?"
             raise invalid("Scene.frequency", scene.frequency, accepted, "Hz")

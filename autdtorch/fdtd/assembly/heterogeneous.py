@@ -321,7 +321,7 @@ def _transferred_mass(coupling: Array, mass: Array, need: Array, touched: Index,
 def _uniform_cells(
     elements: Elements, touched: Index, hard: NDArray[np.bool_], shape: GridShape, stencil: Stencil
 ) -> tuple[list[Array], Index, Array]:
-    """Return the cells inside obstacles that have rows of their own, and others with their mass.
+    """Return the cells inside obstacles whose rows are not those of air, and others with their mass.
 
     Of the former, which absorb or have another speed, indices, rows, masses and losses.
     """

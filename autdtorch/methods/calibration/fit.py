@@ -130,7 +130,7 @@ def _climbed(
     until they no longer change (Gauss-Newton). A step that fits worse than the one before is halved.
     """
     around = prior_around(tangent, simulation.widths, prior).times(unit)
-    fit = _first(around, tangent.amounts, readings, unit)
+    fit = _first(around, tangent, readings, unit)
     enough = _ENOUGH_ON_GRIDS if simulation.changes.simulates else _ENOUGH
     for left in reversed(range(_ROUNDS)):
         before, around = fit, prior_around(tangent, simulation.widths, prior).times(unit)
@@ -150,12 +150,12 @@ def prior_around(tangent: Tangent, widths: torch.Tensor, prior: Prior) -> Matrix
     return gaussian_prior(prior, tangent.matrix, tangent.derivatives, widths, tangent.amounts)
 
 
-def _first(prior: MatrixPrior, amounts: torch.Tensor, readings: Readings, unit: float) -> CalibrationFit:
-    """Return a fit near amounts (K,), with the common phase of the readings and without outliers far off."""
+def _first(prior: MatrixPrior, tangent: Tangent, readings: Readings, unit: float) -> CalibrationFit:
+    """Return a fit near a tangent, with the common phase of the readings and without outliers far off."""
     drives, observed = readings.drives, readings.pressure
-    expected = drives @ (prior.rows + (amounts[:, None, None] * prior.changes).sum(dim=0)).T
+    expected = unit * drives @ tangent.matrix.T
     shift = torch.zeros_like(prior.widths)
-    shift[len(shift) - len(amounts) :] = amounts
+    shift[len(shift) - len(tangent.amounts) :] = tangent.amounts
     if readings.phase is not None:
         parts = torch.polar(observed, readings.phase) * expected.conj()
         shift[2 * drives.shape[1] + 1] = parts[parts.abs().isfinite()].sum().angle()
