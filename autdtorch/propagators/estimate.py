@@ -20,7 +20,7 @@ from autdtorch.propagators.tmatrix.costs import WaveCosts
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator, placed_bodies
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
-from autdtorch.utils.process import available_memory
+from autdtorch.utils.process import available_memory, one_library_thread
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import positive
 
@@ -68,6 +68,7 @@ class Estimate:
         return f"Estimate({self.method}{grid}, {cost})"
 
 
+@one_library_thread()
 def estimate(
     scene: Scene,
     spacing: float | None = 1e-3,

@@ -16,11 +16,13 @@ from autdtorch.propagators.simulated import SimulatedPropagator, refined
 from autdtorch.propagators.store import store_in
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.process import one_library_thread
 from autdtorch.utils.validation import invalid, positive
 
 logger = logging.getLogger(__name__)
 
 
+@one_library_thread()
 def make_propagator(
     scene: Scene,
     method: str = "auto",

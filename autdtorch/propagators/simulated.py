@@ -303,11 +303,10 @@ def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
                 reason = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
                 raise ValueError(f"max_periods: {plan.max_periods}; {reason}")
         ahead = _plans_ahead(plan, grid_error, len(others), aim)
-        _, coarsest = _next_spacings(plan)
-        for finer in (ahead[0], plan.fitted(coarsest, coarsest)):
-            if budget.fits(finer, plan, taken):
-                break
-        else:
+        finer, (_, coarsest) = ahead[0], _next_spacings(plan)
+        if not budget.fits(finer, plan, taken):
+            finer = plan.fitted(coarsest, coarsest)
+        if not budget.fits(finer, plan, taken):
             known = f"estimated error {error:.2g}"
             if not others:
                 known = f"error not estimated, which takes a second grid (usually {grid_error:.2g})"
