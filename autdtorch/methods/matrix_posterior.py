@@ -12,6 +12,12 @@ from autdtorch.methods.linearised_readings import LinearisedReadings
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.process import one_library_thread
 
+USUAL_NOISE = 0.03
+"""Noise assumed before readings, in rms pressures at random phases."""
+
+PSEUDO_READINGS = 4.0
+"""Number of readings that the assumed noise counts as."""
+
 _STEPS = 10  # of the Gauss-Newton search
 _HALVINGS = 6  # of a step that raises the misfit
 _DAMPINGS = (1.0, 10.0, 100.0, 1e3, 1e4)  # of such a step where readings state their deviations
@@ -20,8 +26,6 @@ _NOISE_ROUNDS = 4  # estimates of the noise
 _NOISE_FACTOR = 1.5  # change of the variance above which the maximum is sought again
 _DARK = 1e-6  # floor of a row's spread, relative to the strongest row's
 _TINY = 1e-150  # floor of a row's spread [Pa], whose square is not 0
-_USUAL_NOISE = 0.03  # noise assumed before readings, in rms pressures at random phases
-_WEIGHT = 4.0  # number of pseudo-readings that stand for the assumed noise
 _FAR = 5.0  # ratio of the first reading's scale to the others' beyond which it is an outlier
 _OUTLIER = 6.0  # robust standard deviations beyond which a reading is an outlier
 _HARMLESS = 0.1  # deviation, in rms pressures at random phases, that does no harm
@@ -52,7 +56,7 @@ class MatrixPrior:
     def usual_variance(self) -> torch.Tensor:
         """Variance of the noise that is assumed before readings which state none [Pa^2]."""
         power = (self.rows.abs().square() + self.spread[:, None].square()).sum(dim=1).mean()
-        return 0.5 * _USUAL_NOISE**2 * power
+        return 0.5 * USUAL_NOISE**2 * power
 
     def variance_of(self, read: Magnitudes) -> torch.Tensor:
         """Return the usual variance of the readings' noise [Pa^2], as stated or else assumed."""
@@ -164,8 +168,8 @@ class MatrixPosterior:
         return now, line
 
     def _with_noise(self, line: LinearisedReadings, usual: torch.Tensor) -> MatrixPosterior:
-        left = line.left.square().sum() + _WEIGHT * usual
-        variance = left / (line.unexplained + _WEIGHT)
+        left = line.left.square().sum() + PSEUDO_READINGS * usual
+        variance = left / (line.unexplained + PSEUDO_READINGS)
         return replace(self, variance=variance.expand_as(self.variance))
 
     @one_library_thread()

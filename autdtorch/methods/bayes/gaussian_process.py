@@ -13,6 +13,7 @@ from gpytorch.kernels import Kernel, MaternKernel
 from gpytorch.means import ZeroMean
 from gpytorch.mlls import ExactMarginalLogLikelihood
 
+from autdtorch.methods.matrix_posterior import PSEUDO_READINGS, USUAL_NOISE
 from autdtorch.utils.array_types import REAL
 from autdtorch.utils.validation import complex_tensor, invalid, real_tensor, require_one_of
 
@@ -341,7 +342,11 @@ def _fit_alone(
 
 
 def _likeliest_noise(points: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-    """Return the variance of a reading's noise (T, P), in mean intensities, equal in pascals for all foci."""
+    """Return the variance of a reading's noise (T, P), in mean intensities, equal in pascals for all foci.
+
+    Few intensities are as likely noise alone. The prior is that of `MatrixPosterior.fitted`: a scaled inverse
+    chi-squared distribution, which stands for some readings of the usual noise.
+    """
     features, intensity = phasors(points), values.square()
     mean = mean_intensity(values)
     share, vectors = torch.linalg.eigh(PhasorKernel("drives").forward(features, features))
@@ -351,8 +356,9 @@ def _likeliest_noise(points: torch.Tensor, values: torch.Tensor) -> torch.Tensor
     unit = 1 + noise
     spread = share.clamp_min(0)[..., None] + _intensity_variance(noise)[:, :, None]
     misfit = (spread.log() + unit[:, :, None].square() * seen / spread).sum(dim=2)
-    fit = len(seen[0]) * unit.log() - 0.5 * misfit
-    return noise[fit.sum(dim=-1).argmax(dim=0), torch.arange(len(mean), device="cpu")]
+    fit = (len(seen[0]) * unit.log() - 0.5 * misfit).sum(dim=-1)
+    prior = -0.5 * PSEUDO_READINGS * (_NOISES.log() + USUAL_NOISE**2 / _NOISES)
+    return noise[(fit + prior[:, None]).argmax(dim=0), torch.arange(len(mean), device="cpu")]
 
 
 def mean_intensity(pressure: torch.Tensor) -> torch.Tensor:
