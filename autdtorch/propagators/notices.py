@@ -41,10 +41,9 @@ class SteadyStateWarning(UserWarning):
 class Notices:
     """Log entries on the results of a simulation, each kind once."""
 
-    def __init__(self, simulation: Simulation) -> None:
-        """Log nothing yet."""
-        self._simulation, self._plan = simulation, simulation.plan
-        self._logged: set[str] = set()
+    def __init__(self, simulation: Simulation, logged: set[str]) -> None:
+        """Log nothing yet, and later no kind that is `logged` on another grid; those of here are added."""
+        self._simulation, self._plan, self._logged = simulation, simulation.plan, logged
 
     def of_points(self, points: torch.Tensor) -> None:
         """Log which points (P, 3) are next to a surface."""

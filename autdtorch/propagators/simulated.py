@@ -82,11 +82,12 @@ class SimulatedPropagator(ScenePropagator):
     """
 
     def __init__(
-        self, plan: Plan, store: Store | None = None, others: Sequence[Simulation] = (), may_look: bool = True
-    ) -> None:
+        self, plan: Plan, store: Store | None = None, others: Sequence[Simulation] = (),
+        may_look: bool = True, logged: set[str] | None = None,
+    ) -> None:  # fmt: skip
         """Use `make_propagator`, which checks its arguments. A plan with a refusal raises it.
 
-        `others` are simulations of the scene on other grids, for error estimates; by default one is made.
+        `others` are simulations on other grids for error estimates, by default one, with notices `logged`.
         These look for gaps to silent points on cells half as large, unless a budget does not allow that.
         """
         if plan.refusal:
@@ -94,7 +95,7 @@ class SimulatedPropagator(ScenePropagator):
         self.scene, self.method, self.spacing = plan.scene, plan.method, plan.spacing
         self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
         self.plan, self._store, self._coarser = plan, store or Store(), tuple(others)
-        self._may_look = may_look
+        self._may_look, self._logged = may_look, set() if logged is None else logged
 
     def __repr__(self) -> str:
         settings = f"{self.method}, spacing {1e3 * self.spacing:.4g} mm, steady to {self.tolerance:g}"
@@ -116,7 +117,7 @@ class SimulatedPropagator(ScenePropagator):
 
     @cached_property
     def _notices(self) -> Notices:
-        return Notices(self.simulation)
+        return Notices(self.simulation, self._logged)
 
     @property
     def runs(self) -> list[Run]:
@@ -282,10 +283,9 @@ def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
     plan = first_plan(pilot, budget.is_unlimited)
     if plan.refusal:
         raise ValueError(f"tolerance: {tolerance}; its first grid has {plan.refusal}")
-    others: list[Simulation] = []
-    may_look = budget.is_unlimited
+    others, logged, may_look = list[Simulation](), set[str](), budget.is_unlimited
     while True:
-        begin, propagator = time.perf_counter(), SimulatedPropagator(plan, store, others, may_look)
+        begin, propagator = time.perf_counter(), SimulatedPropagator(plan, store, others, may_look, logged)
         comparison = propagator._compared(with_error=bool(others))
         error, (shape, rigid_error) = comparison.error, comparison.lasting_errors
         taken = time.perf_counter() - begin
@@ -310,8 +310,8 @@ def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
             known = f"estimated error {error:.2g}"
             if not others:
                 known = f"error not estimated, which takes a second grid (usually {grid_error:.2g})"
-            cells = 1e3 * plan.spacing
-            logger.warning("time or memory end at %.3g mm: %s, tolerance %g", cells, known, tolerance)
+            text = "time or memory end at %.3g mm: %s, tolerance %g"
+            logger.warning(text, 1e3 * plan.spacing, known, tolerance)
             return propagator
         may_look = budget.is_unlimited or budget.fits(finer.halved, plan, taken)
         _log_cost(plan, ahead, taken, grid_error, budget, is_second=len(others) == 1)
