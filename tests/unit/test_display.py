@@ -13,6 +13,7 @@ from autdtorch.objectives.objective import SimulatedObjective
 from autdtorch.objectives.perturbations import Noise
 from autdtorch.plot.style import ShownFigure
 from autdtorch.propagators import make_propagator
+from autdtorch.scene.obstacles import Sphere
 from autdtorch.study.results import MethodResult, Provenance, SceneResult, SceneSimulation, StudyResult
 
 
@@ -42,6 +43,11 @@ def test_reprs_are_short_and_hold_no_tensors(objective: SimulatedObjective, resu
         assert len(repr(thing)) < 200  # characters, two lines of a console
         assert "tensor(" not in repr(thing)
     assert repr(box) == "SimulatedPropagator(scene 'scene', box, spacing 2 mm, steady to 0.002, 0 runs)"
+    ball = Sphere((12e-3, 12e-3, 12e-3), 2e-3, rigid=True)
+    waves = [repr(make_propagator(small_scene((body,)), "tmatrix", 2e-3)) for body in (ball, CUBE)]
+    assert "exact waves" in waves[0]
+    assert "spacing" not in waves[0]
+    assert "spacing 2 mm" in waves[1]
 
 
 def test_tables_tell_what_was_reached_and_figures_show_themselves(results: StudyResult) -> None:

@@ -80,7 +80,8 @@ class TMatrixPropagator(ScenePropagator):
         self._make_box = make_box or functools.partial(SimulatedPropagator, plan.on_grids, self._store)
 
     def __repr__(self) -> str:
-        settings = f"tmatrix, spacing {1e3 * self.spacing:.4g} mm, waves left out at {self.tolerance:g}"
+        cells = f"spacing {1e3 * self.spacing:.4g} mm" if self.plan.runs else "exact waves"
+        settings = f"tmatrix, {cells}, waves left out at {self.tolerance:g}"
         return f"TMatrixPropagator(scene {self.scene.name!r}, {settings})"
 
     def for_scene(self, scene: Scene, bodies: TMatrixCluster | None = None) -> TMatrixPropagator:
