@@ -27,11 +27,11 @@ from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.moving import angles_of
 from autdtorch.scene.scene import Scene
 from autdtorch.study.folder import drive_files
-from autdtorch.study.results import StudyResult, summary_rows, with_prefixes
+from autdtorch.study.results import MethodResult, StudyResult, summary_rows, with_prefixes
 from autdtorch.study.run_study import run_study
 from autdtorch.study.study_method import StudyMethod, name_of
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.text import counted
+from autdtorch.utils.text import counted, in_digits
 from autdtorch.utils.units import angles
 from autdtorch.utils.validation import (
     finite_vector,
@@ -181,20 +181,25 @@ def _save_drives(results: StudyResult, scenes: Mapping[str, Scene], folder: Path
 
 def _draw_plane(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> None:
     from autdtorch.plot.plane_maps import plot_plane
-    from autdtorch.plot.style import TITLE_SIZE, readable, wrapped
+    from autdtorch.plot.style import readable
 
     ((name, scene),) = scenes.items()
     (result,) = results.scenes.values()
     ((label, method),) = result.methods.items()
     if method.plane_pressure is not None and scene.observation_plane is not None:
         seen = scene.observation_plane, scene.control_points, scene.obstacles
-        figure = plot_plane(method.plane_pressure, *seen, reflectors=scene.reflectors)
-        score = result.in_unit(f"{float(method.solution.score[method.shown_trial]):.3g}")
-        median = ", of a median trial" if method.trials > 1 else ""
-        lines = f"{readable(name)}, {label_of(label)}", f"{goal_label(result.goal)} {score}{median}"
-        width = figure.get_figwidth() - 1.0  # without the colour bar
-        figure.axes[0].set_title("\n".join(wrapped(line, width) for line in lines), fontsize=TITLE_SIZE)
+        score = result.in_unit(in_digits(float(method.solution.score[method.shown_trial]), 3))
+        title = f"{readable(name)}, {label_of(label)}\n{goal_label(result.goal)} {score}{_shown_of(method)}"
+        figure = plot_plane(method.plane_pressure, *seen, reflectors=scene.reflectors, title=title)
         figure.savefig(folder / "plane.png")
+
+
+def _shown_of(method: MethodResult) -> str:
+    """Return which of its trials is shown, for a title; nothing of a single one."""
+    if method.trials == 1:
+        return ""
+    which = "median" if method.trials % 2 else "one next to the median"
+    return f", {which} of {method.trials} trials"
 
 
 def _draw_poses(results: StudyResult, poses: Poses, folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -20,6 +21,9 @@ from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.reflectors import Reflector, are_in_front
 from autdtorch.utils.array_types import REAL, Array
+from autdtorch.utils.validation import ArrayLike, points_tensor
+
+logger = logging.getLogger(__name__)
 
 _AXIS_TOLERANCE = 1e-12  # deviation from 1 of the coordinate of a unit vector along x, y or z
 _OUTLINE_CELLS = 400  # samples along the longer side of a plane, to outline obstacles
@@ -121,11 +125,26 @@ def coordinates_in(plane: Plane, points: torch.Tensor) -> torch.Tensor:
     return torch.where(along_axis, points[:, axes], (points - points.new_tensor(plane.center)) @ sides.T)
 
 
+def points_for_map(name: str, points: ArrayLike | None, plane: Plane, cells: int) -> torch.Tensor | None:
+    """Return points (P, 3) [m] after checking them; log those that a map of so many cells does not circle."""
+    if points is None:
+        return None
+    points = points_tensor(name, points)
+    if missed := int((~_are_near(plane, points, cells)).sum()):
+        text = "%s: %d of %d are more than a cell off the plane, and not circled"
+        logger.warning(text, name, missed, len(points))
+    return points
+
+
+def _are_near(plane: Plane, points: torch.Tensor, cells: int) -> torch.Tensor:
+    """Return which points (P, 3) [m] are less than one cell off a plane, of so many cells a longer side."""
+    height = (points - points.new_tensor(plane.center)) @ points.new_tensor(plane.normal)
+    return height.abs() < max(plane.size) / cells
+
+
 def _circle_points(ax: Axes, plane: Plane, points: torch.Tensor, cells: int) -> None:
-    """Circle the `points` (P, 3) [m] that are less than one cell away from the plane."""
-    center = points.new_tensor(plane.center)
-    near = ((points - center) @ points.new_tensor(plane.normal)).abs() < max(plane.size) / cells
-    coordinates = coordinates_in(plane, points[near])
+    """Circle the `points` (P, 3) [m] that are on the map."""
+    coordinates = coordinates_in(plane, points[_are_near(plane, points, cells)])
     style: Any = {"marker": "o", "ms": 9, "mfc": "none", "mec": "white", "mew": 1.2, "linestyle": "none"}
     outline = [withStroke(linewidth=2.6, foreground="black")]
     ax.plot(*(MM * coordinates.T.cpu().numpy()), path_effects=outline, **style)

@@ -17,7 +17,7 @@ from autdtorch.hardware.camera.picture import Picture
 from autdtorch.plot import data
 from autdtorch.plot.colours import FLOOR
 from autdtorch.plot.data import MM, ByMethod, largest, outside_on_plane, plane_magnitude, require_each
-from autdtorch.plot.plane_axes import coordinates_in, draw_plane
+from autdtorch.plot.plane_axes import coordinates_in, draw_plane, points_for_map
 from autdtorch.plot.style import TICK_SIZE, label_of, new_figure, readable, set_ticks, styled, wrapped
 from autdtorch.scene.geometry import Plane, cell_centers_of
 from autdtorch.scene.obstacles import Obstacle
@@ -31,7 +31,6 @@ from autdtorch.utils.validation import (
     invalid,
     members,
     not_negative,
-    points_tensor,
     real_tensor,
     require_kind,
 )
@@ -63,6 +62,7 @@ def plot_plane(
     vmax: float | None = None,
     reference: float | None = None,
     reflectors: Iterable[Reflector] = (),
+    title: str = "",
 ) -> Figure:
     """Plot the pressure magnitude on a plane over the coordinates along its edges.
 
@@ -72,7 +72,7 @@ def plot_plane(
     Args:
         pressure: complex pressure or its magnitude (Nu, Nv) [Pa], at `plane.points(...)`.
         plane: the plane.
-        control_points: (P, 3) [m]; those in the plane are circled.
+        control_points: (P, 3) [m]; those in the plane are circled, others are logged.
         obstacles: obstacles, masked and outlined in the plane.
         ax: axes to draw into; by default those of a new figure.
         decibels: True for the level 20 lg(|p| / reference) [dB] instead of |p| [Pa].
@@ -82,6 +82,7 @@ def plot_plane(
             can be compared.
         reflectors: reflectors, drawn where they cross the plane, hatched on their backs; cells behind are
             grey.
+        title: lines above the map, broken where they are wider.
 
     Raises:
         ValueError: an argument of another shape or out of range, `pressure` of 0 everywhere with `decibels`
@@ -93,7 +94,8 @@ def plot_plane(
     obstacles, decibels = members("obstacles", obstacles, Obstacle), boolean("decibels", decibels)
     walls = members("reflectors", reflectors, Reflector)
     values = outside_on_plane(plane_magnitude("pressure", pressure), plane, obstacles, walls)
-    points = None if control_points is None else points_tensor("control_points", control_points)
+    points = points_for_map("control_points", control_points, plane, max(values.shape))
+    require_kind("title", title, str)
     if decibels:
         zero = data.zero_level(reference, "pressure", values)
         limits, unit = _limits(vmin, vmax, FLOOR, 0.0, "dB"), "dB"
@@ -112,6 +114,7 @@ def plot_plane(
     figure = cast(Figure, ax.get_figure(root=True))
     mesh = draw_plane(ax, values, plane, points, (obstacles, walls), size)
     mesh.set_clim(*limits)
+    ax.set_title("\n".join(wrapped(line, width) for line in title.splitlines()))
     length, across = size if flat else (height, width)
     shape: Any = {"orientation": "horizontal" if flat else "vertical", "extend": _beyond([values], limits)}
     shape |= {"aspect": length / _BAR, "fraction": _BAR / across, "pad": 0.5 * _BAR / across}
@@ -242,7 +245,7 @@ def _checked(
             require_each(name, of_scenes, pressure)
     scenes = {}
     for scene, fields in pressure.items():
-        plane, points = planes[scene], None
+        plane = planes[scene]
         require_kind(f"planes[{scene!r}]", plane, Plane)
         bodies = () if obstacles is None else members(f"obstacles[{scene!r}]", obstacles[scene], Obstacle)
         walls = () if reflectors is None else members(f"reflectors[{scene!r}]", reflectors[scene], Reflector)
@@ -250,8 +253,8 @@ def _checked(
         for method, field in fields.items():
             magnitude = plane_magnitude(f"pressure[{scene!r}][{method!r}]", field)
             magnitudes[method] = outside_on_plane(magnitude, plane, bodies, walls)
-        if control_points is not None:
-            points = points_tensor(f"control_points[{scene!r}]", control_points[scene])
+        of_scene = None if control_points is None else control_points[scene]
+        points = points_for_map(f"control_points[{scene!r}]", of_scene, plane, max(magnitude.shape))
         scenes[scene] = _SceneMaps(plane, magnitudes, points, bodies, walls)
     return scenes
 

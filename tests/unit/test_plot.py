@@ -54,10 +54,15 @@ def test_plane_axes_carry_the_name_of_the_real_axis(normal: tuple[int, int, int]
     assert [ax.get_xlabel(), ax.get_ylabel()] == [f"{name} [mm]" for name in AXES[normal]]
 
 
-def test_points_in_the_plane_are_circled_and_obstacles_outlined_where_it_cuts_them() -> None:
+def test_points_in_the_plane_are_circled_and_obstacles_outlined_where_it_cuts_them(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     points = [80e-3, 30e-3, 45e-3], [60e-3, 30e-3, 45e-3]  # the second is not in the plane
     spheres = [at.Sphere((x, 45e-3, 38e-3), 10e-3, rigid=True) for x in (80e-3, 95e-3)]  # nor is this
-    ax = plot_plane(np.ones((6, 4)), PLANE, points, spheres).axes[0]
+    ax = plot_plane(np.ones((6, 4)), PLANE, points, spheres, title="a line\n" + 30 * "word ").axes[0]
+    assert "control_points: 1 of 2 are more than a cell off the plane" in caplog.text
+    assert ax.get_title().startswith("a line\nword")
+    assert max(map(len, ax.get_title().splitlines())) < 60
     (circles,) = ax.get_lines()
     np.testing.assert_allclose(circles.get_xydata(), [[30.0, 45.0]])
     (outline,) = (artist for artist in ax.collections if isinstance(artist, ContourSet))
