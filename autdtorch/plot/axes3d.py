@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,6 +15,7 @@ from autdtorch.utils.array_types import Array
 
 TextSize = Callable[[str], tuple[float, float]]
 """Width and height of a text in the picture."""
+_Ticks = tuple[list[float], int]  # places along an axis, and the decimals of their labels
 
 # Sides of the box with the edges that have the labels of x, y and z; 0 is the lower side, 1 the upper one.
 # The viewer is at low x, low y and high z.
@@ -121,8 +123,8 @@ class _Texts:
         self.labels.append(Label(text, point, corner))
         return True
 
-    def ticks(self, axis: int, low: float, high: float) -> tuple[list[float], int]:
-        """Return ticks along an axis whose labels do not overlap, and their decimals."""
+    def ticks(self, axis: int, low: float, high: float) -> _Ticks:
+        """Return ticks along an axis whose labels do not overlap."""
         length = np.abs(self._view[:, axis]) * (high - low)
 
         def fits(text: str, intervals: float) -> bool:
@@ -135,13 +137,12 @@ def _at_scale(
     lower: Array, upper: Array, view: Array, scale: float, size: TextSize, titles: Sequence[str]
 ) -> BoxAxes:
     """Return the axes of a box at a scale."""
-    centre, ticks = (lower + upper) / 2, []
+    centre = (lower + upper) / 2
     texts = _Texts(centre, scale * view, size)
+    ticks = _alike([texts.ticks(axis, lower[axis], upper[axis]) for axis in range(3)], lower, upper)
     offsets = np.array(_OFFSETS)
     edges = np.where(_EDGES, upper, lower)  # a point of each edge with labels
-    for axis, edge in enumerate(edges):
-        places, decimals = texts.ticks(axis, lower[axis], upper[axis])
-        ticks.append(places)
+    for axis, (edge, (places, decimals)) in enumerate(zip(edges, ticks, strict=True)):
         for place in places:
             name = f"{place:.{decimals}f}".replace("-", "\N{MINUS SIGN}")
             texts.place(name, np.where(np.arange(3) == axis, place, edge), offsets[axis], _APART)
@@ -152,4 +153,16 @@ def _at_scale(
         next(offset for offset in steps if texts.place(title, middle, offset, 2 * _APART))
     boxes, drawn = np.array(texts.boxes), scale * (_corners(lower, upper) - centre) @ view.T
     low, high = np.minimum(boxes[:, 0].min(0), drawn.min(0)), np.maximum(boxes[:, 1].max(0), drawn.max(0))
-    return BoxAxes(tuple(ticks), texts.labels, scale, low, high)
+    return BoxAxes(tuple(places for places, _ in ticks), texts.labels, scale, low, high)
+
+
+def _alike(ticks: Sequence[_Ticks], lower: Array, upper: Array) -> list[_Ticks]:
+    """Return the ticks at the widest step of all, along each axis that is long enough for it."""
+    steps = [(places[1] - places[0], digits) for places, digits in ticks if len(places) > 1]
+    step, decimals = max(steps, default=(math.inf, 0))
+    alike = []
+    for axis, (places, digits) in enumerate(ticks):
+        first, last = math.ceil(lower[axis] / step - 1e-9), math.floor(upper[axis] / step + 1e-9)
+        wide = [step * count for count in range(first, last + 1)]
+        alike.append((wide, decimals) if len(wide) > 1 else (places, digits))
+    return alike

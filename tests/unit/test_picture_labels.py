@@ -205,6 +205,10 @@ def test_labels_of_a_box_are_clear_and_at_their_ticks(
     assert {"x [mm]", "y [mm]", "z [mm]"} <= {label.text for label in axes.labels}
     for axis, ticks in enumerate(axes.ticks):
         assert all(lower[axis] - 1e-6 <= tick <= upper[axis] + 1e-6 for tick in ticks)
+    step = max((ticks[1] - ticks[0] for ticks in axes.ticks if len(ticks) > 1), default=np.inf)
+    for axis, ticks in enumerate(axes.ticks):
+        if np.floor(upper[axis] / step) > np.ceil(lower[axis] / step):  # two ticks of that step fit
+            np.testing.assert_allclose(np.diff(ticks), step)
 
 
 @few
