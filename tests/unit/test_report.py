@@ -323,19 +323,21 @@ def test_the_findings_name_the_best_method_its_share_of_the_bound_and_what_obsta
         "three_cubes": {"lssg": 2.0, "bayes_opt": 7.0, "gabs": 6.0},
     }
     winners, nearness, cost, claims = findings(scored(results, scores), judge_claims(results))
-    assert all(text in winners for text in ("8 Pa in homogeneous", "7 Pa in three_cubes", "by BO"))
+    assert all(text in winners for text in ("8.00 Pa in homogeneous", "7.00 Pa in three_cubes", "by BO"))
     assert "70.0 to 80.0\N{NO-BREAK SPACE}%" in nearness
     assert "12\N{NO-BREAK SPACE}% lower in three_cubes" in cost  # 12.5 %, rounded to even
     assert "LSSG loses most, 60\N{NO-BREAK SPACE}%" in cost
     assert "11 claims" in claims
     scores["three_cubes"] |= {"gabs": 6.99}
     assert "by BO and GABS" in findings(scored(results, scores), [])[0]
+    assert "rank" not in winners
+    assert "do not rank" in findings(scored(studied(BOTH, trials=1), scores), [])[0]
 
 
 def test_findings_of_one_method_are_no_comparison_and_of_many_scenes_count_them():
     results = scored(studied({"a": scene(obstacles=(CUBE,))}), {"a": {"gabs": 4.0}})
     winners, nearness, cost = findings(results, judge_claims(results))
-    assert "4 Pa in a" in winners
+    assert "4.00 Pa in a" in winners
     assert "best" not in winners
     assert "40.0\N{NO-BREAK SPACE}%" in nearness
     assert "not known" in cost

@@ -12,6 +12,7 @@ from autdtorch.study.report.claims import Claim, Verdict
 from autdtorch.study.report.tables import competitors, median_score
 from autdtorch.study.results import SceneResult, StudyResult, in_percent
 from autdtorch.study.statistics import has_shares
+from autdtorch.utils.text import in_digits
 
 MOST_NAMED = 4  # scenes, groups or gaps that a sentence names; more are counted
 
@@ -83,17 +84,18 @@ def _winners(results: StudyResult, best: Mapping[str, _Best]) -> str:
     if rest := sum(len(groups[labels]) for labels in largest_first[MOST_NAMED:]):
         parts.append(f"by other methods in {rest} more scenes")
     kind = f"{'best ' if len(every) > 1 else ''}{'median ' if median else ''}score"
-    return f"For the goal {goal}, the {kind} is {'; '.join(parts)}."
+    single = "" if median or len(every) == 1 else " Single trials do not rank methods with random choices."
+    return f"For the goal {goal}, the {kind} is {'; '.join(parts)}.{single}"
 
 
 def _scores(names: Sequence[str], scenes: Mapping[str, SceneResult], best: Mapping[str, _Best]) -> str:
     """Return the best scores of scenes, or the number of scenes and the range of the scores."""
     if len(names) <= MOST_NAMED:
-        return _in_scenes({name: scenes[name].in_unit(f"{best[name].score:.3g}") for name in names})
+        return _in_scenes({name: scenes[name].in_unit(in_digits(best[name].score, 3)) for name in names})
     where = f"in {len(names)} of {len(scenes)} scenes"
     if any(not _comparable(scenes[name], scenes[names[0]]) for name in names):
         return f"reached {where}"
-    low, high = (f"{edge(best[name].score for name in names):.3g}" for edge in (min, max))
+    low, high = (in_digits(edge(best[name].score for name in names), 3) for edge in (min, max))
     return f"{low} to {scenes[names[0]].in_unit(high)} {where}"
 
 

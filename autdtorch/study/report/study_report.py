@@ -20,6 +20,7 @@ from autdtorch.plot.plane_maps import plot_planes
 from autdtorch.plot.scene_figure import plot_scene
 from autdtorch.plot.trials import plot_convergence, plot_trials
 from autdtorch.plot.view3d import rendering_problem, view3d
+from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.scene import Scene
 from autdtorch.study.folder import TRIALS_FILE
 from autdtorch.study.report import alt_texts, tables
@@ -112,6 +113,7 @@ def _markdown(
         room=tables.room_rows(scenes),
         foci=with_foci(results),
         reflecting=any(scene.reflectors for scene in scenes.values()),
+        of_points=any((radii_of(scene.array) == 0).any() for scene in scenes.values()),
         planes=_draw_planes(results, scenes, folder, "fig2", shown),
         alike=[label_of(name) for name in counts if name not in shown],
         alike_planes=_draw_planes(
@@ -287,7 +289,7 @@ def _draw_costs(results: StudyResult, folder: Path) -> list[str]:
             }
             for name, scene in scenes.items()
         }
-        file, time = _numbered("fig4", pictures), "median time of the search [s per trial]"
+        file, time = _numbered("fig4", pictures), "median search time [s]"
         plot_pareto(points, time, label, higher_is_better=True).savefig(folder / file)
         pictures.append(picture(file, alt_texts.of_costs(scenes)))
     return pictures
