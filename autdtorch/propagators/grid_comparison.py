@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from autdtorch.fdtd.grid_errors import (
+    edge_errors,
     errors_by_grids,
     grid_errors,
     reading_errors,
@@ -58,8 +59,8 @@ class GridComparison:
         """The estimated relative error of the whole matrix; infinite without other grids."""
         if not self.others:
             return math.inf
-        reading = self._reading_errors * sizes(self.result.matrix, self.free)
-        known = float(self._errors(_as_row) + reading.norm() / sizes(*self._whole))
+        near = self._near_errors * sizes(self.result.matrix, self.free)
+        known = float(self._errors(_as_row) + near.norm() / sizes(*self._whole))
         return math.hypot(known, self._settling_error)
 
     @property
@@ -69,7 +70,7 @@ class GridComparison:
         matrix = self.result.matrix
         size = sizes(matrix, self.free)
         settling = torch.where(matrix.any(dim=1), self._settling_error * matrix.norm() / size, 0.0)
-        return torch.hypot(self._errors(lambda rows: rows) + self._reading_errors, settling)
+        return torch.hypot(self._errors(lambda rows: rows) + self._near_errors, settling)
 
     @property
     @one_library_thread()
@@ -108,10 +109,12 @@ class GridComparison:
         ratio, share = spacing / self.plan.spacing, self.plan.spacing / self.plan.law.wavelength
         return displacement_error(self.result.resonances, other.resonances, ratio, share)
 
-    @property
-    def _reading_errors(self) -> torch.Tensor:
-        plan, nodes = self.plan, self.plan.scene.array.nodes.positions
-        return reading_errors(self.result.matrix, self.free, self.points, nodes, plan.region, plan.spacing)
+    @cached_property
+    def _near_errors(self) -> torch.Tensor:
+        """The errors (P,) of points, and by sources, beside surfaces and edges."""
+        plan, places = self.plan, (self.points, self.plan.scene.array.nodes.positions)
+        settings = self.result.matrix, self.free, *places, plan.region, plan.spacing
+        return reading_errors(*settings) + edge_errors(*settings)
 
     def _errors(self, form: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
         """Return the errors of the rows of the matrices in a form: by grids, shapes and rigid bodies.

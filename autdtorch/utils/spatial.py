@@ -130,14 +130,33 @@ def mean_thickness(vertices: Array, triangles: Index) -> float:
     return 2 * volume / area
 
 
-def edge_length(vertices: Array, triangles: Index) -> float:
-    """Return the length of the edges between faces of a surface, vertices (V, 3) [m], triangles (T, 3)."""
+def edges_of(vertices: Array, triangles: Index, most: float = _FLAT) -> Array:
+    """Return the ends (E, 2, 3) [m] of the edges between faces of a surface, (V, 3) [m] and (T, 3).
+
+    The cosine of the angle between the normals of the two faces is less than `most`.
+    """
     joined = distinct_rows(np.round(vertices / LENGTH_TOLERANCE).astype(np.int64))[1][triangles]
     pairs, normals = paired_sides(joined), doubled_normals(vertices[triangles])
     normals /= np.maximum(np.linalg.norm(normals, axis=1), np.finfo(float).tiny)[:, None]
     one, other = normals[pairs.T % len(triangles)]
-    ends = vertices[sides_of(triangles)[pairs[np.einsum("ij,ij->i", one, other) < _FLAT, 0]]]
+    ends: Array = vertices[sides_of(triangles)[pairs[np.einsum("ij,ij->i", one, other) < most, 0]]]
+    return ends
+
+
+def edge_length(vertices: Array, triangles: Index) -> float:
+    """Return the length of the edges between faces of a surface, vertices (V, 3) [m], triangles (T, 3)."""
+    ends = edges_of(vertices, triangles)
     return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum())
+
+
+def places_along(ends: Array, step: float) -> Array:
+    """Return places (n, 3) [m] along lines between ends (E, 2, 3) [m], at most a `step` [m] apart."""
+    along = ends[:, 1] - ends[:, 0]
+    counts = np.maximum(np.ceil(np.linalg.norm(along, axis=1) / step), 1).astype(np.int64)
+    line = np.repeat(np.arange(len(ends)), counts)
+    number = np.arange(len(line)) - np.repeat(counts.cumsum() - counts, counts)
+    places: Array = ends[line, 0] + ((number + 0.5) / counts[line])[:, None] * along[line]
+    return places
 
 
 def extents(vertices: Array) -> Array:

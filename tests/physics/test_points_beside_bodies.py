@@ -1,0 +1,101 @@
+"""Errors claimed of points and sources beside surfaces and edges."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_scenes import AIR, matrix_of_sphere, relative_error, small_scene
+
+import autdtorch as at
+from autdtorch.fdtd.grid_errors import reading_errors
+from autdtorch.propagators import make_propagator
+from autdtorch.propagators.plan import region_of
+from autdtorch.scene.geometry import rotation_matrix
+from autdtorch.scene.obstacles import Sphere
+
+CENTER, RADIUS = (12.2e-3, 11.9e-3, 12.1e-3), 3.3e-3
+RIGID = Sphere(CENTER, RADIUS, rigid=True)
+HEAVY = Sphere(CENTER, RADIUS, density=10 * AIR.density, sound_speed=1.5 * AIR.sound_speed)
+EMPTY = small_scene()
+
+
+@settings(max_examples=3)
+@given(st.integers(0, 10**6), st.floats(1e-3, 1.0), st.floats(0.9e-3, 1.6e-3))
+def test_points_within_a_cell_of_a_rigid_sphere_err_by_no_more_than_their_claims(seed, gap, spacing):
+    """Required: three times the claims, at one point of 12 four times.
+
+    Two grids may agree there by chance: 3.5 measured a cell away, 2.0 at most at 580 points of 8 others.
+    """
+    direction = np.random.default_rng(seed).normal(size=(12, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    points = torch.from_numpy(np.array(CENTER) + (RADIUS + gap * spacing) * direction)
+    propagator = make_propagator(small_scene((RIGID,)), "box", spacing, tolerance=1e-3)
+    series = matrix_of_sphere(propagator.scene, points)
+    true = (propagator.transfer_matrix(points) - series).norm(dim=1) / series.norm(dim=1)
+    ratios = (true / propagator.point_errors(points)).sort().values
+    assert ratios[-2] < 3
+    assert ratios[-1] < 4
+
+
+@pytest.mark.parametrize(("size", "swapped"), [((3e-3, 5e-3, 7e-3), False), ((4.5e-3, 5.5e-3, 5e-3), True)])
+@pytest.mark.parametrize("material", [{"rigid": True}, {"density": 60.0, "sound_speed": 900.0}])
+def test_claims_hold_beside_faces_and_edges_along_the_grid(size, material, swapped):
+    """Required: within a factor of 3 over 24 points, or 24 sources."""
+    gaps = np.random.default_rng(0).uniform(-1, 1, (24, 3))
+    near, far = CENTER + gaps * np.array(size) / 2, EMPTY.array.positions
+    for number, place in enumerate(near):
+        axis = number % 3
+        place[axis] = CENTER[axis] + math.copysign(size[axis] / 2 + 0.1e-3, gaps[number, axis])
+    sources, points = (near, far) if swapped else (far, near)
+    array = at.TransducerArray(sources, (0, 0, 1))
+    scene = at.Scene(array, AIR, 40e3, points, (at.Box(CENTER, size, **material),))
+    matrix, error = make_propagator(scene, "box", 1.1e-3, tolerance=1e-3).transfer_matrix(return_error=True)
+    true = relative_error(matrix, make_propagator(scene, "box", 0.4e-3, tolerance=1e-3).transfer_matrix())
+    assert true / 3 < error < 3 * true
+
+
+@settings(max_examples=3)
+@given(st.integers(0, 10**6), st.floats(0.3e-3, 6e-3), st.booleans(), st.sampled_from([None, 6.0, 200.0]))
+def test_points_beside_edges_err_by_no_more_than_their_claims(seed, thickness, tilted, density):
+    """Required: at most 3 times the claims, but at 4 of 40 points; for all together 0.2 to 1.8 times.
+
+    Measured on 14 others: 2 points at most, and together 0.6 to 1.3 times. Without `edge_errors` 2 to 13
+    points, and 1.1 to 2.3 times.
+    """
+    rng = np.random.default_rng(seed)
+    angles = tuple(rng.uniform(-3, 3, 3).tolist()) if tilted else (0.0, 0.0, 0.0)
+    material = {"density": density * AIR.density, "sound_speed": 900.0} if density else {"rigid": True}
+    size = np.array([thickness, *rng.uniform(4e-3, 7e-3, 2)])
+    box = at.Box(CENTER, tuple(size), angles, **material)
+    edge = rng.choice([-0.5, 0.5], (200, 3)) * size  # places on four edges, and others around these
+    edge[:, 2] *= rng.uniform(-1, 1, 200)
+    angle, distance = rng.uniform(0, 2 * math.pi, 200), 0.3e-3 * 10 ** rng.uniform(0, 1, 200)
+    aside = np.stack([distance * np.cos(angle), distance * np.sin(angle), np.zeros(200)], axis=1)
+    points = torch.from_numpy(CENTER + (edge + aside) @ rotation_matrix(angles).numpy().T)
+    points = points[box.signed_distance(points) > 0.2e-3][:40]
+    scene = small_scene((box,))
+    propagator = make_propagator(scene, "box", 1e-3, tolerance=1e-3)
+    truth = make_propagator(scene, "box", 0.37e-3, tolerance=1e-3).transfer_matrix(points)
+    matrix, error = propagator.transfer_matrix(points, return_error=True)
+    true = (matrix - truth).norm(dim=1) / truth.norm(dim=1)
+    assert int((true > 3 * propagator.point_errors(points)).sum()) <= 4
+    assert error / 5 < relative_error(matrix, truth) < 1.8 * error
+
+
+def test_kernels_count_within_a_cell_of_surfaces_that_the_pressure_has_a_kink_at():
+    gaps = [[RADIUS + gap, 0.0, 0.0] for gap in (0.0, 0.5e-3, 1.001e-3, 9e-3)]
+    places = torch.tensor(CENTER, dtype=torch.float64) + torch.tensor(gaps, dtype=torch.float64)
+    matrix, free, far = torch.full((4, 1), 1.0), torch.full((4, 1), 2.0), places[3:]
+    as_dense = replace(HEAVY, density=AIR.density)
+    for body in (RIGID, HEAVY, as_dense):
+        region = region_of(small_scene((body,)))
+        read = reading_errors(matrix, free, places, far[:, None], region, 1e-3)
+        driven = reading_errors(matrix.mT, free.mT, far, places[:, None], region, 1e-3)
+        assert read.any() == driven.any() == (body is not as_dense)
+        assert read[1] == pytest.approx(float(read[0]) / 2)
+        assert not read[2:].any()
+        assert float(driven) == pytest.approx(float(read.norm()) / 2)  # of four sources
