@@ -44,9 +44,10 @@ $(INSTALLED)-%: pyproject.toml constraints.txt | $(BIN)/python
 paper: $(INSTALLED)
 	$(BIN)/autdtorch experiment=paper $(OVERRIDES)
 
-# Once for all processes of the tests, which would each take 30 s
+# Once for all processes of the tests, which would each take 30 s for kernels and 10 s for modules
 $(VENV)/.kernels: $(wildcard autdtorch/fdtd/kernels/*.py autdtorch/methods/holography/*.py autdtorch/scene/obstacles/*.py) | $(INSTALLED)-dev
-	for dtype in float32 float64; do $(BIN)/python tests/compile_kernels.py $$dtype & done; wait
+	for dtype in float32 float64; do $(BIN)/python tests/compile_kernels.py $$dtype & done; \
+		$(BIN)/python -m pytest --collect-only -q >/dev/null; wait
 	@touch $@
 
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 8

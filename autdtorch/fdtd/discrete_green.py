@@ -14,6 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import fftn, ifftn, next_fast_len  # scipy.signal loads slowly
 
 from autdtorch.fdtd.interpolation import GridShape, Interpolation
 from autdtorch.fdtd.stencil import OFFSETS, Stencil, places_of
@@ -56,8 +57,6 @@ def field_of_kernels(
 
     The source is spread over the cells of some kernels; without any weight it has no field.
     """
-    from scipy.signal import fftconvolve  # loads slowly
-
     loud = kernels.weight != 0
     places, weight = places_of(kernels.index[loud], shape), kernels.weight[loud]
     if not len(weight):
@@ -66,8 +65,10 @@ def field_of_kernels(
     density = np.zeros(high - low + 1)
     np.add.at(density, tuple((places - low).T), weight)
     near = np.asarray(((cells >= low - _BESIDE) & (cells <= high + _BESIDE)).all(axis=1))
-    wave = fftconvolve(_green_around(stencil, *(high - low + _BESIDE).tolist()), density, mode="valid")
-    return near, np.asarray(wave[tuple((cells[near] - low + _BESIDE).T)])
+    field = _green_around(stencil, *(high - low + _BESIDE).tolist())
+    lengths = [next_fast_len(length) for length in field.shape]
+    wave = ifftn(fftn(field, lengths) * fftn(density, lengths))  # not wrapped from the density's size on
+    return near, np.asarray(wave[tuple((cells[near] - low + _BESIDE + density.shape - 1).T)])
 
 
 @lru_cache(maxsize=8)

@@ -102,8 +102,8 @@ def climbed(goal: GoalFunction, matrix: torch.Tensor, drive: torch.Tensor, steps
         weights = slope_of(goal, pressure.abs(), smoothing)
         slope = _product(weights * pressure.sgn(), back)
         slope = slope / slope.abs().mean(dim=-1, keepdim=True).clamp_min(_TINY)
-        velocity = _MOMENTUM * velocity + (1 - _MOMENTUM) * slope
-        drive = drive + step * velocity
+        velocity = slope.lerp(velocity, _MOMENTUM)
+        drive = drive.add(velocity, alpha=step)
         drive = drive / drive.abs().clamp_min(1)
     return drive
 

@@ -113,7 +113,7 @@ class WeakestFocus(Goal):
         temperature = (smoothing * levels.mean(dim=-1, keepdim=True)).clamp_min(
             torch.finfo(levels.dtype).tiny
         )
-        return self.levels(torch.softmax(-levels * (1 / temperature), dim=-1))
+        return self.levels(torch.softmax(levels / -temperature, dim=-1))
 
     def bound(self, G: ArrayLike) -> float:
         """Return the bound [Pa], for few foci nearly attained; see `Goal.bound`."""

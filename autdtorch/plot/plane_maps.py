@@ -262,6 +262,8 @@ def _checked(
 def _rows_of_maps(scenes: Mapping[str, _SceneMaps], vmin: float | None, vmax: float | None) -> Figure:
     """Plot a row for each method and a column for each scene, as `plot_planes` does."""
     every = [maps.magnitudes for maps in scenes.values()]
+    peaks = [max(map(data.largest, magnitudes.values())) for magnitudes in every]
+    ends = [_limits(vmin, vmax, 0.0, peak, "Pa") for peak in peaks]
     methods = data.methods_of(every)
     full = all(method in magnitudes for method in methods for magnitudes in every)
     alike = full and len({maps.plane for maps in scenes.values()}) == 1
@@ -282,8 +284,9 @@ def _rows_of_maps(scenes: Mapping[str, _SceneMaps], vmin: float | None, vmax: fl
         len(heights), len(widths), squeeze=False, height_ratios=heights, width_ratios=widths
     )
     shown: list[tuple[QuadMesh, Collection[Array], float]] = []
-    for column, size, width, (scene, maps) in zip(axes.T, sizes, widths, scenes.items(), strict=True):
-        limits = _limits(vmin, vmax, 0.0, max(map(data.largest, maps.magnitudes.values())), "Pa")
+    for column, size, width, limits, (scene, maps) in zip(
+        axes.T, sizes, widths, ends, scenes.items(), strict=True
+    ):
         mesh = _draw_column(column[:-1], maps, methods, size, limits)
         column[0].set_title(wrapped(readable(scene), width), weight="bold")
         shown.append((mesh, maps.magnitudes.values(), width))

@@ -122,24 +122,26 @@ def plot_poses(
         raise ValueError(f"places: shape {along.shape}; must be (poses,)")
     require_kind("xlabel", xlabel, str)
     require_kind("ylabel", ylabel, str)
-    (width, height), looks = _POSES, looks_of(data)
-    figure = style.new_figure(width, height)
-    ax = figure.subplots()
     for method, values in data.items():
         if len(values) != len(along):
             raise ValueError(f"scores[{method!r}]: {len(values)} poses; must be {len(along)}, as places")
-        ax.plot(along, np.median(values, axis=1), color=looks[method].colour, label=label_of(method))
-        ax.fill_between(
-            along, values.min(axis=1), values.max(axis=1), color=looks[method].colour, alpha=0.2, linewidth=0
-        )
+    limits: Array | None = None
     if bounds is not None:
-        limits: Array = magnitude_tensor("bounds", bounds).detach().cpu().numpy()
+        limits = magnitude_tensor("bounds", bounds).detach().cpu().numpy()
         if limits.shape != along.shape:
             raise ValueError(f"bounds: shape {limits.shape}; must be {along.shape}, as places")
         if np.isnan(limits).any():
             raise ValueError("bounds: nan; must be numbers, or infinite where none is known")
-        if np.isfinite(limits).any():
-            ax.plot(along, limits, "k:", label="bound")
+    (width, height), looks = _POSES, looks_of(data)
+    figure = style.new_figure(width, height)
+    ax = figure.subplots()
+    for method, values in data.items():
+        ax.plot(along, np.median(values, axis=1), color=looks[method].colour, label=label_of(method))
+        ax.fill_between(
+            along, values.min(axis=1), values.max(axis=1), color=looks[method].colour, alpha=0.2, linewidth=0
+        )
+    if limits is not None and np.isfinite(limits).any():
+        ax.plot(along, limits, "k:", label="bound")
     ax.set(xlabel=style.wrapped(xlabel, width - 1.0), ylabel=style.wrapped(ylabel, height - 1.0))
     style.begin_at_zero(ax)
     ax.tick_params(labelsize=TICK_SIZE)

@@ -314,8 +314,8 @@ def test_a_job_logs_one_line_of_cells_runs_error_and_seconds(run, capsys, monkey
         assert run(*given) == 0  # finished before
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("re-using sphere from ")
-    assert run(*given, "hydra.verbose=autdtorch", "seed=1") == 0
-    assert "transfer matrix" in capsys.readouterr().err
+        assert run(*given, "hydra.verbose=autdtorch", "seed=1") == 0
+        assert "transfer matrix" in capsys.readouterr().err
 
 
 def test_solver_settings_are_the_defaults_of_make_propagator():
@@ -325,10 +325,15 @@ def test_solver_settings_are_the_defaults_of_make_propagator():
     assert OmegaConf.to_container(OmegaConf.load(CONFIGS / "solver" / "default.yaml")) == defaults
 
 
-@pytest.mark.parametrize("bench", ["autd3", "emulated", "openmpd", "sonicsurface", "ultraino"])
+BENCHES = ["autd3", "emulated", "openmpd", "sonicsurface", "ultraino"]
+SENSORS = sorted(path.stem for path in (CONFIGS / "hardware" / "sensor").glob("*"))
+
+
+@pytest.mark.parametrize("bench", BENCHES)
 def test_every_bench_has_the_same_keys(bench):
+    """Sensors and benches are files of their own: each with one of the others, and all with the emulator."""
     device = "sonicsurface" if bench == "emulated" else bench
-    for sensor in sorted(path.stem for path in (CONFIGS / "hardware" / "sensor").glob("*")):
+    for sensor in SENSORS if bench == "emulated" else SENSORS[BENCHES.index(bench) :][:1]:
         words = (f"hardware={bench}", f"hardware/sensor={sensor}", "hardware.limits.amplitude=1")
         where = ("hardware.sensor.path=x",) if sensor == "file" else ()
         section = composed(*words, f"hardware.device={device}", *where)["hardware"]

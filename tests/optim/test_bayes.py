@@ -95,7 +95,7 @@ def test_foci_find_the_maximum_and_reach_the_goal_of_a_user(make_objective, rand
     assert 0.98 * highest < solution.score.item() <= highest * (1 + 1e-6)
 
 
-@pytest.mark.parametrize(("transducers", "evaluations", "seed"), [(6, 24, 1), (8, 21, 2)])
+@pytest.mark.parametrize(("transducers", "evaluations", "seed"), [(6, 18, 1), (8, 21, 2)])
 def test_the_last_drive_is_the_best_of_the_fitted_matrix(
     make_objective, random_matrix, transducers, evaluations, seed
 ):

@@ -84,7 +84,7 @@ def test_no_drive_scores_above_the_bound(random_matrix, number, points, transduc
 def test_gradient_ascent_comes_near_the_bounds(random_matrix):
     # median gaps of 1.3 to 5.7 % were measured: 16 transducers cannot always reach the relaxation
     gaps = []
-    for seed in range(5):
+    for seed in range(3):
         matrix, generator = random_matrix(4, 16, seed), torch.Generator().manual_seed(seed)
         for goal in (at.WeakestFocus([1, 2, 1, 1]), at.QuietPoints(at.WeakestFocus(), [3], DB30)):
             drive = climb(goal, matrix, random_drives(16, 16, generator), 300)

@@ -18,7 +18,7 @@ from benchmarks.known_algorithms import ALGORITHMS, Losses
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_an_algorithm_brings_four_transducers_into_phase_within_its_budget(make_objective, name):
     objective = make_objective(torch.ones(1, 4, dtype=torch.complex128))
-    fewest, most = (40, 80) if name == "TuRBO" else (100, 160)  # TuRBO ends with a small region
+    fewest, most = (20, 40) if name == "TuRBO" else (100, 160)  # TuRBO ends with a small region
     losses = Losses(objective, at.WeakestFocus(), most)
     with torch.random.fork_rng():
         drive = answer(ALGORITHMS[name], losses, seed=1, noisy=False)

@@ -163,8 +163,9 @@ def test_the_amount_of_a_variant_is_identified(make_objective, random_matrix):
     assert knowing > 0.99 * best
 
 
-@pytest.mark.parametrize("factor", [1e-4, 1e4])
-@pytest.mark.parametrize("method", [at.identify, partial(at.bayes_opt, fixed_transducer=0, **FOCI)])
+@pytest.mark.parametrize(
+    ("method", "factor"), [(at.identify, 1e-4), (partial(at.bayes_opt, fixed_transducer=0, **FOCI), 1e4)]
+)
 def test_a_sensor_in_other_units_costs_nothing(make_objective, random_matrix, method, factor):
     simulated = random_matrix(3, 8, 2)
     objective = make_objective(factor * deviating(simulated, 1))

@@ -35,12 +35,11 @@ def test_steps_determine_the_rows_up_to_a_phase(make_objective, random_matrix, t
 
 def test_twice_as_many_evaluations_as_transducers_reach_the_best_drive(make_objective, random_matrix):
     """Nothing but the reference's darkest focus limits the first round; the second steps around loud foci."""
-    for seed in range(3):
-        objective = make_objective(random_matrix(4, 60, seed))
-        best = at.gradient_ascent(objective).score
-        share = [at.phase_stepping(objective, rounds, trials=5).score / best for rounds in (1, 2)]
-        assert share[0].median() > 0.95  # a climb of 16 starts is within 1 % of 32 starts
-        assert share[1].min() > 0.97
+    objective = make_objective(random_matrix(4, 60, 0))
+    best = at.gradient_ascent(objective).score
+    share = [at.phase_stepping(objective, rounds, trials=5).score / best for rounds in (1, 2)]
+    assert share[0].median() > 0.95  # a climb of 16 starts is within 1 % of 32 starts
+    assert share[1].min() > 0.97
     assert objective.evaluations == 1 + 5 * (2 * 60 + 2 + 4 * 60 + 3)
 
 
@@ -48,7 +47,7 @@ def test_further_rounds_help_under_noise(make_objective, random_matrix):
     objective = make_objective(random_matrix(3, 40, 0))
     shares = []
     for rounds in (1, 4):
-        drive = at.phase_stepping(at.Noise(objective, 15.0), rounds, trials=9).drive
+        drive = at.phase_stepping(at.Noise(objective, 15.0), rounds, trials=5).drive
         shares.append(at.true_pressure(objective, drive).amin(dim=1).median())
     assert shares[1] > 1.1 * shares[0]
 

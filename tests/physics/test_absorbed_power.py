@@ -69,7 +69,7 @@ def test_power_is_what_flows_through_a_sphere_around_the_body(reflection):
     reflectors = [] if reflection is None else [at.Reflector(*FLOOR, reflection)]
     matched = at.Sphere(BALL.center, 5e-3, impedance=1.0)
     scene = scene_of(monopole((25e-3, 10e-3, 10e-3)), [matched], reflectors)
-    propagator = at.make_propagator(scene, "box", 1e-3, tolerance=1e-4)
+    propagator = at.make_propagator(scene, "box", 1.5e-3, tolerance=1e-4)
     power = propagator.absorbed_power(unit(1)).obstacles
     directions = at.sphere_points((0.0, 0.0, 0.0), 1.0, 600)
     half, radius = 0.02e-3, 14e-3

@@ -35,7 +35,7 @@ def ball(radius, ratios):
 
 
 @pytest.mark.parametrize("sphere", [RIGID, HEAVY], ids=["rigid", "heavy"])
-@pytest.mark.parametrize(("method", "spacing"), [("full", 1.8e-3), ("full", 1.1e-3), ("box", 1e-3)])
+@pytest.mark.parametrize(("method", "spacing"), [("full", 1.8e-3), ("box", 1e-3)])
 def test_the_estimate_is_honest(sphere, method, spacing):
     """Required: within a factor of 3 of the true error, or above it."""
     scene = small_scene((sphere,))

@@ -261,8 +261,13 @@ def test_tilted_walls_with_an_impedance_reflect_as_they_should(impedance, incide
 
 
 # stiff, massive and resonant with the air before the face, whose mass and stiffness add to those of two cells
-@pytest.mark.parametrize("impedance", [1.0, 0.1, 1e-3, 0.3j, 0.05 + 0.4j, 0.7j, -0.3j, 0.01 - 1j])
-@pytest.mark.parametrize("place", [0.1, 0.5, 0.9])
+@pytest.mark.parametrize(
+    ("impedance", "place"),
+    [
+        (1.0, 0.1), (0.1, 0.5), (1e-3, 0.9), (0.3j, 0.1),
+        (0.05 + 0.4j, 0.5), (0.7j, 0.9), (-0.3j, 0.1), (0.01 - 1j, 0.5),
+    ],
+)  # fmt: skip
 def test_faces_along_the_grid_are_passive_and_stable(impedance, place):
     shape = Box((place * 1e-3,) * 3, (2.4e-3, 1.9e-3, 2.1e-3), rigid=True)
     region = region_of_bodies(Body(shape, None, impedance=impedance))

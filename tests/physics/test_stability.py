@@ -189,7 +189,7 @@ def test_energy_is_symmetric_positive_and_bounded(number):
     assert_not_negative(largest * sparse.eye_array(matrix.shape[0]) - matrix, largest)
 
 
-@pytest.mark.parametrize("number", SCENES[::2])
+@pytest.mark.parametrize("number", SCENES[::3])
 def test_random_scenes_are_stable(number, caplog, monkeypatch):
     trial = replace(draw_trial(0, number, long_share=1.0), steps=500)
     caplog.set_level(logging.ERROR)

@@ -104,8 +104,11 @@ def fine_matrix(material):
 
 # measured for the dense cube 2.2 and 1.7 %; with a second transducer 2.1 and 1.6 %, and without finite
 # elements at the edges 3.7 and 2.2 %
-@pytest.mark.parametrize("rotation", TILTS[1:])
-@pytest.mark.parametrize(("material", "bound"), [(RIGID, 0.015), (DENSE, 0.019)], ids=["rigid", "dense"])
+@pytest.mark.parametrize(
+    ("rotation", "material", "bound"),
+    [(TILTS[1], RIGID, 0.015), (TILTS[2], DENSE, 0.019)],
+    ids=["rigid", "dense"],
+)
 def test_on_a_grid_that_is_not_turned_a_tilted_cube_converges(rotation, material, bound):
     coarse, finer = (
         relative_error(

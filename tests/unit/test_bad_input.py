@@ -5,6 +5,7 @@ from collections import UserList, deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -65,14 +66,21 @@ class Accepted(Exception):
     """All arguments were checked; nothing needs to be drawn or simulated."""
 
 
+def unfitted(_: Callable[..., Any], start: np.ndarray, **__: Any) -> SimpleNamespace:
+    """The solution of a fit: where it starts."""
+    return SimpleNamespace(x=start)
+
+
 @pytest.fixture(autouse=True)
 def the_checks_are_all(monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(*_: Any, **__: Any) -> None:
         raise Accepted
 
-    monkeypatch.setattr("autdtorch.plot.plane_maps.draw_plane", stop)
+    monkeypatch.setattr("autdtorch.plot.style.ShownFigure", stop)
+    monkeypatch.setattr("autdtorch.plot.plane_maps.draw_plane", stop)  # into axes of the user
     monkeypatch.setattr("autdtorch.plot.view3d.require_rendering", stop)
     monkeypatch.setattr(explore, "require_rendering", stop)
+    monkeypatch.setattr("autdtorch.hardware.camera.registration.least_squares", unfitted)
     monkeypatch.setattr("autdtorch.propagators.propagator.are_shown", stop)
     monkeypatch.setattr("autdtorch.propagators.differentiable.recorded", stop)
     monkeypatch.setattr("autdtorch.methods.run.show_progress", stop)

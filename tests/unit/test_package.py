@@ -1,5 +1,6 @@
 """The package: cost of the import, content of a wheel, docstrings with shapes and units."""
 
+import functools
 import graphlib
 import inspect
 import json
@@ -160,14 +161,16 @@ def public_members():
                         yield f"{name}.{key}", function
 
 
-MEMBERS = dict(public_members())
+@functools.cache
+def members():
+    return dict(public_members())
 
 
 def written(thing):
     """Return the docstring of a thing with those that it refers to."""
     doc = inspect.getdoc(thing) or ""
     for other in re.findall(r"(?:see|as for) `([\w.]+)`", doc):
-        doc += f"\n\n{inspect.getdoc(MEMBERS.get(other))}"
+        doc += f"\n\n{inspect.getdoc(members().get(other))}"
     return doc
 
 
@@ -199,12 +202,12 @@ def described(thing):
         yield "return", signature.return_annotation, doc
 
 
-@pytest.mark.parametrize("name", MEMBERS)
-def test_docstrings_give_shapes_and_units(name):
+def test_docstrings_give_shapes_and_units():
     wrong = []
-    for part, annotation, text in described(MEMBERS[name]):
-        if ARRAYS.search(str(annotation)) and not SHAPE.search(text):
-            wrong.append(f"{part}: no shape in {text!r}")
-        if QUANTITY.search(str(annotation)) and part in UNIT_OF and f"[{UNIT_OF[part]}]" not in text:
-            wrong.append(f"{part}: no [{UNIT_OF[part]}] in {text!r}")
+    for name, member in members().items():
+        for part, annotation, text in described(member):
+            if ARRAYS.search(str(annotation)) and not SHAPE.search(text):
+                wrong.append(f"{name}, {part}: no shape in {text!r}")
+            if QUANTITY.search(str(annotation)) and part in UNIT_OF and f"[{UNIT_OF[part]}]" not in text:
+                wrong.append(f"{name}, {part}: no [{UNIT_OF[part]}] in {text!r}")
     assert not wrong

@@ -111,7 +111,6 @@ def kinds_in(path):
 
 @pytest.mark.filterwarnings("ignore::autdtorch.utils.units.ScaleWarning")  # boards face all ways
 @given(st.lists(BOARDS, min_size=1, max_size=3))
-@settings(max_examples=15, deadline=None)
 def test_arrays_keep_their_form_and_their_bits(tmp_path_factory, boards):
     array = functools.reduce(operator.add, [board(0.5 * number) for number, board in enumerate(boards)])
     scene = at.Scene(array, at.Medium.air(20.0), 40e3, [(0.03, 0.01, 3.0)])
@@ -176,7 +175,7 @@ def require_equal(loaded, saved):
 
 
 @given(OBSTACLES, st.booleans())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20)
 def test_a_saved_scene_is_the_one_that_is_loaded(tmp_path_factory, obstacle, plane):
     scene = scene_with(obstacle, plane)
     path = tmp_path_factory.mktemp("saved") / "scene.yaml"
