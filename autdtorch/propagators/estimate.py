@@ -15,7 +15,7 @@ from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stepping import assemble, drive_signal
 from autdtorch.propagators.free_space import PAIR_BYTES
 from autdtorch.propagators.plan import Plan, plan
-from autdtorch.propagators.simulated import SimulatedPropagator, first_plan, usual_plans
+from autdtorch.propagators.simulated import Aim, SimulatedPropagator, first_plan, plans_ahead
 from autdtorch.propagators.tmatrix.costs import WaveCosts
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator, placed_bodies
 from autdtorch.scene.scene import Scene
@@ -148,7 +148,7 @@ def _plans_by_tolerance(pilot: Plan) -> list[Plan]:
     loose = replace(first.at(first.spacing, _PILOT_TOLERANCE), runs=len(some))
     if not first.refusal and loose.work / _rate_of(loose) < _PILOT_SECONDS:
         usual = SimulatedPropagator(loose).usual_error(some)
-    return usual_plans(first, usual, pilot.tolerance)
+    return [first, *plans_ahead(first, usual, 0, Aim(pilot.tolerance))]
 
 
 def _rate_of(planned: Plan) -> float:

@@ -8,12 +8,13 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
+from autdtorch.fdtd.resonances import Extrapolation
 from autdtorch.propagators.absorbed_power import AbsorbedPower
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.free_space import PAIR_BYTES
@@ -25,7 +26,7 @@ from autdtorch.propagators.propagator import ScenePropagator
 from autdtorch.propagators.simulation import PressureMap, Run, Simulation
 from autdtorch.propagators.store import Store
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.array_types import COMPLEX, REAL, device_of
+from autdtorch.utils.array_types import COMPLEX, device_of
 from autdtorch.utils.process import cached_property, one_library_thread, require_memory
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import ArrayLike, invalid
@@ -79,6 +80,7 @@ class SimulatedPropagator(ScenePropagator):
         tolerance: relative distance to the steady state at which a run ends.
         max_periods: periods after which a run ends in any case, with a `SteadyStateWarning`.
         plan: the plan.
+        extrapolation: of all pressures, from the last other grid and the plan's; None if none is sure.
     """
 
     def __init__(
@@ -96,6 +98,7 @@ class SimulatedPropagator(ScenePropagator):
         self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
         self.plan, self._store, self._coarser = plan, store or Store(), tuple(others)
         self._may_look, self._logged = may_look, set() if logged is None else logged
+        self.extrapolation: Extrapolation | None = None
 
     def __repr__(self) -> str:
         settings = f"{self.method}, spacing {1e3 * self.spacing:.4g} mm, steady to {self.tolerance:g}"
@@ -103,7 +106,11 @@ class SimulatedPropagator(ScenePropagator):
 
     def for_scene(self, scene: Scene) -> SimulatedPropagator:
         """Return the propagator of a changed scene, with these settings."""
-        return SimulatedPropagator(self.plan.of(scene), self._store)
+        last = self._coarser[-1:] if self.extrapolation else ()
+        others = [simulation_of(each.plan.of(scene), self._store) for each in last]
+        changed = SimulatedPropagator(self.plan.of(scene), self._store, others)
+        changed.extrapolation = self.extrapolation
+        return changed
 
     def coarser(self, factor: float) -> SimulatedPropagator:
         """Return the propagator of the scene with cells larger by a factor, at most the coarsest allowed."""
@@ -121,10 +128,7 @@ class SimulatedPropagator(ScenePropagator):
 
     @property
     def runs(self) -> list[Run]:
-        """All simulations in order.
-
-        A run in several boxes counts as one; symmetry images and loaded matrices take none.
-        """
+        """All simulations in order: in several boxes one, for symmetry images and loaded matrices none."""
         return self.simulation.runs
 
     @property
@@ -150,11 +154,10 @@ class SimulatedPropagator(ScenePropagator):
     @one_library_thread()
     def _matrix(self, points: ArrayLike | None, with_error: bool) -> tuple[torch.Tensor, float]:
         comparison = self._compared(points, with_error)
-        matrix = comparison.result.matrix
-        self._notices.of_cavities(comparison.points, matrix)
+        self._notices.of_cavities(comparison.points, comparison.matrix)
         if points is None:
-            self._notices.of_faint_points(matrix, comparison.free)
-        return matrix, comparison.error if with_error else 0.0
+            self._notices.of_faint_points(comparison.matrix, comparison.free)
+        return comparison.matrix, comparison.error if with_error else 0.0
 
     def point_errors(self, points: ArrayLike | None = None) -> torch.Tensor:
         """Return the estimated relative error of each point's row of the transfer matrix, float64 (P,).
@@ -181,7 +184,8 @@ class SimulatedPropagator(ScenePropagator):
     def _compared(self, points: ArrayLike | None = None, with_error: bool = False) -> GridComparison:
         """Simulate points, by default the control points; for their errors also on other grids."""
         places = self._places(points)
-        grids = self._others if with_error else ()  # a grid that is refused is so before the first run
+        # a grid that is refused is so before the first run
+        grids = self._others if with_error else self._coarser[-1:] if self.extrapolation else ()
         result = self.simulation.transfer_matrix(places)
         others = [(grid.transfer_matrix(places), grid.plan.spacing) for grid in grids]
         every = [result, *(other for other, _ in others)]
@@ -191,7 +195,7 @@ class SimulatedPropagator(ScenePropagator):
         if with_error:
             self._notices.of_ringing(max(each.periods for each in every))
             missed = self._missed(places, every)
-        return GridComparison(self.plan, places, result, others, missed)
+        return GridComparison(self.plan, places, result, others, missed, self.extrapolation)
 
     def _missed(self, points: torch.Tensor, results: Sequence[PressureMap]) -> torch.Tensor:
         """Return which points (P, 3) are silent in all results, but open to the air on cells half as large.
@@ -219,28 +223,29 @@ class SimulatedPropagator(ScenePropagator):
         rows = len(self.scene.array) if by_matrix else len(flat)
         require_memory("points", tuple(points.shape), PAIR_BYTES * rows * len(points))
         field = torch.zeros((len(flat), len(points)), **COMPLEX)
+        result = PressureMap(field.mT)
         if by_matrix:
-            result = self.simulation.transfer_matrix(points)
+            result = self._extrapolated(lambda simulation: simulation.transfer_matrix(points))
             field = flat @ result.matrix.mT
         elif loud.any():
-            result = self.simulation.fields(flat[loud], points)
+            result = self._extrapolated(lambda simulation: simulation.fields(flat[loud], points))
             field[loud] = result.matrix.mT
-        else:
-            result = PressureMap(field.mT)
         warn_of_unsettled(result.runs, self.tolerance)
         if not is_picture:
             self._notices.of_cavities(points, result.matrix)
         return field.reshape(*drive.shape[:-1], len(points))
 
+    def _extrapolated(self, simulated: Callable[[Simulation], PressureMap]) -> PressureMap:
+        """Return what a simulation gives, extrapolated where the propagator is."""
+        result = simulated(self.simulation)
+        if self.extrapolation is None:
+            return result
+        coarser = simulated(self._coarser[-1])
+        return replace(result, matrix=self.extrapolation.of(result.matrix, coarser.matrix))
+
     @one_library_thread()
     def _absorbed(self, drive: torch.Tensor) -> AbsorbedPower:
-        loud = drive.any(dim=1)
-        counts = len(self.scene.obstacles), len(self.scene.reflectors)
-        power = AbsorbedPower(*(torch.zeros((len(drive), count), **REAL) for count in counts))
-        if loud.any():
-            for whole, part in zip(power, self._absorbing.absorbed_power(drive[loud]), strict=True):
-                whole[loud] = part
-        return power
+        return self._absorbing.absorbed_power(drive)
 
     @cached_property
     def _absorbing(self) -> Simulation:
@@ -273,26 +278,31 @@ def simulation_of(plan: Plan, store: Store) -> Simulation:
     return (DomainSimulation if plan.method == "full" else BoxSimulation)(plan, store)
 
 
-def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
+def refined(pilot: Plan, budget: Budget, store: Store, extrapolates: bool = True) -> SimulatedPropagator:
     """Return the propagator of a plan, at a spacing whose estimated error is within its tolerance.
 
-    Where the budget does not suffice, it is the finest that fits. Where the surface of an obstacle is not
-    known well enough, it is one that does not add to that error. Warnings name the error.
+    Where the budget does not suffice, it is the finest that fits, and where the surface of an obstacle is not
+    known well enough, one that does not add to that error; warnings name it. It `extrapolates` by a resonance
+    that makes the difference of two grids, unless bodies absorb power, which only grids tell.
     """
     tolerance = pilot.tolerance
     plan = first_plan(pilot, budget.is_unlimited)
     if plan.refusal:
         raise ValueError(f"tolerance: {tolerance}; its first grid has {plan.refusal}")
     others, logged, may_look = list[Simulation](), set[str](), budget.is_unlimited
+    extrapolates &= not (pilot.scene.reflectors or any(each.is_lossy for each in pilot.scene.obstacles))
     while True:
         begin, propagator = time.perf_counter(), SimulatedPropagator(plan, store, others, may_look, logged)
         comparison = propagator._compared(with_error=bool(others))
+        if others and extrapolates:
+            comparison = comparison.extrapolated
+            propagator.extrapolation = comparison.extrapolation
         error, (shape, rigid_error) = comparison.error, comparison.lasting_errors
         taken = time.perf_counter() - begin
         if rigid_error > _RIGID_SHARE * tolerance:
             logger.debug("obstacles as rigid leave an error of %.2g: their materials count", rigid_error)
-            return refined(pilot.with_materials, budget, store)
-        aim = _Aim(tolerance, shape, shape + rigid_error)
+            return refined(pilot.with_materials, budget, store, extrapolates)
+        aim = Aim(tolerance, shape, shape + rigid_error)
         grid_error = error - aim.known if others else comparison.usual_error
         if others:
             if aim.is_met(grid_error, len(others)):
@@ -302,14 +312,13 @@ def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
             if not math.isfinite(error):
                 reason = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
                 raise ValueError(f"max_periods: {plan.max_periods}; {reason}")
-        ahead = _plans_ahead(plan, grid_error, len(others), aim)
+        ahead = plans_ahead(plan, grid_error, len(others), aim)
         finer, (_, coarsest) = ahead[0], _next_spacings(plan)
         if not budget.fits(finer, plan, taken):
             finer = plan.fitted(coarsest, coarsest)
         if not budget.fits(finer, plan, taken):
-            known = f"estimated error {error:.2g}"
-            if not others:
-                known = f"error not estimated, which takes a second grid (usually {grid_error:.2g})"
+            usual = f"error not estimated, which takes a second grid (usually {grid_error:.2g})"
+            known = f"estimated error {error:.2g}" if others else usual
             text = "time or memory end at %.3g mm: %s, tolerance %g"
             logger.warning(text, 1e3 * plan.spacing, known, tolerance)
             return propagator
@@ -329,13 +338,8 @@ def first_plan(pilot: Plan, is_unlimited: bool = True) -> Plan:
     return settled.fitted(spacing, spacing)
 
 
-def usual_plans(first: Plan, usual: float, tolerance: float) -> list[Plan]:
-    """Return the plans of a choice from the `first` on, if its grids have their `usual` error."""
-    return [first, *_plans_ahead(first, usual, 0, _Aim(tolerance))]
-
-
 @dataclass(frozen=True)
-class _Aim:
+class Aim:
     """The tolerance, and the errors of uncertain surfaces and of all that no grid lowers, in it."""
 
     tolerance: float
@@ -355,7 +359,7 @@ class _Aim:
         return plan.fitted(min(max(wanted, finest), coarsest), coarsest)
 
 
-def _plans_ahead(plan: Plan, grid_error: float, others: int, aim: _Aim) -> list[Plan]:
+def plans_ahead(plan: Plan, grid_error: float, others: int, aim: Aim) -> list[Plan]:
     """Return the finer plans, at least one, that a choice takes after a grid if errors fall as expected.
 
     The error of the first grid, without `others`, is the usual one.
@@ -377,10 +381,7 @@ def _next_spacings(plan: Plan) -> tuple[float, float]:
 def _log_cost(
     plan: Plan, ahead: Sequence[Plan], taken: float, error: float, budget: Budget, is_second: bool
 ) -> None:
-    """Log the time that the grids `ahead` take, after the last one `taken` [s]: more loudly the longer it is.
-
-    Only the second grid warns: in the first one's time is the start of kernels, and later ones repeat it.
-    """
+    """Log the time of the grids `ahead` after one that took `taken` [s]; the first also starts kernels."""
     seconds = taken * sum(each.work for each in ahead) / plan.work
     is_long = is_second and seconds > _LONG and budget.seconds is None
     logger.log(
