@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 import pyvista
 import torch
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from small_scenes import AIR, relative_error, small_scene
 
+from autdtorch.fdtd.grid import Grid
+from autdtorch.fdtd.stepping import assemble_on
 from autdtorch.propagators import make_propagator
 from autdtorch.propagators.grid_comparison import GridComparison
-from autdtorch.propagators.plan import plan
+from autdtorch.propagators.plan import plan, region_of
 from autdtorch.propagators.simulation import PressureMap
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.checks import OverlapWarning
@@ -120,6 +122,23 @@ def test_a_ball_beside_a_closed_room_opens_no_wall(method):
     scene = small_scene([*room(0.05e-3), ball])
     points = with_points(scene, CENTER)
     assert not make_propagator(scene, method, SPACING, 1e-3).transfer_matrix(points)[-1].any()
+
+
+@settings(max_examples=10)
+@given(st.floats(0.1, 0.8), st.floats(0.01, 0.99))
+def test_a_slit_that_no_plane_of_cells_is_in_opens_no_room_beside_it(width, share):
+    """The bodies beside the slit are assembled as a heavy fluid, which no sound in the room may pass."""
+    cells, (x, y, z) = Grid(SPACING, (18,) * 3, (-5.5e-3,) * 3, 0.7, 6, 0.0), CENTER
+    slit = SPACING * (np.floor(x / SPACING) + 0.5 + share * (1 - width) + np.array([0.0, width]))
+    assume(np.abs(slit / SPACING - np.round(slit / SPACING - 0.5) - 0.5).min() > 1e-4)
+    ends = (x - 5e-3, slit[0]), (slit[1], x + 5e-3)
+    bars = [Box(((low + high) / 2, y, z - 8e-3), (high - low, 10e-3, 2e-3), rigid=True) for low, high in ends]
+    region = region_of(small_scene([*bars, *room(1e-3)]))
+    assembly = assemble_on(cells, region, torch.float32, None)
+    assert assembly.is_enclosed(torch.tensor([CENTER], dtype=torch.float64)).all()
+    beside = slit.mean() / SPACING + 5.5
+    columns = np.ravel_multi_index((int(beside) + np.arange(2), [17] * 2, [9] * 2), cells.shape)
+    assert not np.isin(columns, assembly.heterogeneous.rigid).any()
 
 
 @pytest.mark.parametrize("half", [4e-3, 20e-3])

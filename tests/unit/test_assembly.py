@@ -312,7 +312,8 @@ def test_a_gap_without_a_plane_of_cells_is_one_whatever_planes_others_have_in_it
         (9, 2, 2),
         lambda cells: ((cells[..., 0] < begin) | (cells[..., 0] > end)).astype(np.int64),
     )
-    assert walls.closes_gap(np.array([False, True])) == (math.floor(begin) == math.floor(end))
+    beside = walls.beside_gaps(np.array([False, True]))
+    assert beside.tolist() == ([1] if math.floor(begin) == math.floor(end) else [])
 
 
 def corner(place):

@@ -126,20 +126,24 @@ class MaterialBlocks:
         """Mask (3, k, l, m) of the kinds of elements that vary along each axis."""
         return np.stack([varies(self.material, self.planes, axis) for axis in range(3)])
 
-    def closes_gap(self, closed: NDArray[np.bool_]) -> bool:
-        """Return whether a gap between blocks of `closed` materials (m,) has no plane of vertices in it.
+    def beside_gaps(self, closed: NDArray[np.bool_]) -> Index:
+        """Return which of `closed` materials (m,) are beside gaps between these without a plane of vertices.
 
-        Planes of bodies elsewhere may divide it.
+        Planes of bodies elsewhere may divide a gap.
         """
-        of_blocks = closed[self.material]
+        beside = np.zeros(len(closed), bool)
         for axis, planes in enumerate(self.planes):
-            ends = np.concatenate(([-np.inf], planes.places, [np.inf]))
-            blocks = np.moveaxis(of_blocks, axis, 2)
-            begin = np.maximum.accumulate(np.where(blocks, ends[1:], -np.inf), axis=2)
-            end = np.minimum.accumulate(np.where(blocks, ends[:-1], np.inf)[..., ::-1], axis=2)[..., ::-1]
-            if (~blocks & (end - begin > _LEAST_GAP) & (np.floor(begin) == np.floor(end))).any():
-                return True
-        return False
+            blocks = np.moveaxis(self.material, axis, 2)
+            walls, number = closed[blocks], np.arange(blocks.shape[2])
+            before = np.maximum.accumulate(np.where(walls, number, -1), axis=2)
+            after = np.minimum.accumulate(np.where(walls, number, len(number))[..., ::-1], axis=2)[..., ::-1]
+            begin = np.append(planes.places, [math.inf, -math.inf])[before]
+            end = np.append(-math.inf, np.append(planes.places, math.inf))[after]
+            narrow = ~walls & (end - begin > _LEAST_GAP) & (np.floor(begin) == np.floor(end))
+            row, column, _ = np.nonzero(narrow)
+            for side in (before, after):
+                beside[blocks[row, column, side[narrow]]] = True
+        return np.flatnonzero(beside)
 
     def over_elements(self, of_kinds: AnyArray) -> AnyArray:
         """Return the values (nx, ny, nz) of all elements, from values (k, l, m) of their kinds."""

@@ -82,9 +82,11 @@ class Elements:
 def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
     """Return the material of every element, set by the last body there, and the interface elements."""
     bodies, materials = unions_of(region, grid, stencil)
-    blocks = _blocks(bodies, grid)
-    if blocks.closes_gap(materials.rigid & ~materials.reacting):
-        return elements_of(_with_heavy(region, grid.spacing), grid, stencil)
+    blocks = _blocks_of_bodies(bodies, grid)
+    hard = (materials.rigid & ~materials.reacting)[np.append(0, _materials_of_shapes(bodies))]
+    if len(walls := blocks.beside_gaps(hard)):
+        bodies, materials = unions_of(_with_heavy(region, walls - 1), grid, stencil)
+    blocks = replace(blocks, material=np.append(0, _materials_of_shapes(bodies))[blocks.material])
     bodies = measured(bodies, grid.spacing)
     material, cut, beside = _measured(bodies, grid)
     material = np.where(beside, material, blocks.over_elements(blocks.at_centers.astype(np.int16)))
@@ -103,19 +105,15 @@ def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
     return Elements(materials, material, every[order], kind[order], interface)
 
 
-def _with_heavy(region: Region, spacing: float) -> Region:
-    """Return the region with rigid bodies along a grid of a spacing [m] of a heavy fluid.
+def _with_heavy(region: Region, some: Index) -> Region:
+    """Return the region with some of its bodies of a heavy fluid, by their indices (k,).
 
     Cells of rigid bodies hold no sound. Beside a gap between centres of cells, those of a fluid hold what is
     in the gap.
     """
-    heavy, axes = Fluid(_HEAVY * region.fluid.inertia, region.fluid.phase_speed), np.eye(3)
-    bodies = [
-        replace(body, fluid=heavy)
-        if body.fluid is None and body.impedance is None and body.is_along(axes, spacing)
-        else body
-        for body in region.bodies
-    ]
+    heavy, bodies = Fluid(_HEAVY * region.fluid.inertia, region.fluid.phase_speed), list(region.bodies)
+    for index in some.tolist():
+        bodies[index] = replace(bodies[index], fluid=heavy)
     return replace(region, bodies=tuple(bodies))
 
 
@@ -135,21 +133,29 @@ def _aligned(
     return every, np.arange(len(index))
 
 
-def _blocks(bodies: Sequence[Union], grid: Grid) -> MaterialBlocks:
-    """Return the blocks of the bodies whose faces are parallel to the grid."""
-    aligned = [body for body in bodies if body.aligned]
-    faces = [np.zeros((3, 0)), *(body.faces(grid) for body in aligned)]
+def _materials_of_shapes(bodies: Sequence[Union]) -> Index:
+    """Return the material (n,) of every shape of unions, which are in the order of the region's bodies."""
+    return np.array([body.material for body in bodies for _ in body.shapes], np.int64)
 
-    def material(cells: Array) -> Index:
+
+def _blocks_of_bodies(bodies: Sequence[Union], grid: Grid) -> MaterialBlocks:
+    """Return the blocks of the bodies whose faces are parallel to the grid.
+
+    In place of materials they have the numbers of the region's bodies, from 1 on, and 0 in air.
+    """
+    parts = [part for body in bodies for part in body.parts()]
+    aligned = [(number, part) for number, part in enumerate(parts, 1) if part.aligned]
+    faces = [np.zeros((3, 0)), *(part.faces(grid) for _, part in aligned)]
+
+    def body_at(cells: Array) -> Index:
         numbers = np.zeros(cells.shape[:-1], np.int64)
-        for body in aligned:
-            for part in body.parts():
-                near = part.near(cells, grid)
-                numbers[near][part.distance(cells[near], grid) < 0] = body.material
+        for number, part in aligned:
+            near = part.near(cells, grid)
+            numbers[near][part.distance(cells[near], grid) < 0] = number
         return numbers
 
     places = [np.concatenate(along) for along in zip(*faces, strict=True)]
-    return MaterialBlocks.between(places, [cells - 1 for cells in grid.shape], material)
+    return MaterialBlocks.between(places, [cells - 1 for cells in grid.shape], body_at)
 
 
 def _measured(
@@ -157,7 +163,7 @@ def _measured(
 ) -> tuple[NDArray[np.int16], NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the material at the centre of each element, whether a surface intersects it, and a mask.
 
-    The mask has the elements beside a tilted or curved body. `_blocks` serves all others.
+    The mask has the elements beside a tilted or curved body. `_blocks_of_bodies` serves all others.
     """
     material = np.zeros([cells - 1 for cells in grid.shape], np.int16)
     cut, beside = np.zeros(material.shape, bool), np.zeros(material.shape, bool)
