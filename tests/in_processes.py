@@ -23,7 +23,7 @@ def numbers(seed: int) -> list[float]:
         scene := small_scene((CUBE,)), at.make_propagator(scene, "box", 2e-3, cache=False)
     )
     assert objective.transfer_matrix is not None
-    scores = [at.gabs(objective, trials=4, seed=seed), at.identify(objective, 20, seed=seed)]
+    scores = [at.gabs(objective, trials=4, seed=seed), at.identify(objective, 12, seed=seed)]
     return [objective.transfer_matrix.abs().sum().item(), *(each.score.sum().item() for each in scores)]
 
 

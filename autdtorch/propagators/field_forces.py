@@ -8,6 +8,8 @@ ones that it scatters. Pressures on both spheres tell them apart; the force foll
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 
@@ -25,6 +27,7 @@ from autdtorch.propagators.tmatrix.force import radiation_force
 from autdtorch.propagators.tmatrix.obstacle_groups import ObstacleGroup, bodies_of, room_around
 from autdtorch.propagators.tmatrix.propagator import TMatrixPropagator
 from autdtorch.scene.drive import validate_drive
+from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import REAL, device_of
 from autdtorch.utils.validation import ArrayLike, points_grid, real_tensor, require_kind
 
@@ -44,34 +47,48 @@ def forces_on_obstacles(propagator: Propagator, drive: torch.Tensor) -> torch.Te
     """
     scene, bodies = propagator.scene, bodies_of(propagator.scene.obstacles)
     forces = torch.full((len(scene.obstacles), 3), math.nan, **REAL)
-    for number, body in enumerate(bodies):
-        rows = list(body.numbers)
-        if isinstance(propagator, TMatrixPropagator):
-            forces[rows] = radiation_force(propagator, drive, number).detach()
-        else:
-            others = [other for other in bodies if other is not body]
-            if room_around(body.center, others, scene) > body.radius + _APART[1] * scene.wavelength:
-                forces[rows] = _force_on(propagator, drive, body)
+    if isinstance(propagator, TMatrixPropagator):
+        for number, body in enumerate(bodies):
+            forces[list(body.numbers)] = radiation_force(propagator, drive, number).detach()
+    elif spheres := [around for body in bodies if (around := _Spheres.around(body, bodies, scene))]:
+        # one simulation for all; a grid, which may be near obstacles without a warning
+        pressures = propagator.field(drive, torch.cat([each.points for each in spheres], dim=1))
+        sizes = [each.points.shape[1] for each in spheres]
+        for each, pressure in zip(spheres, torch.split(pressures, sizes, dim=1), strict=True):
+            forces[list(each.body.numbers)] = each.force(pressure, scene)
     return forces
 
 
-def _force_on(propagator: Propagator, drive: torch.Tensor, body: ObstacleGroup) -> torch.Tensor:
-    """Return the force (3,) [N] on a body by the pressures on two spheres around it."""
-    scene = propagator.scene
-    radii = torch.tensor([body.radius + share * scene.wavelength for share in _APART], **REAL)
-    degree = math.ceil(scene.wavenumber * float(radii[1])) + _MORE_DEGREES
-    points = body.center + radii[:, None, None] * sphere_rule(degree + 1)[0]
-    # a grid, which may be near obstacles without a warning
-    on_spheres = propagator.field(drive, points) @ to_harmonics(degree, degree + 1)  # (2, N)
-    size = scene.complex_wavenumber * radii
-    radial = regular_radial(degree, size[:, None]), outgoing_radial(degree, size).mT[:, degrees(degree)]
-    columns = torch.stack(radial, dim=-1).movedim(1, 0)  # (N, spheres, kinds)
-    scale = columns.abs().amax(dim=1, keepdim=True)
-    solved = torch.linalg.solve(columns / scale, on_spheres.mT[..., None])[..., 0] / scale[:, 0]
-    incoming, outgoing = solved[:, :1], solved[:, 1:]
-    factor = 1 / (2 * scene.medium.density * scene.angular_frequency**2)
-    force: torch.Tensor = factor * taken_up(linear_momentum, incoming, outgoing)[:, 0, 0].real
-    return force
+class _Spheres(NamedTuple):
+    """Two spheres around a body, with no other between them and it."""
+
+    body: ObstacleGroup
+    radii: torch.Tensor  # (2,) [m]
+    degree: int  # of the waves between them
+    points: torch.Tensor  # nodes (2, S, 3) [m]
+
+    @classmethod
+    def around(cls, body: ObstacleGroup, bodies: Sequence[ObstacleGroup], scene: Scene) -> _Spheres | None:
+        """Return the spheres around one of the bodies of a scene, or None where there is no room for them."""
+        radii = torch.tensor([body.radius + share * scene.wavelength for share in _APART], **REAL)
+        if room_around(body.center, [other for other in bodies if other is not body], scene) <= radii[1]:
+            return None
+        degree = math.ceil(scene.wavenumber * float(radii[1])) + _MORE_DEGREES
+        return cls(body, radii, degree, body.center + radii[:, None, None] * sphere_rule(degree + 1)[0])
+
+    def force(self, pressure: torch.Tensor, scene: Scene) -> torch.Tensor:
+        """Return the force (3,) [N] on the body from pressures (2, S) at the nodes."""
+        on_spheres = pressure @ to_harmonics(self.degree, self.degree + 1)  # (2, N)
+        size = scene.complex_wavenumber * self.radii
+        outgoing_waves = outgoing_radial(self.degree, size).mT[:, degrees(self.degree)]
+        radial = regular_radial(self.degree, size[:, None]), outgoing_waves
+        columns = torch.stack(radial, dim=-1).movedim(1, 0)  # (N, spheres, kinds)
+        scale = columns.abs().amax(dim=1, keepdim=True)
+        solved = torch.linalg.solve(columns / scale, on_spheres.mT[..., None])[..., 0] / scale[:, 0]
+        incoming, outgoing = solved[:, :1], solved[:, 1:]
+        factor = 1 / (2 * scene.medium.density * scene.angular_frequency**2)
+        force: torch.Tensor = factor * taken_up(linear_momentum, incoming, outgoing)[:, 0, 0].real
+        return force
 
 
 def radiation_stress(

@@ -220,7 +220,7 @@ def left_out(reason):
     return rule
 
 
-COARSE = "solver.spacing=2e-3"
+COARSE = "solver.spacing=2.8e-3"  # a third of a wavelength
 SHORT = f"trials=1 {COARSE} plane_spacing=4e-3"
 RULES = [
     (r"pip install ", installs),
@@ -248,7 +248,7 @@ RULES = [
         r"autdtorch calibrate ",
         covered_by("tests/cli/test_calibrate_command.py", "test_a_scene_is_calibrated"),
     ),
-    (r"autdtorch play ", runs("solver.spacing=2e-3 play.seconds=0.1")),
+    (r"autdtorch play ", runs(f"{COARSE} play.seconds=0.1")),
     (r"autdtorch ", runs(SHORT)),
     (r"python -c ", runs()),
 ]
@@ -275,7 +275,7 @@ def program(page, folder):
         for name in ("open_link", "open_scope", "FileSensor"):  # to be undone
             patch.setattr(hardware, name, getattr(hardware, name))
         for name in ("explore", "make_propagator"):  # as coarse as commands, unless the page says otherwise
-            patch.setattr(autdtorch, name, functools.partial(getattr(autdtorch, name), spacing=2e-3))
+            patch.setattr(autdtorch, name, functools.partial(getattr(autdtorch, name), spacing=2.8e-3))
         names = {"__name__": "__main__"}
         exec(compile(code, f"{page} as Python", "exec"), names)
         if "live" in names:
