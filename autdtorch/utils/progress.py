@@ -80,7 +80,7 @@ class Progress:
         if self._bar is None:
             logger.log(level, what)
         else:
-            self._bar.set_description(what)
+            self._bar.set_description_str(what)
 
     def advance(self, steps: int) -> None:
         """Count finished steps; any thread may call it.

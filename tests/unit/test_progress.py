@@ -95,6 +95,23 @@ def test_without_a_terminal_there_is_no_bar(monkeypatch, stream):
     assert not progress.is_terminal(stream)
 
 
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_bar_on_a_terminal_names_each_task(monkeypatch):
+    stream = Terminal()
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr(progress, "_PATIENCE", 0.0)
+    with progress.show_progress(2, "first") as shown:
+        shown.begin("second")
+        shown.advance(2)
+    assert "first: " in stream.getvalue()
+    assert "second: " in stream.getvalue()
+    assert ": :" not in stream.getvalue()
+
+
 @functools.cache
 def propagator_and_matrix(method):
     make = functools.partial(at.make_propagator, small_scene((CUBE,)), method, 2.5e-3, cache=False)
