@@ -136,6 +136,8 @@ def folder_of(key: str, value: object) -> Path:
     if not is_given(key) and (folder.is_absolute() or ".." in folder.parts or not folder.parts):
         accepted = f"must be below the working directory, or given on the command line, as {key}=FOLDER"
         raise ValueError(f"{key}: {value!r}; {accepted}")
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{key}: {value!r} is a file; must be a folder, or a name that is free")
     return folder
 
 
@@ -166,7 +168,7 @@ def given_readings(value: object, **settings: Any) -> Readings | None:
         with within("readings"):
             return load_readings(file, **settings)
     except FileNotFoundError as error:
-        raise invalid("readings", str(file), "there is no such file") from error
+        raise ValueError(f"readings: {str(error).removeprefix('source: ')}") from error
 
 
 def is_given(key: str) -> bool:

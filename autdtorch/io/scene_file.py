@@ -159,7 +159,7 @@ def _part(
     if isinstance(path := section.get("path"), str):
         section["path"] = str(folder / path)
     if key == "medium":
-        builder = air if section.keys() & _parameters(air).keys() else Medium
+        builder = Medium if not section or section.keys() & _parameters(Medium).keys() else air
     elif key in _BUILDERS:
         builder = _BUILDERS[key]
     elif key == "obstacle" and TARGET in section:

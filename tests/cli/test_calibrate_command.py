@@ -68,7 +68,8 @@ def test_units_changes_and_folds_are_settings(bench, run, tmp_path, capsys):
     ("words", "message"),
     [
         ("method=lssg", "method=lssg: has no effect on calibrate; give scene, readings, calibrate.KEY"),
-        ("readings=none.csv", "readings: 'none.csv'; there is no such file"),
+        ("readings=none.csv", "readings: none.csv; there is no such file"),
+        ("readings=.", "readings: trial.jsonl; there is no such file"),
         ("readings=null", "readings: None; must be a file, as in readings=trial.csv"),
         ("calibrate.prior.gain=-1", "calibrate.prior: gain: -1; must be in 1e-06 to 3"),
         ("+calibrate.prior.noise=1", "calibrate.prior: unknown key 'noise'"),

@@ -62,6 +62,8 @@ WRONG = {
     "-m  hydra.sweep.dir=a=b": r"argument 'hydra\.sweep\.dir=a=b': mismatched input",
     "seed=1,2": "Ambiguous value for argument 'seed=1,2'",
     "--config-dir  nowhere": "Additional config directory '.*nowhere' not found",
+    "scene=two_cubes  scene.control_points=[]": r"scene\.control_points: a list in place of a map.*; ~scene",
+    "output=file": "output: 'file' is a file; must be a folder",
     "output=file/below": "file/below: Not a directory",
     "experiment=paper  scene=two_cubes": "scene: given beside an experiment, .* own scenes: homog",
     "experiment=paper  scenes.two_cubes.frequency=0": r"scenes\.two_cubes: Scene\.frequency: 0 Hz",

@@ -238,6 +238,7 @@ FLAT = {"type": "box", "center": [0, 0, 0], "size": [1, 1, 0], "rigid": True}
     [
         ("obstacels", [], "unknown key 'obstacels' (did you mean 'obstacles'?); allowed keys: array, medium"),
         ("array.pich", 1, "array: unknown key 'pich' (did you mean 'pitch'?); allowed keys: shape, pitch"),
+        ("medium", {"temprature": 20}, "medium: unknown key 'temprature' (did you mean 'temperature'?)"),
         ("medium", ..., "scene mapping: missing key 'medium'; allowed keys"),
         ("array.pitch", ..., "scene mapping: array: missing key 'pitch'"),
         ("control_points.type", ..., "type: None; must be one of circle, sphere, plane, points"),
