@@ -134,20 +134,16 @@ def test_errors_of_entries_are_found_in_noise_below_them(seed, with_phase, level
 def test_a_simulation_is_corrected_by_few_readings(make_objective, random_matrix):
     """Fewer readings than unknowns of one row, which without a prior would determine nothing."""
     simulated = random_matrix(3, 12, 2)
-    shares = []
-    for seed in range(3):
-        objective = make_objective(deviating(simulated, seed))
-        best = at.gradient_ascent(objective).score
-        begin = objective(at.gradient_ascent(make_objective(simulated)).drive).amin(dim=1)
-        options = {"evaluations": 14, "prior": at.Prior(simulated), "seed": seed}
-        fitted = at.identify(Noise(objective, 30, seed=seed), **options)
-        foci = at.bayes_opt(Noise(objective, 30, seed=seed), **options, **FOCI)
-        shares.append([begin / best, *(objective(one.drive).amin(dim=1) / best for one in (fitted, foci))])
-    begin, fitted, foci = torch.tensor(shares).median(dim=0).values
-    # Measured: 0.81, 0.994 and 0.994.
-    assert begin < 0.88
-    assert fitted > 0.95
-    assert foci > 0.95
+    objective = make_objective(deviating(simulated, 2))
+    best = at.gradient_ascent(objective).score
+    uncorrected = at.gradient_ascent(make_objective(simulated))
+    options = {"evaluations": 14, "prior": at.Prior(simulated), "seed": 2}
+    fitted = at.identify(Noise(objective, 30, seed=2), **options)
+    foci = at.bayes_opt(Noise(objective, 30, seed=2), **options, **FOCI)
+    shares = [float(objective(one.drive).amin() / best) for one in (uncorrected, fitted, foci)]
+    # Measured: 0.84, 0.990 and 0.995.
+    assert shares[0] < 0.88
+    assert min(shares[1:]) > 0.95
 
 
 def test_the_amount_of_a_variant_is_identified(make_objective, random_matrix):

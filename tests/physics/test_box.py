@@ -35,8 +35,7 @@ def test_scattered_wave_of_a_sphere():
     assert relative_error(simulated(scene).transfer_matrix(far), matrix_of_sphere(scene, far)) < 0.02
 
 
-@pytest.mark.parametrize("absorption", [0.0, 40.0])
-@pytest.mark.parametrize("radius", [0.0, 1.5e-3])
+@pytest.mark.parametrize(("absorption", "radius"), [(0.0, 0.0), (40.0, 1.5e-3)])
 def test_box_and_whole_domain_agree(absorption, radius):
     """Two obstacles, points between the box and the layers; with loss, and with discs for sources."""
     plate = Box((9.3e-3, 8.2e-3, 18.1e-3), (2.2e-3, 5e-3, 3.7e-3), (0.3, 0.1, 0.2), rigid=True)
