@@ -42,7 +42,7 @@ _PAIR_STEPS, _ASSEMBLY_STEPS, _MESH_STEPS = 11.0, 60_000.0, 60_000.0
 """Time of one term of a sum over radiating cells, of the assembly of a heterogeneous cell, and of what a mesh
 adds to that."""
 
-_RUN_STEPS, _SCENE_STEPS = 4e7, 1e8
+_RUN_STEPS, _SCENE_STEPS = 4e7, 1.4e8
 """Further time of a run and of a scene."""
 
 _BESIDE, _SHARE_INSIDE = 2.0, 0.5
@@ -76,6 +76,7 @@ class Costs:
         receivers: of a run, at the most.
         terms: of the sum over radiating cells for each of them.
         meshes: whether each body is a mesh, whose distances are slow.
+        ringing: periods of a run relative to the fewest; None for the usual ones.
     """
 
     region: Region
@@ -88,6 +89,7 @@ class Costs:
     receivers: int
     terms: int
     meshes: tuple[bool, ...]
+    ringing: float | None = None
 
     @property
     def memory(self) -> float:
@@ -111,8 +113,8 @@ class Costs:
         single = _CELL_STEPS * filled.cells + _UNLIKE_STEPS * filled.unlike + _COLUMN_STEPS * filled.columns
         stepping = sum(grid.work for grid in grids) + max(grid.steps for grid in grids) * single
         # coupled boxes are stepped to looser tolerances, and empty grids have no resonances
-        ringing = USUAL_PERIODS if filled.cells and passes == 1 and self.in_boxes else 1.0
-        run = _RUN_STEPS + ringing * passes * stepping
+        usual = USUAL_PERIODS if filled.cells and passes == 1 and self.in_boxes else 1.0
+        run = _RUN_STEPS + (self.ringing or usual) * passes * stepping
         assembly = _SCENE_STEPS + _ASSEMBLY_STEPS * filled.assembled + _MESH_STEPS * filled.meshed
         echoes = sum(grid.echo_work(self.runs) for grid in grids)
         pairs = sum(grid.radiating for grid in grids) * self.terms if self.in_boxes else 0

@@ -101,10 +101,11 @@ class PlannedGrid:
     @property
     def steps(self) -> int:
         """The fewest steps of a run."""
-        return math.ceil(self._periods * self.steps_per_period)
+        return math.ceil(self.periods * self.steps_per_period)
 
     @property
-    def _periods(self) -> int:
+    def periods(self) -> int:
+        """The fewest periods of a run."""
         return fewest_periods(self.extent.path / self.part.wavelength)
 
     @property
@@ -130,7 +131,7 @@ class PlannedGrid:
 
     def echo_work(self, runs: int) -> float:
         """Return the time that these matrices take in runs."""
-        blocks = runs * USUAL_PERIODS * self._periods / _BLOCK_PERIODS
+        blocks = runs * USUAL_PERIODS * self.periods / _BLOCK_PERIODS
         return (_ECHO_MADE + _ECHO_OF_BLOCK * blocks) * self.echo_numbers
 
     @property

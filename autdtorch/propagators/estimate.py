@@ -6,6 +6,7 @@ import functools
 import math
 import time
 from dataclasses import dataclass, replace
+from statistics import mean
 
 import torch
 
@@ -31,8 +32,11 @@ _AIR_SPACING, _AIR_RIM = 1e-3, 28
 _PILOT_CELLS = 6
 """Cells per wavelength in air of the coarse grid that symmetries are found on."""
 
-_PILOT_POINTS, _PILOT_TOLERANCE, _PILOT_SECONDS = 4, 0.05, 10.0
-"""Most points whose scattered field is simulated on a first grid, where runs end, and their most time [s]."""
+_PILOT_POINTS, _PILOT_SECONDS = 4, 10.0
+"""Most points that are simulated on the first grid of a choice by tolerance, and their most time [s]."""
+
+_RINGING = 3.4
+"""Periods of runs there, relative to the fewest, from which a scene resonates: twice the usual ones."""
 
 _PAIR_SECONDS = 1e-8
 """Time [s] of a pair of a point and a transducer in free space."""
@@ -49,8 +53,9 @@ class Estimate:
         runs: number of simulations, with symmetries.
         memory: most memory in use at a time, without what is in use already [bytes].
         seconds: time on this machine, as busy as it is now [s].
-        resonates: whether sound is slower in an obstacle than in the medium. Then `seconds` is the least:
-            such obstacles may ring, which takes longer runs and by a tolerance finer grids.
+        resonates: whether sound is slower in an obstacle than in the medium, or rings on the first grid of a
+            choice by tolerance. Then `seconds` is the least: ringing takes longer runs and by a tolerance
+            finer grids.
     """
 
     method: str
@@ -105,25 +110,16 @@ def estimate(
     memory, seconds = _without_runs(planned)
     if planned.method == "free_space" or not planned.runs:
         return Estimate(planned.method, None, 0, 0, memory, seconds)
-    before: list[Plan] = []
-    if spacing is None:
-        *before, last = _plans_by_tolerance(planned.on_grids)
-        spacing = last.spacing
-        if planned.method == "tmatrix":
-            before, last = [*before, last], planned.by_waves(spacing)
-        planned = last
-    # a multiple of the spacing: a scene that is symmetric on one grid mostly is on the other
-    coarse = min(planned.region.wavelength / _PILOT_CELLS, planned.region.coarsest_spacing)
-    factor = max(1, math.floor(coarse / spacing))
-    pilot = planned.at(spacing * factor, planned.tolerance)
-    kind = TMatrixPropagator if planned.method == "tmatrix" else SimulatedPropagator
-    without_symmetries = planned.work
-    if pilot.memory < available_memory():
-        planned = replace(planned, runs=kind(pilot).planned_runs)
-    work = planned.work + planned.work / without_symmetries * sum(each.work for each in before)
-    memory, seconds = max(memory, planned.memory), seconds + work / _rate_of(planned)
+    choice = [] if spacing else _choice(planned.on_grids)
+    if choice and planned.method != "tmatrix":
+        *choice, planned = choice
+    else:
+        planned = _with_symmetries(planned if spacing else planned.by_waves(choice[-1].spacing))
+    plans = [*choice, planned]
+    memory, seconds = max(memory, *(each.memory for each in plans)), seconds + sum(map(_seconds_of, plans))
     resonates = planned.region.shortest_wavelength < planned.region.wavelength
-    return Estimate(planned.method, spacing, planned.cells, planned.runs, memory, seconds, resonates)
+    resonates |= any(each.ringing is not None and each.ringing > _RINGING for each in plans)
+    return Estimate(planned.method, planned.spacing, planned.cells, planned.runs, memory, seconds, resonates)
 
 
 def _without_runs(planned: Plan) -> tuple[float, float]:
@@ -138,24 +134,48 @@ def _without_runs(planned: Plan) -> tuple[float, float]:
     return memory + costs.memory, seconds + costs.seconds
 
 
-def _plans_by_tolerance(pilot: Plan) -> list[Plan]:
+def _with_symmetries(planned: Plan) -> Plan:
+    """Return the plan with its runs by the symmetries of a coarse grid, if that fits into memory.
+
+    Its spacing is a multiple: a scene that is symmetric on one of both grids mostly is on the other.
+    """
+    coarse = min(planned.region.wavelength / _PILOT_CELLS, planned.region.coarsest_spacing)
+    factor = max(1, math.floor(coarse / planned.spacing))
+    pilot = planned.at(planned.spacing * factor, planned.tolerance)
+    if pilot.memory >= available_memory():
+        return planned
+    kind = TMatrixPropagator if planned.method == "tmatrix" else SimulatedPropagator
+    return replace(planned, runs=kind(pilot).planned_runs)
+
+
+def _choice(pilot: Plan) -> list[Plan]:
     """Return the plans of the grids that a choice by tolerance is expected to take.
 
-    Some points are simulated on the first grid to see how much is scattered; all, if that is refused or long.
+    Some points are simulated on the first one for how much is scattered, how long that rings and what errors
+    no grid lowers. If that is refused or long, all sound is taken to be scattered. The symmetries are those
+    of the first grid.
     """
-    first, points = first_plan(pilot), pilot.scene.control_points
-    some, usual = points[:: math.ceil(len(points) / _PILOT_POINTS)], first.law.usual(first.spacing)
-    loose = replace(first.at(first.spacing, _PILOT_TOLERANCE), runs=len(some))
-    if not first.refusal and loose.work / _rate_of(loose) < _PILOT_SECONDS:
-        usual = SimulatedPropagator(loose).usual_error(some)
-    return [first, *plans_ahead(first, usual, 0, Aim(pilot.tolerance))]
+    first, points, tolerance = first_plan(pilot), pilot.scene.control_points, pilot.tolerance
+    usual, aim, runs, ringing = first.law.usual(first.spacing), Aim(tolerance), first.runs, None
+    if not first.refusal:
+        propagator, some = SimulatedPropagator(first), points[:: math.ceil(len(points) / _PILOT_POINTS)]
+        runs = propagator.planned_runs
+        if _seconds_of(replace(first, runs=min(runs, len(some)))) < _PILOT_SECONDS:
+            comparison = propagator.compared(some)
+            if comparison.needs_materials(tolerance):
+                return [replace(first, runs=runs), *_choice(pilot.with_materials)]
+            shape, rigid_error = comparison.lasting_errors
+            usual, aim = comparison.usual_error, Aim(tolerance, shape, shape + rigid_error)
+            ringing = comparison.ringing
+    plans = [first, *plans_ahead(first, usual, 0, aim)]
+    return [replace(each, runs=runs, ringing=ringing, grids=each.grouping) for each in plans]
 
 
-def _rate_of(planned: Plan) -> float:
-    """Return the steps of a cell in a second on the largest grid of a plan, about."""
+def _seconds_of(planned: Plan) -> float:
+    """Return the time [s] of the runs of a plan, by the rate of kernels on grids about as large."""
     small, large = _MEASURED_CELLS
     is_small = max(grid.cells for grid in planned.grouping.grids) < large / 2
-    return _rate(planned.kernel, planned.dtype, small if is_small else large)
+    return planned.work / _rate(planned.kernel, planned.dtype, small if is_small else large)
 
 
 @functools.cache
@@ -168,11 +188,12 @@ def _rate(kernel: str, dtype: torch.dtype, cells: int) -> float:
     sources = assembly.sources(place, torch.ones(1, **COMPLEX))
     receivers, state = assembly.receivers(place + half / 2), assembly.silence(sources)
     signal = drive_signal(assembly.steps_per_period, 0, _MEASURED_STEPS).to(dtype)
-    spent = math.inf
-    for _ in range(3):  # the first one loads the kernel
+    spent = []
+    for _ in range(3):
         begin = time.perf_counter()
         state, recorded = stepper.advance(state, assembly.coefficients, sources, receivers, signal)
         recorded.cpu()  # waits for a GPU
-        spent = min(spent, time.perf_counter() - begin)
+        spent.append(time.perf_counter() - begin)
     grid = domain_grid(region, _AIR_SPACING)
-    return grid.work / grid.steps * _MEASURED_STEPS / spent
+    # the first one loads the kernel; the mean counts what else the machine does
+    return grid.work / grid.steps * _MEASURED_STEPS / mean(spent[1:])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from statistics import mean
 
 import torch
 
@@ -24,6 +25,8 @@ from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulation import PressureMap
 from autdtorch.utils.process import cached_property, one_library_thread
 
+_RIGID_SHARE = 0.3
+"""Error of bodies taken as rigid, relative to a tolerance, from which their materials count."""
 _TINY = torch.finfo(torch.float64).tiny
 _LONGER = 1.5
 """Ratio of periods from which another grid is next to a resonance that this one is not, and is left out."""
@@ -96,6 +99,10 @@ class GridComparison:
         shape, rigid = (of(*self._whole, self.plan.region) for of in (shape_errors, rigid_errors))
         return float(shape), float(rigid)
 
+    def needs_materials(self, tolerance: float) -> bool:
+        """Return whether bodies taken as rigid leave an error that counts for a tolerance."""
+        return self.lasting_errors[1] > _RIGID_SHARE * tolerance
+
     @property
     @one_library_thread()
     def resonance_error(self) -> float:
@@ -108,6 +115,12 @@ class GridComparison:
     def usual_error(self) -> float:
         """The usual error of grids of this spacing, without any other."""
         return float(usual_errors(*self._whole, self.plan.spacing, self.plan.law))
+
+    @property
+    def ringing(self) -> float | None:
+        """Periods of a run relative to the fewest, in the mean; None without a run in a single grid."""
+        runs, grids = self.result.runs, self.plan.grouping.grids
+        return mean(run.periods for run in runs) / grids[0].periods if runs and len(grids) == 1 else None
 
     @property
     def _whole(self) -> tuple[torch.Tensor, torch.Tensor]:

@@ -66,6 +66,7 @@ class Plan:
             `plan` neglects symmetries.
         grids: the grids, and the obstacles on each; None for the cheapest. See `grouping`.
         is_short: whether runs are of `max_periods`, steady or not; see `short_runs`.
+        ringing: expected periods of a run relative to the fewest; None for the usual ones.
     """
 
     scene: Scene
@@ -80,6 +81,7 @@ class Plan:
     runs: int
     grids: Grouping | None = None
     is_short: bool = False
+    ringing: float | None = None
 
     @cached_property
     def grouping(self) -> Grouping:
@@ -151,7 +153,7 @@ class Plan:
         """A digest of everything that affects the pressure of transducers of unit strength."""
         scene = {entry.name: getattr(self.scene, entry.name) for entry in fields(self.scene)}
         settings = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        settings |= {"scene": None, "region": None, "runs": None, "dtype": str(self.dtype)}
+        settings |= {"scene": None, "region": None, "runs": None, "ringing": None, "dtype": str(self.dtype)}
         settings["grids"] = self.grouping
         rigid = [body.fluid is None for body in self.region.bodies]
         affecting = {name: part for name, part in scene.items() if name not in _NO_EFFECT}
@@ -209,6 +211,7 @@ class Plan:
             receivers=max(points, nodes * len(array)),
             terms=max(points, 2 * len(array)),  # a disc takes twice the time of a point
             meshes=tuple(isinstance(shape, Mesh) for shape in region.shapes),
+            ringing=self.ringing,
         )  # fmt: skip
 
     @property

@@ -57,9 +57,6 @@ claim 0.3 to 3 times the usual error of the finer one."""
 _SHAPE = 3.0
 """Ratio of the errors of uncertain surfaces and of the grid from which a finer grid is of no use."""
 
-_RIGID_SHARE = 0.3
-"""Error of bodies taken as rigid, relative to the tolerance, from which their materials count."""
-
 _SETTLED = 0.05
 """Distance to the steady state at which runs end, relative to the tolerance."""
 
@@ -153,7 +150,7 @@ class SimulatedPropagator(ScenePropagator):
 
     @one_library_thread()
     def _matrix(self, points: ArrayLike | None, with_error: bool) -> tuple[torch.Tensor, float]:
-        comparison = self._compared(points, with_error)
+        comparison = self.compared(points, with_error)
         self._notices.of_cavities(comparison.points, comparison.matrix)
         if points is None:
             self._notices.of_faint_points(comparison.matrix, comparison.free)
@@ -164,24 +161,20 @@ class SimulatedPropagator(ScenePropagator):
 
         Points and errors are those of `transfer_matrix`.
         """
-        return self._compared(points, with_error=True).point_errors.to(device_of(points))
+        return self.compared(points, with_error=True).point_errors.to(device_of(points))
 
     @property
     def known_error(self) -> float:
         """The error of the control points' matrix by the grids given; infinite without any."""
-        return self._compared(with_error=bool(self._coarser)).error
+        return self.compared(with_error=bool(self._coarser)).error
 
     @property
     def resonance_error(self) -> float:
         """The error of the control points' matrix by shifted resonances, relative to what is scattered."""
-        return self._compared(with_error=True).resonance_error
-
-    def usual_error(self, points: ArrayLike | None = None) -> float:
-        """Simulate points, by default the control points; return the usual error of grids of this spacing."""
-        return self._compared(points).usual_error
+        return self.compared(with_error=True).resonance_error
 
     @one_library_thread()
-    def _compared(self, points: ArrayLike | None = None, with_error: bool = False) -> GridComparison:
+    def compared(self, points: ArrayLike | None = None, with_error: bool = False) -> GridComparison:
         """Simulate points, by default the control points; for their errors also on other grids."""
         places = self._places(points)
         # a grid that is refused is so before the first run
@@ -293,13 +286,13 @@ def refined(pilot: Plan, budget: Budget, store: Store, extrapolates: bool = True
     extrapolates &= not (pilot.scene.reflectors or any(each.is_lossy for each in pilot.scene.obstacles))
     while True:
         begin, propagator = time.perf_counter(), SimulatedPropagator(plan, store, others, may_look, logged)
-        comparison = propagator._compared(with_error=bool(others))
+        comparison = propagator.compared(with_error=bool(others))
         if others and extrapolates:
             comparison = comparison.extrapolated
             propagator.extrapolation = comparison.extrapolation
         error, (shape, rigid_error) = comparison.error, comparison.lasting_errors
         taken = time.perf_counter() - begin
-        if rigid_error > _RIGID_SHARE * tolerance:
+        if comparison.needs_materials(tolerance):
             logger.debug("obstacles as rigid leave an error of %.2g: their materials count", rigid_error)
             return refined(pilot.with_materials, budget, store, extrapolates)
         aim = Aim(tolerance, shape, shape + rigid_error)

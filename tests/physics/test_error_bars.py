@@ -297,7 +297,7 @@ def test_the_second_grid_is_no_finer_than_the_usual_error_asks():
     scene = small_scene((at.Box(CENTER, (8e-3, 9e-3, 10e-3), rigid=True),))
     loose, tight = (make_propagator(scene, "box", None, tolerance) for tolerance in (0.3, 0.05))
     assert loose.spacing > 1.15 * tight.spacing
-    assert loose.usual_error() < 0.3 / 2
+    assert loose.compared().usual_error < 0.3 / 2
 
 
 def test_a_choice_ends_where_voxels_are_too_coarse(caplog):
