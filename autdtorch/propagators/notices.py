@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 
-from autdtorch.fdtd.assembly.unions import warn_of_thin_walls
+from autdtorch.fdtd.assembly.unions import warn_of_narrow_gaps, warn_of_thin_walls
 from autdtorch.fdtd.grid_axes import axes_along
 from autdtorch.fdtd.region import warn_if_coarse
 from autdtorch.propagators.plan import Plan, walls_of
@@ -105,6 +105,8 @@ def warn_of_scene(plan: Plan) -> None:
     grids: list[tuple[Sequence[int], Array]] = [(grid.group, grid.axes) for grid in plan.grouping.grids]
     if plan.method == "tmatrix":  # each body has a grid along its faces
         grids = [([body.number], axes_along([body.faces])) for body in region.bodies]
+    else:
+        warn_of_narrow_gaps(region, spacing, grids)
     warn_of_thin_walls(region, spacing, grids)
     if region.held_contrast > _SHARP:
         logger.warning(

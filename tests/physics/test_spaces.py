@@ -14,6 +14,7 @@ from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.stepping import assemble_on
 from autdtorch.propagators import make_propagator
 from autdtorch.propagators.grid_comparison import GridComparison
+from autdtorch.propagators.notices import warn_of_scene
 from autdtorch.propagators.plan import plan, region_of
 from autdtorch.propagators.simulation import PressureMap
 from autdtorch.scene.arrays import TransducerArray
@@ -139,6 +140,18 @@ def test_a_slit_that_no_plane_of_cells_is_in_opens_no_room_beside_it(width, shar
     beside = slit.mean() / SPACING + 5.5
     columns = np.ravel_multi_index((int(beside) + np.arange(2), [17] * 2, [9] * 2), cells.shape)
     assert not np.isin(columns, assembly.heterogeneous.rigid).any()
+
+
+@pytest.mark.parametrize("material", [{"rigid": True}, {"impedance": 1e5}])
+@pytest.mark.parametrize(("turn", "gap"), [(0.04, 0.6e-3), (0.0, 0.6e-3), (0.04, 1.6e-3), (0.0, 0.0)])
+def test_a_gap_that_cells_may_close_is_told(material, turn, gap, caplog):
+    """Of rigid bodies those along the grid are open; a gap of a cell has a layer of cells in it anyway."""
+    (x, y, z), size = CENTER, (5e-3, 8e-3, 6e-3)
+    left = Box((x - size[0] / 2, y, z), size, (0.3, 0.0, turn), **material)
+    right = Box((x + gap + size[0] / 2, y, z), size, (0.3, 0.0, 0.0), **material)
+    warn_of_scene(plan(small_scene([left, right]), "box", SPACING))
+    narrow = 0 < gap < SPACING and (turn != 0 or "impedance" in material)
+    assert ("beside obstacle 0" in caplog.text) == narrow
 
 
 @pytest.mark.parametrize("half", [4e-3, 20e-3])

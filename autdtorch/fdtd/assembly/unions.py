@@ -26,7 +26,7 @@ from autdtorch.fdtd.region import Body, Fluid, Region
 from autdtorch.fdtd.shapes import Shape, Solids, bounds, distance_from, remaining
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index, triple
-from autdtorch.utils.spatial import doubled_normals, extents, spread_evenly
+from autdtorch.utils.spatial import doubled_normals, extents, places_on, spread_evenly
 
 logger = logging.getLogger(__name__)
 
@@ -309,6 +309,47 @@ def thin_wall(shape: Shape, spacing: float, fluids: Sequence[Shape] = ()) -> tup
     Thickness is measured along the inward normal, at places that share the area evenly, up to a face that is
     nearly parallel: of the shape, or of later `fluids` inside it. Places that these cover do not count.
     """
+    return _thin_part(shape, spacing, Solids((shape, *fluids), (True, *[False] * len(fluids))))
+
+
+def warn_of_narrow_gaps(region: Region, spacing: float, grids: Iterable[tuple[Iterable[int], Array]]) -> None:
+    """Log one gap beside a rigid body that is narrower than a cell [m], and that cells close or narrow.
+
+    Those between faces along a grid are exact, unless these have an impedance; `grids` as for thin walls.
+    """
+    for numbers, axes in grids:
+        for number in numbers:
+            body = region.bodies[number]
+            if body.fluid is not None or (body.impedance is None and body.is_along(axes, spacing)):
+                continue
+            if (gap := narrow_gap(region, number, spacing)) is not None:
+                width, place = gap
+                logger.warning(
+                    "a gap of %.2g mm beside obstacle %d at %s mm is narrower than a cell of %.3g mm, which"
+                    " may close it: the error may be larger than estimated",
+                    1e3 * width, number, tuple((1e3 * place).round(2).tolist()), 1e3 * spacing,
+                )  # fmt: skip
+                return
+
+
+def narrow_gap(region: Region, number: int, spacing: float) -> tuple[float, Array] | None:
+    """Return the median width [m] of gaps narrower than a cell before a body, and a place (3,) [m] there."""
+    body = region.bodies[number]
+    lower, upper = np.array(body.shape.lower) - spacing, np.array(body.shape.upper) + spacing
+    near = [
+        other
+        for other in region.bodies
+        if other is not body and (lower < other.shape.upper).all() and (upper > other.shape.lower).all()
+    ]
+    walls = Solids([other.shape for other in near], [other.fluid is None for other in near])
+    return _thin_part(body.shape, spacing, walls, side=-1) if walls else None
+
+
+def _thin_part(shape: Shape, spacing: float, solids: Solids, side: int = 1) -> tuple[float, Array] | None:
+    """Return the median thickness [m] and its place (3,) [m] of what is thinner than a cell at a surface.
+
+    On side 1 it is the part of solids below the surface, and on side -1 the air between it and solids.
+    """
     vertices, triangles = (part.numpy() for part in shape.surface())
     if extents(vertices)[1] < spacing:
         return None
@@ -316,13 +357,11 @@ def thin_wall(shape: Shape, spacing: float, fluids: Sequence[Shape] = ()) -> tup
     normals = doubled_normals(corners)
     area = np.linalg.norm(normals, axis=1)
     some = spread_evenly(area, _PLACES)
-    places, inwards = corners[some].mean(axis=1), -normals[some] / area[some, None]
+    places, across = places_on(corners, _PLACES), -side * normals[some] / area[some, None]
     step = spacing / _DEPTHS
     depths = step * np.arange(_DEPTHS + 2)  # one beyond a cell, for the slope there
-    below = places[:, None] + depths[:, None] * inwards[:, None]
-    remainder = Solids((shape, *fluids), (True, *[False] * len(fluids)))
-    distance = remainder.distance(below)
-    covered = distance[:, 0] > _ROUNDING * step
+    distance = side * solids.distance(places[:, None] + depths[:, None] * across[:, None])
+    covered = distance[:, 0] > side * _ROUNDING * step
     first = 1 + (distance[:, 1:-1] > 0).argmax(axis=1)  # depth behind the opposite face
     behind, farther = (distance[np.arange(_PLACES), first + more] for more in (0, 1))
     thin = (behind > 0) & (farther - behind > _PARALLEL * step) & ~covered
