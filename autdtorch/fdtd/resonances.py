@@ -75,7 +75,8 @@ class Extrapolation(NamedTuple):
 
     Attributes:
         weight: this factor.
-        spread: how much it changes if the shift d_0 - d_1 is uncertain by a half.
+        spread: how much it changes if the shift d_0 - d_1 is uncertain by a half, and what it leaves of other
+            resonances, relative to the difference.
     """
 
     weight: complex
@@ -196,14 +197,25 @@ def extrapolation_of(
     seen, moved = math.hypot(*(_change(*pair) for pair in together)), here.offset - other.offset
     if not _LEAST_SEEN * change < seen < _MOST_SEEN * change or abs(moved.real) < _ALONG * abs(moved.imag):
         return None
-    shift = moved.real / (ratio**_EXTRAPOLATED_POWER - 1)
-    weight, *beside = (
-        (1 / (here.offset + part * shift) - 1 / here.offset) / (1 / here.offset - 1 / other.offset)
-        for part in (1, 1 - _SPREAD, 1 + _SPREAD)
-    )
+    difference = 1 / here.offset - 1 / other.offset
+    parts = 1, 1 - _SPREAD, 1 + _SPREAD
+    weight, *beside = (_ahead(here, other, ratio, part) / difference for part in parts)
     if abs(weight) > _MOST_WEIGHT:
         return None
-    return Extrapolation(weight, max(abs(each - weight) for each in beside))
+    # what the weight leaves of other resonances, whose shifts are others
+    left = [
+        here.excited
+        * abs(_ahead(here, other, ratio) - weight * (1 / here.offset - 1 / other.offset))
+        / change
+        for here, other in pairs
+    ]
+    return Extrapolation(weight, math.hypot(max(abs(each - weight) for each in beside), *left))
+
+
+def _ahead(here: Resonance, other: Resonance, ratio: float, part: float = 1.0) -> complex:
+    """Return the change of 1 / offset by a `part` of the shift from a grid to none, by that from another."""
+    shift = (here.offset - other.offset).real / (ratio**_EXTRAPOLATED_POWER - 1)
+    return complex(1 / (here.offset + part * shift) - 1 / here.offset)
 
 
 def _change(here: Resonance, other: Resonance) -> float:

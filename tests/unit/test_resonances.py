@@ -103,6 +103,34 @@ def test_nothing_is_extrapolated_that_a_resonance_does_not_explain(share):
     assert extrapolation_of([here], [], 1.5, change) is None
 
 
+@given(st.floats(0.05, 0.6))
+def test_a_resonance_of_another_body_that_shifts_otherwise_is_claimed(share):
+    """Required: all that the weight of the first leaves of the second, exactly, as its shift is known."""
+    ratio, power = 1.5, 2.75
+    poles = [
+        (0.02 - 0.01j, 0.003),
+        (-0.03 - 0.01j, 0.003),
+    ]  # without cells, and their shift on the finer grid
+    here, other = ([true + shift * each for true, shift in poles] for each in (1.0, ratio**power))
+    excited = torch.eye(2, dtype=torch.complex128) * torch.tensor([1e-3, share * 1e-3])
+    fine, coarse, exact = (
+        sum(part / offset for part, offset in zip(excited, offsets, strict=True))
+        for offsets in (here, other, [true for true, _ in poles])
+    )
+    change = float((fine - coarse).norm())
+    both = (
+        [
+            Resonance(offset, float(part.norm()) / abs(offset))
+            for part, offset in zip(excited, each, strict=True)
+        ]
+        for each in (here, other)
+    )
+    extrapolation = extrapolation_of(*both, ratio, change)
+    assert extrapolation is not None
+    left = float((extrapolation.of(fine, coarse) - exact).norm())
+    assert left <= extrapolation.spread * change * (1 + 1e-6)
+
+
 def test_points_that_no_sound_reaches_on_the_finer_grid_stay_silent():
     here, other = Resonance(0.02 - 0.01j, 0.05), Resonance(0.03 - 0.01j, 0.0354)
     change = here.excited * abs(1 / here.offset - 1 / other.offset)
