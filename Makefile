@@ -46,8 +46,8 @@ paper: $(INSTALLED)
 
 # Once for all processes of the tests, which would each take 30 s for kernels and 10 s for modules
 $(VENV)/.kernels: $(wildcard autdtorch/fdtd/kernels/*.py autdtorch/methods/holography/*.py autdtorch/scene/obstacles/*.py) | $(INSTALLED)-dev
-	for dtype in float32 float64; do $(BIN)/python tests/compile_kernels.py $$dtype & done; \
-		$(BIN)/python -m pytest --collect-only -q >/dev/null; wait
+	jobs=; for dtype in float32 float64; do $(BIN)/python tests/compile_kernels.py $$dtype & jobs="$$jobs $$!"; done; \
+		$(BIN)/python -m pytest --collect-only -q >/dev/null; for job in $$jobs; do wait $$job || exit 1; done
 	@touch $@
 
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 8
