@@ -80,15 +80,7 @@ def iterated(
             silent = observe(torch.zeros_like(orders[0]), numbers)
             heard = [(observe(alone, numbers)[0] - silent[0]).norm(dim=0) for alone in _alone(parts)]
         else:
-            phasors, left = extrapolated(orders)
-            observed = zip(observe(left, numbers), silent, observe(phasors, numbers), floors, strict=True)
-            missing = [
-                (part - nothing).norm(dim=0) / torch.maximum(value.norm(dim=0), floor)
-                for part, nothing, value, floor in observed
-            ]
-            # what K adds to the first order is a measure of what it adds to the residual
-            echo = (phasors - orders[0]).norm(dim=0) / orders[0].norm(dim=0).clamp_min(_TINY)
-            remaining = _CAUTION * torch.stack(missing).amax(dim=0) * echo
+            phasors, remaining = _combined(orders, observe, silent, floors)
             settled = bool((remaining <= tolerance / 2).all())
             if settled or number == MOST_PASSES:
                 break
@@ -102,6 +94,25 @@ def iterated(
     resonances = _shared(rung, [(part / whole).tolist() for part in heard])
     states = map(SteadyState, phasors.mT, periods.tolist(), residual, reached.tolist(), resonances)
     return list(states), settled
+
+
+def _combined(
+    orders: Sequence[torch.Tensor], observe: Observe, silent: Sequence[torch.Tensor], floors: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the phasors (K, R) of R runs from two or more orders, and what the later ones would add (R,).
+
+    The latter is relative to what is observed, or to the `floors`; `silent` is observed without waves.
+    """
+    phasors, left = extrapolated(orders)
+    numbers = np.arange(phasors.shape[1])
+    observed = zip(observe(left, numbers), silent, observe(phasors, numbers), floors, strict=True)
+    missing = [
+        (part - nothing).norm(dim=0) / torch.maximum(value.norm(dim=0), floor)
+        for part, nothing, value, floor in observed
+    ]
+    # what K adds to the first order is a measure of what it adds to the residual
+    echo = (phasors - orders[0]).norm(dim=0) / orders[0].norm(dim=0).clamp_min(_TINY)
+    return phasors, _CAUTION * torch.stack(missing).amax(dim=0) * echo
 
 
 def _alone(parts: Sequence[torch.Tensor]) -> Iterator[torch.Tensor]:
