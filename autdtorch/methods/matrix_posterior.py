@@ -138,8 +138,8 @@ class MatrixPosterior:
     def fitted(self, drives: torch.Tensor, read: Magnitudes, infer_noise: bool = True) -> MatrixPosterior:
         """Return the posterior by magnitudes (N, P) that drives (N, M) made.
 
-        The search for the maximum begins at this one. The noise follows MacKay's rule (1992): the misfit over
-        the number of readings that no unknown explains, with a few pseudo-readings of the usual noise.
+        The search for the maximum begins at this one. The noise follows MacKay's rule (1992), by the misfit
+        and the number of readings that no unknown explains, with a few pseudo-readings of the usual noise.
         """
         now, line = self._maximum(self.linearised(drives, read), drives, read)
         for _ in range(_NOISE_ROUNDS if infer_noise else 0):
@@ -169,7 +169,8 @@ class MatrixPosterior:
 
     def _with_noise(self, line: LinearisedReadings, usual: torch.Tensor) -> MatrixPosterior:
         left = line.left.square().sum() + PSEUDO_READINGS * usual
-        variance = left / (line.unexplained + PSEUDO_READINGS)
+        # The mean of its posterior, by which 95 % intervals of few readings are as wide as Student's
+        variance = left / (line.unexplained + PSEUDO_READINGS - 2)
         return replace(self, variance=variance.expand_as(self.variance))
 
     @one_library_thread()

@@ -131,6 +131,24 @@ def test_errors_of_entries_are_found_in_noise_below_them(seed, with_phase, level
     assert (off / prediction.deviation).square().mean().sqrt() < 1.5
 
 
+@pytest.mark.parametrize("count", [1, 2, 8])
+def test_few_readings_leave_the_noise_as_unsure_as_it_is(count):
+    """A matrix that is known, and noise as the prior has it: the usual variance as if by four readings."""
+    row, empty = torch.ones(1, 1).cdouble(), torch.empty(0).double()
+    known = MatrixPrior(row, torch.tensor([1e-9]).double(), empty, torch.empty(0, 1, 1).cdouble())
+    draws = generator(count)
+    normal = partial(torch.randn, 300, dtype=torch.float64, generator=draws)
+    level = (known.usual_variance / torch.stack([normal() for _ in range(4)]).square().mean(dim=0)).sqrt()
+    drives, inside = torch.ones(count, 1).cdouble(), []
+    for noise in level:
+        read = 1 + noise * torch.randn(count + 50, 1, dtype=torch.float64, generator=draws)
+        fit = MatrixPosterior.start(known, exact(read[:count])).fitted(drives, exact(read[:count]))
+        inside.append(((read[count:] - 1).abs() < 1.96 * fit.variance.sqrt()).double().mean())
+    # Student's distribution gives 0.945 to 0.950, and 300 levels of noise leave 0.006. The likeliest noise
+    # would hold 0.89 of the readings, or 0.93 after eight.
+    assert torch.stack(inside).mean() == pytest.approx(0.95, abs=0.02)
+
+
 def test_a_simulation_is_corrected_by_few_readings(make_objective, random_matrix):
     """Fewer readings than unknowns of one row, which without a prior would determine nothing."""
     simulated = random_matrix(3, 12, 2)
