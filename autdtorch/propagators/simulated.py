@@ -60,6 +60,9 @@ _SHAPE = 3.0
 _SETTLED = 0.05
 """Distance to the steady state at which runs end, relative to the tolerance."""
 
+_SLOW = 2e8
+"""Steps of a cell in a second on a slow machine, by which a budget has time for two grids or the coarsest."""
+
 _NOTICED, _LONG = 10.0, 300.0
 """Times of further grids [s] from which the log and a warning tell them; shorter ones only a verbose log."""
 
@@ -279,7 +282,10 @@ def refined(pilot: Plan, budget: Budget, store: Store, extrapolates: bool = True
     that makes the difference of two grids, unless bodies absorb power, which only grids tell.
     """
     tolerance = pilot.tolerance
-    plan = first_plan(pilot, budget.is_unlimited)
+    plan = first_plan(pilot)
+    second = plan.at(plan.spacing / _SMALLEST_STEP, plan.tolerance)
+    if not (budget.is_unlimited or budget.fits(second, second, 2 * second.work / _SLOW)):
+        plan = first_plan(pilot, is_coarsest=True)
     if plan.refusal:
         raise ValueError(f"tolerance: {tolerance}; its first grid has {plan.refusal}")
     others, logged, may_look = list[Simulation](), set[str](), budget.is_unlimited
@@ -321,10 +327,10 @@ def refined(pilot: Plan, budget: Budget, store: Store, extrapolates: bool = True
         plan, others = finer, [*others, simulation_of(plan, store)]
 
 
-def first_plan(pilot: Plan, is_unlimited: bool = True) -> Plan:
-    """Return the plan of the first grid of a choice; without a budget it is finer where that saves a grid."""
+def first_plan(pilot: Plan, is_coarsest: bool = False) -> Plan:
+    """Return the plan of the first grid of a choice: the coarsest, or finer where that saves a grid."""
     region, spacing = pilot.region, pilot.region.coarsest_spacing
-    if is_unlimited:
+    if not is_coarsest:
         spacing /= min(region.wavelength / region.shortest_wavelength, _FINER_IF_SLOW)
         spacing = min(spacing, pilot.law.spacing_of(pilot.tolerance / _FIRST_ERROR))
     settled = replace(pilot, tolerance=_SETTLED * pilot.tolerance, grids=pilot.grouping)

@@ -239,6 +239,13 @@ def test_a_budget_returns_the_finest_grid_within_it(caplog):
     assert in_no_time.spacing == least.spacing
 
 
+def test_a_budget_that_is_not_reached_changes_nothing():
+    ball = Sphere(CENTER, 1.5e-3, density=3 * AIR.density, sound_speed=0.5 * AIR.sound_speed)
+    budgets = [{}, {"seconds": 1e4}, {"memory": 1e11}]
+    chosen = [make_propagator(small_scene((ball,)), "box", None, 0.5, **budget) for budget in budgets]
+    assert len({propagator.spacing for propagator in chosen}) == 1
+
+
 def test_the_error_of_each_point():
     propagator = make_propagator(small_scene((RIGID,)), "box", 1.3e-3, tolerance=1e-3)
     matrix, reference = propagator.transfer_matrix(), matrix_of_sphere(propagator.scene)
