@@ -207,7 +207,7 @@ def test_a_block_of_bayes_opt_is_the_same_on_any_number_of_threads(objective, me
     solutions = []
     for count in (1, 3):
         set_threads(count)
-        solutions.append(at.run(method, objective, trials=3, seed=3))
+        solutions.append(at.run(method, objective, trials=2, seed=3))
     assert torch.equal(solutions[0].drive, solutions[1].drive)
     assert torch.equal(solutions[0].history, solutions[1].history)
 

@@ -37,7 +37,7 @@ def parts(box, axis, share, overlap=0.0):
         yield replace(box, center=tuple(box.center + ((begin + end) / 2 - 0.5) * along), size=tuple(size))
 
 
-@settings(max_examples=4)
+@settings(max_examples=3)
 @given(
     size=st.tuples(*[st.floats(4e-3, 8e-3)] * 3),
     rotation=st.sampled_from([(0.0, 0.0, 0.0), (0.5, 0.4, 0.3), (math.pi / 4, 0.0, 0.0)]),
@@ -54,7 +54,7 @@ def test_parts_of_a_box_have_the_field_of_the_whole(size, rotation, axis, share,
     assert relative_error(cut, whole) < (1e-4 if rotation == (0.0, 0.0, 0.0) else 0.01)
 
 
-@settings(max_examples=3)
+@settings(max_examples=2)
 @given(
     rotation=st.sampled_from([(0.0, 0.0, 0.0), (0.5, 0.4, 0.3)]),
     axis=st.integers(0, 2),
