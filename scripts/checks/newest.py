@@ -18,6 +18,7 @@ import venv
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
+IN_ENVIRONMENT = sys.prefix != sys.base_prefix
 
 OPTIONS = {
     "--install": {"nargs": "+", "default": [".[dev]"], "help": "what pip installs, with what that needs"},
@@ -36,6 +37,8 @@ def main(install: list[str], keep: list[str], arguments: list[str]) -> int:
         constraints.write_text("".join(f"{name}=={pinned[name]}\n" for name in keep), encoding="utf-8")
         pip = [sys.executable, "-m", "pip", "--python", python, "--disable-pip-version-check", "-qq"]
         newest = ["install", "--no-compile", "--upgrade", "--upgrade-strategy", "eager", "-c", constraints]
+        if IN_ENVIRONMENT:
+            newest.append("--no-build-isolation")  # its hatchling builds
         subprocess.run([*pip, *newest, "-e", *install], cwd=ROOT, check=True)
         frozen = subprocess.run([*pip, "freeze"], capture_output=True, text=True, check=True).stdout
         versions = pins(frozen).items()  # constraints.txt need not name all
@@ -50,7 +53,7 @@ def main(install: list[str], keep: list[str], arguments: list[str]) -> int:
 def new_environment(folder: Path) -> Path:
     """Make an environment that also sees the packages of this process; return its Python."""
     venv.create(folder)
-    if sys.prefix != sys.base_prefix:
+    if IN_ENVIRONMENT:
         base = {"base": str(folder), "platbase": str(folder)}
         packages = Path(sysconfig.get_path("purelib", "venv", base))
         (packages / "zz_older.pth").write_text(f"{sysconfig.get_path('purelib')}\n", encoding="utf-8")

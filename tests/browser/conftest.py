@@ -23,13 +23,13 @@ def scene():
 
 @pytest.fixture(scope="session")
 def shared(scene):
-    """A live view and the first drive that it finds."""
+    """A live view, the first drive that it finds, and the calculated fields of the first scene."""
     pytest.importorskip("trame_rca", reason="trame: install autdtorch[explore]")
     if problem := rendering_problem():
         pytest.skip(problem)
     explorer = at.explore(scene, spacing=SPACING)
     explorer.ready()
-    yield explorer, explorer.drive
+    yield explorer, explorer.drive, dict(explorer._application.session._calculator._propagators)
     explorer.close()
 
 
@@ -39,11 +39,12 @@ def view(shared, scene):
     from autdtorch.plot.explore.display import first_state
     from autdtorch.plot.explore.situation import History, Situation
 
-    explorer, drive = shared
+    explorer, drive, propagators = shared
     first = Situation.of(scene, drive)
 
     def begin_again(session):
         session.cancel()
+        session._calculator._propagators = dict(propagators)  # calculated once, not again for each test
         session.grip, session._history = None, History(first)
         state = first_state(first, session.methods)
         session._state.update({name: state[name] for name in state.keys() - {"shown", "wanted"}})
