@@ -116,7 +116,7 @@ class GridComparison:
     @one_library_thread()
     def usual_error(self) -> float:
         """The usual error of grids of this spacing, without any other."""
-        return float(usual_errors(*self._whole, self.plan.spacing, self.plan.law))
+        return float(usual_errors(*self._whole, self.plan.spacing, self.plan.law)) + self._near_error
 
     @property
     def ringing(self) -> float | None:
@@ -156,6 +156,12 @@ class GridComparison:
         """The error by shifted resonances, relative to the norm of the whole."""
         (other, _), share = self.others[-1], self.plan.spacing / self.plan.law.wavelength
         return displacement_error(self.result.resonances, other.resonances, self._ratio, share)
+
+    @property
+    def _near_error(self) -> float:
+        """The error of the whole matrix beside surfaces and edges."""
+        errors = self._near_errors * sizes(self.result.matrix, self.free)
+        return float(errors.norm() / sizes(*self._whole))
 
     @cached_property
     def _near_errors(self) -> torch.Tensor:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from small_scenes import AIR, matrix_of_sphere, relative_error, small_scene
 
 import autdtorch as at
-from autdtorch.fdtd.grid_errors import reading_errors
+from autdtorch.fdtd.grid_errors import reading_errors, usual_errors
 from autdtorch.propagators import make_propagator
 from autdtorch.propagators.plan import region_of
 from autdtorch.scene.geometry import rotation_matrix
@@ -99,3 +99,22 @@ def test_kernels_count_within_a_cell_of_surfaces_that_the_pressure_has_a_kink_at
         assert read[1] == pytest.approx(float(read[0]) / 2)
         assert not read[2:].any()
         assert float(driven) == pytest.approx(float(read.norm()) / 2)  # of four sources
+
+
+@given(st.integers(0, 2), st.floats(0.2e-3, 4e-3))
+@settings(max_examples=4)
+def test_the_usual_error_counts_edges_within_half_a_wavelength(axis, gap):
+    """A choice of spacing begins with it, so that grids at points there are as fine as they need to be."""
+    box = at.Box(CENTER, (5e-3, 6e-3, 7e-3), rigid=True)
+    propagator = make_propagator(small_scene((box,)), "box", 1.3e-3, tolerance=1e-2)
+    outwards = np.ones(3) / math.sqrt(2)
+    outwards[axis] = 0.0
+    edge = CENTER + np.array(box.size) / 2 * (outwards > 0)
+    near, far = edge + gap * outwards, edge + 7e-3 * outwards
+    errors = []
+    for place in (near, far):
+        comparison, plan = propagator.compared(torch.from_numpy(place[None])), propagator.plan
+        waves = usual_errors(comparison.result.matrix, comparison.free, plan.spacing, plan.law)
+        errors.append(comparison.usual_error - float(waves))
+    assert errors[0] > 0
+    assert errors[1] == 0
