@@ -114,7 +114,8 @@ def plot_plane(
     figure = cast(Figure, ax.get_figure(root=True))
     mesh = draw_plane(ax, values, plane, points, (obstacles, walls), size)
     mesh.set_clim(*limits)
-    ax.set_title("\n".join(wrapped(line, width) for line in title.splitlines()))
+    if title:  # without one, axes of the user keep theirs
+        ax.set_title("\n".join(wrapped(line, width) for line in title.splitlines()))
     length, across = size if flat else (height, width)
     shape: Any = {"orientation": "horizontal" if flat else "vertical", "extend": _beyond([values], limits)}
     shape |= {"aspect": length / _BAR, "fraction": _BAR / across, "pad": 0.5 * _BAR / across}

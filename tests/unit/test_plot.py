@@ -63,6 +63,8 @@ def test_points_in_the_plane_are_circled_and_obstacles_outlined_where_it_cuts_th
     assert "control_points: 1 of 2 are more than a cell off the plane" in caplog.text
     assert ax.get_title().startswith("a line\nword")
     assert max(map(len, ax.get_title().splitlines())) < 60
+    plot_plane(np.ones((6, 4)), PLANE, ax=ax)
+    assert ax.get_title().startswith("a line")  # that of the user's axes
     (circles,) = ax.get_lines()
     np.testing.assert_allclose(circles.get_xydata(), [[30.0, 45.0]])
     (outline,) = (artist for artist in ax.collections if isinstance(artist, ContourSet))
