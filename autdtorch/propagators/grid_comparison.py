@@ -60,8 +60,14 @@ class GridComparison:
 
     @property
     def extrapolated(self) -> GridComparison:
-        """The comparison with the extrapolation that a resonance tells, if that lowers the error."""
-        if self.plan.method == "full":  # whose incident fields err too
+        """The comparison with the extrapolation that a resonance tells, if that lowers the error.
+
+        There is none with method "full", whose incident fields err too, nor where sound is absorbed: powers,
+        which grids tell alone, would not match.
+        """
+        scene = self.plan.scene
+        is_lossy = scene.reflectors or any(each.is_lossy for each in scene.obstacles)
+        if self.plan.method == "full" or is_lossy:
             return self
         other, _ = self.others[-1]
         change = self._change / self.result.matrix.norm().clamp(min=_TINY)
@@ -81,9 +87,7 @@ class GridComparison:
         """The estimated relative error of the whole matrix; infinite without other grids."""
         if not self.others:
             return math.inf
-        near = self._near_errors * sizes(self.matrix, self.free)
-        known = float(self._errors(_as_row) + near.norm() / sizes(*self._whole))
-        return math.hypot(known, self._settling_error)
+        return math.hypot(float(self._errors(_as_row)) + self._near_error, self._settling_error)
 
     @property
     @one_library_thread()
@@ -160,7 +164,7 @@ class GridComparison:
     @property
     def _near_error(self) -> float:
         """The error of the whole matrix beside surfaces and edges."""
-        errors = self._near_errors * sizes(self.result.matrix, self.free)
+        errors = self._near_errors * sizes(self.matrix, self.free)
         return float(errors.norm() / sizes(*self._whole))
 
     @cached_property

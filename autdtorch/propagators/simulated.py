@@ -44,11 +44,9 @@ _SMALLEST_STEP, _LARGEST_STEP = 1.25, 1.6
 """Ratios of a spacing and the next: the smallest that tells two errors apart; the largest over which the fall
 of an error is known."""
 
-_BY_TWO_GRIDS, _BY_THREE_GRIDS = 0.45, 0.7
-"""Estimated error, relative to the tolerance, that is accepted. Two coarse grids may agree by chance."""
-
-_AIM = 0.5
-"""Error for which a spacing is chosen, relative to the tolerance."""
+_BY_TWO_GRIDS, _BY_THREE_GRIDS, _AIM = 0.45, 0.7, 0.5
+"""Estimated errors, relative to the tolerance, that are accepted, and for which a spacing is chosen. Two
+coarse grids may agree by chance."""
 
 _UNUSUAL = 3.5
 """Safety factor: the second spacing is chosen as if the first had this many times the usual error. Two grids
@@ -80,17 +78,17 @@ class SimulatedPropagator(ScenePropagator):
         tolerance: relative distance to the steady state at which a run ends.
         max_periods: periods after which a run ends in any case, with a `SteadyStateWarning`.
         plan: the plan.
-        extrapolation: of all pressures, from the last other grid and the plan's; None if none is sure.
     """
 
     def __init__(
         self, plan: Plan, store: Store | None = None, others: Sequence[Simulation] = (),
-        may_look: bool = True, logged: set[str] | None = None,
+        may_look: bool = True, logged: set[str] | None = None, extrapolates: bool = False,
     ) -> None:  # fmt: skip
         """Use `make_propagator`, which checks its arguments. A plan with a refusal raises it.
 
         `others` are simulations on other grids for error estimates, by default one, with notices `logged`.
         These look for gaps to silent points on cells half as large, unless a budget does not allow that.
+        With `extrapolates`, a resonance may tell what the last of them and this one leave.
         """
         if plan.refusal:
             raise ValueError(plan.refusal)
@@ -98,7 +96,7 @@ class SimulatedPropagator(ScenePropagator):
         self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
         self.plan, self._store, self._coarser = plan, store or Store(), tuple(others)
         self._may_look, self._logged = may_look, set() if logged is None else logged
-        self.extrapolation: Extrapolation | None = None
+        self._extrapolates = extrapolates
 
     def __repr__(self) -> str:
         settings = f"{self.method}, spacing {1e3 * self.spacing:.4g} mm, steady to {self.tolerance:g}"
@@ -108,9 +106,7 @@ class SimulatedPropagator(ScenePropagator):
         """Return the propagator of a changed scene, with these settings."""
         last = self._coarser[-1:] if self.extrapolation else ()
         others = [simulation_of(each.plan.of(scene), self._store) for each in last]
-        changed = SimulatedPropagator(self.plan.of(scene), self._store, others)
-        changed.extrapolation = self.extrapolation
-        return changed
+        return SimulatedPropagator(self.plan.of(scene), self._store, others, extrapolates=True)
 
     def coarser(self, factor: float) -> SimulatedPropagator:
         """Return the propagator of the scene with cells larger by a factor, at most the coarsest allowed."""
@@ -177,11 +173,13 @@ class SimulatedPropagator(ScenePropagator):
         return self.compared(with_error=True).resonance_error
 
     @one_library_thread()
-    def compared(self, points: ArrayLike | None = None, with_error: bool = False) -> GridComparison:
+    def compared(
+        self, points: ArrayLike | None = None, with_error: bool = False, extrapolates: bool = True
+    ) -> GridComparison:
         """Simulate points, by default the control points; for their errors also on other grids."""
-        places = self._places(points)
+        places, extrapolation = self._places(points), self.extrapolation if extrapolates else None
         # a grid that is refused is so before the first run
-        grids = self._others if with_error else self._coarser[-1:] if self.extrapolation else ()
+        grids = self._others if with_error else self._coarser[-1:] if extrapolation else ()
         result = self.simulation.transfer_matrix(places)
         others = [(grid.transfer_matrix(places), grid.plan.spacing) for grid in grids]
         every = [result, *(other for other, _ in others)]
@@ -191,7 +189,15 @@ class SimulatedPropagator(ScenePropagator):
         if with_error:
             self._notices.of_ringing(max(each.periods for each in every))
             missed = self._missed(places, every)
-        return GridComparison(self.plan, places, result, others, missed, self.extrapolation)
+        return GridComparison(self.plan, places, result, others, missed, extrapolation)
+
+    @cached_property
+    @one_library_thread()
+    def extrapolation(self) -> Extrapolation | None:
+        """The extrapolation from the last other grid, if a resonance at the control points tells it."""
+        if not (self._extrapolates and self._coarser):
+            return None
+        return self.compared(with_error=True, extrapolates=False).extrapolated.extrapolation
 
     def _missed(self, points: torch.Tensor, results: Sequence[PressureMap]) -> torch.Tensor:
         """Return which points (P, 3) are silent in all results, but open to the air on cells half as large.
@@ -278,24 +284,19 @@ def refined(pilot: Plan, budget: Budget, store: Store, extrapolates: bool = True
     """Return the propagator of a plan, at a spacing whose estimated error is within its tolerance.
 
     Where the budget does not suffice, it is the finest that fits, and where the surface of an obstacle is not
-    known well enough, one that does not add to that error; warnings name it. It `extrapolates` by a resonance
-    that makes the difference of two grids, unless bodies absorb power, which only grids tell.
+    known well enough, one that does not add to that error; warnings name it. See `extrapolation`.
     """
-    tolerance = pilot.tolerance
-    plan = first_plan(pilot)
+    tolerance, plan = pilot.tolerance, first_plan(pilot)
     second = plan.at(plan.spacing / _SMALLEST_STEP, plan.tolerance)
     if not (budget.is_unlimited or budget.fits(second, second, 2 * second.work / _SLOW)):
         plan = first_plan(pilot, is_coarsest=True)
     if plan.refusal:
         raise ValueError(f"tolerance: {tolerance}; its first grid has {plan.refusal}")
     others, logged, may_look = list[Simulation](), set[str](), budget.is_unlimited
-    extrapolates &= not (pilot.scene.reflectors or any(each.is_lossy for each in pilot.scene.obstacles))
     while True:
-        begin, propagator = time.perf_counter(), SimulatedPropagator(plan, store, others, may_look, logged)
+        settings = store, others, may_look, logged, extrapolates
+        begin, propagator = time.perf_counter(), SimulatedPropagator(plan, *settings)
         comparison = propagator.compared(with_error=bool(others))
-        if others and extrapolates:
-            comparison = comparison.extrapolated
-            propagator.extrapolation = comparison.extrapolation
         error, (shape, rigid_error) = comparison.error, comparison.lasting_errors
         taken = time.perf_counter() - begin
         if comparison.needs_materials(tolerance):
