@@ -344,8 +344,8 @@ def _fit_alone(
 def _likeliest_noise(points: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     """Return the variance of a reading's noise (T, P), in mean intensities, equal in pascals for all foci.
 
-    Few intensities are as likely noise alone, so the noise has the prior of `MatrixPosterior.fitted`, a scaled
-    inverse chi-squared distribution that stands for some readings of the usual noise.
+    Few intensities are as likely noise alone, so the noise has the prior of `MatrixPosterior.fitted`, a
+    scaled inverse chi-squared distribution that stands for some readings of the usual noise.
     """
     features, intensity = phasors(points), values.square()
     mean = mean_intensity(values)
