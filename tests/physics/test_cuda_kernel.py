@@ -106,7 +106,7 @@ def test_losses_in_two_calls_are_those_of_the_reference_kernel():
 
 
 def test_programs_run_in_any_order(monkeypatch):
-    """Interpreted, they run one after the other: here the last one first. Rows are as many as one takes."""
+    """Interpreted, they run one after the other: here the last one first."""
     builder = interpreter.InterpreterBuilder
     place = builder.set_grid_idx
     monkeypatch.setattr(
@@ -116,7 +116,7 @@ def test_programs_run_in_any_order(monkeypatch):
     assert len(c.sound_hard_index) > 0
     case = shape, c, sources.chosen(slice(1)), receivers
     expected = advance(ReferenceKernel(), case, (1,))
-    halves = BlockSizes(x=16, y=32, z=16, rows=4, lanes=512)
+    halves = BlockSizes(x=16, y=16, z=16, rows=4, lanes=512)  # of each axis
     assert_same(advance(CudaKernel(halves), case, (1,)), expected, 1e-6)
 
 
