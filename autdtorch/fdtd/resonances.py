@@ -13,9 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.lib.stride_tricks import sliding_window_view
-from torch import Tensor
 
 from autdtorch.utils.array_types import ComplexArray
 
@@ -37,12 +35,6 @@ _SAME = 0.2  # Distance in half widths up to which two runs have told one resona
 # Resonances of two grids that are the same one: most that it moves, relative to the drive's frequency, and
 # ratios of widths and of excitations
 _MOVED, _ALIKE_WIDTH, _ALIKE_EXCITED = 0.06, 2.0, 4.0
-# An extrapolation takes the falling power of pairs of grids of 1.25 to 1.6, 2 to 3.3, and a shift that is
-# known to a half. One resonance makes the difference of two grids if its part has that norm, about, and it
-# moves far more than its width changes, which cells hardly do. Large weights add to all other errors.
-_EXTRAPOLATED_POWER, _SPREAD = 2.75, 0.5
-_LEAST_SEEN, _MOST_SEEN = 0.7, 1.6
-_ALONG, _MOST_WEIGHT = 4.0, 2.5
 # Usual shift on a grid, relative to the cube of a cell in wavelengths: of bodies in air 0.3 to 5 measured, of
 # slow fluids 8 to 36
 _USUAL_SHIFT = 10.0
@@ -64,27 +56,6 @@ class Resonance(NamedTuple):
     def excited(self) -> float:
         """The strength times the offset, which does not depend on the offset."""
         return self.strength * abs(self.offset)
-
-
-class Extrapolation(NamedTuple):
-    """The extrapolation in the spacing of what one resonance changes from a grid to the next.
-
-    It has a part c / d of any steady state, by its offset d. Those on two grids, d_1 and d_2, tell d_0
-    without any cells. The result without any is that on the first grid, plus its difference from the second
-    times (1 / d_0 - 1 / d_1) / (1 / d_1 - 1 / d_2).
-
-    Attributes:
-        weight: this factor.
-        spread: how much it changes if the shift d_0 - d_1 is uncertain by a half, and what it leaves of other
-            resonances, relative to the difference.
-    """
-
-    weight: complex
-    spread: float
-
-    def of(self, result: Tensor, coarser: Tensor) -> Tensor:
-        """Return the extrapolation of results on both grids; a 0, where no sound arrives, stays."""
-        return torch.where(result == 0, result, result + self.weight * (result - coarser))
 
 
 def offsets_of(products: ComplexArray, interval: float, share: float = _WINDOW) -> ComplexArray:
@@ -173,54 +144,14 @@ def displacement_error(
     """
     squares = 0.0
     for here in resonances:
-        if nearest := _alike(here, others):
+        alike = [other for other in others if _are_alike(here, other)]
+        if alike:
+            nearest = min(alike, key=lambda other: abs(other.offset - here.offset))
             shift = (here.offset - nearest.offset).real / (ratio**_POWER - 1)
             squares += (here.strength * shift / abs(here.offset + shift)) ** 2
         elif not any(_may_be_same(here, other) for other in others):
             squares += here.strength**2 * _mean_square(here.offset, 2 * _USUAL_SHIFT * spacing**_POWER)
     return math.sqrt(squares)
-
-
-def extrapolation_of(
-    resonances: Sequence[Resonance], others: Sequence[Resonance], ratio: float, change: float
-) -> Extrapolation | None:
-    """Return the extrapolation by the resonance that makes the difference of two grids, if one surely does.
-
-    `others` are those on another grid, whose spacing is larger by a `ratio`, and whose result differs by a
-    relative `change`.
-    """
-    pairs = [(here, other) for here in resonances if (other := _alike(here, others))]
-    if not pairs:
-        return None
-    here, other = max(pairs, key=lambda pair: _change(*pair))
-    together = (pair for pair in pairs if abs(pair[0].offset - here.offset) < -here.offset.imag)
-    seen, moved = math.hypot(*(_change(*pair) for pair in together)), here.offset - other.offset
-    if not _LEAST_SEEN * change < seen < _MOST_SEEN * change or abs(moved.real) < _ALONG * abs(moved.imag):
-        return None
-    difference = 1 / here.offset - 1 / other.offset
-    parts = 1, 1 - _SPREAD, 1 + _SPREAD
-    weight, *beside = (_ahead(here, other, ratio, part) / difference for part in parts)
-    if abs(weight) > _MOST_WEIGHT:
-        return None
-    # what the weight leaves of other resonances, whose shifts are others
-    left = [
-        here.excited
-        * abs(_ahead(here, other, ratio) - weight * (1 / here.offset - 1 / other.offset))
-        / change
-        for here, other in pairs
-    ]
-    return Extrapolation(weight, math.hypot(max(abs(each - weight) for each in beside), *left))
-
-
-def _ahead(here: Resonance, other: Resonance, ratio: float, part: float = 1.0) -> complex:
-    """Return the change of 1 / offset by a `part` of the shift from a grid to none, by that from another."""
-    shift = (here.offset - other.offset).real / (ratio**_EXTRAPOLATED_POWER - 1)
-    return complex(1 / (here.offset + part * shift) - 1 / here.offset)
-
-
-def _change(here: Resonance, other: Resonance) -> float:
-    """Return the norm of what a resonance changes from a grid to another, relative to the result."""
-    return here.excited * abs(1 / here.offset - 1 / other.offset)
 
 
 def _mean_square(offset: complex, most: float) -> float:
@@ -230,12 +161,6 @@ def _mean_square(offset: complex, most: float) -> float:
     turned = math.atan(rest / half) + math.atan(distance / half)
     grown = math.log((rest**2 + half**2) / abs(offset) ** 2)
     return 1 + (distance * grown + (distance**2 - half**2) / half * turned) / most
-
-
-def _alike(here: Resonance, others: Sequence[Resonance]) -> Resonance | None:
-    """Return the resonance of another grid that is the same one, if any."""
-    alike = (other for other in others if _are_alike(here, other))
-    return min(alike, key=lambda other: abs(other.offset - here.offset), default=None)
 
 
 def _are_alike(one: Resonance, other: Resonance) -> bool:

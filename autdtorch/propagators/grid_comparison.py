@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import mean
 
 import torch
@@ -19,7 +19,7 @@ from autdtorch.fdtd.grid_errors import (
     sizes,
     usual_errors,
 )
-from autdtorch.fdtd.resonances import Extrapolation, displacement_error, extrapolation_of
+from autdtorch.fdtd.resonances import displacement_error
 from autdtorch.propagators.free_space import free_space_matrix
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulation import PressureMap
@@ -39,10 +39,9 @@ class GridComparison:
     Attributes:
         plan: the plan.
         points: (P, 3) [m].
-        result: their transfer matrix on its grid.
+        result: their transfer matrix.
         others: those on other grids, each with its spacing [m].
         missed: mask (P,) of the points that are silent only because cells close a gap; see `_errors`.
-        extrapolation: that from the last other grid to the plan's, if one resonance tells it.
     """
 
     plan: Plan
@@ -50,30 +49,6 @@ class GridComparison:
     result: PressureMap
     others: Sequence[tuple[PressureMap, float]]
     missed: torch.Tensor
-    extrapolation: Extrapolation | None = None
-
-    @cached_property
-    def matrix(self) -> torch.Tensor:
-        """The transfer matrix (P, M) [Pa]."""
-        matrix = self.result.matrix
-        return self.extrapolation.of(matrix, self.others[-1][0].matrix) if self.extrapolation else matrix
-
-    @property
-    def extrapolated(self) -> GridComparison:
-        """The comparison with the extrapolation that a resonance tells, if that lowers the error.
-
-        There is none with method "full", whose incident fields err too, nor where sound is absorbed: powers,
-        which grids tell alone, would not match.
-        """
-        scene = self.plan.scene
-        is_lossy = scene.reflectors or any(each.is_lossy for each in scene.obstacles)
-        if self.plan.method == "full" or is_lossy:
-            return self
-        other, _ = self.others[-1]
-        change = self._change / self.result.matrix.norm().clamp(min=_TINY)
-        resonances = self.result.resonances, other.resonances
-        better = replace(self, extrapolation=extrapolation_of(*resonances, self._ratio, float(change)))
-        return better if better.error < self.error else self
 
     @cached_property
     def free(self) -> torch.Tensor:
@@ -87,13 +62,15 @@ class GridComparison:
         """The estimated relative error of the whole matrix; infinite without other grids."""
         if not self.others:
             return math.inf
-        return math.hypot(float(self._errors(_as_row)) + self._near_error, self._settling_error)
+        near = self._near_errors * sizes(self.result.matrix, self.free)
+        known = float(self._errors(_as_row) + near.norm() / sizes(*self._whole))
+        return math.hypot(known, self._settling_error)
 
     @property
     @one_library_thread()
     def point_errors(self) -> torch.Tensor:
         """The estimated relative error of each point's row of the matrix, float64 (P,)."""
-        matrix = self.matrix
+        matrix = self.result.matrix
         size = sizes(matrix, self.free)
         settling = torch.where(matrix.any(dim=1), self._settling_error * matrix.norm() / size, 0.0)
         return torch.hypot(self._errors(lambda rows: rows) + self._near_errors, settling)
@@ -131,47 +108,31 @@ class GridComparison:
     @property
     def _whole(self) -> tuple[torch.Tensor, torch.Tensor]:
         """The matrix and that in free space, each as one row (1, P M)."""
-        return _as_row(self.matrix), _as_row(self.free)
+        return _as_row(self.result.matrix), _as_row(self.free)
 
     @property
     def _settling_error(self) -> float:
         """The error relative to the norm of the whole: of the steady state, and by shifted resonances."""
-        residual = self.result.residual
-        if self.extrapolation:
-            weight, (other, _) = abs(self.extrapolation.weight), self.others[-1]
-            shifted = self.extrapolation.spread * self._change / self.matrix.norm().clamp(min=_TINY)
-            return math.hypot((1 + weight) * residual, weight * other.residual, shifted)
-        return math.hypot(residual, self._of_resonances) if self.others else residual
-
-    @property
-    def _change(self) -> torch.Tensor:
-        """The norm of the difference from the last other grid."""
-        other, _ = self.others[-1]
-        change: torch.Tensor = (self.result.matrix - other.matrix).norm()
-        return change
-
-    @property
-    def _ratio(self) -> float:
-        """The ratio of the spacings of the last other grid and the plan's."""
-        return self.others[-1][1] / self.plan.spacing
+        return math.hypot(self.result.residual, self._of_resonances) if self.others else self.result.residual
 
     @property
     def _of_resonances(self) -> float:
         """The error by shifted resonances, relative to the norm of the whole."""
-        (other, _), share = self.others[-1], self.plan.spacing / self.plan.law.wavelength
-        return displacement_error(self.result.resonances, other.resonances, self._ratio, share)
+        other, spacing = self.others[-1]
+        ratio, share = spacing / self.plan.spacing, self.plan.spacing / self.plan.law.wavelength
+        return displacement_error(self.result.resonances, other.resonances, ratio, share)
 
     @property
     def _near_error(self) -> float:
         """The error of the whole matrix beside surfaces and edges."""
-        errors = self._near_errors * sizes(self.matrix, self.free)
+        errors = self._near_errors * sizes(self.result.matrix, self.free)
         return float(errors.norm() / sizes(*self._whole))
 
     @cached_property
     def _near_errors(self) -> torch.Tensor:
         """The errors (P,) of points, and by sources, beside surfaces and edges."""
         plan, places = self.plan, (self.points, self.plan.scene.array.nodes.positions)
-        settings = self.matrix, self.free, *places, plan.region, plan.spacing
+        settings = self.result.matrix, self.free, *places, plan.region, plan.spacing
         return reading_errors(*settings) + edge_errors(*settings)
 
     def _errors(self, form: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
@@ -182,12 +143,10 @@ class GridComparison:
         longest = _LONGER * self.result.periods
         calm = [pair for pair in self.others if pair[0].periods <= longest] or self.others[-1:]
         grids = [(form(other.matrix), spacing) for other, spacing in calm]
-        matrix, free, plan = form(self.matrix), form(self.free), self.plan
-        if self.extrapolation:  # after which the grids differ no more
-            errors = usual_errors(matrix, free, plan.spacing, plan.law)
-        else:  # only boxes know the incident field
-            of_grids = errors_by_grids if plan.method == "full" else grid_errors
-            errors = of_grids(matrix, free, plan.spacing, grids, plan.law)
+        matrix, free, plan = form(self.result.matrix), form(self.free), self.plan
+        # only boxes know the incident field
+        of_grids = errors_by_grids if plan.method == "full" else grid_errors
+        errors = of_grids(matrix, free, plan.spacing, grids, plan.law)
         every = [matrix, *(form(other.matrix) for other, _ in self.others)]
         heard = torch.stack([each.any(dim=1) for each in every]).any(dim=0)
         errors = torch.where(heard, errors, 0.0)  # silence on all grids is exact, unless a gap is too narrow

@@ -93,8 +93,7 @@ def make_propagator(
     @functools.cache  # T-matrices need it for some points only; its time begins then
     def on_grids() -> SimulatedPropagator:
         if spacing is None:
-            by_waves = planned.method == "tmatrix"  # of a body, on a grid of this spacing alone
-            return refined(planned.on_grids, Budget(seconds, memory), store, extrapolates=not by_waves)
+            return refined(planned.on_grids, Budget(seconds, memory), store)
         return SimulatedPropagator(planned.on_grids, store)
 
     if not planned.runs:

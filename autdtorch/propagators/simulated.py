@@ -8,13 +8,12 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
-from autdtorch.fdtd.resonances import Extrapolation
 from autdtorch.propagators.absorbed_power import AbsorbedPower
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.free_space import PAIR_BYTES
@@ -26,7 +25,7 @@ from autdtorch.propagators.propagator import ScenePropagator
 from autdtorch.propagators.simulation import PressureMap, Run, Simulation
 from autdtorch.propagators.store import Store
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.array_types import COMPLEX, device_of
+from autdtorch.utils.array_types import COMPLEX, REAL, device_of
 from autdtorch.utils.process import cached_property, one_library_thread, require_memory
 from autdtorch.utils.text import counted
 from autdtorch.utils.validation import ArrayLike, invalid
@@ -44,9 +43,11 @@ _SMALLEST_STEP, _LARGEST_STEP = 1.25, 1.6
 """Ratios of a spacing and the next: the smallest that tells two errors apart; the largest over which the fall
 of an error is known."""
 
-_BY_TWO_GRIDS, _BY_THREE_GRIDS, _AIM = 0.45, 0.7, 0.5
-"""Estimated errors, relative to the tolerance, that are accepted, and for which a spacing is chosen. Two
-coarse grids may agree by chance."""
+_BY_TWO_GRIDS, _BY_THREE_GRIDS = 0.45, 0.7
+"""Estimated error, relative to the tolerance, that is accepted. Two coarse grids may agree by chance."""
+
+_AIM = 0.5
+"""Error for which a spacing is chosen, relative to the tolerance."""
 
 _UNUSUAL = 3.5
 """Safety factor: the second spacing is chosen as if the first had this many times the usual error. Two grids
@@ -82,13 +83,12 @@ class SimulatedPropagator(ScenePropagator):
 
     def __init__(
         self, plan: Plan, store: Store | None = None, others: Sequence[Simulation] = (),
-        may_look: bool = True, logged: set[str] | None = None, extrapolates: bool = False,
+        may_look: bool = True, logged: set[str] | None = None,
     ) -> None:  # fmt: skip
         """Use `make_propagator`, which checks its arguments. A plan with a refusal raises it.
 
         `others` are simulations on other grids for error estimates, by default one, with notices `logged`.
         These look for gaps to silent points on cells half as large, unless a budget does not allow that.
-        With `extrapolates`, a resonance may tell what the last of them and this one leave.
         """
         if plan.refusal:
             raise ValueError(plan.refusal)
@@ -96,7 +96,6 @@ class SimulatedPropagator(ScenePropagator):
         self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
         self.plan, self._store, self._coarser = plan, store or Store(), tuple(others)
         self._may_look, self._logged = may_look, set() if logged is None else logged
-        self._extrapolates = extrapolates
 
     def __repr__(self) -> str:
         settings = f"{self.method}, spacing {1e3 * self.spacing:.4g} mm, steady to {self.tolerance:g}"
@@ -104,9 +103,7 @@ class SimulatedPropagator(ScenePropagator):
 
     def for_scene(self, scene: Scene) -> SimulatedPropagator:
         """Return the propagator of a changed scene, with these settings."""
-        last = self._coarser[-1:] if self.extrapolation else ()
-        others = [simulation_of(each.plan.of(scene), self._store) for each in last]
-        return SimulatedPropagator(self.plan.of(scene), self._store, others, extrapolates=True)
+        return SimulatedPropagator(self.plan.of(scene), self._store)
 
     def coarser(self, factor: float) -> SimulatedPropagator:
         """Return the propagator of the scene with cells larger by a factor, at most the coarsest allowed."""
@@ -124,7 +121,10 @@ class SimulatedPropagator(ScenePropagator):
 
     @property
     def runs(self) -> list[Run]:
-        """All simulations in order: in several boxes one, for symmetry images and loaded matrices none."""
+        """All simulations in order.
+
+        A run in several boxes counts as one; symmetry images and loaded matrices take none.
+        """
         return self.simulation.runs
 
     @property
@@ -150,10 +150,11 @@ class SimulatedPropagator(ScenePropagator):
     @one_library_thread()
     def _matrix(self, points: ArrayLike | None, with_error: bool) -> tuple[torch.Tensor, float]:
         comparison = self.compared(points, with_error)
-        self._notices.of_cavities(comparison.points, comparison.matrix)
+        matrix = comparison.result.matrix
+        self._notices.of_cavities(comparison.points, matrix)
         if points is None:
-            self._notices.of_faint_points(comparison.matrix, comparison.free)
-        return comparison.matrix, comparison.error if with_error else 0.0
+            self._notices.of_faint_points(matrix, comparison.free)
+        return matrix, comparison.error if with_error else 0.0
 
     def point_errors(self, points: ArrayLike | None = None) -> torch.Tensor:
         """Return the estimated relative error of each point's row of the transfer matrix, float64 (P,).
@@ -173,13 +174,10 @@ class SimulatedPropagator(ScenePropagator):
         return self.compared(with_error=True).resonance_error
 
     @one_library_thread()
-    def compared(
-        self, points: ArrayLike | None = None, with_error: bool = False, extrapolates: bool = True
-    ) -> GridComparison:
+    def compared(self, points: ArrayLike | None = None, with_error: bool = False) -> GridComparison:
         """Simulate points, by default the control points; for their errors also on other grids."""
-        places, extrapolation = self._places(points), self.extrapolation if extrapolates else None
-        # a grid that is refused is so before the first run
-        grids = self._others if with_error else self._coarser[-1:] if extrapolation else ()
+        places = self._places(points)
+        grids = self._others if with_error else ()  # a grid that is refused is so before the first run
         result = self.simulation.transfer_matrix(places)
         others = [(grid.transfer_matrix(places), grid.plan.spacing) for grid in grids]
         every = [result, *(other for other, _ in others)]
@@ -189,15 +187,7 @@ class SimulatedPropagator(ScenePropagator):
         if with_error:
             self._notices.of_ringing(max(each.periods for each in every))
             missed = self._missed(places, every)
-        return GridComparison(self.plan, places, result, others, missed, extrapolation)
-
-    @cached_property
-    @one_library_thread()
-    def extrapolation(self) -> Extrapolation | None:
-        """The extrapolation from the last other grid, if a resonance at the control points tells it."""
-        if not (self._extrapolates and self._coarser):
-            return None
-        return self.compared(with_error=True, extrapolates=False).extrapolated.extrapolation
+        return GridComparison(self.plan, places, result, others, missed)
 
     def _missed(self, points: torch.Tensor, results: Sequence[PressureMap]) -> torch.Tensor:
         """Return which points (P, 3) are silent in all results, but open to the air on cells half as large.
@@ -225,29 +215,28 @@ class SimulatedPropagator(ScenePropagator):
         rows = len(self.scene.array) if by_matrix else len(flat)
         require_memory("points", tuple(points.shape), PAIR_BYTES * rows * len(points))
         field = torch.zeros((len(flat), len(points)), **COMPLEX)
-        result = PressureMap(field.mT)
         if by_matrix:
-            result = self._extrapolated(lambda simulation: simulation.transfer_matrix(points))
+            result = self.simulation.transfer_matrix(points)
             field = flat @ result.matrix.mT
         elif loud.any():
-            result = self._extrapolated(lambda simulation: simulation.fields(flat[loud], points))
+            result = self.simulation.fields(flat[loud], points)
             field[loud] = result.matrix.mT
+        else:
+            result = PressureMap(field.mT)
         warn_of_unsettled(result.runs, self.tolerance)
         if not is_picture:
             self._notices.of_cavities(points, result.matrix)
         return field.reshape(*drive.shape[:-1], len(points))
 
-    def _extrapolated(self, simulated: Callable[[Simulation], PressureMap]) -> PressureMap:
-        """Return what a simulation gives, extrapolated where the propagator is."""
-        result = simulated(self.simulation)
-        if self.extrapolation is None:
-            return result
-        coarser = simulated(self._coarser[-1])
-        return replace(result, matrix=self.extrapolation.of(result.matrix, coarser.matrix))
-
     @one_library_thread()
     def _absorbed(self, drive: torch.Tensor) -> AbsorbedPower:
-        return self._absorbing.absorbed_power(drive)
+        loud = drive.any(dim=1)
+        counts = len(self.scene.obstacles), len(self.scene.reflectors)
+        power = AbsorbedPower(*(torch.zeros((len(drive), count), **REAL) for count in counts))
+        if loud.any():
+            for whole, part in zip(power, self._absorbing.absorbed_power(drive[loud]), strict=True):
+                whole[loud] = part
+        return power
 
     @cached_property
     def _absorbing(self) -> Simulation:
@@ -280,13 +269,14 @@ def simulation_of(plan: Plan, store: Store) -> Simulation:
     return (DomainSimulation if plan.method == "full" else BoxSimulation)(plan, store)
 
 
-def refined(pilot: Plan, budget: Budget, store: Store, extrapolates: bool = True) -> SimulatedPropagator:
+def refined(pilot: Plan, budget: Budget, store: Store) -> SimulatedPropagator:
     """Return the propagator of a plan, at a spacing whose estimated error is within its tolerance.
 
-    Where the budget does not suffice, it is the finest that fits, and where the surface of an obstacle is not
-    known well enough, one that does not add to that error; warnings name it. See `extrapolation`.
+    Where the budget does not suffice, it is the finest that fits. Where the surface of an obstacle is not
+    known well enough, it is one that does not add to that error. Warnings name the error.
     """
-    tolerance, plan = pilot.tolerance, first_plan(pilot)
+    tolerance = pilot.tolerance
+    plan = first_plan(pilot)
     second = plan.at(plan.spacing / _SMALLEST_STEP, plan.tolerance)
     if not (budget.is_unlimited or budget.fits(second, second, 2 * second.work / _SLOW)):
         plan = first_plan(pilot, is_coarsest=True)
@@ -294,14 +284,13 @@ def refined(pilot: Plan, budget: Budget, store: Store, extrapolates: bool = True
         raise ValueError(f"tolerance: {tolerance}; its first grid has {plan.refusal}")
     others, logged, may_look = list[Simulation](), set[str](), budget.is_unlimited
     while True:
-        settings = store, others, may_look, logged, extrapolates
-        begin, propagator = time.perf_counter(), SimulatedPropagator(plan, *settings)
+        begin, propagator = time.perf_counter(), SimulatedPropagator(plan, store, others, may_look, logged)
         comparison = propagator.compared(with_error=bool(others))
         error, (shape, rigid_error) = comparison.error, comparison.lasting_errors
         taken = time.perf_counter() - begin
         if comparison.needs_materials(tolerance):
             logger.debug("obstacles as rigid leave an error of %.2g: their materials count", rigid_error)
-            return refined(pilot.with_materials, budget, store, extrapolates)
+            return refined(pilot.with_materials, budget, store)
         aim = Aim(tolerance, shape, shape + rigid_error)
         grid_error = error - aim.known if others else comparison.usual_error
         if others:
@@ -317,8 +306,9 @@ def refined(pilot: Plan, budget: Budget, store: Store, extrapolates: bool = True
         if not budget.fits(finer, plan, taken):
             finer = plan.fitted(coarsest, coarsest)
         if not budget.fits(finer, plan, taken):
-            usual = f"error not estimated, which takes a second grid (usually {grid_error:.2g})"
-            known = f"estimated error {error:.2g}" if others else usual
+            known = f"estimated error {error:.2g}"
+            if not others:
+                known = f"error not estimated, which takes a second grid (usually {grid_error:.2g})"
             text = "time or memory end at %.3g mm: %s, tolerance %g"
             logger.warning(text, 1e3 * plan.spacing, known, tolerance)
             return propagator
@@ -381,7 +371,10 @@ def _next_spacings(plan: Plan) -> tuple[float, float]:
 def _log_cost(
     plan: Plan, ahead: Sequence[Plan], taken: float, error: float, budget: Budget, is_second: bool
 ) -> None:
-    """Log the time of the grids `ahead` after one that took `taken` [s]; the first also starts kernels."""
+    """Log the time that the grids `ahead` take, after the last one `taken` [s]: more loudly the longer it is.
+
+    Only the second grid warns: in the first one's time is the start of kernels, and later ones repeat it.
+    """
     seconds = taken * sum(each.work for each in ahead) / plan.work
     is_long = is_second and seconds > _LONG and budget.seconds is None
     logger.log(

@@ -198,17 +198,7 @@ class Simulation(ABC):
         return everywhere, weights.reshape(-1, len(receivers.centers)) / len(images)
 
     def absorbed_power(self, drive: torch.Tensor) -> AbsorbedPower:
-        """Simulate drives (R, M); return the power [W] by obstacle and reflector."""
-        loud, scene = drive.any(dim=1), self.plan.scene
-        counts = len(scene.obstacles), len(scene.reflectors)
-        power = AbsorbedPower(*(torch.zeros((len(drive), count), **REAL) for count in counts))
-        if loud.any():
-            for whole, part in zip(power, self._absorbed(drive[loud]), strict=True):
-                whole[loud] = part
-        return power
-
-    def _absorbed(self, drive: torch.Tensor) -> AbsorbedPower:
-        """Do the work of `absorbed_power` for drives none of which is silent."""
+        """Simulate drives (R, M), none of them silent; return the power [W] by obstacle and reflector."""
         scene = self.plan.scene
         obstacles = torch.zeros((len(scene.obstacles), len(drive)), **REAL)
         if self.absorptions:

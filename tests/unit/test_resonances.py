@@ -9,14 +9,7 @@ from hypothesis import strategies as st
 from small_scenes import relative_error
 
 from autdtorch.fdtd.extrapolation import Extrapolation
-from autdtorch.fdtd.resonances import (
-    Resonance,
-    as_numbers,
-    displacement_error,
-    extrapolation_of,
-    merged,
-    of_numbers,
-)
+from autdtorch.fdtd.resonances import Resonance, as_numbers, displacement_error, merged, of_numbers
 
 INTERVAL = 0.75  # Between two values [periods]
 
@@ -70,72 +63,6 @@ def test_a_shift_as_the_cube_of_the_spacing_is_known_from_two_grids(real, width,
     expected = abs(excited / true - excited / here)
     assert displacement_error([fine], [coarse], ratio, 0.1) == pytest.approx(expected, rel=1e-6)
     assert displacement_error([], [coarse], ratio, 0.1) == 0
-
-
-@given(st.floats(-0.05, 0.05), st.floats(3e-3, 0.02), st.floats(1.25, 1.6), st.floats(2.0, 3.3))
-def test_two_grids_tell_what_a_resonance_leaves_without_cells(real, width, ratio, power):
-    """Measured shifts fall as the power of 2 to 3.3 of the spacing: what is left is within the spread."""
-    true, shift = complex(real, -width), 0.003
-    here, other = (complex(true + shift * each) for each in (1.0, ratio**power))
-    part = torch.tensor([1e-3, 2e-3j], dtype=torch.complex128)
-    fine, coarse, exact = (part / offset for offset in (here, other, true))
-    change = float((fine - coarse).norm())
-    resonances = (Resonance(offset, float(part.norm()) / abs(offset)) for offset in (here, other))
-    extrapolation = extrapolation_of(*([each] for each in resonances), ratio, change)
-    if extrapolation is None:  # next to the drive's frequency
-        factor = abs((1 / true - 1 / here) / (1 / here - 1 / other))
-        assert factor > 1
-        return
-    left = float((extrapolation.of(fine, coarse) - exact).norm())
-    assert left < 3 * extrapolation.spread * change  # claims are right to a factor of 3
-
-
-@pytest.mark.parametrize("share", [0.5, 2.0])
-def test_nothing_is_extrapolated_that_a_resonance_does_not_explain(share):
-    """The grids differ by a half or twice of its part, or its width is what changes."""
-    here, other = Resonance(0.02 - 0.01j, 0.05), Resonance(0.03 - 0.01j, 0.0354)
-    change = here.excited * abs(1 / here.offset - 1 / other.offset)
-    assert extrapolation_of([here], [other], 1.5, change) is not None
-    assert extrapolation_of([here], [other], 1.5, change / share) is None
-    wider = Resonance(0.022 - 0.015j, 0.042)
-    change = here.excited * abs(1 / here.offset - 1 / wider.offset)
-    assert extrapolation_of([here], [wider], 1.5, change) is None
-    assert extrapolation_of([here], [], 1.5, change) is None
-
-
-@given(st.floats(0.05, 0.6))
-def test_a_resonance_of_another_body_that_shifts_otherwise_is_claimed(share):
-    """Required: all that the weight of the first leaves of the second, exactly, as its shift is known."""
-    ratio, power = 1.5, 2.75
-    poles = [
-        (0.02 - 0.01j, 0.003),
-        (-0.03 - 0.01j, 0.003),
-    ]  # without cells, and their shift on the finer grid
-    here, other = ([true + shift * each for true, shift in poles] for each in (1.0, ratio**power))
-    excited = torch.eye(2, dtype=torch.complex128) * torch.tensor([1e-3, share * 1e-3])
-    fine, coarse, exact = (
-        sum(part / offset for part, offset in zip(excited, offsets, strict=True))
-        for offsets in (here, other, [true for true, _ in poles])
-    )
-    change = float((fine - coarse).norm())
-    both = (
-        [
-            Resonance(offset, float(part.norm()) / abs(offset))
-            for part, offset in zip(excited, each, strict=True)
-        ]
-        for each in (here, other)
-    )
-    extrapolation = extrapolation_of(*both, ratio, change)
-    assert extrapolation is not None
-    left = float((extrapolation.of(fine, coarse) - exact).norm())
-    assert left <= extrapolation.spread * change * (1 + 1e-6)
-
-
-def test_points_that_no_sound_reaches_on_the_finer_grid_stay_silent():
-    here, other = Resonance(0.02 - 0.01j, 0.05), Resonance(0.03 - 0.01j, 0.0354)
-    change = here.excited * abs(1 / here.offset - 1 / other.offset)
-    extrapolation = extrapolation_of([here], [other], 1.5, change)
-    assert extrapolation.of(torch.zeros(2), torch.ones(2)).abs().max() == 0
 
 
 @given(st.floats(-0.05, 0.05), st.floats(1e-4, 0.02), st.floats(0.03, 0.2))
