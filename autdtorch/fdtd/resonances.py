@@ -35,6 +35,9 @@ _SAME = 0.2  # Distance in half widths up to which two runs have told one resona
 # Resonances of two grids that are the same one: most that it moves, relative to the drive's frequency, and
 # ratios of widths and of excitations
 _MOVED, _ALIKE_WIDTH, _ALIKE_EXCITED = 0.06, 2.0, 4.0
+# Most times that the change of a resonance from a grid to the next may be that of the steady state, as others
+# cancel it. Fits of fields that are no sum of resonances, as between facing surfaces, have more: up to 70
+_MOST_CANCELLED = 3.0
 # Usual shift on a grid, relative to the cube of a cell in wavelengths: of bodies in air 0.3 to 5 measured, of
 # slow fluids 8 to 36
 _USUAL_SHIFT = 10.0
@@ -134,13 +137,18 @@ def of_numbers(numbers: Sequence[float]) -> tuple[Resonance, ...]:
 
 
 def displacement_error(
-    resonances: Sequence[Resonance], others: Sequence[Resonance], ratio: float, spacing: float
+    resonances: Sequence[Resonance],
+    others: Sequence[Resonance],
+    ratio: float,
+    spacing: float,
+    change: float = math.inf,
 ) -> float:
     """Return the relative error of a steady state by the shift of its resonances on a grid.
 
     `spacing` is the edge of the grid's cells [wavelengths]. `others` are those on another grid, whose spacing
-    is larger by a `ratio`. One without any like it there has moved too far to tell: its shift is taken
-    to be between none and twice the usual one, towards the drive's frequency.
+    is larger by a `ratio`, and whose steady state differs by a relative `change`: what resonances change is
+    not far more. One without any like it there has moved too far to tell: its shift is taken to be between
+    none and twice the usual one, towards the drive's frequency.
     """
     squares = 0.0
     for here in resonances:
@@ -148,7 +156,9 @@ def displacement_error(
         if alike:
             nearest = min(alike, key=lambda other: abs(other.offset - here.offset))
             shift = (here.offset - nearest.offset).real / (ratio**_POWER - 1)
-            squares += (here.strength * shift / abs(here.offset + shift)) ** 2
+            seen = here.strength * abs(1 - here.offset / nearest.offset)
+            share = min(1.0, _MOST_CANCELLED * change / seen) if seen else 1.0
+            squares += (share * here.strength * shift / abs(here.offset + shift)) ** 2
         elif not any(_may_be_same(here, other) for other in others):
             squares += here.strength**2 * _mean_square(here.offset, 2 * _USUAL_SHIFT * spacing**_POWER)
     return math.sqrt(squares)

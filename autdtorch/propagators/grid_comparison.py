@@ -120,7 +120,9 @@ class GridComparison:
         """The error by shifted resonances, relative to the norm of the whole."""
         other, spacing = self.others[-1]
         ratio, share = spacing / self.plan.spacing, self.plan.spacing / self.plan.law.wavelength
-        return displacement_error(self.result.resonances, other.resonances, ratio, share)
+        matrix = self.result.matrix
+        change = float((matrix - other.matrix).norm() / matrix.norm().clamp(min=_TINY))
+        return displacement_error(self.result.resonances, other.resonances, ratio, share, change)
 
     @property
     def _near_error(self) -> float:

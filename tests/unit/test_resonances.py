@@ -65,6 +65,14 @@ def test_a_shift_as_the_cube_of_the_spacing_is_known_from_two_grids(real, width,
     assert displacement_error([], [coarse], ratio, 0.1) == 0
 
 
+def test_a_resonance_changes_not_far_more_than_grids_differ():
+    """Fits of fields between facing surfaces have resonances that cancel each other, on both grids."""
+    fine, coarse = Resonance(0.02 - 0.004j, 0.2), Resonance(0.025 - 0.005j, 0.2)
+    errors = [displacement_error([fine], [coarse], 1.4, 0.1, change) for change in (1e-3, 0.01, 0.04, 1.0)]
+    assert errors[1] == pytest.approx(10 * errors[0])
+    assert errors[2] == errors[3]  # it changes 0.04 of the whole, which is no more than grids differ
+
+
 @given(st.floats(-0.05, 0.05), st.floats(1e-4, 0.02), st.floats(0.03, 0.2))
 def test_a_resonance_on_one_grid_alone_may_be_next_to_the_drive(real, width, spacing):
     """The error is the mean over shifts towards the drive, up to twice the usual 10 spacing^3."""
