@@ -28,7 +28,7 @@ from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL, device_of
 from autdtorch.utils.process import cached_property, one_library_thread, require_memory
 from autdtorch.utils.text import counted
-from autdtorch.utils.validation import ArrayLike, invalid
+from autdtorch.utils.validation import ArrayLike, boolean, invalid
 
 logger = logging.getLogger(__name__)
 
@@ -176,7 +176,7 @@ class SimulatedPropagator(ScenePropagator):
     @one_library_thread()
     def compared(self, points: ArrayLike | None = None, with_error: bool = False) -> GridComparison:
         """Simulate points, by default the control points; for their errors also on other grids."""
-        places = self._places(points)
+        places, with_error = self._places(points), boolean("with_error", with_error)
         grids = self._others if with_error else ()  # a grid that is refused is so before the first run
         result = self.simulation.transfer_matrix(places)
         others = [(grid.transfer_matrix(places), grid.plan.spacing) for grid in grids]

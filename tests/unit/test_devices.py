@@ -22,7 +22,13 @@ from autdtorch.utils.validation import real_tensor
 TENSORS = {"drive", "drives", "G", "points", "positions", "pressure", "X"}
 """Parameters that are tensors, wherever a tensor is accepted."""
 
-RESULTS_ON_CPU = {"PoseBall.certificate", "equilibrium", "haptic_metrics", "modulated"}
+RESULTS_ON_CPU = {
+    "PoseBall.certificate",
+    "SimulatedPropagator.compared",
+    "equilibrium",
+    "haptic_metrics",
+    "modulated",
+}
 """Calls whose results are kept, as scenes are, on the CPU."""
 
 ROOMS = tuple(f"autdtorch.{room}." for room in ("analytic", "methods", "objectives", "propagators", "scene"))
