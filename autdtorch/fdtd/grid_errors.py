@@ -216,7 +216,7 @@ def _edge_shares(places: Array, region: Region, spacing: float) -> Array:
 
 
 def _contrast(body: Body, air: Fluid) -> float:
-    """Return the contrast of the density of a body with that of the air; it is 1 for rigid bodies."""
+    """Return the contrast of a body's density with the air's; it is 1 for rigid bodies."""
     if body.fluid is None:
         return 1.0
     ratio = body.fluid.inertia / air.inertia

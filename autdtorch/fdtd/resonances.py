@@ -35,8 +35,8 @@ _SAME = 0.2  # Distance in half widths up to which two runs have told one resona
 # Resonances of two grids that are the same one: most that it moves, relative to the drive's frequency, and
 # ratios of widths and of excitations
 _MOVED, _ALIKE_WIDTH, _ALIKE_EXCITED = 0.06, 2.0, 4.0
-# Most times that the change of a resonance from a grid to the next may be that of the steady state, as others
-# cancel it. Fits of fields that are no sum of resonances, as between facing surfaces, have more: up to 70
+# A resonance changes at most so many times as much from a grid to the next as the steady state, as others
+# cancel its change. Fits of fields that are no sum of resonances, as between facing surfaces, have up to 70
 _MOST_CANCELLED = 3.0
 # Usual shift on a grid, relative to the cube of a cell in wavelengths: of bodies in air 0.3 to 5 measured, of
 # slow fluids 8 to 36
