@@ -150,8 +150,10 @@ def _of_hydra(error: BaseException, text: str) -> str:
         return f"{key}: unknown key{hint}{listed}; autdtorch --cfg job lists the settings"
     if merging := re.match(r"(Error merging override [^,\n]+)", text):
         text = f"{merging[1]}: {error.__cause__}"
+        key = merging[1].removeprefix("Error merging override ").partition("=")[0]
+        if "list index out of range" in text:
+            return f"{key}: a list has no item of this number; autdtorch --cfg job lists the settings"
         if "Cannot merge" in text:
-            key = merging[1].removeprefix("Error merging override ").partition("=")[0]
             return f"{key}: a list in place of a mapping, or the reverse; ~{key} +{key}=VALUE replaces it"
     if missing := re.match(r"Missing mandatory value: (\S+)", text):
         return f"{missing[1]}: none; must be given, as {missing[1]}=VALUE"

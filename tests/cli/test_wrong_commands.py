@@ -56,7 +56,7 @@ WRONG = {
     "method._target_='a b.gabs'  modules='a b'": r"method\._target_: 'a b\.gabs'; must be a module",
     "method._target_=autdtorch": r"method\._target_: 'autdtorch'; must be one of",
     "~method._target_": "method: no _target_",
-    "scene.obstacles.0.density=5": "Error merging override scene.obstacles.0.density=5: list index",
+    "scene.obstacles.0.density=5": "scene.obstacles.0.density: a list has no item",
     "scene.array={type: file, path: a.csv}": r"scene\.array\.path: unknown key",
     "solver.spacing=[1": r"argument 'solver\.spacing=\[1': no viable alternative at input",
     "-m  hydra.sweep.dir=a=b": r"argument 'hydra\.sweep\.dir=a=b': mismatched input",

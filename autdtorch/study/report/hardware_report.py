@@ -112,6 +112,7 @@ def write_hardware_report(
         times=times,
         interval=statistics.median_low(gaps) if gaps else 0.0,  # an interruption does not change it
         solution=solution,
+        is_best=bool(solution.score[0] >= solution.history[0].max()),  # `identify` computes its last drive
         convergence=convergence,
         goal=score_label(goal.name),
         of_pressures=goal.of_pressures,
