@@ -21,7 +21,7 @@ _INTACT = 1e-6  # relative change of a part's volume, as manifold3d takes it, th
 # Distance by which parts grow, relative to the extent of all: 1 um for a body of 0.1 m, the rounding of text
 # with six decimals in metres. It closes slits of twice this width
 _GROWTH = 1e-5
-_FARTHEST = 3.0  # move of a vertex at a sharp edge, relative to the move of its faces
+_FARTHEST = 10.0  # move of a vertex relative to its faces': edges of 11.5 degrees and more grow exactly
 _SEAM = 1e-4  # area of seams, relative to all: parts that meet at edges alone have less when they grow
 _ALONG = 1e-8  # weight of directions for which the faces at a vertex do not tell how far it moves
 
