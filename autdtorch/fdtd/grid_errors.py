@@ -18,7 +18,7 @@ from torch import Tensor
 from autdtorch.fdtd.region import Body, Fluid, Region
 from autdtorch.fdtd.steady_state import SILENCE
 from autdtorch.utils.array_types import REAL, Array
-from autdtorch.utils.spatial import edges_of, places_along
+from autdtorch.utils.spatial import edge_ends, places_along
 
 _WEIGHT = 0.3  # of the logarithm of the usual error: grids may agree by chance
 _MOST_ABOVE = 10.0  # Largest ratio of the error by grids and the usual one that counts, as at resonances
@@ -207,7 +207,7 @@ def _edge_shares(places: Array, region: Region, spacing: float) -> Array:
         near = beyond < reach
         if body.continued or body.uncertainty or not near.any():  # edges of voxels are no edges
             continue
-        ends = edges_of(*body.surface, _SHARP_EDGE)
+        ends = edge_ends(*body.surface, _SHARP_EDGE)
         if len(ends):
             distance, _ = KDTree(places_along(ends, _LEAST_CELLS * spacing)).query(places[near])
             error = _AT_EDGES * np.clip(error_at(distance) - error_at(np.array(reach)), 0, None)

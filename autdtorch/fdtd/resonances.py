@@ -141,7 +141,7 @@ def displacement_error(
     others: Sequence[Resonance],
     ratio: float,
     spacing: float,
-    change: float = math.inf,
+    change: float,
 ) -> float:
     """Return the relative error of a steady state by the shift of its resonances on a grid.
 

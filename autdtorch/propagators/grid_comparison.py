@@ -62,9 +62,7 @@ class GridComparison:
         """The estimated relative error of the whole matrix; infinite without other grids."""
         if not self.others:
             return math.inf
-        near = self._near_errors * sizes(self.result.matrix, self.free)
-        known = float(self._errors(_as_row) + near.norm() / sizes(*self._whole))
-        return math.hypot(known, self._settling_error)
+        return math.hypot(float(self._errors(_as_row)) + self._near_error, self._settling_error)
 
     @property
     @one_library_thread()

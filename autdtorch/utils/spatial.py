@@ -130,7 +130,7 @@ def mean_thickness(vertices: Array, triangles: Index) -> float:
     return 2 * volume / area
 
 
-def edges_of(vertices: Array, triangles: Index, most: float = _FLAT) -> Array:
+def edge_ends(vertices: Array, triangles: Index, most: float = _FLAT) -> Array:
     """Return the ends (E, 2, 3) [m] of the edges between faces of a surface, (V, 3) [m] and (T, 3).
 
     The cosine of the angle between the normals of the two faces is less than `most`.
@@ -145,7 +145,7 @@ def edges_of(vertices: Array, triangles: Index, most: float = _FLAT) -> Array:
 
 def edge_length(vertices: Array, triangles: Index) -> float:
     """Return the length of the edges between faces of a surface, vertices (V, 3) [m], triangles (T, 3)."""
-    ends = edges_of(vertices, triangles)
+    ends = edge_ends(vertices, triangles)
     return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum())
 
 

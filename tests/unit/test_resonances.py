@@ -61,8 +61,8 @@ def test_a_shift_as_the_cube_of_the_spacing_is_known_from_two_grids(real, width,
     here, other = (complex(true + shift * each) for each in (1.0, ratio**3))
     fine, coarse = (Resonance(offset, excited / abs(offset)) for offset in (here, other))
     expected = abs(excited / true - excited / here)
-    assert displacement_error([fine], [coarse], ratio, 0.1) == pytest.approx(expected, rel=1e-6)
-    assert displacement_error([], [coarse], ratio, 0.1) == 0
+    assert displacement_error([fine], [coarse], ratio, 0.1, math.inf) == pytest.approx(expected, rel=1e-6)
+    assert displacement_error([], [coarse], ratio, 0.1, math.inf) == 0
 
 
 def test_a_resonance_changes_not_far_more_than_grids_differ():
@@ -81,12 +81,12 @@ def test_a_resonance_on_one_grid_alone_may_be_next_to_the_drive(real, width, spa
     changes = shifts / (fine.offset + shifts.to(torch.complex128))
     expected = fine.strength * float((changes.abs() ** 2).mean().sqrt())
     # steps of up to 8e-6, a twelfth of the least width
-    assert displacement_error([fine], [], 1.3, spacing) == pytest.approx(expected, rel=1e-2)
+    assert displacement_error([fine], [], 1.3, spacing, math.inf) == pytest.approx(expected, rel=1e-2)
 
 
 def test_a_resonance_that_another_grid_excites_otherwise_counts_nothing():
     one, other = Resonance(0.02 - 0.003j, 0.01), Resonance(0.021 - 0.003j, 0.1)
-    assert displacement_error([one], [other], 1.3, 0.1) == 0
+    assert displacement_error([one], [other], 1.3, 0.1, math.inf) == 0
 
 
 def test_resonances_of_runs_are_merged_and_survive_a_file():

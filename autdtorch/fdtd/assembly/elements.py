@@ -83,10 +83,10 @@ def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
     """Return the material of every element, set by the last body there, and the interface elements."""
     bodies, materials = unions_of(region, grid, stencil)
     blocks = _blocks_of_bodies(bodies, grid)
-    hard = (materials.rigid & ~materials.reacting)[np.append(0, _materials_of_shapes(bodies))]
+    hard = (materials.rigid & ~materials.reacting)[_materials_of_numbers(bodies)]
     if len(walls := blocks.beside_gaps(hard)):
         bodies, materials = unions_of(_with_heavy(region, walls - 1), grid, stencil)
-    blocks = replace(blocks, material=np.append(0, _materials_of_shapes(bodies))[blocks.material])
+    blocks = replace(blocks, material=_materials_of_numbers(bodies)[blocks.material])
     bodies = measured(bodies, grid.spacing)
     material, cut, beside = _measured(bodies, grid)
     material = np.where(beside, material, blocks.over_elements(blocks.at_centers.astype(np.int16)))
@@ -133,9 +133,9 @@ def _aligned(
     return every, np.arange(len(index))
 
 
-def _materials_of_shapes(bodies: Sequence[Union]) -> Index:
-    """Return the material (n,) of every shape of unions, which are in the order of the region's bodies."""
-    return np.array([body.material for body in bodies for _ in body.shapes], np.int64)
+def _materials_of_numbers(bodies: Sequence[Union]) -> Index:
+    """Return the materials (n + 1,) of air and of the region's n bodies, in their order."""
+    return np.array([0, *(body.material for body in bodies for _ in body.shapes)], np.int64)
 
 
 def _blocks_of_bodies(bodies: Sequence[Union], grid: Grid) -> MaterialBlocks:
