@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from autdtorch.utils.array_types import AnyArray, Array
-from autdtorch.utils.files import replacing
+from autdtorch.utils.files import replacing, require_file
 from autdtorch.utils.units import warn_user, warned_within
 from autdtorch.utils.validation import invalid, require_known, within
 
@@ -132,7 +132,7 @@ def read_rows(path: str | os.PathLike[str], gaps: bool = False) -> CsvRows:
 
     An empty cell at the end of a line is left out, unless there may be `gaps` and other lines are longer.
     """
-    content = Path(path).read_bytes()
+    content = require_file(path).read_bytes()
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -20,7 +20,7 @@ from autdtorch.scene.arrays import TransducerArray, phase_offsets_of, radii_of, 
 from autdtorch.scene.drive import amplitudes_of, drive_from_phases, phases_of, validate_drive
 from autdtorch.scene.sequence import Sequence
 from autdtorch.utils.array_types import AnyArray, Array
-from autdtorch.utils.files import path_of, read_arrays, write_arrays
+from autdtorch.utils.files import path_of, read_arrays, require_file, write_arrays
 from autdtorch.utils.units import warn_user, warned_within
 from autdtorch.utils.validation import ArrayLike, positive, real_tensor, require_kind, require_one_of, within
 
@@ -125,7 +125,7 @@ def load_sequence(path: str | os.PathLike[str], rate: float | None = None) -> Se
 
 def _timing_in_comment(path: Path) -> dict[str, AnyArray]:
     """Return rate and loop of the comment that `save_sequence` writes at the top of a table."""
-    with path.open(encoding="utf-8-sig") as lines:
+    with require_file(path).open(encoding="utf-8-sig") as lines:
         match = _TIMING.match(next(lines, ""))
     return (
         {"rate": np.array(float(match["rate"])), "loop": np.array(match["loop"] == "True")} if match else {}

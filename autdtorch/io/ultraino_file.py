@@ -19,6 +19,7 @@ from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
 import numpy as np
 
 from autdtorch.utils.array_types import Array
+from autdtorch.utils.files import require_file
 from autdtorch.utils.validation import invalid, within
 
 SUFFIX = ".xml.gz"
@@ -127,7 +128,7 @@ def _values(what: str, records: list[Any], defaults: Mapping[str, float]) -> dic
 
 def _unpacked(path: Path) -> bytes:
     """Return the text of a file, packed or not, of limited size."""
-    content = path.read_bytes()
+    content = require_file(path).read_bytes()
     if content[:2] != b"\x1f\x8b":
         text, rest = content[:_LARGEST], content[_LARGEST:]
     else:

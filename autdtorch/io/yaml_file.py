@@ -9,9 +9,10 @@ import re
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from types import FunctionType
 from typing import TYPE_CHECKING, Any, TypeAlias
+
+from autdtorch.utils.files import require_file
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig, ListConfig
@@ -48,7 +49,7 @@ class _Extent:
 
 def load_yaml(path: str | os.PathLike[str]) -> Config:
     """Read a YAML file with the checks of `parse_yaml`."""
-    with Path(path).open(encoding="utf-8") as file:
+    with require_file(path).open(encoding="utf-8") as file:
         try:
             text = file.read(_LARGEST + 1)
         except UnicodeDecodeError as error:

@@ -27,7 +27,14 @@ from autdtorch.scene.obstacles import Mesh, Obstacle
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.process import cached_property, require_memory
 from autdtorch.utils.units import warn_user
-from autdtorch.utils.validation import integer_at_least, invalid, positive, require_kind, require_one_of
+from autdtorch.utils.validation import (
+    finite_number,
+    integer_at_least,
+    invalid,
+    positive,
+    require_kind,
+    require_one_of,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -265,9 +272,9 @@ def plan(
     """Plan a simulation, with the arguments of `make_propagator`; no spacing gives the coarsest."""
     require_kind("scene", scene, Scene)
     kernel, precision = available_kernel(kernel, device), precision_of(dtype)
-    tolerance = positive("tolerance", tolerance)
-    if tolerance >= 1:
-        raise invalid("tolerance", tolerance, "must be in (0, 1)")
+    tolerance = finite_number("tolerance", tolerance)
+    if not 0 < tolerance < 1:
+        raise invalid("tolerance", tolerance, "must be in (0, 1), such as 0.01 for 1 %")
     max_periods = integer_at_least("max_periods", max_periods, 1)
     time_step = None if time_step is None else positive("time_step", time_step, "s")
     if isinstance(method, str) and method == "operator":

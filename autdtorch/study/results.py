@@ -332,7 +332,9 @@ def _share_of_bound(scene: SceneResult, score: float) -> str:
     bound = scene.in_unit(f"{scene.bound:.4g}")
     if scene.bound <= 0:
         return f"no drive above {bound} (certified)"
-    return f"{in_percent(score / scene.bound)} % of {bound}" if score > 0 else f"none of {bound}"
+    if score <= 0:  # a stiffness below 0 is no trap
+        return f"{'below 0' if score < 0 else '0'} % of {bound}"
+    return f"{in_percent(score / scene.bound)} % of {bound}"
 
 
 def in_percent(share: float) -> str:

@@ -32,7 +32,7 @@ from autdtorch.study.results import (
     stored_numbers,
     stored_solution,
 )
-from autdtorch.utils.files import path_of, replace_file, require_name
+from autdtorch.utils.files import path_of, replace_file, require_file, require_name
 from autdtorch.utils.validation import (
     boolean,
     complex_tensor,
@@ -86,7 +86,7 @@ def load_results(path: str | os.PathLike[str]) -> StudyResult:
     path = path_of("path", path)
     if path.is_dir():
         path = path / RESULTS_FILE
-    content = path.read_bytes()
+    content = require_file(path).read_bytes()
     try:
         if content[:_USER_BLOCK] != _user_block(content[_USER_BLOCK:]):
             raise ValueError("its checksum is wrong")

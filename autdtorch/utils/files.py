@@ -52,6 +52,17 @@ def path_of(name: str, value: object, what: str = "a file", suffixes: Collection
     return path
 
 
+def require_file(path: str | os.PathLike[str]) -> Path:
+    """Return a path that has a file, or raise `FileNotFoundError` or `IsADirectoryError` with the fix."""
+    file = Path(path)
+    if file.is_dir():
+        raise IsADirectoryError(f"{file}: a folder; must be a file")
+    if not file.exists():
+        begin = "" if file.is_absolute() else f"; the path starts from {Path.cwd()}"
+        raise FileNotFoundError(f"{file}: there is no such file{begin}")
+    return file
+
+
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
     """Add the path to an `OSError` that has none, such as the error of a full disk."""
@@ -134,8 +145,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
 
 def read_arrays(path: str | os.PathLike[str]) -> dict[str, AnyArray]:
     """Read the arrays of a .npz file by name; the array of a .npy file has the name ""."""
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"{os.fspath(path)}: there is no such file")
+    require_file(path)
     try:
         if not zipfile.is_zipfile(path):
             with Path(path).open("rb") as file:

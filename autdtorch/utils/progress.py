@@ -109,7 +109,7 @@ class Progress:
     def _forecast(self) -> str:
         """Return the time left as text; nothing before it is known, and when the work ends soon."""
         if self._done > self._steps:
-            return "longer than expected"
+            return f"{self._done} steps where {self._steps} were expected"
         least, most = self._left()
         known = math.isfinite(most)
         if (most if known else least) < _SOON:

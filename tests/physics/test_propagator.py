@@ -208,6 +208,7 @@ SLOW = Box(CUBE.center, CUBE.size, density=100.0, sound_speed=100.0)
         ({"spacing": 1e-5, "method": "full"}, r"spacing: 1e-05 m; must be at least 1\.7e-05 m, 500 cells"),
         ({"spacing": -1e-3}, "spacing: -0.001 m; must be finite and > 0"),
         ({"tolerance": 1.5}, r"tolerance: 1.5; must be in \(0, 1\)"),
+        ({"tolerance": 0}, r"tolerance: 0.0; must be in \(0, 1\)"),
         ({"kernel": "fortran"}, "kernel: .*fortran.*must be one of auto, cpu, cuda, reference"),
         ({"dtype": "float16"}, "dtype: .*float16.*must be one of float32, float64"),
         ({"max_periods": 0}, "max_periods: 0"),

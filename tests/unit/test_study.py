@@ -259,7 +259,10 @@ def test_a_study_of_a_force_has_a_score_and_a_bound_and_no_figures_of_foci(goal,
     silent = torch.zeros_like(scores[0])[None]
     climb = replace(climb, solution=replace(climb.solution, score=silent))
     idle = replace(results.scenes["a"], methods={"climb": climb})
-    assert summary_rows(replace(results, scenes={"a": idle}))[1][-1].startswith("none of ")
+    assert summary_rows(replace(results, scenes={"a": idle}))[1][-1].startswith("0 % of ")
+    falling = replace(climb, solution=replace(climb.solution, score=-1 - silent))  # as of no trap
+    idle.methods["climb"] = falling
+    assert summary_rows(replace(results, scenes={"a": idle}))[1][-1].startswith("below 0 % of ")
     (row, *_) = map(json.loads, (tmp_path / TRIALS_FILE).read_text().splitlines())
     assert "weakest" not in str(row)
     assert "min" not in row
