@@ -381,6 +381,8 @@ def open_autd3(
         boards: number of boards, >= 1.
         transducers: the device's transducer for each of the scene's (M,); by default all in order.
         network: `autd3.UdpOption` or `autd3.ServerLink`; by default UDP on the interface that finds them.
+            An option without a `recovery_interval` gets one: boards are lost after 2 s of silence, and looked
+            for again every 0.1 s.
         settle: time that a drive plays before its pressure is read [s].
 
     `LinkError` if they are not there or do not take the commands, `ImportError` without the packages autd3

@@ -3,7 +3,10 @@
 import asyncio
 import contextlib
 import signal
+import subprocess
+import sys
 import threading
+import time
 
 import pytest
 import torch
@@ -13,6 +16,14 @@ from autdtorch.hardware import AUTD3, LimitedLink, LimitError, Limits, LinkError
 from autdtorch.hardware.devices import autd3 as module
 from autdtorch.hardware.devices.autd3 import Autd3Port
 from autdtorch.hardware.safety import Signalled, ended_by_signals
+
+#: A process of its own can be stopped: boards that fall silent.
+BOARDS = """
+import autd3, sys
+boards = autd3.UdpEmulator(1)
+print(str(boards.option().iface).split('"')[1], flush=True)
+sys.stdin.read()
+"""
 
 
 def noted(monkeypatch, method, note):
@@ -154,6 +165,22 @@ class TestWithTheKit:
         monkeypatch.setattr(module, "_OPENING_TIMEOUT", 0.02)
         with pytest.raises(LinkError, match=r"AUTD3 cannot be opened: no answer within 0.02 s"):
             open_autd3(1, network=boards.option())  # takes 0.3 s
+
+    def test_a_network_that_pauses_loses_no_boards(self, kit):
+        """By the kit's defaults 0.1 s of silence ends the link, and no board can be switched off any more."""
+        command, pipe = [sys.executable, "-c", BOARDS], subprocess.PIPE
+        with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as boards:
+            try:
+                option = kit.UdpOption(kit.Interface.Addr(boards.stdout.readline().strip()))
+                with open_autd3(1, network=option, settle=0) as link:
+                    link.play(random_frames(1, 249)[0])
+                    for pause in (0.3, 2.5):  # boards are lost in the second
+                        boards.send_signal(signal.SIGSTOP)
+                        time.sleep(pause)
+                        boards.send_signal(signal.SIGCONT)
+                        link.off()
+            finally:
+                boards.kill()
 
     def test_no_boards_are_an_error(self, kit):
         option = kit.UdpOption("127.0.0.1", enumeration_timeout=kit.Duration.from_millis(50))

@@ -24,6 +24,8 @@ from autdtorch.utils.validation import invalid
 
 _ANSWER_MS = 100  # wait of the kit for an answer; its default of 10 ms is too short on a busy computer
 _TIMEOUT = 5.0  # of a command [s]; the kit asks boards that do not answer 8 times more before it gives up
+_SILENCE_MS = 2000  # of boards that are then lost: longer than the kit asks twice, as when outputs go off
+_RECOVERY_MS = 100  # between attempts to reach lost boards again
 _OPENING_TIMEOUT = 60.0  # [s]; the kit takes up to 10 s to find the boards and 30 s to synchronise them
 
 _CLOCK = 40_000.0  # ticks per second, of which every frame lasts a whole number [Hz]
@@ -182,7 +184,7 @@ class Autd3Port(Port):
 
         # A pattern is by board and transducer: the places of the boards play no part.
         geometry = Geometry([Autd3() for _ in range(boards)])
-        option = autd3.UdpOption() if network is None else network
+        option = _lasting(autd3.UdpOption() if network is None else network)
         config = autd3.ClientConfig(ack_timeout=autd3.Duration.from_millis(_ANSWER_MS))
         self._error: type[Exception] = autd3.Autd3Error
         self._boards = boards
@@ -229,6 +231,10 @@ class Autd3Port(Port):
 
         self._run("start a sequence", start, _TIMEOUT)
         time.sleep(_LEAD)
+
+    def recover(self) -> None:
+        """Wait until lost boards have been looked for again."""
+        time.sleep(3e-3 * _RECOVERY_MS)
 
     def close(self) -> None:
         """Release the boards, even if they do not answer."""
@@ -356,3 +362,17 @@ def _network(text: str) -> Any:
     if not (port.isdecimal() and 0 < int(port) < 2**16):
         raise invalid("hardware.network", text, "must be server:PORT with a port from 1 to 65535")
     return autd3_kit().ServerLink(int(port))
+
+
+def _lasting(network: Any) -> Any:
+    """Return a way to the boards that outlasts a busy moment of the network or the computer.
+
+    By the kit's defaults boards that are silent for 0.1 s are lost for good, and cannot be switched off.
+    """
+    autd3 = autd3_kit()
+    if not isinstance(network, autd3.UdpOption) or network.recovery_interval is not None:
+        return network
+    settings = {name: getattr(network, name) for name in dir(network) if not name.startswith("_")}
+    settings["lost_timeout"] = max(network.lost_timeout, autd3.Duration.from_millis(_SILENCE_MS))
+    settings["recovery_interval"] = autd3.Duration.from_millis(_RECOVERY_MS)
+    return autd3.UdpOption(**settings)
