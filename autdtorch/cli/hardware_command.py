@@ -191,7 +191,10 @@ class _Trial:
             command,
             self._calibration(measured),
         )
-        score = _shown(measured.goal, measured.again.mean(dim=0))
+        goal, mean = measured.goal, measured.again.mean(dim=0)
+        score, first = _shown(goal, mean), measured.log.evaluations[0].pressure
+        if goal(mean) < goal(first) and len(measured.log.evaluations) > 1:
+            logger.warning("the first drive of the search read more: %s", _shown(goal, first))
         print(f"{score}, measured once more; the report is {report}")
 
     def _measure(self, log: Path) -> _Measured:

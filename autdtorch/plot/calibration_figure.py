@@ -117,13 +117,14 @@ def _draw_readings(ax: Axes, calibration: Calibration) -> list[Line2D]:
     size = 9.0 if len(levels) < 3 * _MOST_DOTS else 2.0
     ax.plot([0, most], [0, most], color="0.2", linewidth=0.8, zorder=1)
     handles = []
-    for part, colour, label, error in (
-        (before, _BEFORE, "simulation with one gain", errors[0]),
-        (after, _AFTER, "calibrated", errors[1]),
+    worse = "" if errors[1] < errors[0] else ", no better than the simulation"
+    for part, colour, label, error, note in (
+        (before, _BEFORE, "simulation with one gain", errors[0], ""),
+        (after, _AFTER, "calibrated", errors[1], worse),
     ):
         ax.scatter(observed[known] / unit, part[known] / unit, size, color=colour, linewidths=0, alpha=0.7)
         dot: Any = {"marker": "o", "linestyle": "none", "markersize": 4, "color": colour}
-        handles.append(Line2D([], [], label=f"{label}: {100 * error:.1f} % off", **dot))
+        handles.append(Line2D([], [], label=f"{label}: {100 * error:.1f} % off{note}", **dot))
     if outliers:
         cross: Any = {"marker": "x", "color": _LEFT_OUT}
         ax.scatter((lost / unit).clamp(max=most), fitted[rejected] / unit, 18, clip_on=False, **cross)

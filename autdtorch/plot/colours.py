@@ -4,7 +4,7 @@ import numpy as np
 
 # Colours of the Okabe-Ito palette, which colour-blind readers can distinguish.
 TRANSDUCER_COLOUR = "#0072B2"
-FOCUS_COLOUR = "#D55E00"
+FOCUS_COLOUR = "#009E73"  # green: not in the colour map of the pressure
 PLANE_COLOUR = "#56B4E9"
 OBSTACLE_COLOUR = "#B0B0B0"
 REFLECTOR_COLOUR = "#8A6D3B"

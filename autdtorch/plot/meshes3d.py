@@ -37,7 +37,6 @@ logger = logging.getLogger(__name__)
 
 _MARGINS = (160, 185)  # pixels, for colour bars on the left and on the right
 
-POINT_COLOUR = "#00C8A0"  # green: not in the colour map of the pressure
 ARROWS = "arrows"
 """Name of the actor of the arrows that show where transducers emit."""
 _ARROW_COLOUR = "#555555"
@@ -65,7 +64,7 @@ def new_plotter(scene: Scene, off_screen: bool, bars: tuple[bool, bool]) -> pyvi
     points = pyvista.PolyData(MM * scene.control_points.numpy())
     sphere = pyvista.Sphere(radius=MM * scene.wavelength / 5)
     spheres = points.glyph(orient=False, scale=False, geom=sphere)
-    plotter.add_mesh(spheres, color=POINT_COLOUR, ambient=0.3)
+    plotter.add_mesh(spheres, color=colours.FOCUS_COLOUR, ambient=0.3)
     plotter.enable_anti_aliasing("ssaa")
     return plotter
 

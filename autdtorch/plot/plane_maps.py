@@ -24,6 +24,8 @@ from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.reflectors import Reflector
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
+from autdtorch.utils.text import in_digits
+from autdtorch.utils.units import prefixed
 from autdtorch.utils.validation import (
     ArrayLike,
     boolean,
@@ -172,7 +174,7 @@ def plot_force(
     """Plot the force at places of a plane as arrows, over the pressure magnitude on it.
 
     Arrows are the part of the force along the plane. Their lengths are in proportion to the force, up to 2.5
-    times their distance.
+    times their distance; the key is of the median.
 
     Args:
         force: (Mu, Mv, 3) [N], at `plane.points(...)` of another spacing; 0 draws no arrow.
@@ -199,10 +201,16 @@ def plot_force(
     shown = along * (_ARROW * apart / typical)
     shown /= np.maximum(np.linalg.norm(shown, axis=1) / (_LONGEST * apart), 1)[:, None]
     drawn = size > 0  # Matplotlib would mark the others by dots
-    figure.axes[0].quiver(
+    arrows = figure.axes[0].quiver(
         *(MM * starts[drawn]).T, *shown[drawn].T, angles="xy", scale_units="xy", scale=1, color="white",
         pivot="mid", width=0.006, path_effects=[withStroke(linewidth=1.6, foreground="black")],
     )  # fmt: skip
+    if drawn.any():
+        factor, unit = prefixed(typical, "N")
+        label = f"median force {in_digits(factor * typical, 2)} {unit}"
+        figure.axes[0].set_title(" ", fontsize=TICK_SIZE)  # room for the key
+        key = {"labelpos": "W", "fontproperties": {"size": TICK_SIZE}}
+        figure.axes[0].quiverkey(arrows, 0.92, 1.04, _ARROW * apart, label, **key)
     return figure
 
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor
 
 from autdtorch.plot import meshes3d, plotter3d
-from autdtorch.plot.colours import FLOOR, WAVE_MAP
+from autdtorch.plot.colours import FLOOR, FOCUS_COLOUR, WAVE_MAP
 from autdtorch.plot.data import MM, in_decibels, largest, legible_unit, pressure_text, zero_level
 from autdtorch.plot.plotter3d import STILL_AXES
 from autdtorch.scene.scene import Scene
@@ -232,7 +232,7 @@ def _colours(plotter: pyvista.Plotter) -> NDArray[np.uint8]:
     """Return one palette (256, 3) for all frames: with different palettes, static parts would flicker."""
     tables = [np.asarray(bar.lookup_table.values)[:, :3] for bar in plotter.scalar_bars.values()]
     greys = np.linspace(0, 255, _GREYS)[:, None] * np.ones(3)
-    shades = np.linspace(0.3, 1.0, _SHADES)[:, None] * np.array(ImageColor.getrgb(meshes3d.POINT_COLOUR))
+    shades = np.linspace(0.3, 1.0, _SHADES)[:, None] * np.array(ImageColor.getrgb(FOCUS_COLOUR))
     each = (256 - _GREYS - _SHADES) // len(tables)
     maps = [table[np.linspace(0, len(table) - 1, each).astype(int)] for table in tables]
     return np.concatenate([greys, shades, *maps]).astype(np.uint8)

@@ -6,6 +6,7 @@ import json
 import math
 import re
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -240,6 +241,21 @@ def test_with_a_prior_few_evaluations_find_how_the_transducers_deviate(trial, mo
     for number, method in enumerate(methods):
         words = (f"method.evaluations={few}", "method.prior={gain: 0.1, phase: 0.7}", f"output=out{number}")
         assert measured(*method, *words) > 1.2 * simulated
+
+
+def test_a_drive_that_reads_less_than_the_first_one_is_told(trial, monkeypatch, tmp_path):
+    words = (*EMULATED, "method.levels=2")
+    assert "first drive" not in trial(*words)[2]
+    solve = autdtorch.cli.hardware_command.solve
+
+    def fainter(*arguments, **named):
+        solution = solve(*arguments, **named)
+        return replace(solution, drive=0.01 * solution.drive)
+
+    monkeypatch.setattr(autdtorch.cli.hardware_command, "solve", fainter)
+    status, _, log = trial(*words, "output=fainter")
+    assert (status, "the first drive of the search read more: weakest focus" in log) == (0, True)
+    assert "**the first drive of the search read more**" in (tmp_path / "fainter/report.md").read_text()
 
 
 def test_a_limit_ends_a_trial_with_a_status_of_its_own(trial):

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
-from matplotlib.quiver import Quiver
+from matplotlib.quiver import Quiver, QuiverKey
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from small_scenes import AIR, scene_of_all_kinds, small_scene
 
@@ -312,4 +312,6 @@ def test_no_arrow_is_drawn_where_there_is_no_force() -> None:
     for count in range(3):
         (arrows,) = at.plot_force(force, torch.ones(8, 8), plane).axes[0].findobj(Quiver)
         assert len(arrows.get_offsets()) == arrows.N == count
-        force[count, 0, 0] = 1e-6
+        keys = [key.text.get_text() for key in arrows.axes.findobj(QuiverKey)]
+        assert keys == ["median force 2.0 µN"] * min(count, 1)
+        force[count, 0, 0] = 2e-6

@@ -124,6 +124,11 @@ def test_a_calibration_is_drawn_on_the_array_or_by_index() -> None:
     np.testing.assert_allclose(after[:, 1], after[:, 0], atol=0.05 * pressure[:7].max())
     assert outlier.max() <= left.get_xlim()[1]  # at the edge, so that others can be told apart
     assert f"{100 * calibration.held_back.before:.1f} %" in left.figure.legends[0].get_texts()[0].get_text()
+    held = calibration.held_back
+    useless = replace(calibration, held_back=held._replace(error=held.before))
+    figures = map(at.plot_calibration, (calibration, useless))
+    labels = [figure.legends[0].get_texts()[1].get_text() for figure in figures]
+    assert ["no better than the simulation" in label for label in labels] == [False, True]
     for ax, values in ((gains, calibration.gain), (phases, calibration.phase)):
         (dots,) = ax.collections
         np.testing.assert_array_equal(dots.get_array(), values)

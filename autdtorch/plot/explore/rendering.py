@@ -81,7 +81,7 @@ class Rendering:
             self.plotter, scene, meshes3d.emitted_phases(situation.drive, len(scene.array)), bar=False
         )
         self._ringed, self._ring = 0, self._around(0)
-        self.plotter.add_mesh(self._ring, color=meshes3d.POINT_COLOUR, lighting=False, reset_camera=False)
+        self.plotter.add_mesh(self._ring, color=colours.FOCUS_COLOUR, lighting=False, reset_camera=False)
         self._sheet = meshes3d.plane_mesh(situation.sheet, np.full((1, 1), math.nan))
         self._actor = meshes3d.add_sheet(self.plotter, self._sheet, colours.PRESSURE_MAP, (0.0, 1.0))
         self.set_dark(self._dark)
@@ -134,7 +134,7 @@ class Rendering:
             self.plotter.remove_actor(self._foci.pop(), reset_camera=False, render=False)
         while len(self._foci) < len(points):
             radius, wire = (MM * share * situation.scene.wavelength for share in (_MARK, _WIRE))
-            look = {"color": meshes3d.POINT_COLOUR, "ambient": 0.5, "reset_camera": False}
+            look = {"color": colours.FOCUS_COLOUR, "ambient": 0.5, "reset_camera": False}
             self._foci.append(self.plotter.add_mesh(meshes3d.torus_mesh(radius, wire), **look))
         across = np.stack([axis.numpy() for axis in situation.sheet.basis])
         axes = np.vstack([across, np.cross(*across)]).T  # rings lie in the plane of the field

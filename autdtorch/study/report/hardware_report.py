@@ -118,6 +118,7 @@ def write_hardware_report(
         of_pressures=goal.of_pressures,
         unit=goal.unit and f" {goal.unit}",
         score_again=float(goal(again_mean)),
+        first=float(goal(evaluations[0].pressure)) if len(evaluations) > 1 else -torch.inf,
         readings=len(again),
         same=alike(solution.drive[0], expected.drive[0]),
         points=_points(names, readings, preflight.unit),
