@@ -41,19 +41,17 @@ def random_drive(rows, transducers, seed=0):
 
 # required of the paper's scene: 0.5 % at 1 mm, 2 % at 2 mm; this small one has its points closer to the
 # absorbing layers. At 2.8 mm, 3 cells per wavelength, the layers send back up to 1.6 % each (-36 dB).
-@pytest.mark.parametrize(("spacing", "tolerance"), [(7e-4, 1e-3), (1e-3, 2e-3), (2e-3, 1e-2), (2.8e-3, 4e-2)])
+@pytest.mark.parametrize(("spacing", "tolerance"), [(1e-3, 2e-3), (2e-3, 1e-2), (2.8e-3, 4e-2)])
 def test_free_space_is_exact_to_the_grid(spacing, tolerance):
     scene = small_scene()
     simulated = full(scene, spacing, tolerance=tolerance / 10).transfer_matrix()
     assert relative_error(simulated, free_space(scene)) < tolerance
 
 
-# [dB/m]: air at 40 kHz, and thirty times as much, which attenuates by a tenth on the way
-@pytest.mark.parametrize(
-    ("absorption", "spacing", "tolerance"), [(1.3, 1e-3, 5e-4), (40.0, 1e-3, 5e-4), (40.0, 2e-3, 5e-3)]
-)
-def test_absorption_is_exact_to_the_grid(absorption, spacing, tolerance):
-    scene, lossless = both = small_scene(absorption=absorption), small_scene()
+@pytest.mark.parametrize(("spacing", "tolerance"), [(1e-3, 5e-4), (2e-3, 5e-3)])
+def test_absorption_is_exact_to_the_grid(spacing, tolerance):
+    """Thirty times that of air at 40 kHz: 40 dB/m attenuate by a tenth on the way."""
+    scene, lossless = both = small_scene(absorption=40.0), small_scene()
     simulated, without = (
         full(one, spacing, tolerance=1e-5, dtype="float64").transfer_matrix() for one in both
     )
@@ -107,13 +105,18 @@ DISCS = small_scene((CUBE,), radius=3.9e-3, extent=28e-3)
         # a disc receives the mean over its nodes; 1e-5 from the steady state, single precision adds as much
         (DISCS, DISCS.control_points, {"tolerance": 1e-5}, 5e-5),
         # Green's function is symmetric, too
-        (small_scene((ASIDE,)), None, {"method": "box", "tolerance": 1e-6, "dtype": "float64"}, 1e-4),
+        (
+            small_scene((ASIDE,)),
+            None,
+            {"method": "box", "spacing": 1e-3, "tolerance": 1e-6, "dtype": "float64"},
+            1e-4,
+        ),
     ],
     ids=["edges", "discs", "box"],
 )
 def test_reciprocity(scene, points, settings, bound):
     """From the points, and from the four transducers where there are more points than these."""
-    propagator = make_propagator(scene, **{"method": "full", "spacing": 1e-3, **settings})
+    propagator = make_propagator(scene, **{"method": "full", "spacing": 1.6e-3, **settings})
     points = scene.control_points if points is None else points
     backward, count = propagator.transfer_matrix(points), len(points)
     assert len(propagator.runs) == count
@@ -125,7 +128,7 @@ def test_reciprocity(scene, points, settings, bound):
 
 def test_replay_and_transfer_objectives_agree():
     scene = small_scene((CUBE,))
-    propagator = full(scene, tolerance=1e-5, dtype="float64")
+    propagator = full(scene, 1.6e-3, tolerance=1e-5, dtype="float64")
     drive = random_drive(3, 4, seed=1)
     transfer = SimulatedObjective(scene, propagator, mode="transfer")(drive)
     before = len(propagator.runs)
@@ -134,8 +137,7 @@ def test_replay_and_transfer_objectives_agree():
     assert float((replay - transfer).norm() / transfer.norm()) < 1e-4
 
 
-@pytest.mark.parametrize("method", ["full", "box"])
-@pytest.mark.parametrize("absorption", [0.0, 40.0])
+@pytest.mark.parametrize(("absorption", "method"), [(40.0, "full"), (0.0, "box")])
 def test_an_obstacle_of_air_is_no_obstacle(absorption, method):
     cube = Box(CUBE.center, CUBE.size, density=AIR.density, sound_speed=AIR.sound_speed)
     scene = small_scene((cube,), absorption=absorption)
@@ -147,7 +149,7 @@ def test_the_distance_to_the_steady_state_is_below_the_tolerance():
     """In a scene with resonances."""
     scene = small_scene((CUBE,))
     matrices = {
-        tolerance: full(scene, tolerance=tolerance, dtype="float64").transfer_matrix()
+        tolerance: full(scene, 1.6e-3, tolerance=tolerance, dtype="float64").transfer_matrix()
         for tolerance in (1e-7, 1e-2, 1e-3, 1e-4)
     }
     for tolerance, matrix in matrices.items():

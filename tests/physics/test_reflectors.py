@@ -116,8 +116,7 @@ def test_the_memory_of_waves_that_mirrors_send_back_is_planned(monkeypatch):
     assert propagator.plan.memory > sum(pair.left.nbytes + pair.right.nbytes for pair in pairs) / 2
 
 
-@pytest.mark.parametrize("reflection", [0.5, 0.3 + 0.4j])
-@pytest.mark.parametrize("gap", GAPS[2:])
+@pytest.mark.parametrize(("gap", "reflection"), [(10e-3, 0.5), (60e-3, 0.3 + 0.4j)])
 def test_sphere_apart_from_a_plane_that_absorbs(gap, reflection):
     scene, exact = before_plane("rigid", gap, TILTED, reflection)
     assert relative_error(make_propagator(scene, "box", 1e-3).transfer_matrix(), exact) < 5e-3

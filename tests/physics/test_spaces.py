@@ -59,12 +59,8 @@ def mask(hollow):
 # the same geometry, up to the order of triangles
 @pytest.mark.parametrize(
     ("hollow", "solid", "difference"),
-    [
-        (lambda: ball(0.3e-3), ball, 10 * STEADY),
-        (lambda: ball(1e-3), ball, 10 * STEADY),
-        (lambda: mask(True), lambda: mask(False), 1e-12),
-    ],
-    ids=["thin ball", "ball", "mask"],
+    [(lambda: ball(0.3e-3), ball, 10 * STEADY), (lambda: mask(True), lambda: mask(False), 1e-12)],
+    ids=["ball", "mask"],
 )
 def test_a_hollow_rigid_body_is_a_solid_one(hollow, solid, difference):
     matrices = [
@@ -164,8 +160,9 @@ def test_a_transducer_in_a_closed_room_is_refused(half):
         make_propagator(scene, "box", SPACING).transfer_matrix()
 
 
-@pytest.mark.parametrize("method", ["box", "full"])
-@pytest.mark.parametrize(("balls", "tolerance"), [(1, 1e-3), (2, 1e-3), (1, 1e-5)])
+@pytest.mark.parametrize(
+    ("method", "balls", "tolerance"), [("box", 1, 1e-5), ("box", 2, 1e-3), ("full", 1, 1e-5)]
+)
 def test_a_run_ends_where_a_drive_cancels(method, balls, tolerance):
     """In a plane of symmetry two opposite drives leave rounding alone, which never becomes steady."""
     array = TransducerArray([(-10e-3, 0.0, -20e-3), (10e-3, 0.0, -20e-3)], (0, 0, 1))

@@ -83,7 +83,9 @@ def tilted(rotation, material):
     points = np.array([[1e-3, 2e-3, 14e-3], [7e-3, -3e-3, 13e-3], [-9e-3, 5e-3, 8e-3]])
     array = TransducerArray(transducers @ turn.T, turn @ [0.0, 0.0, 1.0])
     box = Box((0, 0, 0), (8e-3,) * 3, rotation, **material)
-    return Scene(array, AIR, 40e3, points @ turn.T, [box], domain=((-22e-3,) * 3, (22e-3,) * 3))
+    places = np.concatenate((transducers, points, [[-7e-3] * 3, [7e-3] * 3])) @ turn.T
+    domain = places.min(axis=0) - 2e-3, places.max(axis=0) + 2e-3
+    return Scene(array, AIR, 40e3, points @ turn.T, [box], domain=domain)
 
 
 @functools.cache
@@ -126,15 +128,9 @@ def test_cubes_with_different_tilts_have_boxes_of_their_own():
         Box((0, -20e-3, 0), (8e-3,) * 3, (0.3, 0.2, 0), rigid=True),
         Box((0, 20e-3, 0), (8e-3,) * 3, (0, 0.4, 0.7), rigid=True),
     ]
-    array = TransducerArray([[0, 0, -30e-3], [9e-3, 0, -30e-3]], (0, 0, 1))
-    scene = Scene(
-        array,
-        AIR,
-        40e3,
-        [(0, 2e-3, 20e-3), (5e-3, -9e-3, 24e-3)],
-        cubes,
-        domain=((-35e-3,) * 3, (35e-3,) * 3),
-    )
+    array = TransducerArray([[0, 0, -20e-3], [9e-3, 0, -20e-3]], (0, 0, 1))
+    domain = (-12e-3, -30e-3, -23e-3), (12e-3, 30e-3, 23e-3)
+    scene = Scene(array, AIR, 40e3, [(0, 2e-3, 18e-3), (5e-3, -9e-3, 20e-3)], cubes, domain=domain)
     box = make_propagator(scene, "box", 1e-3)
     axes = [axes_along([flat_faces(cube)]) for cube in cubes]
     assert np.allclose(box.simulation.boxes[1].axes, axes[1])
@@ -167,7 +163,7 @@ def test_a_mesh_in_single_precision_turns_the_grid(rotation, tmp_path):
 
 
 @pytest.mark.parametrize("rotation", TILTS)
-@pytest.mark.parametrize("thickness", [1e-3, 2e-3, 4e-3])
+@pytest.mark.parametrize("thickness", [1e-3, 2e-3])
 def test_no_cell_of_a_tilted_plate_belongs_to_the_air_on_both_sides(thickness, rotation):
     plate = Box((0, 0, 0), (0.1, 0.1, thickness), rotation, rigid=True)
     array = TransducerArray([[0, 0, -12e-3]], (0, 0, 1))

@@ -11,10 +11,7 @@ from hypothesis import strategies as st
 from small_scenes import assert_slopes, matrix_of_sphere, relative_error
 
 import autdtorch as at
-from autdtorch.analytic.spherical_waves import (
-    outgoing_waves,
-    sphere_coefficients,
-)
+from autdtorch.analytic.spherical_waves import outgoing_waves, sphere_coefficients
 from autdtorch.propagators import make_propagator
 
 AIR = at.Medium(density=1.2, sound_speed=340.0)
