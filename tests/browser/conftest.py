@@ -1,7 +1,7 @@
 """One live view that all tests in a browser share; each begins with the first scene and drive."""
 
 import pytest
-from live_view import SPACING, in_session, opened
+from live_view import SPACING, in_session, opened, wait_for_fine, wait_in_page
 
 import autdtorch as at
 from autdtorch.plot.view3d import rendering_problem
@@ -59,8 +59,20 @@ def view(shared, scene):
     return explorer
 
 
+@pytest.fixture(scope="module")
+def first_page(shared, browser):
+    """A page for all tests of a file: to open it takes a second."""
+    with opened(browser, shared[0]) as page:
+        yield page
+
+
 @pytest.fixture
-def live(view, browser):
-    """The shared live view and its page."""
-    with opened(browser, view) as page:
-        yield view, page
+def live(view, first_page):
+    """The shared live view and its page, scrolled up and begun again too."""
+    first_page.evaluate("document.activeElement.blur(); scrollTo(0, 0)")
+    numbers = []
+    in_session(view, lambda session: numbers.append(session._state.shown))
+    is_there = "number => document.querySelector('section.picture').dataset.shown === `${number}`"
+    wait_in_page(first_page, is_there, numbers[0])
+    wait_for_fine(first_page)
+    return view, first_page

@@ -38,6 +38,7 @@ from packaging.requirements import Requirement
 import autdtorch
 from autdtorch import hardware
 from autdtorch.cli import main as command_line
+from autdtorch.propagators import CACHE_VARIABLE
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 
@@ -285,7 +286,13 @@ def program(page, folder):
 # --- tests
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.fixture
+def matrices(tmp_path_factory, monkeypatch):
+    """A folder of matrices that all pages share: several show the same scenes."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "matrices"))
+
+
+@pytest.mark.usefixtures("undrawn", "matrices")
 @pytest.mark.parametrize("page", [page for page in PAGES if LISTED[page] or PYTHON[page]])
 def test_a_page_runs(page, tmp_path):
     furnish(tmp_path)
