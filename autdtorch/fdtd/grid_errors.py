@@ -15,10 +15,11 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from autdtorch.fdtd.assembly.edges import sharp_sides
 from autdtorch.fdtd.region import Body, Fluid, Region
 from autdtorch.fdtd.steady_state import SILENCE
 from autdtorch.utils.array_types import REAL, Array
-from autdtorch.utils.spatial import edge_ends, places_along
+from autdtorch.utils.spatial import places_along
 
 _WEIGHT = 0.3  # of the logarithm of the usual error: grids may agree by chance
 _MOST_ABOVE = 10.0  # Largest ratio of the error by grids and the usual one that counts, as at resonances
@@ -39,7 +40,8 @@ _READING = 2.0
 # this, and with it 1 %; the medians of error over claim are 2.1 and 0.9.
 _AT_EDGES = 0.012
 _EDGE_POWER = 2 / 3  # Power of the distance with which the pressure at a right edge of a rigid body varies
-_SHARP_EDGE = 0.7  # Cosine of the angle between the normals of faces that meet at a sharp edge, at most
+_SHARP_EDGE = 0.8  # Angle [rad] between the normals of faces that meet at a sharp edge, at least
+_COVERED = 0.5  # Least contrast of a body, relative to another's, whose edges on it are not sharp
 _EDGE_REACH = 0.5  # Distance from an edge that counts [wavelengths]
 _LEAST_CELLS = 0.5  # Least distance from an edge [cells] that counts as such
 _USUAL, _USUAL_CUT = 0.8, 2.1  # Usual error relative to `growth`: of faces along the grid, and of cut ones
@@ -202,25 +204,32 @@ def _edge_shares(places: Array, region: Region, spacing: float) -> Array:
         error: Array = (region.wavenumber * spacing) ** _EDGE_POWER * cells ** (_EDGE_POWER - 2)
         return error
 
-    for body in region.bodies:
+    bodies = region.part(range(len(region.bodies)), range(len(region.mirrors))).bodies
+    contrasts = [_contrast(body, region.fluid) for body in bodies]
+    for body, contrast in zip(bodies, contrasts, strict=True):
         beyond = np.maximum(np.subtract(body.shape.lower, places), places - body.shape.upper).max(axis=-1)
         near = beyond < reach
-        if body.continued or body.uncertainty or not near.any():  # edges of voxels are no edges
-            continue
-        ends = edge_ends(*body.surface, _SHARP_EDGE)
+        if not contrast or not near.any() or body.continued or body.uncertainty:
+            continue  # edges of voxels are no edges
+        covering = [
+            other.shape
+            for other, its in zip(bodies, contrasts, strict=True)
+            if other is not body and its / contrast >= _COVERED
+        ]
+        ends = sharp_sides(body.shape, covering, _SHARP_EDGE)
         if len(ends):
             distance, _ = KDTree(places_along(ends, _LEAST_CELLS * spacing)).query(places[near])
             error = _AT_EDGES * np.clip(error_at(distance) - error_at(np.array(reach)), 0, None)
-            shares[near] = np.maximum(shares[near], _contrast(body, region.fluid) * error)
+            shares[near] = np.maximum(shares[near], abs(contrast) * error)
     return shares
 
 
 def _contrast(body: Body, air: Fluid) -> float:
-    """Return the contrast of a body's density with the air's; it is 1 for rigid bodies."""
+    """Return the contrast of a body's density with the air's, 1 for rigid bodies, negative for light ones."""
     if body.fluid is None:
         return 1.0
     ratio = body.fluid.inertia / air.inertia
-    return abs(ratio - 1) / (ratio + 1)
+    return (ratio - 1) / (ratio + 1)
 
 
 def rigid_errors(matrix: Tensor, free: Tensor, region: Region) -> Tensor:

@@ -130,22 +130,13 @@ def mean_thickness(vertices: Array, triangles: Index) -> float:
     return 2 * volume / area
 
 
-def edge_ends(vertices: Array, triangles: Index, most: float = _FLAT) -> Array:
-    """Return the ends (E, 2, 3) [m] of the edges between faces of a surface, (V, 3) [m] and (T, 3).
-
-    The cosine of the angle between the normals of the two faces is less than `most`.
-    """
+def edge_length(vertices: Array, triangles: Index) -> float:
+    """Return the length of the edges between faces of a surface, vertices (V, 3) [m], triangles (T, 3)."""
     joined = distinct_rows(np.round(vertices / LENGTH_TOLERANCE).astype(np.int64))[1][triangles]
     pairs, normals = paired_sides(joined), doubled_normals(vertices[triangles])
     normals /= np.maximum(np.linalg.norm(normals, axis=1), np.finfo(float).tiny)[:, None]
     one, other = normals[pairs.T % len(triangles)]
-    ends: Array = vertices[sides_of(triangles)[pairs[np.einsum("ij,ij->i", one, other) < most, 0]]]
-    return ends
-
-
-def edge_length(vertices: Array, triangles: Index) -> float:
-    """Return the length of the edges between faces of a surface, vertices (V, 3) [m], triangles (T, 3)."""
-    ends = edge_ends(vertices, triangles)
+    ends = vertices[sides_of(triangles)[pairs[np.einsum("ij,ij->i", one, other) < _FLAT, 0]]]
     return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum())
 
 

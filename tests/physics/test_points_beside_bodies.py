@@ -8,10 +8,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_meshes import box as box_mesh
+from small_meshes import inverted, merged
 from small_scenes import AIR, matrix_of_sphere, relative_error, small_scene
 
 import autdtorch as at
-from autdtorch.fdtd.grid_errors import reading_errors, usual_errors
+from autdtorch.fdtd.grid_errors import edge_errors, reading_errors, usual_errors
 from autdtorch.propagators import make_propagator
 from autdtorch.propagators.plan import region_of
 from autdtorch.scene.geometry import rotation_matrix
@@ -84,6 +86,52 @@ def test_points_beside_edges_err_by_no_more_than_their_claims(seed, thickness, t
     true = (matrix - truth).norm(dim=1) / truth.norm(dim=1)
     assert int((true > 3 * propagator.point_errors(points)).sum()) <= 4
     assert error / 5 < relative_error(matrix, truth) < 1.8 * error
+
+
+def edge_errors_of(scene, points):
+    matrix = torch.ones((len(points), 1), dtype=torch.complex128)
+    far = torch.full((1, 1, 3), -1.0, dtype=torch.float64)
+    return edge_errors(matrix, matrix, torch.from_numpy(points), far, region_of(scene), 1e-3)
+
+
+@settings(max_examples=5)
+@given(st.integers(0, 10**6), st.floats(0.2, 0.8), st.integers(0, 2), st.sampled_from([None, 0.2, 2.0, 60.0]))
+def test_edges_that_parts_of_a_body_or_a_reflector_cover_do_not_count(seed, share, axis, density):
+    """Edges count at places up to half a cell apart, the errors of a cell away are known to 4 % by that."""
+    rng = np.random.default_rng(seed)
+    angles, size = tuple(rng.uniform(-3, 3, 3).tolist()), rng.uniform(5e-3, 9e-3, 3)
+    turn, across = rotation_matrix(angles).numpy(), np.eye(3)[axis]
+    material = {"density": density * AIR.density, "sound_speed": 400.0} if density else {"rigid": True}
+
+    def part(low, high):
+        """The box from one share of its length to another."""
+        center = CENTER + turn @ ((low + high - 1) / 2 * across * size)
+        return at.Box(tuple(center), tuple(size * np.where(across, high - low, 1)), angles, **material)
+
+    whole, apart = part(0, 1), [part(0, share), part(share, 1)]
+    points = CENTER + rng.uniform(-1, 1, (300, 3)) * 10e-3
+    points = points[whole.signed_distance(torch.from_numpy(points)).numpy() > 1e-3]
+    errors = edge_errors_of(small_scene((whole,)), points)
+    assert errors.any()
+    assert edge_errors_of(small_scene(apart), points).numpy() == pytest.approx(errors, rel=0.05, abs=1e-4)
+    normal = turn @ across
+    before = points[(points - CENTER) @ normal > 0]
+    scene = at.Scene(
+        at.TransducerArray([CENTER + 30e-3 * normal], (0, 0, 1)), AIR, 40e3, [CENTER + 20e-3 * normal],
+        [part(0.5, 1)], reflectors=[at.Reflector(CENTER, normal)],
+    )  # fmt: skip
+    errors = edge_errors_of(small_scene((whole,)), before)
+    assert edge_errors_of(scene, before).numpy() == pytest.approx(errors, rel=0.05, abs=1e-4)
+
+
+def test_concave_edges_do_not_count():
+    """A room in a body has no others."""
+    inner = box_mesh((-3, -4, -5), (3, 4, 5))
+    body = at.Mesh.from_surface(merged(box_mesh((-12,) * 3, (12,) * 3), inverted(inner)), 1e-3, rigid=True)
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 3)) * (2.9e-3, 3.9e-3, 4.9e-3)
+    scene = at.Scene(at.TransducerArray([[0, 0, 50e-3]], (0, 0, 1)), AIR, 40e3, [[0, 0, 40e-3]], (body,))
+    assert not edge_errors_of(scene, points).any()
+    assert edge_errors_of(scene, points + np.array([0, 12.5e-3, 12.5e-3])).any()
 
 
 def test_kernels_count_within_a_cell_of_surfaces_that_the_pressure_has_a_kink_at():

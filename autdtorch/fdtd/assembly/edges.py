@@ -163,13 +163,24 @@ def edges_of(shape: Shape, others: Sequence[Shape] = ()) -> list[Segment | Circl
         if circle and free.any():  # whole: sides of a polygon would depend on its corners
             edges.append(circle)
         elif not circle:
-            for side in np.flatnonzero(free):
-                begin, whole = ends[side, 0], ends[side, 1] - ends[side, 0]
-                edges += [
-                    Segment(begin + low * whole, begin + high * whole, normals[side])
-                    for low, high in _runs(~covered[side])
-                ]
+            edges += [
+                Segment(begin, end, normals[side])
+                for side in np.flatnonzero(free)
+                for begin, end in _parts(ends[side], ~covered[side])
+            ]
     return edges
+
+
+def sharp_sides(shape: Shape, others: Sequence[Shape], sharp: float) -> Array:
+    """Return the ends (n, 2, 3) [m] of what `others` leave of the sides at convex edges of a shape.
+
+    The angle [rad] between the normals of the two faces is at least `sharp`.
+    """
+    ends, normals = _sharp_sides(*(part.numpy() for part in shape.surface()))
+    chosen = np.einsum("ij,ij->i", normals[:, 0], normals[:, 1]) < math.cos(sharp)
+    ends, normals = ends[chosen], normals[chosen]
+    parts = [_parts(*side) for side in zip(ends, ~_covered(ends, normals, others), strict=True)]
+    return np.concatenate([np.zeros((0, 2, 3)), *parts])
 
 
 def _covered(ends: Array, normals: Array, others: Sequence[Shape]) -> NDArray[np.bool_]:
@@ -188,9 +199,10 @@ def _covered(ends: Array, normals: Array, others: Sequence[Shape]) -> NDArray[np
     return covered
 
 
-def _runs(mask: NDArray[np.bool_]) -> Array:
-    """Return where runs of a mask (n,) begin and end (r, 2), as shares of its length."""
-    return np.flatnonzero(np.diff(mask, prepend=False, append=False)).reshape(-1, 2) / len(mask)
+def _parts(ends: Array, mask: NDArray[np.bool_]) -> Array:
+    """Return the ends (r, 2, 3) [m] of runs of a mask (n,) over the parts of a side with ends (2, 3)."""
+    runs = np.flatnonzero(np.diff(mask, prepend=False, append=False)).reshape(-1, 2) / len(mask)
+    return np.asarray(ends[0] + runs[:, :, None] * (ends[1] - ends[0]))
 
 
 def rims_of(
