@@ -13,6 +13,7 @@ from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.base import inside_any
 from autdtorch.scene.reflectors import Reflector, are_in_front
 from autdtorch.utils.array_types import Array
+from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
@@ -106,9 +107,19 @@ def outside_on_plane(
 
     The field in a body may be many times stronger than in air, and would determine the colour scale.
     """
+    _warn_of_swapped_axes(magnitude.shape, plane.size)
     points = cell_centers_of(plane, (magnitude.shape[0], magnitude.shape[1]))
     hidden = inside_any(points, obstacles) | ~are_in_front(reflectors, points)
     return np.where(hidden.numpy(), np.nan, magnitude)
+
+
+def _warn_of_swapped_axes(counts: tuple[int, ...], size: tuple[float, ...]) -> None:
+    """Warn of a map whose cells are oblong, and would be square if it were transposed."""
+    sides = [MM * side / count for side, count in zip(size, counts, strict=True)]
+    swapped = [side / count for side, count in zip(size, counts[::-1], strict=True)]
+    if max(sides) > 1.5 * min(sides) and max(swapped) < 1.2 * min(swapped):
+        cells = f"cells of {sides[0]:.3g} mm x {sides[1]:.3g} mm, and square ones if transposed"
+        warn_user(f"pressure: shape {counts} has {cells}: are the axes (Nu, Nv) of the plane swapped?")
 
 
 def largest(magnitude: Array) -> float:

@@ -225,4 +225,5 @@ def readable(name: str) -> str:
 def wrapped(text: str, width: float, most: int | None = None) -> str:
     """Return the text in lines of at most a width [inch]; beyond `most` lines an ellipsis ends it."""
     spaced, letters = text.replace(",", ", ").replace(",  ", ", "), max(8, int(width / _LETTER))
-    return textwrap.fill(spaced, letters, max_lines=most, placeholder="\N{HORIZONTAL ELLIPSIS}")
+    ellipsis = "\N{HORIZONTAL ELLIPSIS}"
+    return textwrap.fill(spaced, letters, max_lines=most, placeholder=ellipsis, break_on_hyphens=False)

@@ -149,6 +149,9 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, AnyArray]:
     try:
         if not zipfile.is_zipfile(path):
             with Path(path).open("rb") as file:
+                if file.read(2) in (b"", b"PK"):  # PK begins an archive, whose end has its table
+                    raise ValueError("empty or broken off")
+                file.seek(0)
                 return {"": _read(file, Path(path).stat().st_size)}
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()

@@ -306,6 +306,16 @@ def test_maps_of_several_methods_share_the_reflectors() -> None:
     assert len(figure.axes[0].lines) == 2
 
 
+def test_a_map_with_swapped_axes_is_told(recwarn) -> None:
+    plane = at.Plane(center=(0, 0, 0), normal=(0, 0, 1), size=(20e-3, 40e-3))
+    field = np.ones(plane.points(2e-3).shape[:2])
+    at.plot_plane(field, plane)
+    at.plot_plane(field[:, ::3], plane)  # oblong cells of a user's choice
+    assert not recwarn
+    with pytest.warns(at.ScaleWarning, match=r"shape \(20, 10\) has cells of 1 mm x 4 mm"):
+        at.plot_plane(field.T, plane)
+
+
 def test_no_arrow_is_drawn_where_there_is_no_force() -> None:
     plane = at.Plane(center=(0, 0, 0), normal=(0, 0, 1), size=(4e-3, 4e-3))
     force = torch.zeros(4, 4, 3)

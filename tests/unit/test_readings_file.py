@@ -311,6 +311,15 @@ def test_a_broken_file_of_numpy_is_refused(tmp_path, arrays, message):
         at.load_readings(tmp_path / "trial.npz")
 
 
+@pytest.mark.parametrize("share", [0, 0.5, 0.99])
+def test_a_file_of_numpy_that_broke_off_is_told(tmp_path, share):
+    file = tmp_path / "trial.npz"
+    np.savez(file, drives=Q.numpy(), pressure=RMS.numpy())
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+    with pytest.raises(ValueError, match=r"trial\.npz: empty or broken off; must hold plain NumPy arrays$"):
+        at.load_readings(file)
+
+
 def test_arrays_of_others_are_read_with_their_units(tmp_path):
     np.savez(tmp_path / "trial.npz", phases=np.degrees(-Q.angle().numpy()), pressure=RMS.numpy())
     readings = at.load_readings(tmp_path / "trial.npz", phases="deg", pressure="kPa rms")
