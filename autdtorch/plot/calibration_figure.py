@@ -134,6 +134,8 @@ def _draw_readings(ax: Axes, calibration: Calibration) -> list[Line2D]:
     ax.set(xlim=(0, most), ylim=(0, most), aspect="equal")
     ax.set(xlabel=f"reading [{name}]", ylabel=f"predicted [{name}]", title=title)
     ax.tick_params(labelsize=TICK_SIZE)
+    for axis in (ax.xaxis, ax.yaxis):
+        set_ticks(axis, _PANEL, (0, most))
     return handles
 
 
