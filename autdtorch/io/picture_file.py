@@ -10,7 +10,6 @@ import numpy as np
 from autdtorch.hardware.camera.picture import Picture
 from autdtorch.scene.drive import validate_single_drive
 from autdtorch.scene.geometry import Plane
-from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.files import path_of, read_arrays, write_arrays
 from autdtorch.utils.validation import ArrayLike, complex_tensor, real_tensor, require_kind, within
 
@@ -20,7 +19,8 @@ PICTURES = "pictures"
 EVALUATION, AGAIN = "evaluation", "again"  # begin the names of these
 
 _MAPS = ("pressure", "deviation")
-_PLANE = {"center": 3, "normal": 3, "size": 2}
+_PLANE = ("center", "normal", "size")
+_REST = ("relative", "frames", "latency")
 
 
 def save_picture(path: str | os.PathLike[str], picture: Picture, drive: ArrayLike | None = None) -> None:
@@ -39,7 +39,7 @@ def save_picture(path: str | os.PathLike[str], picture: Picture, drive: ArrayLik
     require_kind("picture", picture, Picture)
     maps = {name: getattr(picture, name).numpy().astype(np.float32) for name in _MAPS}
     plane = {name: np.asarray(getattr(picture.plane, name)) for name in _PLANE}
-    rest = {name: getattr(picture, name) for name in ("relative", "frames", "latency")}
+    rest = {name: getattr(picture, name) for name in _REST}
     rest["doubts"] = np.asarray(picture.doubts, dtype=np.str_)
     if drive is not None:
         checked = complex_tensor("drive", drive)
@@ -60,19 +60,15 @@ def load_picture(path: str | os.PathLike[str]) -> Picture:
     path = path_of("path", path, suffixes=(".npz",))
     arrays = read_arrays(path)
     with within(path):
-        wanted = {*_MAPS, *_PLANE, "relative", "frames", "latency", "doubts"}
+        wanted = {*_MAPS, *_PLANE, *_REST, "doubts"}
         if missing := sorted(wanted - set(arrays)):
             raise ValueError(f"no array {missing[0]!r}; must be written by save_picture")
         pressure, deviation = (real_tensor(name, arrays[name], "Pa") for name in _MAPS)
-        center, normal, size = (_numbers(name, arrays[name], count) for name, count in _PLANE.items())
-        relative, frames, latency = (
-            _numbers(name, arrays[name], 1)[0] for name in ("relative", "frames", "latency")
-        )
-        plane = Plane(
-            (center[0], center[1], center[2]), (normal[0], normal[1], normal[2]), (size[0], size[1])
-        )
+        plane = Plane(*(arrays[name].tolist() for name in _PLANE))
+        relative, frames, latency = (arrays[name].tolist() for name in _REST)
+        require_kind("relative", relative, bool)
         doubts = tuple(map(str, arrays["doubts"].ravel()))
-        return Picture(plane, pressure, deviation, bool(relative), int(frames), latency, doubts)
+        return Picture(plane, pressure, deviation, relative, frames, latency, doubts)
 
 
 def pictures_of_evaluations(folder: Path) -> list[Path]:
@@ -89,9 +85,3 @@ def newest_picture(folder: Path) -> Path | None:
         except OSError:  # removed meanwhile
             continue
     return max(times, key=lambda path: (times[path], path.name), default=None)
-
-
-def _numbers(name: str, values: AnyArray, count: int) -> list[float]:
-    if values.size != count or values.dtype.kind not in "biuf" or not np.isfinite(values).all():
-        raise ValueError(f"{name}: {values.tolist()!r:.80}; must be {count} finite numbers")
-    return [float(value) for value in values.ravel()]

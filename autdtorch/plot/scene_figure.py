@@ -21,8 +21,8 @@ from autdtorch.plot.style import TICK_SIZE, new_figure, styled, text_width
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.reflectors import are_in_front
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.array_types import Array
-from autdtorch.utils.spatial import doubled_normals, sides_of
+from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.spatial import doubled_normals, paired_sides, sides_of
 from autdtorch.utils.validation import ArrayLike, Vector, require_kind
 
 # Lengths [inch]
@@ -172,16 +172,12 @@ def _hidden(obstacle: Obstacle, points: Array) -> NDArray[np.bool_]:
     return obstacle.contains(points[:, None] + steps[:, None] * _TO_VIEWER).any(dim=1).numpy()
 
 
-def _sharp_edges(faces: NDArray[np.int64], normals: Array, front: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _sharp_edges(faces: Index, normals: Array, front: NDArray[np.bool_]) -> Index:
     """Return the vertices (E, 2) of edges between faces at over `SHARP_ANGLE`, one of them in `front`."""
-    ends = sides_of(faces)
-    face = np.tile(np.arange(len(faces)), 3)
-    pairs = np.sort(ends, axis=1)
-    # On a closed surface, sorting brings the two faces of an edge together.
-    order = np.lexsort(pairs.T)
-    one, other = face[order[0::2]], face[order[1::2]]
+    pairs = paired_sides(faces)
+    one, other = pairs.T % len(faces)
     sharp = (normals[one] * normals[other]).sum(axis=1) < np.cos(colours.SHARP_ANGLE)
-    edges: NDArray[np.int64] = pairs[order[0::2]][sharp & (front[one] | front[other])]
+    edges: Index = sides_of(faces)[pairs[sharp & (front[one] | front[other]), 0]]
     return edges
 
 

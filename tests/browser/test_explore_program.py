@@ -17,7 +17,7 @@ import autdtorch as at
 from autdtorch.hardware import Picture
 from autdtorch.io.picture_file import PICTURES
 from autdtorch.plot.explore import calculation
-from autdtorch.plot.explore.grip import Grip
+from autdtorch.plot.explore.rendering import Grip
 from autdtorch.plot.explore.trial_pictures import TrialPictures
 
 

@@ -52,9 +52,11 @@ def test_a_picture_without_doubts_is_loaded(tmp_path: Path) -> None:
         ("pressure", np.full((8, 6), np.nan), "pressure.*finite"),
         ("deviation", np.ones((2, 2)), r"deviation: \(2, 2\).*\(8, 6\)"),
         ("deviation", -np.ones((8, 6)), "deviation.*>= 0"),
-        ("center", np.array([0.0, np.inf, 0.0]), "center.*3 finite numbers"),
+        ("center", np.array([0.0, np.inf, 0.0]), "Plane.center.*finite"),
         ("size", np.array([0.0, 1.0]), "Plane.size"),
-        ("frames", np.array("many"), "frames.*1 finite"),
+        ("normal", np.array([0.0, 1.0]), "Plane.normal.*3 real numbers"),
+        ("relative", np.ones(2), "relative"),
+        ("frames", np.array("many"), "frames.*integer"),
     ],
 )
 def test_a_file_from_elsewhere_is_refused_by_name(

@@ -106,7 +106,7 @@ class ThermalCamera:
                 raise ValueError(f"corners: shape {tuple(pixels.shape)}; must be (4, 2), as (column, row)")
             with within("corners"):
                 self.registration = Registration.of(plane, pixels, plane.corners)
-        self._source, self._plane = frames, plane
+        self._source = frames
         grid = plane.points(spacing)
         self._counts = grid.shape[0], grid.shape[1]
         self._points = grid.reshape(-1, 3) if points is None else points_tensor("points", points)

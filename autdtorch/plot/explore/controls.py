@@ -14,8 +14,8 @@ import numpy as np
 
 from autdtorch.plot.data import MM
 from autdtorch.plot.explore.display import ANGLES, FOCUS, POSITION, first_state, four_digits, in_mm
-from autdtorch.plot.explore.grip import DIGITS
 from autdtorch.plot.explore.page import CAMERA
+from autdtorch.plot.explore.rendering import DIGITS
 from autdtorch.plot.explore.session import Session
 
 _LOWEST = -60.0  # level of the isosurface in the volume [dB]

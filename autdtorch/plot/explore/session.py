@@ -17,7 +17,7 @@ import torch
 from autdtorch.plot.data import largest
 from autdtorch.plot.explore.calculation import Calculator, Finished, Report, Request, Result
 from autdtorch.plot.explore.display import Display, offered, refusal
-from autdtorch.plot.explore.grip import Grip
+from autdtorch.plot.explore.rendering import Grip
 from autdtorch.plot.explore.situation import (
     History,
     Situation,

@@ -22,6 +22,7 @@ from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import COMPLEX, REAL
 from autdtorch.utils.files import replace_file
 from autdtorch.utils.process import cached_property
+from autdtorch.utils.spatial import volume_and_area
 from autdtorch.utils.validation import ArrayLike, Vector, finite_vector, require_one_of
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -75,9 +76,8 @@ class MovedObstacle:
             return None
         if isinstance(self.original, Sphere):
             return 4 / 3 * math.pi * self.original.radius**3 * density.real * GRAVITY
-        vertices, triangles = self.original.surface()
-        corners = (vertices - vertices.mean(dim=0))[triangles]
-        return float(torch.linalg.det(corners).sum() / 6) * density.real * GRAVITY
+        volume, _ = volume_and_area(*(part.numpy() for part in self.original.surface()))
+        return volume * density.real * GRAVITY
 
     @cached_property
     def pose(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -11,8 +11,8 @@ from typing import Any
 import torch
 
 from autdtorch.scene.geometry import rotation_matrix
+from autdtorch.scene.obstacles import KINDS
 from autdtorch.scene.obstacles.base import Obstacle
-from autdtorch.scene.obstacles.kinds import KINDS
 from autdtorch.utils.array_types import REAL, triple
 from autdtorch.utils.validation import Vector, invalid
 
