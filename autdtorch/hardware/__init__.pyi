@@ -9,9 +9,9 @@ from .camera.registration import Registration as Registration
 from .camera.registration import registered_by_foci as registered_by_foci
 from .camera.screen import Screen as Screen
 from .camera.thermal_camera import ThermalCamera as ThermalCamera
+from .devices import DEVICES as DEVICES
 from .devices.autd3 import AUTD3 as AUTD3
 from .devices.device import Device as Device
-from .devices.kinds import DEVICES as DEVICES
 from .devices.openmpd import OPENMPD as OPENMPD
 from .devices.openmpd import openmpd_boards as openmpd_boards
 from .devices.sonicsurface import SONICSURFACE as SONICSURFACE

@@ -12,9 +12,9 @@ from typing import Any, TypeAlias
 
 import torch
 
+from autdtorch.hardware.devices import require_device
 from autdtorch.hardware.devices.autd3 import AUTD3
 from autdtorch.hardware.devices.device import Device
-from autdtorch.hardware.devices.kinds import require_device
 from autdtorch.hardware.streaming import (
     Playback,
     PreparedSequence,

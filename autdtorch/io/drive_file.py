@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from autdtorch.hardware.devices.kinds import DEVICES
+from autdtorch.hardware.devices import DEVICES
 from autdtorch.io.array_file import NORMAL_COLUMNS, OFFSET, PLACE_COLUMNS, SIZE_COLUMNS
 from autdtorch.io.csv_table import CsvRows, Guessed, read_rows, table_of, write_table
 from autdtorch.io.ultraino_file import SUFFIX, read_ultraino

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from autdtorch.hardware.devices.kinds import DEVICES
+from autdtorch.hardware.devices import DEVICES
 from autdtorch.io.readings_units import (
     UNIT_WORDS,
     UNSTATED,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from autdtorch.hardware.devices.kinds import DEVICES
+from autdtorch.hardware.devices import DEVICES
 from autdtorch.hardware.link import AmplitudeScale, Wiring
 from autdtorch.hardware.log import read_log
 from autdtorch.io.csv_table import write_table

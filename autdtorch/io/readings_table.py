@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from autdtorch.hardware.devices.kinds import DEVICES
+from autdtorch.hardware.devices import DEVICES
 from autdtorch.io.csv_table import read_rows, without_index
 from autdtorch.io.readings_columns import SKIP, Columns, Named, ReadingColumn, columns_of, counted_quantities
 from autdtorch.io.readings_units import Unit, drives_of, in_metres, merged, peak_amplitudes, radians, range_of

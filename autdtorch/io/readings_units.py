@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from autdtorch.hardware.devices.kinds import DEVICES
+from autdtorch.hardware.devices import DEVICES
 from autdtorch.scene.drive import PhaseLevels
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.units import warn_user

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from autdtorch.hardware.devices.kinds import DEVICES
+from autdtorch.hardware.devices import DEVICES
 from autdtorch.io.drive_file import save_drive
 from autdtorch.io.scene_file import save_scene, scene_lines
 from autdtorch.scene.arrays import TransducerArray
