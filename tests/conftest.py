@@ -32,9 +32,11 @@ for name in ("SIGINT", "SIGQUIT", "SIGHUP"):
     if number is not None and signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, signal.default_int_handler if name == "SIGINT" else lambda *_: None)
 
-# An example may take long on a busy machine; pytest's limit stays. Each run draws other examples.
-hypothesis.settings.register_profile("autdtorch", deadline=None, max_examples=10)
-hypothesis.settings.load_profile("autdtorch")
+# An example may take long on a busy machine; pytest's limit stays. Each run draws the same examples, so that
+# a failure is of the change; by `--hypothesis-profile=search` each draws others.
+hypothesis.settings.register_profile("search", deadline=None, max_examples=10)
+hypothesis.settings.register_profile("steady", hypothesis.settings.get_profile("search"), derandomize=True)
+hypothesis.settings.load_profile("steady")
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when Triton's functions are defined
