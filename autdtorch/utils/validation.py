@@ -351,6 +351,7 @@ def _holds_numbers(value: object) -> bool:
     """
     entries = [value]
     for _ in range(MOST_AXES):
+        entries = [entry for entry in entries if type(entry) is not float]  # nearly all of long lists
         if not all(map(_is_plain, entries)):
             return False
         lists = {id(entry): entry for entry in entries if _is_list(entry)}
