@@ -17,7 +17,7 @@ from autdtorch.fdtd.stepping import air_stencil
 from autdtorch.propagators.plan import region_of
 
 SPHERE = at.Sphere((6.2e-3, 5.7e-3, 6.1e-3), 2e-3, density=20.0, sound_speed=300.0)
-RIGID = at.Box((3e-3, 9.5e-3, 9.5e-3), (3e-3, 3e-3, 3e-3), rigid=True)
+RIGID = at.Sphere((3e-3, 9.5e-3, 9.5e-3), 1.7e-3, rigid=True)
 BOX = at.Box((9e-3, 9e-3, 3e-3), (3e-3, 3e-3, 3e-3), density=3.0, sound_speed=400.0)
 WALL = at.Box((6e-3, 6e-3, 12e-3), (40e-3, 40e-3, 2e-3), density=5.0, sound_speed=340.0)
 
@@ -262,12 +262,12 @@ def test_reflectors_are_in_field_and_gradient():
 
     def field(density):
         return at.differentiable_field(
-            scene, drive, density=density, sound_speed=speed, spacing=2e-3, dtype="float64", periods=40
+            scene, drive, density=density, sound_speed=speed, spacing=2.4e-3, dtype="float64", periods=40
         )
 
     density = torch.tensor([3.0], dtype=torch.float64, requires_grad=True)
     pressure = field(density)
-    whole = at.make_propagator(scene, method="full", spacing=2e-3, dtype="float64", tolerance=1e-4)
+    whole = at.make_propagator(scene, method="full", spacing=2.4e-3, dtype="float64", tolerance=1e-4)
     expected = whole.transfer_matrix() @ drive
     # both end within 1e-4 of the steady state; 3e-6 measured, at any spacing
     assert (pressure - expected).abs().max() < 3e-4 * expected.abs().max()

@@ -18,7 +18,7 @@ from autdtorch.methods.bayes.gaussian_process import (
 from autdtorch.objectives.objective import weakest_focus
 from autdtorch.scene.drive import drive_from_phases
 
-SMALL = {"evaluations": 24, "initial": 6, "fixed_transducer": 2}
+SMALL = {"evaluations": 18, "initial": 6, "fixed_transducer": 2}
 FOCI = {"model": "foci", "kernel": "phasor", "noise": "inferred"}
 
 
@@ -29,7 +29,7 @@ def matrix(random_matrix):
 
 @pytest.fixture(scope="module", params=[{}, {"kernel": "circle", "acquisition": "log_ei"}, FOCI])
 def solution(request, make_objective, matrix):
-    """Two trials of 24 evaluations on a small problem."""
+    """Two trials of 18 evaluations on a small problem."""
     return at.bayes_opt(make_objective(matrix), trials=2, seed=5, **SMALL, **request.param)
 
 
@@ -44,9 +44,9 @@ def fit_of(trials, outputs, length_scale, noise):
 
 
 def test_beats_random_search(make_objective, matrix, solution):
-    phases = 2 * math.pi * uniform(200, 24, 4)
+    phases = 2 * math.pi * uniform(200, 18, 4)
     scores = weakest_focus(make_objective(matrix)(drive_from_phases(phases).flatten(0, 1)))
-    searches = scores.unflatten(0, (200, 24)).max(dim=1).values
+    searches = scores.unflatten(0, (200, 18)).max(dim=1).values
     assert (solution.score > searches.median()).all()
 
 
@@ -70,8 +70,7 @@ def test_goal_without_a_derivative_is_refused_for_the_foci(make_objective, matri
         at.bayes_opt(make_objective(matrix), goal=lambda p: torch.ones_like(p[..., 0]), **SMALL, **FOCI)
 
 
-@pytest.mark.parametrize("dark", [1, slice(None)])
-@pytest.mark.parametrize("with_prior", [False, True])
+@pytest.mark.parametrize(("dark", "with_prior"), [(1, False), (slice(None), True)])
 def test_foci_that_nothing_reaches(make_objective, random_matrix, dark, with_prior):
     simulated = random_matrix(3, 5, 0)
     matrix = simulated.clone()

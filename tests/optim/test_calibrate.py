@@ -96,7 +96,7 @@ def test_gaps_are_no_readings(matrix):
     assert calibration.held_back.readings == 160
 
 
-@pytest.mark.parametrize("shift", [-2, -1, 1, 3])
+@pytest.mark.parametrize("shift", [-2, 1])
 def test_shifted_rows_are_refused(matrix, shift):
     readings = Bench(matrix, 6, phase=0.2).readings(60)
     pairs = (

@@ -18,19 +18,17 @@ from autdtorch.objectives.bound import focus_bound
 from autdtorch.objectives.perturbations import Noise, Quantised
 
 
-@pytest.mark.parametrize("evaluations", [47, 64])
-def test_as_good_as_the_gradient_without_seeing_the_matrix(paper_objective, evaluations):
+def test_as_good_as_the_gradient_without_seeing_the_matrix(paper_objective):
     best = gradient_ascent(paper_objective).score
     # 1e-4 is what either climb leaves.
-    assert identify(paper_objective, evaluations=evaluations).score.item() > 0.999 * best
+    assert identify(paper_objective, evaluations=47).score.item() > 0.999 * best
 
 
-@pytest.mark.parametrize(("evaluations", "share"), [(64, 0.95), (256, 0.98)])
-def test_readings_average_noise(paper_objective, evaluations, share):
+def test_readings_average_noise(paper_objective):
     best = gradient_ascent(paper_objective).score
-    solution = identify(Noise(paper_objective, 20), evaluations=evaluations)
-    # Measured in three cubes, 60 trials: 0.989 and 0.997 (docs/decisions/identify.md).
-    assert paper_objective(solution.drive).amin() > share * best
+    solution = identify(Noise(paper_objective, 20), evaluations=256)
+    # Measured in three cubes, 60 trials: 0.997, of 64 evaluations 0.989 (docs/decisions/identify.md).
+    assert paper_objective(solution.drive).amin() > 0.98 * best
 
 
 class Lucky:
@@ -186,15 +184,8 @@ def share(paper_objective, caplog):
 
 @pytest.mark.parametrize(
     "change",
-    [
-        times(100, [20]),
-        times(100, [0, 20, 31], 2),
-        times(0, [7, 20]),
-        times(4, [20], 1),
-        times(100, [50]),
-        times(0, [50], 3),
-    ],
-    ids=["all", "one sensor", "zero", "four times", "late", "late zero"],
+    [times(100, [0, 20, 31], 2), times(0, [7, 20]), times(4, [20], 1), times(100, [50])],
+    ids=["one sensor", "zero", "four times", "late"],
 )
 def test_outliers_change_nothing_and_are_told(share, change):
     reached, said = share(change, evaluations=64)
@@ -217,10 +208,9 @@ def test_noisy_readings_are_not_doubted(make_objective, random_matrix, caplog, l
     assert not re.search("outliers|sensor|leaves", caplog.text)
 
 
-COARSE = [(1, 16, 0.5, None), (2, 6, 1.0, None), (4, 16, 0.5, None), (3, 8, 0.5, 16), (1, 16, 0.5, 24)]
-
-
-@pytest.mark.parametrize(("points", "transducers", "step", "evaluations"), COARSE)
+@pytest.mark.parametrize(
+    ("points", "transducers", "step", "evaluations"), [(1, 16, 0.5, None), (2, 6, 1.0, None), (3, 8, 0.5, 16)]
+)
 def test_a_coarse_sensor_is_not_taken_for_saturated(
     make_objective, random_matrix, caplog, points, transducers, step, evaluations
 ):

@@ -168,7 +168,6 @@ def results_of(solver=None, seed=0):
         return run_study(scenes, methods, Path(folder), seed=seed, config=text)
 
 
-#: HDF5 itself has no groups of the first four names.
 NAMES = ["", ".", "a/b", "a\0b", "..", "...", "..\\a", "a\nb", "a b", "x" * 101, "é" * 51, "<b>", "![a](b)"]
 
 
@@ -181,7 +180,7 @@ def test_a_study_refuses_a_name_that_is_no_part_of_a_file_name(tmp_path, name):
         run_study({"air": scene}, {name: method}, tmp_path)
 
 
-@pytest.mark.parametrize("name", NAMES[4:])
+@pytest.mark.parametrize("name", ["..", "<b>"])
 def test_results_with_such_a_name_are_refused(tmp_path, name):
     results = results_of()
     (scene,) = results.scenes.values()

@@ -115,12 +115,6 @@ def test_processes_that_compile_two_dtypes_at_once_write_two_files(kernel, monke
     assert made()(3) == 6
 
 
-def test_garbage_is_collected_after_a_compilation(kernel):
-    made, _ = kernel
-    made()(3)
-    assert gc.isenabled()
-
-
 needs_fork = pytest.mark.skipif(sys.platform != "linux", reason="compiles in one process")
 
 

@@ -185,7 +185,4 @@ def test_work_of_several_kinds_says_what_is_known_of_the_time_left(clock, caplog
         for seconds in (4, 100, 4000):
             clock.now += seconds
             shown.advance(1)
-    assert told(caplog) == [
-        "study: 4 s so far, at least 30 s left",
-        "study: 104 s so far, about 22 s left",
-    ]
+    assert told(caplog) == ["study: 4 s so far, at least 30 s left", "study: 104 s so far, about 22 s left"]
