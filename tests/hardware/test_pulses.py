@@ -28,6 +28,11 @@ class Heat:
         return pressure
 
 
+def wait_until_off(bench: hw.EmulatedBench) -> None:
+    while bench.drive().any():
+        time.sleep(1e-3)
+
+
 def test_a_pulse_is_read_for_each_evaluation_as_a_steady_sound_is(trial):
     drives = torch.stack([FULL, 1j * FULL, 0.5 * FULL])
     with trial.limited() as (bench, link):
@@ -59,7 +64,7 @@ def test_pulses_count_against_the_limits_and_rest_for_the_duty_cycle(trial, cloc
 
 def test_a_pulse_that_lasts_too_long_is_void(trial):
     with trial.limited(seconds_in_a_row=0.05) as (bench, link):
-        sensor = Heat(bench, lambda: time.sleep(0.2))
+        sensor = Heat(bench, lambda: wait_until_off(bench))
         with pytest.raises(hw.LimitError, match=r"longer than .* 0\.05 s in a row"):
             trial.objective(link, sensor)(FULL)
         assert not bench.drive().any()
@@ -131,13 +136,13 @@ def test_a_pulse_that_its_sensor_does_not_end_is_void_if_the_time_was_up(trial):
         def read_pulse(self, on, off):
             return super().read_pulse(on, self._bench.drive)
 
-    def sensor(bench, seconds):
-        sensor = Endless(bench, lambda: time.sleep(seconds))
+    def sensor(bench, during):
+        sensor = Endless(bench, during)
         sensor._bench = type("Bench", (), {"drive": lambda: torch.zeros(1), "pressure": bench.pressure})
         return sensor
 
-    with trial.limited(seconds_in_a_row=0.1) as (bench, link):
-        assert link.measure(FULL, sensor(bench, 0.0), 2).shape == (1, 2)
+    with trial.limited() as (bench, link):
+        assert link.measure(FULL, sensor(bench, lambda: None), 2).shape == (1, 2)
         assert not bench.drive().any()
-        with pytest.raises(hw.LimitError):
-            link.measure(FULL, sensor(bench, 0.3), 2)
+    with trial.limited(seconds_in_a_row=0.05) as (bench, link), pytest.raises(hw.LimitError):
+        link.measure(FULL, sensor(bench, lambda: wait_until_off(bench)), 2)
