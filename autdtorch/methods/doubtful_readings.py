@@ -14,8 +14,7 @@ from scipy.special import fdtri
 
 logger = logging.getLogger(__name__)
 
-_GROSS = 4.5  # times the median; of random phases, one magnitude in a million exceeds it
-_NOTHING = 1e-3  # times the median; one in a million is below it
+_GROSS = 1e-6  # chance of a magnitude of random phases to count as far above or below the others
 _EQUAL = 1e-6  # relative difference of readings at the end of a sensor's range
 _SATURATED = 4  # different drives that have this reading
 _ENOUGH = 8  # readings below the end of a range from which on the sensor's steps are judged
@@ -104,9 +103,20 @@ class Magnitudes:
 
 
 def gross_outliers(observed: torch.Tensor) -> torch.Tensor:
-    """Return the readings (N, P), bool, that are far above or far below the others of random phases."""
-    middle = observed.nanmedian(dim=0).values
-    return ((observed > _GROSS * middle) | (observed < _NOTHING * middle)) & (middle > 0)
+    """Return the readings (N, P), bool, that are far above or far below the others of random phases.
+
+    Their powers are exponential. The lower half shows their mean; what the others have above it, over the
+    mean, follows the distribution F of 2 and N degrees of freedom (Epstein and Sobel, Journal of the American
+    Statistical Association 48 (1953) 486). A fixed ratio to the median, 4.5, counts one in 26 sets of four.
+    """
+    relative = observed / observed.nanmedian(dim=0).values  # whose power is 1; NaN where it is 0
+    power = relative.square().sort(dim=0).values  # with gaps last
+    count = (~relative.isnan()).sum(dim=0)
+    half = (count + 1) // 2
+    lower = power.nan_to_num() * (torch.arange(len(power), device=power.device)[:, None] < half)
+    mean = (lower.sum(dim=0) + (count - half)) / half
+    most = 1 + mean * half * (_GROSS ** (-1 / half) - 1)
+    return (relative.square() > most) | (relative.square() < _GROSS * mean)
 
 
 def range_ends(drives: torch.Tensor, observed: torch.Tensor) -> torch.Tensor:

@@ -95,9 +95,12 @@ def test_levels_of_the_device_are_known_to_the_fit(paper_objective):
     assert paper_objective(solution.drive).amin() > 0.9 * best
 
 
-@pytest.mark.parametrize(("points", "transducers"), [(1, 1), (2, 2), (1, 3), (8, 3), (3, 8)])
-def test_from_the_fewest_evaluations(make_objective, random_matrix, points, transducers):
-    objective = make_objective(random_matrix(points, transducers, 0))
+@pytest.mark.parametrize(
+    ("points", "transducers", "seed"),
+    [(1, 1, 0), (2, 2, 0), (2, 2, 1), (1, 3, 0), (8, 3, 0), (3, 8, 0)],  # 1: of four readings, two are low
+)
+def test_from_the_fewest_evaluations(make_objective, random_matrix, points, transducers, seed):
+    objective = make_objective(random_matrix(points, transducers, seed))
     solution = identify(objective, evaluations=3 * transducers - 1, trials=3)
     assert objective.evaluations == 3 * (3 * transducers - 1)
     assert solution.score.min() > 0.98 * gradient_ascent(objective).score
@@ -330,6 +333,17 @@ def test_ends_of_ranges_fine_readings_and_gross_outliers():
     magnitudes[3], magnitudes[5] = 30 * magnitudes.median(), 0
     assert gross_outliers(magnitudes)[:, 0].nonzero()[:, 0].tolist() == [3, 5]
     assert not gross_outliers(0 * magnitudes).any()
+
+
+@pytest.mark.parametrize("count", [4, 7, 20, 100])
+def test_no_reading_is_a_gross_outlier_by_chance_among_few(count):
+    """The chance of a reading is 2e-6, so that 20,000 have two with a chance of 1e-3."""
+    generator = torch.Generator().manual_seed(count)
+    magnitudes = torch.randn(count, 20000 // count, dtype=torch.complex128, generator=generator).abs()
+    assert gross_outliers(magnitudes).sum() <= 1
+    magnitudes[0] = torch.nan
+    magnitudes[1] = 1000 * magnitudes.nanmedian()
+    assert gross_outliers(magnitudes)[1].double().mean() > 0.95  # of three, with one from the highest half
 
 
 def test_a_last_drive_that_attains_the_targets_is_not_doubted(caplog):
