@@ -36,11 +36,14 @@ class Step(NamedTuple):
         drives: B drives to observe for each of the L trials that go on (L, B, M); B = 0 at the end.
         search: tensors by name, from which the method goes on.
         goes_on: True for those of the observed trials that go on, bool; None for all.
+        chosen: indices of the observed drives that take the place of the best so far (L',), of the L' trials
+            that were observed; -1 leaves it, and None all.
     """
 
     drives: torch.Tensor
     search: Mapping[str, torch.Tensor]
     goes_on: torch.Tensor | None = None
+    chosen: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,6 +281,8 @@ class Method(ABC):
         score = scores_of(state.problem.goal, pressure)
         state = replace(state, best=_improved(state, pressure, score))
         step = self.advance(state, pressure, score)
+        if step.chosen is not None:
+            state = replace(state, best=_chosen(state, step.chosen, score))
         trials = state.trials if step.goes_on is None else state.trials[step.goes_on]
         unread = _unread(step.drives, state.problem)
         state = replace(state, trials=trials, drives=step.drives, search=step.search, pressure=unread)
@@ -323,6 +328,18 @@ def _with_readings(best: Solution, readings: Readings | None, goal: GoalFunction
         drive=torch.where(better[:, None], drives[index], best.drive),
         pressure=torch.where(better[:, None], pressure[index], best.pressure),
         score=torch.where(better, score[index], best.score),
+    )
+
+
+def _chosen(state: State, index: torch.Tensor, score: torch.Tensor) -> Solution:
+    """Return the best drives with those of indices (L,) of the last step, if >= 0, in place of others."""
+    row = torch.nonzero(index >= 0)[:, 0]
+    trials, index = state.trials[row], index[row]
+    return replace(
+        state.best,
+        drive=state.best.drive.index_copy(0, trials, state.drives[row, index]),
+        pressure=state.best.pressure.index_copy(0, trials, state.pressure[row, index]),
+        score=state.best.score.index_copy(0, trials, score[row, index]),
     )
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import torch
 
 from autdtorch.methods.base import Method, State, Step, choice, setting, whole
+from autdtorch.methods.gain_trend import GainTrend, trends_of
 from autdtorch.methods.gradient import climbed, highest_drive
 from autdtorch.methods.matrix_fit import least_readings, posteriors, tensors_of
 from autdtorch.methods.phase_points import (
@@ -258,6 +259,9 @@ class BayesOpt(Method):
                 [text, *others] if count else others
                 for count, text, others in zip(counts, texts, doubts, strict=True)
             ]
+        if state.done and "trend" in state.search:
+            told = [list(GainTrend(*trend).doubts()) for trend in state.search["trend"].tolist()]
+            doubts = [[*texts, *more] for texts, more in zip(doubts, told, strict=True)]
         return doubts
 
     def _with(
@@ -327,6 +331,8 @@ class BayesOpt(Method):
         prior = None if self.prior is None else matrix_prior(self.prior, problem)
         fits = posteriors(prior, search, drives, observed, generators, variance, deviation)
         search |= tensors_of(fits)
+        if left == 0:
+            search["trend"] = trends_of(fits, drives)
         mean = torch.stack([fit.posterior.matrix for fit in fits])
         search["fitted_values"] = (drives @ mean.mT).abs()
         each = zip(fits, drives, generators, strict=True)

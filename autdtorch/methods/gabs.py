@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import torch
 
 from autdtorch.methods.base import NEAR_TIE, Method, State, Step, whole
+from autdtorch.methods.gain_trend import step_doubts
 from autdtorch.methods.lssg import (
     Search,
     ascend,
@@ -35,6 +36,9 @@ class GABS(Method):
 
     Where the problem has a drive to start from, all its transducers are on from the beginning, with the
     nearest of the phases, and every pass goes through all M of them: 1 + M * levels evaluations.
+
+    Where the gain drifts, as on a bench that warms up, the readings of a step are compared without its trend,
+    and the last choice is the solution.
 
     A trial takes 1 + (M - 1) * levels evaluations: the first transducer alone, whose phase changes no
     magnitude, then `levels` for each of the others. That is 241 for the paper's M = levels = 16; the paper
@@ -92,14 +96,19 @@ class GABS(Method):
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
         """Compare the phases of the next transducer."""
         problem = state.problem
-        search, goes_on = state.search or self._begun(problem, _best_first(score)), None
-        done = (state.best.history.shape[1] - self._alone(problem)) // self.levels
-        step = done + self._skipped(problem)
-        if done > 0:
-            search, goes_on = ascend(search, step - 1, score)
+        search = state.search or self._begun(problem, _best_first(score))
+        count = (state.best.history.shape[1] - self._alone(problem)) // self.levels
+        step = count + self._skipped(problem)
+        done = Step(state.drives[:, :0], search)
+        if count > 0:
+            done = ascend(search, step - 1, state, pressure, score)
         if step == self.passes * problem.transducers:
-            return Step(state.drives[:, :0], search)
-        return Step(candidates(search, self.levels, step), search, goes_on)
+            return done
+        return done._replace(drives=candidates(done.search, self.levels, step))
+
+    def _doubts(self, state: State) -> Sequence[Iterable[str]]:
+        """Describe a lone highest score, or a drift of the gain."""
+        return super()._doubts(state) if state.done else step_doubts(state.search)
 
     def _skipped(self, problem: Problem) -> int:
         """Return 1 where the first transducer is on alone, whose phase changes nothing."""

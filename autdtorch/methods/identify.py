@@ -14,6 +14,7 @@ import torch
 from autdtorch.methods.base import Method, State, Step, setting, whole
 from autdtorch.methods.doubtful_readings import Magnitudes, reading_doubts, sensor_doubts
 from autdtorch.methods.further_readings import independent_readings
+from autdtorch.methods.gain_trend import GainTrend, trends_of
 from autdtorch.methods.gradient import climbed, highest_drive, random_drives
 from autdtorch.methods.matrix_fit import MatrixFit, least_readings, posteriors, tensors_of
 from autdtorch.methods.prior import (
@@ -54,7 +55,8 @@ class Identify(Method):
     others. They replace random drives where these would show nothing new of the matrix.
 
     Readings far from the fit of the others are left out, and readings at the end of a sensor's range are
-    taken as lower limits. Both are logged, like a sensor that does not respond to the drives.
+    taken as lower limits. Both are logged, like a sensor that does not respond to the drives, and a gain
+    that drifts.
 
     Attributes:
         evaluations: number of evaluations of a trial, > 2.3 M, or >= 2 with a prior. With fewer than 3 M - 1
@@ -149,7 +151,9 @@ class Identify(Method):
         search = {**search, **tensors_of(fits)}
         if left == 0:
             last = problem.quantise(best)[:, None]
-            return Step(last, {**search, "fitted": _magnitudes(fits, torch.cat([drives, last], dim=1))})
+            trend = trends_of(fits, drives)
+            fitted = _magnitudes(fits, torch.cat([drives, last], dim=1))
+            return Step(last, {**search, "fitted": fitted, "trend": trend})
         count = min(left, max(1, drives.shape[1] // _GROWTH))
         chosen = []  # the best drives of samples of the matrix, near the best of the fitted one
         for (fit, played, draws), start in zip(trials, best, strict=True):
@@ -192,6 +196,7 @@ class Identify(Method):
             yield from reading_doubts(
                 names, observed, read, fitted, search["variance"].sqrt(), prior=self.prior is not None
             )
+            yield from GainTrend(*search["trend"].tolist()).doubts()
             if int(search["answer"]) < count:
                 yield f"the last drive is far worse than the solution, {names[int(search['answer'])]}"
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import torch
 
 from autdtorch.methods.base import Method, State, Step, first_of_best, setting, whole
+from autdtorch.methods.gain_trend import steadied, step_doubts
 from autdtorch.methods.problem import FOR_FORCE, Problem
 from autdtorch.objectives.goals import scores_pressures
 from autdtorch.objectives.over_scenes import OverScenes
@@ -24,6 +25,7 @@ Search = Mapping[str, torch.Tensor]
 
 - ``weights`` (L, N), complex128: e^{-i phi}, or 0 for what is off; ``before``: as they were before this pass.
 - ``order`` (L, K): indices of the weights to go through in a pass.
+- ``trend``, ``drifting``: of the gain, as `steadied`.
 """
 
 
@@ -77,21 +79,32 @@ def candidates(search: Search, levels: int, step: int) -> torch.Tensor:
     return weights.expand(-1, levels, -1).scatter(2, index, phases)
 
 
-def ascend(search: Search, step: int, score: torch.Tensor) -> tuple[Search, torch.Tensor | None]:
-    """Take the best of the `candidates` of a step by their scores (L, levels); of near ties the first.
+def ascend(search: Search, step: int, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
+    """Take the best of the `candidates` of a step; of near ties the first.
+
+    Args:
+        search: the state of the ascent.
+        step: its number.
+        state: with the drives (L, levels, M) that were observed.
+        pressure: magnitudes (L, levels, P) [Pa].
+        score: of these (L, levels).
 
     Returns:
-        The state, and which of the L trials go on (L,), None for all. A trial ends after a pass that changed
-        none of its weights.
+        A step without drives. A trial ends after a pass that changed none of its weights. Where the gain
+        drifts, the choice takes the place of the best before, whose reading is of another gain.
     """
-    order = search["order"]
+    search, score = steadied(state.problem, search, state.drives, pressure, score)
+    order, best = search["order"], first_of_best(score)
     index = order[:, step % order.shape[1], None]
-    phases = _phases(score.shape[1])[first_of_best(score)]
-    weights = search["weights"].scatter(1, index, phases[:, None])
+    weights = search["weights"].scatter(1, index, _phases(score.shape[1])[best][:, None])
+    chosen = best.masked_fill(search["drifting"] == 0, -1)
+    none = state.drives[:, :0]
     if (step + 1) % order.shape[1]:
-        return {**search, "weights": weights}, None
+        return Step(none, {**search, "weights": weights}, None, chosen)
     goes_on = (weights != search["before"]).any(dim=1)
-    return {**search, **begin_ascent(weights[goes_on], order[goes_on])}, goes_on
+    further = {name: search[name][goes_on] for name in ("trend", "drifting")}
+    search = {**search, **begin_ascent(weights[goes_on], order[goes_on]), **further}
+    return Step(none, search, goes_on, chosen)
 
 
 @functools.lru_cache(maxsize=8)
@@ -167,11 +180,15 @@ class LSSG(Method):
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
         """Compare the offsets of the next focus."""
         step = state.best.history.shape[1] // self.levels
-        search, goes_on = ascend(state.search, step - 1, score)
+        done = ascend(state.search, step - 1, state, pressure, score)
         if step == self.passes * _foci(state.problem):
-            return Step(state.drives[:, :0], search)
-        weights = candidates(search, self.levels, step)
-        return Step(normalise(weights @ search["foci"]), search, goes_on)
+            return done
+        weights = candidates(done.search, self.levels, step)
+        return done._replace(drives=normalise(weights @ done.search["foci"]))
+
+    def _doubts(self, state: State) -> Sequence[Iterable[str]]:
+        """Describe a lone highest score, or a drift of the gain."""
+        return super()._doubts(state) if state.done else step_doubts(state.search)
 
 
 def _foci(problem: Problem) -> int:

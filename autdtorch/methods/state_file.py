@@ -31,7 +31,7 @@ from autdtorch.utils.validation import invalid, require_kind, within
 
 _BEST, _SEARCH, _READINGS, _HEADER = "best.", "search.", "readings.", "header"
 _OF_READINGS = ("drives", "pressure")
-_VERSION = 4  # of the format; a new one where `State`, or the `search` of a method, changes
+_VERSION = 5  # of the format; a new one where `State`, or the `search` of a method, changes
 _SHOWN = 16  # digits of a digest
 _COLUMNS = tuple(field.name for field in dataclasses.fields(Solution))
 

@@ -173,15 +173,15 @@ def test_a_state_goes_on_under_a_function_of_the_same_code_and_values_alone(tmp_
 
 
 # The search of each method in files of this version. Where it changes, `_VERSION` must, too.
-VERSION = 4
+VERSION = 5
 SEARCHES = {
     "lss": "",
-    "lssg": "before foci order weights",
-    "gabs": "before order weights",
+    "lssg": "before drifting foci order trend weights",
+    "gabs": "before drifting order trend weights",
     "bayes_opt": "answer ends entries factors fitted fitted_values generators length_scale noise outliers "
-    "points spread values variance",
+    "points spread trend values variance",
     "identify": "answer drives ends entries factors fitted generators numbers observed outliers random "
-    "spread variance",
+    "spread trend variance",
     "phase_stepping": "generators matrix weight",
     "random_search": "generators",
     "gradient_ascent": "",

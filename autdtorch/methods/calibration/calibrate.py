@@ -18,6 +18,7 @@ from autdtorch.methods.calibration.calibration import (
 )
 from autdtorch.methods.calibration.fit import CalibrationFit, CalibrationStart, LinearChanges, fitted
 from autdtorch.methods.doubtful_readings import saturation_doubts
+from autdtorch.methods.gain_trend import trend_of_fit
 from autdtorch.methods.prior import Prior, prior_of
 from autdtorch.objectives.readings import Readings
 from autdtorch.propagators import Propagator
@@ -90,6 +91,7 @@ def calibrate(
         doubts.append('amounts half a wavelength aside may fit better: method "tmatrix" looks there, too')
     for point in range(len(failed)):
         doubts += saturation_doubts(fit.read, point)
+    doubts += trend_of_fit(fit.posterior, used.drives, fit.read).doubts()
     calibration = Calibration(simulation, start, used, prior, fit, None, tuple(doubts))
     for row, column in calibration.outliers:
         logger.warning(
