@@ -21,6 +21,7 @@ from autdtorch.utils.validation import LENGTH_TOLERANCE, Vector
 _SAGITTA = 1.5  # Growth of a bounding box, relative to the distance of triangles from a curved surface
 # Steps from a place to another, and the distance, relative to the precision, at which a shape is reached
 _STEPS, _TOUCHING = 60, 1e-3
+_SLOPE = 1e-6  # Step from a point to others that tell the slope of distances [m]
 
 
 class Shape(Protocol):
@@ -78,6 +79,12 @@ class Solids:
         where = torch.from_numpy(points)
         level = remaining((shape.signed_distance(where).numpy() for shape in self.shapes), self.solid)
         return np.broadcast_to(level, points.shape[:-1])
+
+    def normals(self, points: Array) -> Array:
+        """Return the normals (..., 3) of the nearest surface at points (..., 3) [m]; halfway, their mean."""
+        steps = _SLOPE * np.eye(3)
+        slopes = [self.distance(points + step) - self.distance(points - step) for step in steps]
+        return np.stack(slopes, axis=-1) / (2 * _SLOPE)
 
 
 def sees(begin: Array, end: Array, solids: Solids, precision: float) -> NDArray[np.bool_]:

@@ -53,6 +53,8 @@ _BACKGROUND = 1e-20
 _CELL_BYTES = 20  # Memory of an assembled cell
 _FEWEST_IDLE = 32  # Cells of a row from which it is quicker to skip them than to step them
 _LOOKING = 512  # Points whose kernels are looked at together
+# Cosine of the angle between the normals at a point and at a cell, at most, of faces with an edge in between
+_AROUND_AN_EDGE = 0.2
 _LAYERS = 4  # Cells along an axis, two on each side of a point, that tell whether it is in a slit
 _BLOCK = np.moveaxis(np.indices((_LAYERS,) * 3), 0, -1).reshape(-1, 3)  # those of all axes, from the first
 _ONE_NODE = torch.ones(1, **REAL)  # Weight of a point with a single node
@@ -138,9 +140,11 @@ class Assembly:
     def _behind(
         self, solids: Solids, points: Array, cells: Index, rigid: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which cells (P, n) are behind solid bodies, as seen from points (P, 3) [m].
+        """Return which cells (P, n) are behind solid bodies or around their edges, from points (P, 3) [m].
 
         Points in these see all cells, and so do those in gaps where only `rigid` cells (P, n) are in sight.
+        The pressure bends around edges more than waves do: kernels with some cells in a body do without those
+        beyond the plane of the nearest face.
         """
         spacing = self.grid.spacing
         behind, reach = np.zeros(cells.shape, bool), ONE_SIDED_REACH * spacing
@@ -152,8 +156,8 @@ class Assembly:
         count = math.prod(self.grid.shape)
         numbers = distinct_cells(cells[near], count)
         place_of, centers = places_among(numbers, count), self.grid.centers_of(numbers)
-        free = solids.distance(centers)
-        centers, outward = (np.ascontiguousarray(each.T) for each in (centers, self._outward(numbers)))
+        free, of_cells = solids.distance(centers), (centers, self._outward(numbers), solids.normals(centers))
+        centers, outward, normals = (np.ascontiguousarray(each.T) for each in of_cells)
         for first in range(0, len(near), _LOOKING):
             some = near[first : first + _LOOKING]
             place = place_of[cells[some]]
@@ -164,8 +168,13 @@ class Assembly:
             row, cell = np.nonzero((off < reach) & (clear > 0) & ~seen)
             seen[row, cell] = sees(points[some[row]], ends[:, row, cell].T, solids, spacing)
             seen |= (outward[:, place] * way).sum(axis=0) < 0
-            beside = (seen & ~rigid[some] & (off < (1 - AT_CENTRE) * spacing)).any(axis=1)
-            behind[some] = ~seen & ((off < reach) | (clear <= 0)) & beside[:, None]
+            face = solids.normals(points[some]).T[..., None]
+            beyond = (way * face).sum(axis=0) < -around[some, None] - LENGTH_TOLERANCE
+            around_edge = beyond & (clear > 0) & (~seen | rigid[some]).any(axis=1)[:, None]
+            around_edge &= (normals[:, place] * face).sum(axis=0) < _AROUND_AN_EDGE
+            beside = ~rigid[some] & (off < (1 - AT_CENTRE) * spacing)
+            seen &= ~around_edge | ~(beside & seen & ~around_edge).any(axis=1)[:, None]
+            behind[some] = ~seen & ((off < reach) | (clear <= 0)) & (beside & seen).any(axis=1)[:, None]
         return behind
 
     def _outward(self, cells: Index) -> Array:

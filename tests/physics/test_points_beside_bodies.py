@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from small_meshes import box as box_mesh
 from small_meshes import inverted, merged
@@ -61,12 +61,13 @@ def test_claims_hold_beside_faces_and_edges_along_the_grid(size, material, swapp
 
 
 @settings(max_examples=3)
+@example(280665, 3.264e-3, False, None)  # kernels that read around its edges erred by 4 %, at five points
 @given(st.integers(0, 10**6), st.floats(0.3e-3, 6e-3), st.booleans(), st.sampled_from([None, 6.0, 200.0]))
 def test_points_beside_edges_err_by_no_more_than_their_claims(seed, thickness, tilted, density):
     """Required: at most 3 times the claims, but at 4 of 40 points; for all together 0.2 to 1.8 times.
 
-    Measured on 14 others: 2 points at most, and together 0.6 to 1.3 times. Without `edge_errors` 2 to 13
-    points, and 1.1 to 2.3 times.
+    Of 61 others, 54 have no such point, 6 one and 1 two, so about one in 5000 has five. Together they have
+    0.45 to 1.32 times, 0.71 in the median: both limits are 4 standard deviations of the logarithm away.
     """
     rng = np.random.default_rng(seed)
     angles = tuple(rng.uniform(-3, 3, 3).tolist()) if tilted else (0.0, 0.0, 0.0)
