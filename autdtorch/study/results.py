@@ -23,7 +23,7 @@ from autdtorch.objectives.objective import validate_drives
 from autdtorch.propagators import Run
 from autdtorch.utils.digest import digest_of, package_versions, source_digest
 from autdtorch.utils.files import line_of, replace_file, row_of
-from autdtorch.utils.text import counted, decimals_of, html_table
+from autdtorch.utils.text import counted, decimals_of, html_table, in_percent
 from autdtorch.utils.units import prefixed
 from autdtorch.utils.validation import invalid, real_tensor
 
@@ -335,12 +335,6 @@ def _share_of_bound(scene: SceneResult, score: float) -> str:
     if score <= 0:  # a stiffness below 0 is no trap
         return f"{'below 0' if score < 0 else '0'} % of {bound}"
     return f"{in_percent(score / scene.bound)} % of {bound}"
-
-
-def in_percent(share: float) -> str:
-    """Return a share > 0 in percent, rounded down, so that 100.0 is all of it."""
-    tenths = math.floor(1000 * share + 1e-9)  # 0.9 is 900 of them, not 899 and a rounding error
-    return f"{tenths / 10:.1f}" if tenths >= 10 else f"{100 * share:.2g}"
 
 
 def with_foci(results: StudyResult) -> bool:

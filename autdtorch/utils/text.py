@@ -32,6 +32,12 @@ def in_digits(number: float, digits: int) -> str:
     return f"{number:.{decimals_of([number], digits)}f}"
 
 
+def in_percent(share: float) -> str:
+    """Return a share > 0 in percent, rounded down, so that 100.0 is all of it."""
+    tenths = math.floor(1000 * share + 1e-9)  # 0.9 is 900 of them, not 899 and a rounding error
+    return f"{tenths / 10:.1f}" if tenths >= 10 else f"{100 * share:.2g}"
+
+
 def counted(count: int, noun: str, plural: str | None = None) -> str:
     """Return a count with its noun, such as "1 run" or "3 runs"; irregular nouns need a `plural`."""
     return f"{count} {noun if count == 1 else plural or f'{noun}s'}"

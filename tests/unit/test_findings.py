@@ -7,8 +7,9 @@ from small_scenes import small_scene
 
 import autdtorch as at
 from autdtorch.study.report.findings import findings
-from autdtorch.study.results import in_percent, summary_rows
+from autdtorch.study.results import summary_rows
 from autdtorch.study.run_study import run_study
+from autdtorch.utils.text import in_percent
 
 
 def studied(scene, folder, **methods):

@@ -19,7 +19,7 @@ from autdtorch.plot.explore.situation import SCENE_PLANE, History, Situation, de
 from autdtorch.plot.meshes3d import map_colours
 from autdtorch.scene.drive import amplitudes_of, phases_of
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.text import decimals_of
+from autdtorch.utils.text import decimals_of, in_percent
 from autdtorch.utils.units import prefixed
 
 POSITION, ANGLES = ("body_x", "body_y", "body_z"), ("turn_x", "turn_y", "turn_z")
@@ -225,8 +225,8 @@ def _summary(result: Result) -> str:
     weakest = float(result.pressure.min())
     text = f"Weakest focus {_three_digits(weakest)} Pa"
     if result.bound is not None:
-        share, most = 100 * weakest / result.bound, _three_digits(result.bound)
-        text += f", {share:.0f} % of what any drive can reach ({most} Pa)"
+        share, most = in_percent(weakest / result.bound), _three_digits(result.bound)
+        text += f", {share} % of what any drive can reach ({most} Pa)"
     if result.spacing is None and not result.error:
         return f"{text}. In closed form, without cells."
     cells = "without cells" if result.spacing is None else f"cells of {MM * result.spacing:.3g} mm"

@@ -10,9 +10,9 @@ from autdtorch.io.goal_section import goal_label
 from autdtorch.methods.catalogue import label_of
 from autdtorch.study.report.claims import Claim, Verdict
 from autdtorch.study.report.tables import competitors, median_score
-from autdtorch.study.results import SceneResult, StudyResult, in_percent
+from autdtorch.study.results import SceneResult, StudyResult
 from autdtorch.study.statistics import has_shares
-from autdtorch.utils.text import in_digits
+from autdtorch.utils.text import in_digits, in_percent
 
 MOST_NAMED = 4  # scenes, groups or gaps that a sentence names; more are counted
 
