@@ -67,10 +67,13 @@ class GridComparison:
     @property
     @one_library_thread()
     def point_errors(self) -> torch.Tensor:
-        """The estimated relative error of each point's row of the matrix, float64 (P,)."""
-        matrix = self.result.matrix
-        size = sizes(matrix, self.free)
-        settling = torch.where(matrix.any(dim=1), self._settling_error * matrix.norm() / size, 0.0)
+        """The estimated relative error of each point's row of the matrix, float64 (P,).
+
+        Settling and resonances leave a mean error at quiet points, and one in proportion to loud ones.
+        """
+        size, heard = sizes(self.result.matrix, self.free), self.result.matrix.any(dim=1)
+        usual = (size * heard).norm() / heard.sum().clamp(min=1).sqrt()
+        settling = torch.where(heard, self._settling_error * (usual / size).clamp(min=1), 0.0)
         return torch.hypot(self._errors(lambda rows: rows) + self._near_errors, settling)
 
     @property

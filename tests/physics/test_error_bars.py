@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import pyvista
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import AIR, matrix_of_sphere, relative_error, small_scene
 
@@ -253,6 +253,21 @@ def test_the_error_of_each_point():
     assert errors.shape == true.shape
     assert (errors > true / 3).all()
     assert (errors < 20 * true).all()
+
+
+@settings(max_examples=3)
+@given(st.integers(0, 10**6), st.integers(30, 300), st.floats(0.1, 0.4), st.floats(2.7e-3, 3e-3))
+def test_points_beside_a_resonance_err_together_as_their_matrix(seed, count, density, radius):
+    """Required: within a factor of 2, as grids may agree at single points; each once counted for all."""
+    scene = small_scene((ball(radius, (density, 0.5)),))
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    points = torch.from_numpy(CENTER + (radius + rng.uniform(0.5e-3, 9e-3, (count, 1))) * direction)
+    propagator = make_propagator(scene, "box", 1e-3, tolerance=1e-3)
+    matrix, error = propagator.transfer_matrix(points, return_error=True)
+    together = float((propagator.point_errors(points) * matrix.norm(dim=1)).norm() / matrix.norm())
+    assert error / 2 < together < 2 * error
 
 
 @pytest.mark.filterwarnings("ignore:no steady state")
