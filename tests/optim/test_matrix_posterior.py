@@ -128,7 +128,7 @@ def test_errors_of_entries_are_found_in_noise_below_them(seed, with_phase, level
     off = prediction.pressure - (others @ matrix.T).abs()
     # 240 readings of at most 50 unknowns leave sqrt(50 / 240) = 0.46 of a magnitude's noise, level / sqrt(2).
     assert off.square().mean().sqrt() < 1.5 * 0.46 * level / 2**0.5
-    # Predictions share few unknowns: over 800 draws, the mean square varies like that of 13 deviates around
+    # Predictions share few unknowns: over 800 draws, the mean square varies as the mean of 13 would around
     # 0.7. It exceeds 4 in less than one draw of a million; 1.5^2 was exceeded in one of the 800.
     assert (off / prediction.deviation).square().mean() < 4
 
