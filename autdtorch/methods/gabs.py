@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -107,8 +108,9 @@ class GABS(Method):
         return done._replace(drives=candidates(done.search, self.levels, step))
 
     def _doubts(self, state: State) -> Sequence[Iterable[str]]:
-        """Describe a lone highest score, or a drift of the gain."""
-        return super()._doubts(state) if state.done else step_doubts(state.search)
+        """Describe a lone highest score at the end, and a drift of the gain when it is first seen."""
+        drifts = step_doubts(state)
+        return list(map(itertools.chain, super()._doubts(state), drifts)) if state.done else drifts
 
     def _skipped(self, problem: Problem) -> int:
         """Return 1 where the first transducer is on alone, whose phase changes nothing."""

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
 from scipy.special import stdtrit
 
+from autdtorch.methods.base import State
 from autdtorch.methods.doubtful_readings import Magnitudes
 from autdtorch.methods.matrix_fit import MatrixFit
 from autdtorch.methods.matrix_posterior import MatrixPosterior
 from autdtorch.methods.problem import Problem
 from autdtorch.objectives.goals import scores_of, scores_pressures
 from autdtorch.utils.array_types import REAL
+from autdtorch.utils.text import in_digits
 
 _BY_CHANCE = 1e-4  # share of steady benches that one test may take for drifting ones; a search makes many
 _LEAST = 0.01  # change of the gain that matters
@@ -21,6 +24,7 @@ _LEAST_IN_STEP = 0.003  # the same, between the readings of a step
 _MEMORY = 0.7  # weight of a step's readings in the next step's trend
 _SPANNED = 1e-9  # eigenvalue, relative to the largest, above which a form of the readings is in their span
 _SHOWN = 60  # readings for which the trend of steps is described
+_LARGEST = 50.0  # change of ln gain that is described, lest its exponential overflow
 _ADVICE = "let the bench warm up, and run again"
 
 
@@ -114,16 +118,16 @@ def steadied(
     return {**search, "trend": sums, "drifting": drifting}, score
 
 
-def step_doubts(search: Mapping[str, torch.Tensor]) -> list[Iterator[str]]:
-    """Describe the trends of the trials in the step that shows them first."""
-    return [_doubts_of_step(search, trial) for trial in range(len(search.get("drifting", ())))]
-
-
-def _doubts_of_step(search: Mapping[str, torch.Tensor], trial: int) -> Iterator[str]:
-    if int(search["drifting"][trial]) == 1:
-        rate, deviation, _ = _rates(search["trend"][trial, None])
-        change = _described(_SHOWN * float(rate), _SHOWN * float(deviation))
-        yield f"{change} in {_SHOWN} readings, so that older ones no longer count: {_ADVICE}"
+def step_doubts(state: State) -> list[Iterable[str]]:
+    """Describe the trends of the gain, of all T trials, in the step that shows them first."""
+    doubts: list[Iterable[str]] = [() for _ in state.seeds]
+    if "drifting" in state.search:
+        for row in torch.nonzero(state.search["drifting"] == 1)[:, 0].tolist():
+            rate, deviation, _ = _rates(state.search["trend"][row, None])
+            change = _described(_SHOWN * float(rate), _SHOWN * float(deviation))
+            text = f"{change} in {_SHOWN} readings, so that older ones no longer count: {_ADVICE}"
+            doubts[int(state.trials[row])] = [text]
+    return doubts
 
 
 def _sums_of_step(drives: torch.Tensor, pressure: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
@@ -175,5 +179,6 @@ def _quantile(freedom: float) -> float:
 
 def _described(change: float, deviation: float) -> str:
     way = "fall" if change < 0 else "rise"
-    percent = 100 * abs(torch.expm1(torch.tensor(change)).item())
-    return f"the readings {way} by {percent:.2g} +- {100 * deviation:.1g} %"
+    gain = math.exp(min(change, _LARGEST))
+    percent, error = in_digits(100 * abs(gain - 1), 2), in_digits(100 * gain * deviation, 1)
+    return f"the readings {way} by {percent} +- {error} %"

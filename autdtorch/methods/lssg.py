@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -187,8 +188,9 @@ class LSSG(Method):
         return done._replace(drives=normalise(weights @ done.search["foci"]))
 
     def _doubts(self, state: State) -> Sequence[Iterable[str]]:
-        """Describe a lone highest score, or a drift of the gain."""
-        return super()._doubts(state) if state.done else step_doubts(state.search)
+        """Describe a lone highest score at the end, and a drift of the gain when it is first seen."""
+        drifts = step_doubts(state)
+        return list(map(itertools.chain, super()._doubts(state), drifts)) if state.done else drifts
 
 
 def _foci(problem: Problem) -> int:

@@ -1,6 +1,7 @@
 """Trends of the gain of a bench: told with their size, and no reason to keep an old drive."""
 
 import logging
+from dataclasses import replace
 
 import noisy_bench
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 import autdtorch as at
-from autdtorch.methods.gain_trend import trend_of_fit
+from autdtorch.methods.gain_trend import step_doubts, trend_of_fit
 from autdtorch.objectives.perturbations import Noise, Perturbation
 
 
@@ -86,6 +87,15 @@ def test_gabs_loses_little_by_a_gain_that_falls(make_objective, random_matrix, c
     # Noise of 3 % is 24 % at an eighth of the gain. Without the trend, solutions reach 46 %.
     assert reached(0.5) > 0.85 * steady
     assert "the readings fall by" in caplog.text
+
+
+def test_a_drift_is_told_of_the_trial_that_shows_it(make_objective, random_matrix):
+    state = at.GABS(passes=2).start(at.Problem.of(make_objective(random_matrix(3, 5, 0))), trials=3)
+    sums = torch.tensor([[-0.02, 1.0, 1e-4, 11.0, 0.0]], dtype=torch.float64)  # ln gain: -0.02 +- 0.0032
+    going_on = {"trials": torch.tensor([2]), "search": {"trend": sums, "drifting": torch.tensor([1])}}
+    *others, (text,) = step_doubts(replace(state, **going_on))  # two trials have ended
+    assert others == [(), ()]
+    assert text.startswith("the readings fall by 70 +- 6 % in 60 readings")  # 0.30 of the gain, +- 19 % of it
 
 
 class Spikes(Perturbation):
