@@ -28,7 +28,7 @@ from autdtorch.fdtd.assembly.reference_element import (
     InterfaceElements,
     Materials,
 )
-from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, roughness, unfolded
+from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, roughness, unfolded, unfolded_from_beyond
 from autdtorch.fdtd.assembly.surface_impedance import with_impedance, with_impedance_faces
 from autdtorch.fdtd.assembly.thin_walls import Side, wall_sides
 from autdtorch.fdtd.assembly.unions import (
@@ -189,8 +189,12 @@ def _distances(bodies: list[Union], first: Index, grid: Grid) -> Array:
         near = ((center > lower - 2 * grid.spacing) & (center < upper + 2 * grid.spacing)).all(axis=1)
         far[~near] = FAR
         if near.any():
-            level = lattice_distances(partial(body.distance, grid=grid), first[near])
-            far[near] = level if body.rigid else unfolded(level)
+            measure = partial(body.distance, grid=grid)
+            level = lattice_distances(measure, first[near])
+            if not body.rigid:
+                several = len(body.shapes) > 1
+                level = unfolded_from_beyond(level, measure, first[near]) if several else unfolded(level)
+            far[near] = level
     return distance
 
 

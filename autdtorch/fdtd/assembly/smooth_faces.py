@@ -19,6 +19,7 @@ Both are virtual elements (Beirao da Veiga et al. 2013) with the local solutions
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -71,7 +72,8 @@ def quadratic(x: Array) -> Array:
     return np.column_stack((np.ones(len(x)), x, *second))
 
 
-_MONOMIALS = quadratic(LATTICE - 0.5)
+_BEYOND = 2 * LATTICE - 0.5  # places around an element, up to half a cell off
+_MONOMIALS, _MONOMIALS_BEYOND = quadratic(LATTICE - 0.5), quadratic(_BEYOND - 0.5)
 _FIT = np.linalg.pinv(_MONOMIALS)
 
 
@@ -130,25 +132,40 @@ def unfolded(level: Array) -> Array:
     for around in (_ALONE, _AROUND):  # a few places outside do not show the slope
         outside = level > 0
         some = np.flatnonzero(outside.any(axis=1) & ~outside.all(axis=1) & (roughness(level) > _UNFOLDED))
-        here, inside = level[some], ~outside[some]
+        here = level[some]
         seen = binary_dilation(outside[some].reshape(-1, *(SUBCELLS + 1,) * 3), around)
-        fit, smooth = _continued(here, seen.reshape(here.shape))
-        smooth &= (fit < _UNFOLDED).all(axis=1, where=inside)
-        level[some] = np.where(inside & smooth[:, None], np.minimum(fit, here), here)
+        level[some] = _continued(here, here, seen.reshape(here.shape), _MONOMIALS)
     return level
 
 
-def _continued(level: Array, seen: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
-    """Return quadratic functions (n, 125) that fit signed distances (n, 125) where these are `seen`.
+def unfolded_from_beyond(level: Array, measure: Callable[[Array], Array], first: Index) -> Array:
+    """Return distances (n, 125) as of `unfolded`, the rest of them from places outside beyond the elements.
 
-    Also returns a mask (n,) of those that do, and have a slope of one.
+    `measure` returns those of places (..., 3) [cells], and `first` (n, 3) are the elements' first cells.
     """
-    monomials = seen[:, :, None] * _MONOMIALS
+    level = unfolded(level)
+    outside = level > 0
+    some = np.flatnonzero(outside.any(axis=1) & ~outside.all(axis=1) & (roughness(level) > _UNFOLDED))
+    far, way = measure(first[some, None] + _BEYOND), outside[some] @ (LATTICE - 0.5)
+    seen = (far > 0) & (way @ (_BEYOND - 0.5).T > 0)  # not of a face behind
+    level[some] = _continued(level[some], far, seen, _MONOMIALS_BEYOND)
+    return level
+
+
+def _continued(level: Array, shown: Array, seen: NDArray[np.bool_], monomials: Array) -> Array:
+    """Return signed distances (n, 125) with those inside from quadratic functions, where these serve.
+
+    They fit distances `shown` (n, l), at places with `monomials` (l, 10), where these are `seen`. They serve
+    if they do so, have a slope of one, and are negative inside.
+    """
+    masked = seen[:, :, None] * monomials
     least = np.diag([_FLAT] * 4 + [_BENT] * 6)
-    factors = np.linalg.solve(monomials.mT @ _MONOMIALS + least, monomials.mT @ level[:, :, None])[:, :, 0]
-    fit = factors @ _MONOMIALS.T
-    good = (np.abs(fit - level) < _UNFOLDED).all(axis=1, where=seen)
-    return fit, good & (np.abs(np.linalg.norm(factors[:, 1:4], axis=1) - 1) < _STEEP)
+    factors = np.linalg.solve(masked.mT @ monomials + least, masked.mT @ shown[:, :, None])[:, :, 0]
+    fit, inside = factors @ _MONOMIALS.T, level <= 0
+    smooth = (np.abs(factors @ monomials.T - shown) < _UNFOLDED).all(axis=1, where=seen)
+    smooth &= np.abs(np.linalg.norm(factors[:, 1:4], axis=1) - 1) < _STEEP
+    smooth &= (fit < _UNFOLDED).all(axis=1, where=inside)
+    return np.where(inside & smooth[:, None], np.minimum(fit, level), level)
 
 
 def surfaces(level: Array, density: Array) -> tuple[NDArray[np.bool_], Surface]:
