@@ -186,10 +186,10 @@ def test_the_error_is_that_of_the_grid_which_the_tolerance_chooses():
     matrix, error = by_tmatrix(scene, spacing=1.4e-3).transfer_matrix(return_error=True)
     fine = make_propagator(scene, "box", 0.7e-3, cache=False).transfer_matrix()
     assert relative_error(matrix, fine) < error < 0.2
-    chosen = by_tmatrix(scene, spacing=None, tolerance=0.1)
-    assert 0.5e-3 < chosen.spacing < 3e-3
+    chosen = by_tmatrix(scene, spacing=None, tolerance=0.01)
+    assert 0.5e-3 < chosen.spacing < 1.5e-3  # 1.65 mm for 0.05 and more
     matrix, error = chosen.transfer_matrix(return_error=True)
-    assert relative_error(matrix, fine) < error <= 0.1
+    assert relative_error(matrix, fine) < error <= 0.01
 
 
 def test_obstacles_that_cannot_be_turned_are_simulated_where_they_are():

@@ -360,3 +360,23 @@ def test_errors_of_a_generator_are_its_own() -> None:
     spheres = (at.Sphere((0, 0, 0.05), radius, rigid=True) for radius in (1e-3, -1e-3))
     with pytest.raises(ValueError, match=r"^Sphere\.radius: -0\.001"):
         at.Scene(array, air, 40e3, [(0, 0, 0.1)], spheres)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("load", "name"),
+    [
+        (at.load_scene, "lab.yaml"),
+        (at.load_results, "study.h5"),
+        (at.load_array, "array.csv"),
+        (at.load_drive, "drive.npz"),
+        (at.load_sequence, "ring.csv"),
+        (at.load_drive, "drive.xml.gz"),
+    ],
+)
+def test_a_missing_file_or_a_folder_is_named_with_what_to_do(load, name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match=f"^{name}: there is no such file; .* from {tmp_path}$"):
+        load(name)
+    (tmp_path / name / "results.h5").mkdir(parents=True)
+    with pytest.raises(IsADirectoryError, match=r"^[\w./]*: a folder; must be a file$"):
+        load(name)

@@ -395,23 +395,3 @@ def test_one_is_singular():
     single = at.Scene(at.TransducerArray([(0, 0, 0)], (1, 0, 0)), AIR, 40e3, [(0.05, 0, 0)], [box()])
     assert "1 transducer, 1 control point, 1 obstacle," in repr(single)
     assert "16 transducers, 4 control points, 0 obstacles" in repr(scene())
-
-
-@pytest.mark.parametrize(
-    ("load", "name"),
-    [
-        (at.load_scene, "lab.yaml"),
-        (at.load_results, "study.h5"),
-        (at.load_array, "array.csv"),
-        (at.load_drive, "drive.npz"),
-        (at.load_sequence, "ring.csv"),
-        (at.load_drive, "drive.xml.gz"),
-    ],
-)
-def test_a_missing_file_or_a_folder_is_named_with_what_to_do(load, name, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(FileNotFoundError, match=f"^{name}: there is no such file; .* from {tmp_path}$"):
-        load(name)
-    (tmp_path / name / "results.h5").mkdir(parents=True)
-    with pytest.raises(IsADirectoryError, match=r"^[\w./]*: a folder; must be a file$"):
-        load(name)
