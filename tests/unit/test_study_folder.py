@@ -16,6 +16,8 @@ from filelock import FileLock
 from small_scenes import CUBE, small_scene
 
 from autdtorch.methods.functions import gabs
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.scene import Scene
 from autdtorch.study.folder import PREVIOUS, TRIALS_FILE
 from autdtorch.study.results import PROVENANCE_FILE, load_provenance
 from autdtorch.study.results_file import RESULTS_FILE, load_results
@@ -156,6 +158,16 @@ def test_a_damaged_matrix_is_computed_again(tmp_path, warnings):
         assert torch.equal(scene.transfer_matrix, undisturbed.scenes[name].transfer_matrix)
     assert len(warnings()) == len(matrices) > 0
     assert contents(cache) == matrices
+
+
+def test_trials_of_other_shapes_do_not_count_though_the_settings_are_called_the_same(tmp_path):
+    study(tmp_path, scenes={"one": small_scene()})
+    (tmp_path / RESULTS_FILE).unlink()
+    small = small_scene()
+    array = TransducerArray.grid((2, 3), pitch=8e-3, center=(1.2e-3, 12e-3, 12e-3))
+    other = Scene(array, small.medium, 40e3, small.control_points)
+    (found,) = study(tmp_path, scenes={"one": other}).scenes.values()
+    assert found.methods["gabs"].solution.drive.shape == (3, 6)
 
 
 def test_with_a_method_of_ones_own_everything_is_computed_again(tmp_path):
