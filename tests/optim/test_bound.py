@@ -72,6 +72,7 @@ def test_the_paper_scene_without_obstacles_is_solved_by_every_trial(paper_object
     [
         (torch.ones(2, 3), "G: .*; must be an array of complex numbers"),
         (torch.ones(3, dtype=torch.complex128), r"G: shape \(3,\); must be \(P, M\) with P, M >= 1"),
+        (np.ones((0, 3), dtype=complex), r"G: shape \(0, 3\); must be \(P, M\) with P, M >= 1"),
         (torch.full((1, 2), complex(math.nan, 0)), "G: .*; every entry must be finite"),
     ],
 )

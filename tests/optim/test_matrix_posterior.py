@@ -193,6 +193,7 @@ def test_a_sensor_in_other_units_costs_nothing(make_objective, random_matrix, me
     ("settings", "message"),
     [
         ({"gain": 0}, "gain: 0; must be"),
+        ({"gain": 1e6}, "gain: 1e\\+06|gain: 1000000"),
         ({"phase": math.nan}, "phase: nan"),
         ({"rest": -1}, "rest: -1; must be"),
         ({"variants": torch.ones(3, dtype=torch.complex128)}, r"variants: shape \(3,\)"),
