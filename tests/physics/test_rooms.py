@@ -162,7 +162,7 @@ def one_way(obstacles, reflectors, spacing=1e-3):
     return (forth - back.mT).norm() / max(free.norm(), forth.norm())
 
 
-@settings(max_examples=1)
+@settings(max_examples=2)  # the first is always the simplest
 @given(scene=rooms())
 @example(scene=([CUT], [SOFT, at.Reflector((0.0, 0.0, 47.5e-3), (0.0, 0.0, -1.0), 0.3j)]))
 def test_reciprocity(scene):

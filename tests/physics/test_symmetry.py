@@ -168,7 +168,7 @@ OBSTACLES = st.one_of(
 HALF_WAY = Cylinder((11.71875e-3, 15.625e-3, 15.625e-3), 1.953125e-3 / 2, 3.90625e-3, (1, 1, 0.5), rigid=True)
 
 
-@settings(max_examples=1)
+@settings(max_examples=2)  # the first is always the simplest
 @example(HALF_WAY, 0.0014194609350529578)
 @given(OBSTACLES, st.floats(1.2e-3, 1.6e-3))
 def test_random_symmetric_scenes(obstacle, spacing):
