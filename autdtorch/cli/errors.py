@@ -164,7 +164,9 @@ def _of_hydra(error: BaseException, text: str) -> str:
     if isinstance(error, OverrideParseException):
         why = text.partition("\n")[0]
         accepted = "must be KEY=VALUE, a value with signs in quotes: 'KEY=\"a=b\"'"
-        if re.search(r"=\{.*(?<!\\)\[\d+\]\S*:", error.override or ""):
+        if re.match(r"[^=]*\[\d+\\?\]", error.override or ""):
+            accepted = "an item of a list has its number between dots: scene.obstacles.0.density=1.5"
+        elif re.search(r"=\{.*(?<!\\)\[\d+\]\S*:", error.override or ""):
             accepted = r"in {...}, brackets of a name have backslashes, as in {obstacles\[0\].x: 2e-3}"
         return f"argument {error.override!r}: {why}; {accepted}"
     lines = [line.strip() for line in text.splitlines()]

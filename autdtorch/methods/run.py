@@ -19,7 +19,7 @@ from autdtorch.objectives.objective import GoalFunction, Objective, require_obje
 from autdtorch.objectives.perturbations import continued
 from autdtorch.objectives.readings import Readings
 from autdtorch.utils.files import path_of
-from autdtorch.utils.hints import did_you_mean, renamed_keywords
+from autdtorch.utils.hints import nearest_name, renamed_keywords
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.validation import invalid, require_callable, within
 
@@ -118,10 +118,9 @@ def require_method(method: object) -> None:
     if isinstance(method, Method):
         return
     text = method if isinstance(method, str) else getattr(method, "__name__", "")
-    classes = {name: kind.__name__ for name, kind in METHODS.items()}
-    meant = [kind for name, kind in classes.items() if text in (name, kind)]
-    hint = f"such as {meant[0]}()" if meant else f"such as GABS(){did_you_mean(text, classes)}"
-    raise invalid("method", method, f"must be a Method, {hint}")
+    classes = {word: kind.__name__ for name, kind in METHODS.items() for word in (name, kind.__name__)}
+    meant = classes[nearest_name(text, classes) or "gabs"]
+    raise invalid("method", method, f"must be a Method, such as {meant}()")
 
 
 def _run(

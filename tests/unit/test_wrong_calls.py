@@ -209,7 +209,7 @@ REFUSED = {
     "phases": (lambda seen: seen(PHASES), r"drive.*complex.*drive_from_phases\(phases\)"),
     "amplitudes_of": (lambda _: at.amplitudes_of(PHASES), "drive.*drive_from_phases"),
     "name": (lambda seen: at.run("gabs", seen), r"method.*GABS\(\)"),
-    "wrong name": (lambda seen: at.run("lsg", seen), "method.*did you mean 'lssg'"),
+    "wrong name": (lambda seen: at.run("lsg", seen), "method.*such as LSSG\\("),
     "function": (lambda seen: at.run(at.identify, seen), r"method.*Identify\(\)"),
     "class": (lambda seen: at.run(at.BayesOpt, seen), r"method.*BayesOpt\(\)"),
     "scene": (lambda seen: at.run(at.GABS(), seen.scene), r"objective.*SimulatedObjective\(scene"),

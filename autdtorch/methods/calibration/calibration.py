@@ -257,6 +257,7 @@ class Calibration:
         facts = [("readings", f"{count}, of {counted(drives, 'drive')} at {counted(points, 'point')}")]
         if (held := self.held_back) is not None:
             error = f"{_percent(held.error)} after, {_percent(held.before)} before with one gain"
+            error += "" if held.error < held.before else ": no better than the simulation"
             facts += [
                 ("error at readings held back", error),
                 ("within 95 % intervals", f"{100 * held.coverage:.0f} % of {held.readings}"),
