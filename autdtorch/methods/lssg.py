@@ -140,6 +140,7 @@ class LSSG(Method):
     pass takes P * levels evaluations, as many as the paper's: 64 with 4 foci. The search ends early with a
     pass that changes nothing. Obstacles enter through the observed scores, not through the phases. The
     amplitudes are in [0, 1], not all 1. For a force, the foci are the scene's control points, two or more.
+    Where the gain drifts, the last choice is the solution, as of `GABS`.
 
     Attributes:
         levels: number of offsets in [0, 2 pi), >= 2.

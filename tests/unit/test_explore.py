@@ -15,7 +15,7 @@ import autdtorch as at
 from autdtorch.plot.explore import calculation
 from autdtorch.plot.explore import situation as situation_module
 from autdtorch.plot.explore.calculation import Calculator, Finished, Request, Result
-from autdtorch.plot.explore.display import _force_text, offered
+from autdtorch.plot.explore.display import _force_text, _summary, offered
 from autdtorch.plot.explore.rendering import followed
 from autdtorch.plot.explore.situation import SCENE_PLANE, History, MovedObstacle, Situation, in_phase
 
@@ -238,3 +238,15 @@ def test_a_newer_request_and_the_end_stop_what_is_calculated():
     made.close()
     while not reports.empty():
         assert not isinstance(reports.get(), Result)
+
+
+@pytest.mark.parametrize(
+    ("bound", "text"),
+    [(832.0, "99.7 % of what any drive can reach"), (0.0, "Weakest focus"), (None, "Weakest focus")],
+    ids=["all but 2 Pa", "in a hollow body", "unknown"],
+)
+def test_the_share_of_the_bound_is_rounded_down_and_left_out_where_nothing_is_heard(bound, text):
+    field, pressure = np.zeros((1, 1)), torch.tensor([830.0 if bound else 0.0], dtype=torch.float64)
+    result = Result(Request(1, None), pressure, None, pressure, field, bound)
+    assert text in _summary(result)
+    assert ("%" in _summary(result)) is bool(bound)

@@ -224,7 +224,7 @@ def _rows(result: Result, reference: float) -> list[list[str]]:
 def _summary(result: Result) -> str:
     weakest = float(result.pressure.min())
     text = f"Weakest focus {_three_digits(weakest)} Pa"
-    if result.bound is not None:
+    if result.bound:  # 0 where no sound reaches a focus, as in a hollow body
         share, most = in_percent(weakest / result.bound), _three_digits(result.bound)
         text += f", {share} % of what any drive can reach ({most} Pa)"
     if result.spacing is None and not result.error:
