@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -10,10 +9,10 @@ from typing import ClassVar, Literal
 import torch
 
 from autdtorch.methods.base import NEAR_TIE, Method, State, Step, whole
-from autdtorch.methods.gain_trend import step_doubts
 from autdtorch.methods.lssg import (
     Search,
     ascend,
+    ascent_doubts,
     at_levels,
     begin_ascent,
     candidates,
@@ -109,8 +108,7 @@ class GABS(Method):
 
     def _doubts(self, state: State) -> Sequence[Iterable[str]]:
         """Describe a lone highest score at the end, and a drift of the gain when it is first seen."""
-        drifts = step_doubts(state)
-        return list(map(itertools.chain, super()._doubts(state), drifts)) if state.done else drifts
+        return ascent_doubts(state, super()._doubts(state))
 
     def _skipped(self, problem: Problem) -> int:
         """Return 1 where the first transducer is on alone, whose phase changes nothing."""

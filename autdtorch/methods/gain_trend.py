@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from scipy.special import stdtrit
 
@@ -15,7 +16,7 @@ from autdtorch.methods.matrix_fit import MatrixFit
 from autdtorch.methods.matrix_posterior import MatrixPosterior
 from autdtorch.methods.problem import Problem
 from autdtorch.objectives.goals import scores_of, scores_pressures
-from autdtorch.utils.array_types import REAL
+from autdtorch.utils.array_types import REAL, Array
 from autdtorch.utils.text import in_digits
 
 _BY_CHANCE = 1e-4  # share of steady benches that one test may take for drifting ones; a search makes many
@@ -44,7 +45,7 @@ class GainTrend(NamedTuple):
     @property
     def is_seen(self) -> bool:
         """True if the change matters and is not by chance."""
-        return abs(self.change) > max(_LEAST, _quantile(self.freedom) * self.deviation)
+        return abs(self.change) > max(_LEAST, float(_quantile(self.freedom)) * self.deviation)
 
     def doubts(self) -> Iterator[str]:
         """Describe a trend that is seen."""
@@ -109,7 +110,7 @@ def steadied(
         count = drives.shape[1]
         sums = _sums_of_step(problem.quantise(drives), pressure, sums)
         rate, deviation, freedom = _rates(sums)
-        least = (_quantiles(freedom) * deviation).clamp_min(_LEAST_IN_STEP / count)
+        least = (torch.from_numpy(_quantile(freedom.numpy())) * deviation).clamp_min(_LEAST_IN_STEP / count)
         drifting = drifting + ((drifting > 0) | (rate.abs() > least))
         if (drifting > 0).any():
             gain = (rate[:, None] * torch.arange(1 - count, 1, device="cpu")).exp()
@@ -168,13 +169,9 @@ def _rates(sums: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor
     return rate, deviation.masked_fill((freedom < 1) | (information <= tiny), torch.inf), freedom
 
 
-def _quantiles(freedom: torch.Tensor) -> torch.Tensor:
-    """Return deviations (L,) beyond which a trend of some degrees of freedom (L,) is not by chance."""
-    return torch.from_numpy(stdtrit(freedom.clamp_min(1).numpy(), 1 - _BY_CHANCE / 2))
-
-
-def _quantile(freedom: float) -> float:
-    return float(stdtrit(max(1.0, freedom), 1 - _BY_CHANCE / 2))
+def _quantile(freedom: Array | float) -> Array:
+    """Return the deviations beyond which trends of some degrees of freedom are not by chance."""
+    return np.asarray(stdtrit(np.maximum(freedom, 1.0), 1 - _BY_CHANCE / 2))
 
 
 def _described(change: float, deviation: float) -> str:

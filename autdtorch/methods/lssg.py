@@ -108,6 +108,12 @@ def ascend(search: Search, step: int, state: State, pressure: torch.Tensor, scor
     return Step(none, search, goes_on, chosen)
 
 
+def ascent_doubts(state: State, others: Sequence[Iterable[str]]) -> Sequence[Iterable[str]]:
+    """Describe a drift of the gain when it is first seen, after `others` of the trials, if there are any."""
+    drifts = step_doubts(state)
+    return list(map(itertools.chain, others, drifts)) if others else drifts
+
+
 @functools.lru_cache(maxsize=8)
 def _phases(levels: int) -> torch.Tensor:
     """Return e^{-i phi} (levels,) of the phases to compare."""
@@ -190,8 +196,7 @@ class LSSG(Method):
 
     def _doubts(self, state: State) -> Sequence[Iterable[str]]:
         """Describe a lone highest score at the end, and a drift of the gain when it is first seen."""
-        drifts = step_doubts(state)
-        return list(map(itertools.chain, super()._doubts(state), drifts)) if state.done else drifts
+        return ascent_doubts(state, super()._doubts(state))
 
 
 def _foci(problem: Problem) -> int:

@@ -130,10 +130,9 @@ def unfolded(level: Array) -> Array:
     """
     level = level.copy()
     for around in (_ALONE, _AROUND):  # a few places outside do not show the slope
-        outside = level > 0
-        some = np.flatnonzero(outside.any(axis=1) & ~outside.all(axis=1) & (roughness(level) > _UNFOLDED))
+        some = _folded(level)
         here = level[some]
-        seen = binary_dilation(outside[some].reshape(-1, *(SUBCELLS + 1,) * 3), around)
+        seen = binary_dilation((here > 0).reshape(-1, *(SUBCELLS + 1,) * 3), around)
         level[some] = _continued(here, here, seen.reshape(here.shape), _MONOMIALS)
     return level
 
@@ -144,12 +143,17 @@ def unfolded_from_beyond(level: Array, measure: Callable[[Array], Array], first:
     `measure` returns those of places (..., 3) [cells], and `first` (n, 3) are the elements' first cells.
     """
     level = unfolded(level)
-    outside = level > 0
-    some = np.flatnonzero(outside.any(axis=1) & ~outside.all(axis=1) & (roughness(level) > _UNFOLDED))
-    far, way = measure(first[some, None] + _BEYOND), outside[some] @ (LATTICE - 0.5)
+    some = _folded(level)
+    far, way = measure(first[some, None] + _BEYOND), (level[some] > 0) @ (LATTICE - 0.5)
     seen = (far > 0) & (way @ (_BEYOND - 0.5).T > 0)  # not of a face behind
     level[some] = _continued(level[some], far, seen, _MONOMIALS_BEYOND)
     return level
+
+
+def _folded(level: Array) -> Index:
+    """Return the elements (k,) that a surface intersects, and whose distances (n, 125) are not smooth."""
+    outside = level > 0
+    return np.flatnonzero(outside.any(axis=1) & ~outside.all(axis=1) & (roughness(level) > _UNFOLDED))
 
 
 def _continued(level: Array, shown: Array, seen: NDArray[np.bool_], monomials: Array) -> Array:
